@@ -17,11 +17,11 @@ from unittest import mock
 import msgspec
 
 from fleet import cli
-from fleet.access.roles import SAID, keys
+from fleet.access.roles import TOPIC_RULES, topic_keys
 from fleet.bus.codec import encoding
 from fleet.bus.memory_bus import MemoryBus
 from fleet.commands.offline import schema
-from fleet.contract import COLUMNS, QUERIES, TOPICS, Account, FleetState, Link, Sample, Status, meaning
+from fleet.contract import COLUMNS, QUERIES, TOPICS, FleetState, GatewayCounters, Link, Sample, Status, meaning
 from fleet.effects import catalogue
 from gateway import __main__ as gateway
 from gateway.status import metrics as gateway_metrics
@@ -131,8 +131,13 @@ def configuration_page() -> str:
     text += "\n## Rules by role\n\nEnforced by the router where certificates or passwords are used; everything not "
     text += "listed is denied.\nThe size limit applies everywhere.\n\n"
     rows = [
-        (code(keys(topic)), ", ".join(rule.by), ", ".join(rule.asked), f"{rule.most / 1024:,.0f} KiB")
-        for topic, rule in SAID.items()
+        (
+            code(topic_keys(topic)),
+            ", ".join(rule.publishers),
+            ", ".join(rule.queriers),
+            f"{rule.max_bytes / 1024:,.0f} KiB",
+        )
+        for topic, rule in TOPIC_RULES.items()
     ]
     text += table(("Keys", "Published by, replies by", "Queried by", "Largest message"), rows)
     text += (
@@ -161,25 +166,25 @@ def metrics_page() -> str:
 
 def gateway_families() -> Iterable[Any]:
     """Return the metrics of a gateway with all optional numbers present."""
-    return gateway_metrics.counters(lambda: (filled(Account), [filled(Status)]))()
+    return gateway_metrics.counters(lambda: (make_filled(GatewayCounters), [make_filled(Status)]))()
 
 
 def worker_families() -> Iterable[Any]:
     """Return the metrics of a worker with all optional numbers present."""
-    return worker_metrics.counters(lambda: filled(FleetState), MemoryBus())()
+    return worker_metrics.counters(lambda: make_filled(FleetState), MemoryBus())()
 
 
-def filled(hint: Any) -> Any:
+def make_filled(hint: Any) -> Any:
     """Create a value of a type in which every optional part is present."""
     if hasattr(hint, "__metadata__"):
-        return filled(get_args(hint)[0])
+        return make_filled(get_args(hint)[0])
     origin, inner = get_origin(hint), get_args(hint)
     if origin is not None and (origin is Union or "Union" in origin.__name__):
-        return filled(inner[0])
+        return make_filled(inner[0])
     if origin is dict:
-        return {filled(inner[0]): filled(inner[1])}
+        return {make_filled(inner[0]): make_filled(inner[1])}
     if origin is tuple:
-        return (filled(inner[0]),) if inner[-1] is ... else tuple(filled(part) for part in inner)
+        return (make_filled(inner[0]),) if inner[-1] is ... else tuple(make_filled(part) for part in inner)
     if hint is Link:
         return Link.LIVE
     if issubclass(hint, enum.Enum):
@@ -187,7 +192,7 @@ def filled(hint: Any) -> Any:
     if issubclass(hint, msgspec.Struct):
         return hint(
             **{
-                name: filled(part)
+                name: make_filled(part)
                 for name, part in get_type_hints(hint, include_extras=True).items()
                 if name in hint.__struct_fields__
             }
@@ -210,13 +215,13 @@ def effects_page() -> str:
     for effect in effects.values():
         text += f"\n## {effect.name} {{ #{effect.name} }}\n\nSource: {effect.source}.\n\n"
         rows = [
-            (code(p.name), p.unit, p.meaning + (" *(nuisance)*" if p.aside else ""), f"{p.low:g} to {p.high:g}")
+            (code(p.name), p.unit, p.meaning + (" *(nuisance)*" if p.nuisance else ""), f"{p.low:g} to {p.high:g}")
             for p in effect.parameters
         ]
         text += table(("Parameter", "Unit", "Meaning", "Bounds"), rows)
-        for other, difference in effect.confused.items():
+        for other, difference in effect.confusable_with.items():
             text += f"\n- confusable with `{other}`: {difference}"
-        text += "\n" if effect.confused else ""
+        text += "\n" if effect.confusable_with else ""
     return text
 
 

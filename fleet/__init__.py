@@ -16,7 +16,7 @@ from pathlib import Path
 from fleet.process import private_files
 
 __version__ = "0.1.0"
-_UNUSED_S = 30 * 86_400  # age at which the compile cache of other sources is removed [s]
+_CACHE_EXPIRY_S = 30 * 86_400  # age at which the compile cache of other sources is removed [s]
 
 
 def _sources_hash() -> str:
@@ -44,35 +44,35 @@ def _compile_cache() -> tuple[Path, str]:
         ValueError: when the configured folder is writable by others.
         OSError: when it cannot be created.
     """
-    if given := os.environ.get("NUMBA_CACHE_DIR"):
-        return private_files.folder(Path(given).absolute(), "NUMBA_CACHE_DIR"), ""
-    if given := os.environ.get("PARAUAV_CACHE"):
-        return _within(private_files.folder(Path(given).absolute(), "PARAUAV_CACHE")), ""
+    if configured := os.environ.get("NUMBA_CACHE_DIR"):
+        return private_files.ensure_private_folder(Path(configured).absolute(), "NUMBA_CACHE_DIR"), ""
+    if configured := os.environ.get("PARAUAV_CACHE"):
+        return _sources_folder(private_files.ensure_private_folder(Path(configured).absolute(), "PARAUAV_CACHE")), ""
     try:
-        usual = private_files.cache_folder()
-        private_files.folder(usual, "cache")
-        private_files.close(usual)
-        return _within(usual), ""
+        default = private_files.cache_folder()
+        private_files.ensure_private_folder(default, "cache")
+        private_files.restrict_to_owner(default)
+        return _sources_folder(default), ""
     except (ValueError, OSError, RuntimeError) as error:
-        found = Path(tempfile.mkdtemp(prefix="parauav-cache-"))
-        atexit.register(_remove, found, os.getpid())
-        return found, f"the user's cache folder is not usable ({error}), so every start compiles; see PARAUAV_CACHE"
+        temporary = Path(tempfile.mkdtemp(prefix="parauav-cache-"))
+        atexit.register(_remove_if_owner, temporary, os.getpid())
+        return temporary, f"the user's cache folder is not usable ({error}), so every start compiles; see PARAUAV_CACHE"
 
 
-def _within(base: Path) -> Path:
+def _sources_folder(base: Path) -> Path:
     """Return the private cache folder of the current sources; when it is new, remove expired folders of others."""
-    found = base / f"numba-{SOURCES}"
-    if not found.exists():
+    cache = base / f"numba-{SOURCES}"
+    if not cache.exists():
         for old in base.glob("numba-*"):
-            if time.time() - old.lstat().st_mtime > _UNUSED_S:
+            if time.time() - old.lstat().st_mtime > _CACHE_EXPIRY_S:
                 shutil.rmtree(old, ignore_errors=True)
-    private_files.folder(found, "compile cache")
-    private_files.close(found)
-    os.utime(found)
-    return found
+    private_files.ensure_private_folder(cache, "compile cache")
+    private_files.restrict_to_owner(cache)
+    os.utime(cache)
+    return cache
 
 
-def _remove(folder: Path, pid: int) -> None:
+def _remove_if_owner(folder: Path, pid: int) -> None:
     if os.getpid() == pid:
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -80,10 +80,10 @@ def _remove(folder: Path, pid: int) -> None:
 try:
     _folder, CACHE_NOTE = _compile_cache()
 except (ValueError, OSError) as _error:
-    _why = (
+    _reason = (
         str(_error) if isinstance(_error, ValueError) else f"compile cache: found {_error}, expected a writable folder"
     )
-    print(f"{_why}; or leave NUMBA_CACHE_DIR and PARAUAV_CACHE unset", file=sys.stderr, flush=True)
+    print(f"{_reason}; or leave NUMBA_CACHE_DIR and PARAUAV_CACHE unset", file=sys.stderr, flush=True)
     raise SystemExit(2) from None
 os.environ["NUMBA_CACHE_DIR"] = str(_folder)
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):

@@ -11,15 +11,15 @@ import threading
 from collections.abc import Callable
 
 from fleet import __version__, commands
-from fleet.process.interrupt import INTERRUPTED, PARENT, exits_with, interruptible
-from fleet.process.logs import begin, fail
+from fleet.process.interrupt import INTERRUPTED, PARENT, run_interruptible, set_exit_code
+from fleet.process.logs import configure_logging, report_failure
 
-GRACE_S = 30.0  # time for an orphan process to shut down in order [s]
+ORPHAN_GRACE_S = 30.0  # time for an orphan process to shut down in order [s]
 
-Run = Callable[[argparse.Namespace], int]
+Command = Callable[[argparse.Namespace], int]
 
 
-def parser_for(prog: str, summary: str, examples: str) -> argparse.ArgumentParser:
+def make_parser(prog: str, summary: str, examples: str) -> argparse.ArgumentParser:
     """Create a parser whose help ends with examples."""
     parser = argparse.ArgumentParser(
         prog=prog,
@@ -31,47 +31,47 @@ def parser_for(prog: str, summary: str, examples: str) -> argparse.ArgumentParse
     return parser
 
 
-def guarded(prog: str, run: Run, args: argparse.Namespace) -> int:
+def run_command(prog: str, run: Command, args: argparse.Namespace) -> int:
     """Run a command; report an expected failure in one line with exit code 2, Ctrl-C with exit code 130.
 
     A command that runs until it is stopped handles Ctrl-C itself (`stop_on_signal`) and returns 0.
     """
     logs = hasattr(args, "log_json")
-    begin(prog, as_json=logs and args.log_json)
+    configure_logging(prog, as_json=logs and args.log_json)
     try:
-        code = interruptible(lambda: run(args))
+        code = run_interruptible(lambda: run(args))
     except (ValueError, OSError) as error:
-        fail(prog, str(error), logged=logs)
-        return exits_with(2)
+        report_failure(prog, str(error), logged=logs)
+        return set_exit_code(2)
     if code == INTERRUPTED and not os.environ.get(PARENT):  # otherwise the parent reports it
-        fail(prog, "interrupted", logged=logs)
-    return exits_with(code)
+        report_failure(prog, "interrupted", logged=logs)
+    return set_exit_code(code)
 
 
 def stop_on_signal() -> threading.Event:
     """Return an event that Ctrl-C, SIGTERM and the end of the parent set, for an orderly shutdown."""
-    stop, told = threading.Event(), queue.SimpleQueue[int]()
+    stop, signals = threading.Event(), queue.SimpleQueue[int]()
     for number in (signal.SIGINT, signal.SIGTERM):
         # not stop.set(): a handler runs in the main thread, which may own that event's lock in wait(): a deadlock
-        signal.signal(number, lambda number, _: told.put(number))
-    threading.Thread(target=_pass_on, args=(told, stop), daemon=True).start()
+        signal.signal(number, lambda number, _: signals.put(number))
+    threading.Thread(target=_forward_signal, args=(signals, stop), daemon=True).start()
     if parent := os.environ.get(PARENT):
-        threading.Thread(target=_outlive_nobody, args=(int(parent), stop), daemon=True).start()
+        threading.Thread(target=_stop_with_parent, args=(int(parent), stop), daemon=True).start()
     return stop
 
 
-def _pass_on(told: queue.SimpleQueue[int], stop: threading.Event) -> None:
+def _forward_signal(signals: queue.SimpleQueue[int], stop: threading.Event) -> None:
     """Set the event after a signal."""
-    told.get()
+    signals.get()
     stop.set()
 
 
-def _outlive_nobody(parent: int, stop: threading.Event) -> None:
+def _stop_with_parent(parent: int, stop: threading.Event) -> None:
     """Stop when the parent process has ended, also if it was killed."""
     while not stop.wait(1.0):
         if os.getppid() != parent:
             stop.set()
-            threading.Event().wait(GRACE_S)  # after this a process blocked in a foreign library is ended
+            threading.Event().wait(ORPHAN_GRACE_S)  # after this a process blocked in a foreign library is ended
             os._exit(1)
 
 
@@ -97,7 +97,7 @@ def command_modules() -> dict[str, str]:
 
 def main(argv: list[str] | None = None) -> int:
     """Run `fleet <verb>`."""
-    parser = parser_for(
+    parser = make_parser(
         "fleet",
         "Digital twins for UAV swarms.",
         "  fleet up --uavs 8\n  fleet status --json\n  fleet schema prediction\n",
@@ -116,7 +116,7 @@ def main(argv: list[str] | None = None) -> int:
         module.arguments(verb)
         verb.set_defaults(run=module.run)
     args = parser.parse_args(argv)
-    return guarded(f"fleet {args.verb}", args.run, args)
+    return run_command(f"fleet {args.verb}", args.run, args)
 
 
 if __name__ == "__main__":

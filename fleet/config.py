@@ -4,7 +4,7 @@ import argparse
 import tomllib
 from pathlib import Path
 
-from fleet.access.entry import ROUTER, Entry
+from fleet.access.entry import ROUTER, BusConfig
 from fleet.access.roles import TOOLS
 
 KEYS = ("at", "certificates", "passwords")
@@ -18,38 +18,40 @@ def router_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def entry(args: argparse.Namespace, role: str = TOOLS) -> Entry:
+def bus_config_from(args: argparse.Namespace, role: str = TOOLS) -> BusConfig:
     """Return the bus configuration of this process from the command line.
 
     Raises:
         ValueError: when the file is invalid; the text names the key.
         OSError: when it cannot be read.
     """
-    told = {} if args.config is None else _read(args.config)
+    settings = {} if args.config is None else _read_router_table(args.config)
     # absolute: the output of `fleet router` is read in another folder, zenohd under systemd runs in /
-    paths = {n: args.config.absolute().parent / told[n] for n in ("certificates", "passwords") if n in told}
-    return Entry(args.router or told.get("at", ROUTER), role, **paths)
+    paths = {n: args.config.absolute().parent / settings[n] for n in ("certificates", "passwords") if n in settings}
+    return BusConfig(args.router or settings.get("at", ROUTER), role, **paths)
 
 
-def passed_on(args: argparse.Namespace) -> list[str]:
+def router_options(args: argparse.Namespace) -> list[str]:
     """Return the router options of the command line, for a child process."""
     router = [] if args.router is None else [f"--router={args.router}"]
     return router + ([] if args.config is None else [f"--config={args.config.absolute()}"])
 
 
-def _read(path: Path) -> dict[str, str]:
+def _read_router_table(path: Path) -> dict[str, str]:
     """Read the table `router` of a file; reject any other content."""
     try:
-        told = tomllib.loads(path.read_text())
+        document = tomllib.loads(path.read_text())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(
             f"--config: found invalid TOML in {path} ({error}), expected a table [router]; see deploy/fleet.toml"
         ) from None
-    router = told.pop("router", {})
-    strange = [*told, *(name for name in router if name not in KEYS)] if isinstance(router, dict) else ["router"]
-    if strange:
+    router = document.pop("router", {})
+    unknown_keys = (
+        [*document, *(name for name in router if name not in KEYS)] if isinstance(router, dict) else ["router"]
+    )
+    if unknown_keys:
         raise ValueError(
-            f"--config: found {', '.join(map(repr, strange))} in {path}, expected only [router] with "
+            f"--config: found {', '.join(map(repr, unknown_keys))} in {path}, expected only [router] with "
             f"{', '.join(KEYS)}; correct it"
         )
     if not all(isinstance(value, str) and value for value in router.values()):

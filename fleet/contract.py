@@ -21,7 +21,7 @@
 `*` and `**` never match a chunk that starts with `@`, so `parauav/*/prediction` is aircraft only.
 
 Wire: a msgpack map; any msgpack library reads it. Arrays are maps `{dtype, shape, data}`. The Zenoh encoding
-carries the version: `application/msgpack;parauav.prediction.1`. Fields may be added (with a default); a reader
+carries the version: `application/msgpack;parauav.prediction.2`. Fields may be added (with a default); a reader
 refuses another major version. Worker results carry an attachment of 16 bytes, little endian: epoch u64, writer u64.
 An epoch is the time of the claim [ms since 1970], at least the previous epoch plus one. Readers reject an epoch more
 than 5 minutes ahead of their own clock and accept the highest of the others per UAV.
@@ -66,9 +66,9 @@ class Array(msgspec.Struct, frozen=True, gc=False):  # numbers form no reference
         size, shape = _SIZES.get(self.dtype), self.shape
         if size is None or len(shape) > 4 or (shape and not 0 <= min(shape) <= max(shape) < 2**31):
             raise ValueError(f"array: found dtype {self.dtype!r} shape {self.shape}, expected one of {DTYPES}; resend")
-        want = prod(shape) * size
-        if want != len(self.data):
-            raise ValueError(f"array: found {len(self.data)} bytes, shape {self.shape} needs {want}; resend")
+        n_bytes = prod(shape) * size
+        if n_bytes != len(self.data):
+            raise ValueError(f"array: found {len(self.data)} bytes, shape {self.shape} needs {n_bytes}; resend")
         return np.frombuffer(self.data, self.dtype).reshape(self.shape)
 
 
@@ -101,7 +101,7 @@ COLUMNS: dict[str, tuple[tuple[str, str], ...]] = {
     "height": (("above_home", "m"),),
 }
 """Columns of each `Rows` field of a `Sample`: name and unit, in wire order. Specific force and rates are FRD."""
-UNTOLD = {"command": 2}
+FIRST_OPTIONAL_COLUMN = {"command": 2}
 """Index of the first column that is nan where the autopilot does not report it, by field."""
 
 
@@ -230,7 +230,7 @@ class Outcome(StrEnum):
     """Outcome of an identification; an outcome other than VERIFIED is not an error."""
 
     VERIFIED = "verified"
-    STARVED = "starved"
+    INSUFFICIENT_DATA = "starved"
     NOT_IDENTIFIABLE = "not_identifiable"
     BELOW_THRESHOLD = "below_threshold"
     WORSE_THAN_LAST = "worse_than_last"
@@ -244,10 +244,10 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     outcome: Outcome
     sentence: str
     fit: Annotated[dict[str, float], Meta(description="100 (1 - nrmse) per state at `horizon_s` [%]")] = {}
-    fit_hold: Annotated[
+    fit_persistence: Annotated[
         dict[str, float], Meta(description="the same for the persistence forecast (last value) [%]")
     ] = {}
-    fit_at: Annotated[
+    fit_by_length: Annotated[
         dict[str, float], Meta(description="mean fit of both axes by free-run length in s, e.g. lon16, lat16 [%]")
     ] = {}
     whiteness: Annotated[
@@ -256,10 +256,10 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     ] = {}
     horizon_s: Annotated[float, Meta(description="free-run length of the fit [s]")] = 0.0
     threshold: Annotated[float, Meta(description="omega: minimum mean fit [%]")] = 0.0
-    tries: Annotated[int, Meta(description="identification attempts for this verdict")] = 0
+    attempts: Annotated[int, Meta(description="identification attempts for this verdict")] = 0
 
 
-class Linear(msgspec.Struct, frozen=True, kw_only=True):
+class LinearModel(msgspec.Struct, frozen=True, kw_only=True):
     """Discrete linear model about a trim point: x' = A x + B u + c, y = x (C = I, D = 0).
 
     Source: Huang 2021 eq. 2-4.
@@ -285,7 +285,9 @@ class Derivatives(msgspec.Struct, frozen=True, kw_only=True):
     names: Annotated[tuple[str, ...], Meta(description="X_0 X_u ... N_0 w_n w_e")]
     value: Annotated[Array, Meta(description="(n,) <f8")]
     covariance: Annotated[Array, Meta(description="(n, n) <f4")]
-    told: Annotated[Array, Meta(description="relative reduction of each prior variance by the data, (n,) 0..1")]
+    variance_reduction: Annotated[
+        Array, Meta(description="relative reduction of each prior variance by the data, (n,) 0..1")
+    ]
     U0: Annotated[float, Meta(description="airspeed of the trim point of the derivatives [m/s]")]
     W0: Annotated[float, Meta(description="velocity down the body at trim [m/s]")]
     tau_s: Annotated[Array, Meta(description="lags of delta_a delta_e delta_r delta_t, (4,) [s]")]
@@ -299,14 +301,17 @@ class Model(Message, frozen=True, kw_only=True):
     """Active model (none before the first verified one), newest identification window and its verdict."""
 
     topic: ClassVar[str] = "model"
+    version: ClassVar[int] = 2
 
     method: Annotated[str, Meta(description="dynamics (coupled derivatives) or paper (two linear axes)")]
     verdict: Annotated[Verdict, Meta(description="of the newest identification")]
-    in_force: Annotated[Verdict | None, Meta(description="of the model below; null before any was verified")] = None
-    longitudinal: Linear | None = None
-    lateral: Linear | None = None
+    active_verdict: Annotated[Verdict | None, Meta(description="of the model below; null before any was verified")] = (
+        None
+    )
+    longitudinal: LinearModel | None = None
+    lateral: LinearModel | None = None
     derivatives: Annotated[Derivatives | None, Meta(description="of the coupled model; null for method paper")] = None
-    earned: Annotated[
+    shrinkage_weights: Annotated[
         dict[str, float],
         Meta(description="weight of the model against persistence in a 10 s free run, from held-out data, 0..1"),
     ] = {}
@@ -315,12 +320,12 @@ class Model(Message, frozen=True, kw_only=True):
     interpolated: Annotated[float, Meta(description="share of the window that was interpolated, 0..1")] = 0.0
     wind_n: Annotated[float, Meta(description="estimated wind, north, the direction it blows to [m/s]")] = 0.0
     wind_e: Annotated[float, Meta(description="estimated wind, east [m/s]")] = 0.0
-    extended: Annotated[
+    active_effect: Annotated[
         str, Meta(description="missing physics added to the active model, and since when; empty: as identified")
     ] = ""
 
 
-class State(StrEnum):
+class TwinState(StrEnum):
     """State of one aircraft's twin; the most severe applicable state."""
 
     UNCLAIMED = "unclaimed"
@@ -341,7 +346,7 @@ class Controller(msgspec.Struct, frozen=True, kw_only=True):
     received: Annotated[dict[str, float], Meta(description="reported by the autopilot")] = {}
     identified: Annotated[dict[str, float], Meta(description="not reported; identified from flight data")] = {}
     default: Annotated[dict[str, float], Meta(description="neither; the autopilot's default is assumed")] = {}
-    asked: Annotated[dict[str, float], Meta(description="what-if only: set by the request")] = {}
+    overridden: Annotated[dict[str, float], Meta(description="what-if only: set by the request")] = {}
 
 
 class Event(StrEnum):
@@ -354,15 +359,15 @@ class Event(StrEnum):
     LANDING = "landing"
     TOUCH_DOWN = "touch_down"
     LINK_LOST = "link_lost"
-    LINK_BACK = "link_back"
-    HORIZON_OVER = "horizon_over"
-    TELEMETRY_BROKEN = "telemetry_broken"
-    TELEMETRY_WHOLE = "telemetry_whole"
+    LINK_RESTORED = "link_back"
+    COASTING_EXPIRED = "horizon_over"
+    POSITION_LOST = "telemetry_broken"
+    POSITION_RESTORED = "telemetry_whole"
     CLOCK = "clock"
     ORIGIN = "origin"
 
 
-SENTENCES: dict[Event, str] = {
+EVENT_TEXTS: dict[Event, str] = {
     Event.MODE: "flight mode changed: previous predictions are invalid",
     Event.MISSION: "mission on board changed: previous predictions are invalid",
     Event.PARAMETERS: "autopilot parameters changed: previous predictions are invalid",
@@ -370,10 +375,10 @@ SENTENCES: dict[Event, str] = {
     Event.LANDING: "landing: predictions end at the touch-down point",
     Event.TOUCH_DOWN: "touch-down: predictions along the route end",
     Event.LINK_LOST: "link lost: the twin predicts from the last valid state",
-    Event.LINK_BACK: "link restored: the twin predicts from telemetry again",
-    Event.HORIZON_OVER: "confidence horizon exceeded: no prediction until telemetry returns",
-    Event.TELEMETRY_BROKEN: "positions stopped but other telemetry continues: the twin predicts from the last position",
-    Event.TELEMETRY_WHOLE: "positions received again: the twin predicts from telemetry again",
+    Event.LINK_RESTORED: "link restored: the twin predicts from telemetry again",
+    Event.COASTING_EXPIRED: "confidence horizon exceeded: no prediction until telemetry returns",
+    Event.POSITION_LOST: "positions stopped but other telemetry continues: the twin predicts from the last position",
+    Event.POSITION_RESTORED: "positions received again: the twin predicts from telemetry again",
     Event.CLOCK: "the aircraft's clock jumped: estimates on the old time base are discarded",
     Event.ORIGIN: "the origin of the local frame was moved to the aircraft",
 }
@@ -384,8 +389,9 @@ class Prediction(Message, frozen=True, kw_only=True):
     """Predicted path of one aircraft, its prediction region and confidence horizon."""
 
     topic: ClassVar[str] = "prediction"
+    version: ClassVar[int] = 2
 
-    state: State
+    state: TwinState
     method: Annotated[
         str,
         Meta(
@@ -399,7 +405,7 @@ class Prediction(Message, frozen=True, kw_only=True):
     origin: Annotated[tuple[int, int, int], Meta(description="NED origin: lat, lon [1e-7 deg], alt [mm AMSL]")]
     ahead: Annotated[Array, Meta(description="look-ahead from `t`, increasing, unequally spaced, (n,) <f4 [s]")]
     path: Annotated[Array, Meta(description="mean position, NED from origin, (n, 3) <f4 [m]")]
-    tube: Annotated[
+    prediction_region_half_axes: Annotated[
         Array,
         Meta(description="half-axes of the simultaneous region: along, cross, vertical, (n, 3) <f4 [m]"),
     ]
@@ -412,24 +418,24 @@ class Prediction(Message, frozen=True, kw_only=True):
         float, Meta(description="confidence horizon: `quantile` of similar predictions stay within 10 % [s]")
     ] = 0.0
     horizon_open: Annotated[bool, Meta(description="true: still below 10 % at the end of `ahead`")] = False
-    held: Annotated[
+    coverage: Annotated[
         float, Meta(description="empirical coverage of the prediction region, 0..1; nan before any evaluation")
     ] = float("nan")
-    held_n: Annotated[int, Meta(description="past predictions behind `coverage`")] = 0
+    coverage_n: Annotated[int, Meta(description="past predictions behind `coverage`")] = 0
     rollout_age_s: Annotated[
         float, Meta(description="age of the rollout propagated from the newest position; 0: a new rollout [s]")
     ] = 0.0
-    coverage_renewed: Annotated[
+    coverage_propagated: Annotated[
         float | None, Meta(description="as `coverage`, propagated rollouts only, up to 60 s, 0..1; null before any")
     ] = None
-    coverage_renewed_n: Annotated[int, Meta(description="past predictions behind `coverage_propagated`")] = 0
+    coverage_propagated_n: Annotated[int, Meta(description="past predictions behind `coverage_propagated`")] = 0
     calibration: Annotated[str, Meta(description="calibration table of region and horizon, and its adaptation")] = ""
     coast_s: Annotated[float, Meta(description="time predicted without telemetry since the last sample [s]")] = 0.0
     seq: Annotated[int, Meta(description="mission item the prediction starts on; -1 none")] = -1
     sentence: Annotated[str, Meta(description="limitation of this prediction, or empty")] = ""
     event: Annotated[Event | None, Meta(description="last event that restarted it or made it coast")] = None
     event_t: Annotated[float, Meta(description="time of that event; 0 never [s since 1970]")] = 0.0
-    event_said: Annotated[str, Meta(description="text of the event, with details")] = ""
+    event_text: Annotated[str, Meta(description="text of the event, with details")] = ""
     controller: Annotated[
         Controller | None,
         Meta(description="active law and parameters; null: unchanged. Sent on change, every 10 s and to queries"),
@@ -465,7 +471,7 @@ class WhatIf(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     params: Annotated[dict[str, float], Meta(description="parameters, in the autopilot's names and units")] = {}
 
 
-class Found(StrEnum):
+class DiagnosisOutcome(StrEnum):
     """Outcome of a diagnosis."""
 
     NONE = "none"
@@ -482,7 +488,9 @@ class Cause(msgspec.Struct, frozen=True, kw_only=True):
         str, Meta(description="where it acts, e.g. actuator, thrust, air, airspeed, or the name of a residual")
     ] = ""
     surface: Annotated[str, Meta(description="aileron, elevator, rudder, all surfaces; empty: no surface")] = ""
-    rivals: Annotated[tuple[str, ...], Meta(description="effects that this flight cannot distinguish from it")] = ()
+    confusable_with: Annotated[
+        tuple[str, ...], Meta(description="effects that this flight cannot distinguish from it")
+    ] = ()
     segments: Annotated[
         tuple[tuple[float, float], ...],
         Meta(description="active intervals; the last ends at the newest [s since 1970]"),
@@ -495,10 +503,12 @@ class Mismatch(Message, frozen=True, kw_only=True):
     """Deviation of the flight from the twin, and the physics that explains it; answers queries."""
 
     topic: ClassVar[str] = "mismatch"
+    version: ClassVar[int] = 2
 
     outcome: Annotated[
-        Found, Meta(description="named: verified on held-out data; suspected: not; unknown: no effect explains it")
-    ] = Found.NONE
+        DiagnosisOutcome,
+        Meta(description="named: verified on held-out data; suspected: not; unknown: no effect explains it"),
+    ] = DiagnosisOutcome.NONE
     causes: Annotated[tuple[Cause, ...], Meta(description="most significant first; empty for none")] = ()
     fit_before: Annotated[
         float | None,
@@ -509,9 +519,11 @@ class Mismatch(Message, frozen=True, kw_only=True):
     ] = None
     force_before: Annotated[float | None, Meta(description="rms error of specific force, held-out data [m/s2]")] = None
     force_after: Annotated[float | None, Meta(description="the same with the causes [m/s2]")] = None
-    stray_before: Annotated[float | None, Meta(description="rms attitude error of free runs of 5 s [deg]")] = None
-    stray_after: Annotated[float | None, Meta(description="the same with the causes [deg]")] = None
-    seen_t0: Annotated[float, Meta(description="first instant of the diagnosed flight [s since 1970]")] = 0.0
+    attitude_error_before: Annotated[float | None, Meta(description="rms attitude error of free runs of 5 s [deg]")] = (
+        None
+    )
+    attitude_error_after: Annotated[float | None, Meta(description="the same with the causes [deg]")] = None
+    flight_t0: Annotated[float, Meta(description="first instant of the diagnosed flight [s since 1970]")] = 0.0
     adapted: Annotated[bool, Meta(description="true: the prediction model includes the causes")] = False
     sentence: Annotated[str, Meta(description="summary, and which model predicts")] = ""
 
@@ -533,14 +545,15 @@ class AlertKind(StrEnum):
     SECOND_SENDER = "second_sender"
 
 
-About = tuple[AlertKind, int]
+AlertKey = tuple[AlertKind, int]
 """Identity of an alert within one UAV: its kind, and the other UAV of a conflict (-1 none)."""
 
 
 class Alert(Message, frozen=True, kw_only=True):
-    """Warning for the operator, published once when raised and once, with `active` false, when cleared."""
+    """Warning for the operator, published when raised and, with `active` false, when cleared."""
 
     topic: ClassVar[str] = "alert"
+    version: ClassVar[int] = 2
 
     kind: AlertKind
     active: bool = True
@@ -549,13 +562,13 @@ class Alert(Message, frozen=True, kw_only=True):
     probability: Annotated[
         float | None, Meta(description="probability of the event, 0..1; null: it is present now")
     ] = None
-    at: Annotated[float | None, Meta(description="predicted time [s since 1970]; null: now")] = None
+    predicted_t: Annotated[float | None, Meta(description="predicted time [s since 1970]; null: now")] = None
     lat: Annotated[int | None, Meta(description="latitude of the event [1e-7 deg]; null: no single position")] = None
     lon: Annotated[int | None, Meta(description="longitude of the event [1e-7 deg]")] = None
     alt: Annotated[int | None, Meta(description="height of the event above mean sea level [mm]")] = None
 
     @property
-    def about(self) -> About:
+    def about(self) -> AlertKey:
         """Return the identity of the alert within its UAV."""
         return self.kind, self.other
 
@@ -564,7 +577,7 @@ class FleetRow(msgspec.Struct, frozen=True, kw_only=True):
     """One row of the fleet table."""
 
     uav: int
-    state: State
+    state: TwinState
     verdict: Annotated[str, Meta(description="sentence of the last verdict")]
     fit: Annotated[dict[str, float], Meta(description="per state [%]")] = {}
     horizon_s: Annotated[float, Meta(description="confidence horizon of the newest prediction [s]")] = 0.0
@@ -585,20 +598,22 @@ class FleetState(msgspec.Struct, frozen=True, kw_only=True):
     """The rows of one worker."""
 
     topic: ClassVar[str] = "@fleet/state"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     t: Annotated[float, Meta(description="fleet time of the rows [s since 1970]")]
     rows: tuple[FleetRow, ...] = ()
     sentence: Annotated[str, Meta(description="e.g. compiling the twin's physics, once")] = ""
-    done: Annotated[dict[str, int], Meta(description="tasks completed since start: predict, identify, ensemble")] = {}
-    shed: Annotated[int, Meta(description="messages of its current aircraft dropped because a queue was full")] = 0
+    tasks: Annotated[dict[str, int], Meta(description="tasks completed since start: predict, identify, ensemble")] = {}
+    dropped_messages: Annotated[
+        int, Meta(description="messages of its current aircraft dropped because a queue was full")
+    ] = 0
 
 
 class Predictions(msgspec.Struct, frozen=True, kw_only=True):
     """The newest prediction of every aircraft of one worker, in one answer."""
 
     topic: ClassVar[str] = "@fleet/prediction"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     t: Annotated[float, Meta(description="fleet time of the answer [s since 1970]")]
     predictions: Annotated[tuple[msgspec.Raw, ...], Meta(description="each a packed Prediction")] = ()
@@ -607,7 +622,7 @@ class Predictions(msgspec.Struct, frozen=True, kw_only=True):
     ] = ()
 
 
-class LinkAccount(msgspec.Struct, frozen=True, kw_only=True):
+class LinkCounters(msgspec.Struct, frozen=True, kw_only=True):
     """Counters of one link since the gateway started; values in Hz and bytes/s are current rates."""
 
     link: Annotated[str, Meta(description="the link as configured")]
@@ -629,15 +644,17 @@ class LinkAccount(msgspec.Struct, frozen=True, kw_only=True):
     noise: Annotated[int, Meta(description="bytes not recorded because they belong to no frame")] = 0
     unrecorded: Annotated[int, Meta(description="bytes lost because the disk was full or too slow")] = 0
     unwritten: Annotated[int, Meta(description="bytes waiting for the disk or for the rest of their frame")] = 0
-    share: Annotated[float, Meta(description="requested fraction of the desired message rates, by budget, 0..1")] = 1.0
+    rate_fraction: Annotated[
+        float, Meta(description="requested fraction of the desired message rates, by budget, 0..1")
+    ] = 1.0
     sentence: Annotated[str, Meta(description="note for the operator, or empty")] = ""
 
 
-class Account(msgspec.Struct, frozen=True, kw_only=True):
+class GatewayCounters(msgspec.Struct, frozen=True, kw_only=True):
     """Counters of one gateway."""
 
     topic: ClassVar[str] = "@gateway"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     t: Annotated[float, Meta(description="fleet time of the count [s since 1970]")]
     links: tuple[str, ...] = ()
@@ -650,13 +667,15 @@ class Account(msgspec.Struct, frozen=True, kw_only=True):
     refused: Annotated[dict[str, int], Meta(description="valid frames rejected, by reason")] = {}
     published: Annotated[int, Meta(description="messages published while a router was connected")] = 0
     sentence: str = ""
-    per_link: tuple[LinkAccount, ...] = ()
+    per_link: tuple[LinkCounters, ...] = ()
     router: Annotated[bool, Meta(description="a router is connected")] = True
     unsent: Annotated[int, Meta(description="messages not published because no router was connected")] = 0
-    unsure: Annotated[int, Meta(description="published in the second before the loss of a router was detected")] = 0
+    unconfirmed: Annotated[
+        int, Meta(description="published in the second before the loss of a router was detected")
+    ] = 0
     removed: Annotated[int, Meta(description="recordings removed to stay within the budget")] = 0
     history_bytes: Annotated[int, Meta(description="size of the history stored for late joiners")] = 0
-    now: Annotated[float, Meta(description="send time by the gateway's own clock [s since 1970]")] = 0.0
+    wall_t: Annotated[float, Meta(description="send time by the gateway's own clock [s since 1970]")] = 0.0
     machine: Annotated[str, Meta(description="name of the machine it runs on")] = ""
     code: Annotated[str, Meta(description="hash of the sources it runs")] = ""
 
@@ -669,43 +688,45 @@ class Claim(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     topic: ClassVar[str] = "@claim"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     t: Annotated[float, Meta(description="send time by the worker's clock [s since 1970]")]
     worker: Annotated[str, Meta(description="writer, 16 hex digits")]
-    held: Annotated[tuple[tuple[int, int], ...], Meta(description="UAV id and epoch of each owned aircraft")] = ()
-    bare: Annotated[tuple[int, ...], Meta(description="owned aircraft whose earlier telemetry is still missing")] = ()
+    owned: Annotated[tuple[tuple[int, int], ...], Meta(description="UAV id and epoch of each owned aircraft")] = ()
+    without_history: Annotated[
+        tuple[int, ...], Meta(description="owned aircraft whose earlier telemetry is still missing")
+    ] = ()
     leaving: Annotated[bool, Meta(description="true: it hands over all aircraft and stops")] = False
     machine: Annotated[str, Meta(description="name of the machine it runs on")] = ""
     code: Annotated[str, Meta(description="hash of the sources it runs")] = ""
-    seen: Annotated[
+    highest_claims: Annotated[
         tuple[tuple[int, int, str], ...],
         Meta(description="in query replies only: UAV id, epoch and writer of the highest known claim"),
     ] = ()
 
 
 class Handover(msgspec.Struct, frozen=True, kw_only=True):
-    """Copy of one aircraft's twin for its new owner; the old owner writes until the new one does."""
+    """Copy of a twin for its new owner; the old owner writes until the new one does."""
 
     topic: ClassVar[str] = "@handover"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     t: Annotated[float, Meta(description="time of the copy by the worker's clock [s since 1970]")]
     uav: Annotated[int, Meta(description="UAV id")]
     epoch: Annotated[int, Meta(description="epoch of the old owner; the new owner's is higher")]
     code: Annotated[str, Meta(description="hash of the sources that wrote `snapshot`; other versions must not read it")]
-    load: Annotated[bytes, Meta(description="twin, unprocessed messages, open conflicts, mismatch")] = b""
+    snapshot: Annotated[bytes, Meta(description="twin, unprocessed messages, open conflicts, mismatch")] = b""
 
 
-class Wanted(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class HandoverRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Payload of a query on `parauav/@handover/{writer}`: ids of the requested aircraft."""
 
     uavs: Annotated[tuple[int, ...], Meta(description="UAV ids")] = ()
 
 
 PER_UAV: tuple[type[Message], ...] = (Sample, Status, Mission, Params, History, Model, Prediction, Mismatch, Alert)
-CONTROL: tuple[type, ...] = (FleetState, Predictions, Account, Claim, Handover)
-QUERIES: dict[type, type] = {Prediction: WhatIf, Handover: Wanted}  # optional payload of a query on a key
+CONTROL: tuple[type, ...] = (FleetState, Predictions, GatewayCounters, Claim, Handover)
+QUERIES: dict[type, type] = {Prediction: WhatIf, Handover: HandoverRequest}  # optional payload of a query on a key
 TOPICS: dict[str, type] = {c.topic: c for c in (*PER_UAV, *CONTROL)}  # type: ignore[attr-defined]
 
 

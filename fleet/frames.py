@@ -59,18 +59,20 @@ def to_ned(origin: Origin, lat_e7: np.ndarray, lon_e7: np.ndarray, alt_mm: np.nd
     """
     out = np.empty((*np.shape(lat_e7), 3))
     out[..., 0], out[..., 1], out[..., 2] = lat_e7, lon_e7, alt_mm
-    _place(out.reshape(-1, 3), float(origin[0]), float(origin[1]), float(origin[2]), _radii(origin))
+    _to_ned_in_place(out.reshape(-1, 3), float(origin[0]), float(origin[1]), float(origin[2]), _radii(origin))
     return out
 
 
 @nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath: same result as numpy
-def _place(at: np.ndarray, lat_e7: float, lon_e7: float, alt_mm: float, radii: tuple[float, float]) -> None:
+def _to_ned_in_place(
+    positions: np.ndarray, lat_e7: float, lon_e7: float, alt_mm: float, radii: tuple[float, float]
+) -> None:
     """Convert geodetic positions, (n, 3), to NED in place."""
-    for k in range(len(at)):
-        d_lon = (at[k, 1] - lon_e7 + 1.8e9) % 3.6e9 - 1.8e9  # shortest difference across the date line
-        at[k, 0] = (at[k, 0] - lat_e7) * 1e-7 * _DEGREE * radii[0]
-        at[k, 1] = d_lon * 1e-7 * _DEGREE * radii[1]
-        at[k, 2] = (alt_mm - at[k, 2]) * 1e-3
+    for k in range(len(positions)):
+        d_lon = (positions[k, 1] - lon_e7 + 1.8e9) % 3.6e9 - 1.8e9  # shortest difference across the date line
+        positions[k, 0] = (positions[k, 0] - lat_e7) * 1e-7 * _DEGREE * radii[0]
+        positions[k, 1] = d_lon * 1e-7 * _DEGREE * radii[1]
+        positions[k, 2] = (alt_mm - positions[k, 2]) * 1e-3
 
 
 def to_geodetic(origin: Origin, ned: np.ndarray) -> np.ndarray:
@@ -92,12 +94,12 @@ def body_to_ned(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray, body: np.nd
 def ned_to_body(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray, ned: np.ndarray) -> np.ndarray:
     """Rotate NED vectors to the body. Angles (n,) [rad], NED (n, 3)."""
     euler, out = np.column_stack([phi, theta, psi]).astype(float), np.empty((len(phi), 3))
-    _turn_each(euler, np.ascontiguousarray(ned, float), out)
+    _ned_to_body_rows(euler, np.ascontiguousarray(ned, float), out)
     return out
 
 
 @nb.njit(cache=True, nogil=True)
-def _turn_each(euler: np.ndarray, ned: np.ndarray, out: np.ndarray) -> None:
+def _ned_to_body_rows(euler: np.ndarray, ned: np.ndarray, out: np.ndarray) -> None:
     """Rotate NED vectors to the body, (n, 3), into `out`; compiled because it dominates the cost of resampling."""
     for k in range(len(euler)):
         cf, sf, ct, st = cos(euler[k, 0]), sin(euler[k, 0]), cos(euler[k, 1]), sin(euler[k, 1])
@@ -123,5 +125,5 @@ def rotation(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarray:
 @nb.njit(cache=True)
 def wrap(angle: Any) -> Any:
     """Wrap an angle, or an array of them, to (-pi, pi] [rad]; a non-finite angle stays non-finite."""
-    turned = (angle + pi) % (2 * pi) - pi
-    return turned + 2 * pi * (turned <= -pi)
+    wrapped = (angle + pi) % (2 * pi) - pi
+    return wrapped + 2 * pi * (wrapped <= -pi)

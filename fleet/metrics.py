@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from types import MappingProxyType
-from typing import Any, NamedTuple, get_type_hints
+from typing import Any, ClassVar, NamedTuple, get_origin, get_type_hints
 
 from prometheus_client import CollectorRegistry, ProcessCollector, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -11,9 +11,10 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from fleet.contract import Link, meaning
 
 Families = Callable[[], Iterable[Metric]]
+_UNITS = {"s": "seconds", "hz": "hertz"}
 
 
-class Naming(NamedTuple):
+class MetricNaming(NamedTuple):
     """Mapping of the fields of a message class to metrics.
 
     Attributes:
@@ -26,24 +27,33 @@ class Naming(NamedTuple):
 
     prefix: str
     labels: tuple[str, ...] = ()
-    now: Collection[str] = ()
-    other: Mapping[str, str] = MappingProxyType({})
-    left_out: Collection[str] = ("t", "uav")
+    gauges: Collection[str] = ()
+    renamed: Mapping[str, str] = MappingProxyType({})
+    excluded: Collection[str] = ("t", "uav")
 
 
-def families(kind: type, told: list[tuple[tuple[str, ...], Any]], naming: Naming) -> Iterator[Metric]:
+def families(kind: type, messages: list[tuple[tuple[str, ...], Any]], naming: MetricNaming) -> Iterator[Metric]:
     """Yield a metric for every number and flag of a message class; messages: (label values, message)."""
     for name, hint in get_type_hints(kind, include_extras=True).items():
-        values = [(who, _number(getattr(message, name))) for who, message in told]
-        known = [(who, value) for who, value in values if value is not None]
-        if not known or name in naming.left_out:
+        values = [(label_values, _number(getattr(message, name))) for label_values, message in messages]
+        available = [(label_values, value) for label_values, value in values if value is not None]
+        if not available or name in naming.excluded or get_origin(hint) is ClassVar:
             continue
-        family = GaugeMetricFamily if name in naming.now else CounterMetricFamily
-        what = naming.other.get(name, name)
-        metric = family(f"{naming.prefix}_{what}", meaning(hint) or name, labels=naming.labels)
-        for who, value in known:
-            metric.add_metric(who, value)
+        family = GaugeMetricFamily if name in naming.gauges else CounterMetricFamily
+        suffix = naming.renamed.get(name) or with_unit(name)
+        metric = family(f"{naming.prefix}_{suffix}", meaning(hint) or name, labels=naming.labels)
+        for label_values, value in available:
+            metric.add_metric(label_values, value)
         yield metric
+
+
+def with_unit(name: str) -> str:
+    """Return a field name with its unit in full, e.g. `latency_seconds`.
+
+    Source: Prometheus documentation, "Metric and label naming".
+    """
+    stem, _, unit = name.rpartition("_")
+    return f"{stem}_{_UNITS[unit]}" if stem and unit in _UNITS else name
 
 
 def _number(value: Any) -> float | None:
@@ -55,41 +65,41 @@ def _number(value: Any) -> float | None:
 class _Collector:
     """Read the newest counters at every scrape."""
 
-    def __init__(self, told: Families) -> None:
-        self._told = told
+    def __init__(self, source: Families) -> None:
+        self._source = source
 
     def collect(self) -> Iterable[Metric]:
-        return self._told()
+        return self._source()
 
 
-def address(where: str) -> tuple[str, int]:
+def parse_address(text: str) -> tuple[str, int]:
     """Parse `HOST:PORT`.
 
     Raises:
         ValueError: when it is malformed.
     """
-    host, _, port = where.rpartition(":")
+    host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or int(port) > 65_535:
-        raise ValueError(f"--metrics: found {where!r}, expected HOST:PORT such as 127.0.0.1:9100; correct it")
+        raise ValueError(f"--metrics: found {text!r}, expected HOST:PORT such as 127.0.0.1:9100; correct it")
     return host, int(port)
 
 
 @contextmanager
-def served(where: str, told: Families) -> Iterator[str]:
+def serve(endpoint: str, source: Families) -> Iterator[str]:
     """Serve the metrics, and CPU and memory of this process, at `HOST:PORT` within the block; yield the URL.
 
     Raises:
         ValueError: when the address is malformed.
         OSError: when it is not free.
     """
-    host, port = address(where)
+    host, port = parse_address(endpoint)
     registry = CollectorRegistry()
-    registry.register(_Collector(told))  # type: ignore[arg-type]
+    registry.register(_Collector(source))  # type: ignore[arg-type]
     ProcessCollector(registry=registry)
     try:
         server, thread = start_http_server(port, host.strip("[]"), registry)
     except OSError as error:
-        raise OSError(f"--metrics: {where} is not free ({error.strerror or error}); name another port") from None
+        raise OSError(f"--metrics: {endpoint} is not free ({error.strerror or error}); name another port") from None
     try:
         yield f"http://{host}:{server.server_address[1]}/metrics"
     finally:

@@ -31,25 +31,27 @@ P_N, P_E, P_D = 1, 2, 3  # target, or centre of the circle, NED from the route's
 RADIUS = 4  # radius of the circle, positive clockwise; 0: the autopilot's WP_LOITER_RAD [m]
 TURNS = 5  # turns; seconds for LOITER_TIME
 VA_C = 6  # commanded airspeed; <= 0: cruise [m/s]
-ACCEPT = 7  # acceptance radius; 0: from the parameters; negative: pass by at that distance [m]; of a circle: 1: exit
+ACCEPT_RADIUS = (
+    7  # acceptance radius; 0: from the parameters; negative: pass by at that distance [m]; of a circle: 1: exit
+)
 # only towards the next leg (PX4; ArduPlane always does)
 SEQ = 8  # mission item of this leg; -1: return to launch after the last one
 N_COLUMNS = 9
 
-NAMES = ("waypoint", "loiter turns", "loiter", "loiter time", "loiter to altitude", "takeoff", "land")
+LEG_NAMES = ("waypoint", "loiter turns", "loiter", "loiter time", "loiter to altitude", "takeoff", "land")
 _KINDS = {16: WAYPOINT, 17: LOITER_UNLIMITED, 18: LOITER_TURNS, 19: LOITER_TIME, 20: LOITER_UNLIMITED}
 _KINDS |= {21: LAND, 22: TAKEOFF, 31: LOITER_TO_ALT, 82: WAYPOINT, 84: TAKEOFF, 85: LAND}
 _RETURN, _LAST_NAV, _JUMP, SPEED = 20, 95, 177, 178  # MAV_CMD: RETURN_TO_LAUNCH, NAV_LAST, DO_JUMP, DO_CHANGE_SPEED
 _ABSOLUTE, _RELATIVE, _TERRAIN = (0, 5), (3, 6), (10, 11)  # MAV_FRAME
 GLOBAL_FRAMES = _ABSOLUTE + _RELATIVE + _TERRAIN
-_SHORTEST = 1.0  # a shorter leg has no usable direction [m]
-FIRST = {"px4": 0}  # number of the first item to fly, by autopilot; 1 elsewhere
-READ = ("RTL_ALTITUDE", "ALT_HOLD_RTL", "RTL_RADIUS", "WP_LOITER_RAD")
+_MIN_LEG = 1.0  # a shorter leg has no usable direction [m]
+FIRST_ITEM = {"px4": 0}  # number of the first item to fly, by autopilot; 1 elsewhere
+ROUTE_PARAMS = ("RTL_ALTITUDE", "ALT_HOLD_RTL", "RTL_RADIUS", "WP_LOITER_RAD")
 """Autopilot parameters that shape a route."""
-_SAID = 3  # remarks reported of one mission
-_FAR = 500e3  # a longer leg is an input error, and flat earth does not give its direction [m]
-_FASTEST = 300.0  # higher commanded speeds are input errors [m/s]
-_HIGHEST = 1e5  # higher altitudes are input errors [m]
+_MAX_REMARKS = 3  # remarks reported of one mission
+_MAX_LEG = 500e3  # a longer leg is an input error, and flat earth does not give its direction [m]
+_MAX_SPEED = 300.0  # higher commanded speeds are input errors [m/s]
+_MAX_ALTITUDE = 1e5  # higher altitudes are input errors [m]
 _RTL_ALTITUDE = 100.0  # ArduPlane's default RTL_ALTITUDE [m]
 
 
@@ -63,19 +65,19 @@ class Route:
     sentences: tuple[str, ...] = ()  # errors in the mission and their handling
 
     @property
-    def said(self) -> str:
+    def summary(self) -> str:
         """Return the first remarks and the number of further ones; empty for a mission without errors."""
-        return few(self.sentences)
+        return join_remarks(self.sentences)
 
     def __str__(self) -> str:
-        kinds = Counter(NAMES[int(kind)] for kind in self.legs[:, KIND])
-        what = ", ".join(f"{n} {name}" for name, n in kinds.items()) or "nothing to fly"
+        kinds = Counter(LEG_NAMES[int(kind)] for kind in self.legs[:, KIND])
+        legs_text = ", ".join(f"{n} {name}" for name, n in kinds.items()) or "nothing to fly"
         first = f" from item {int(self.legs[0, SEQ])}" if len(self.legs) else ""
-        return f"route of {len(self.legs)} legs{first}: {what}; {len(self.sentences)} remarks"
+        return f"route of {len(self.legs)} legs{first}: {legs_text}; {len(self.sentences)} remarks"
 
 
 @dataclass
-class _Walk:
+class _RouteBuilder:
     """State of the traversal of the mission items."""
 
     items: dict[int, Item]
@@ -84,27 +86,27 @@ class _Walk:
     origin: Origin
     params: Mapping[str, float]
     home: np.ndarray  # (3,) NED [m]
-    point: np.ndarray  # (3,) the last navigation point passed, NED [m]
-    places: dict[int, np.ndarray] = field(default_factory=dict)  # of every item, NED except the height, (3,) [m]
-    kind: int = TAKEOFF  # type of the leg that ended there; no line starts at home
+    last_point: np.ndarray  # (3,) the last navigation point passed, NED [m]
+    positions: dict[int, np.ndarray] = field(default_factory=dict)  # of every item, NED except the height, (3,) [m]
+    last_kind: int = TAKEOFF  # type of the leg that ended there; no line starts at home
     speed: float = 0.0  # commanded airspeed; 0: cruise [m/s]
-    left: dict[int, float] = field(default_factory=dict)  # jumps left at each DO_JUMP
-    taken: set[int] = field(default_factory=set)  # jumps taken since the last leg
+    jumps_left: dict[int, float] = field(default_factory=dict)  # jumps left at each DO_JUMP
+    jumps_taken: set[int] = field(default_factory=set)  # jumps taken since the last leg
     legs: list[np.ndarray] = field(default_factory=list)
     sentences: dict[str, None] = field(default_factory=dict)  # an ordered set
 
-    def say(self, sentence: str) -> None:
+    def remark(self, sentence: str) -> None:
         """Add a remark, once."""
         self.sentences.setdefault(sentence)
 
 
-def few(sentences: Sequence[str]) -> str:
+def join_remarks(sentences: Sequence[str]) -> str:
     """Join the first remarks, and state the number of further ones."""
-    more = len(sentences) - _SAID
-    return " ".join([*sentences[:_SAID], *([f"and {more} more remarks on the mission"] if more > 0 else [])])
+    n_more = len(sentences) - _MAX_REMARKS
+    return " ".join([*sentences[:_MAX_REMARKS], *([f"and {n_more} more remarks on the mission"] if n_more > 0 else [])])
 
 
-def route(
+def unroll_route(
     items: Sequence[Item], *, seq: int, origin: Origin, params: Mapping[str, float], limit: int = 64, first: int = 1
 ) -> Route:
     """Unroll the legs from item `seq` on: jumps, speeds and altitude frames resolved. Never raises on a bad mission.
@@ -119,234 +121,244 @@ def route(
     Returns:
         legs, the point before them, and one remark per error
     """
-    walk = _begin(items, origin, params, first)
-    at = _arrive(walk, _first(walk, seq))
+    builder = _make_builder(items, origin, params, first)
+    item_seq = _advance_to(builder, _first_seq(builder, seq))
     # after a circle or a takeoff ArduPlane starts the line at the aircraft's position
-    start = walk.point.copy() if walk.kind in (WAYPOINT, LAND) else np.full(3, np.nan)
-    walk.legs = []
-    if walk.last >= walk.first and walk.items:
-        _unroll(walk, at, limit)
-    legs = np.array(walk.legs[:limit]) if walk.legs[:limit] else np.empty((0, N_COLUMNS))
-    return Route(origin, legs, start, tuple(walk.sentences))
+    start = builder.last_point.copy() if builder.last_kind in (WAYPOINT, LAND) else np.full(3, np.nan)
+    builder.legs = []
+    if builder.last >= builder.first and builder.items:
+        _append_legs(builder, item_seq, limit)
+    legs = np.array(builder.legs[:limit]) if builder.legs[:limit] else np.empty((0, N_COLUMNS))
+    return Route(origin, legs, start, tuple(builder.sentences))
 
 
-def _begin(items: Sequence[Item], origin: Origin, params: Mapping[str, float], first: int) -> _Walk:
-    kept = {item.seq: item for item in items if 0 <= item.seq < MAX_ITEMS}
-    walk = _Walk(kept, first, max(kept, default=0), origin, params, np.zeros(3), np.zeros(3))
+def _make_builder(items: Sequence[Item], origin: Origin, params: Mapping[str, float], first: int) -> _RouteBuilder:
+    by_seq = {item.seq: item for item in items if 0 <= item.seq < MAX_ITEMS}
+    builder = _RouteBuilder(by_seq, first, max(by_seq, default=0), origin, params, np.zeros(3), np.zeros(3))
     if any(not 0 <= item.seq < MAX_ITEMS for item in items):
-        walk.say(f"mission: found {len(items)} items, expected at most {MAX_ITEMS}; used the first, shorten it")
-    if walk.last < first or not kept:
-        wanted = "home and at least one more" if first else "at least one"
-        walk.say(f"mission: found {len(items)} items, expected {wanted}; nothing to fly, upload a mission")
-        return walk
-    lost = walk.last + 1 - len(kept)
-    if lost:
-        walk.say(f"mission: found {len(kept)} of {walk.last + 1} items; skipped {lost}, download the mission again")
-    walk.home = walk.point = _home(walk) if first else np.zeros(3)
-    lat, lon = (np.array([getattr(item, name) for item in kept.values()], float) for name in ("lat_e7", "lon_e7"))
-    walk.places = dict(zip(kept, to_ned(origin, lat, lon, np.zeros(len(lat))), strict=True))
-    return walk
+        builder.remark(f"mission: found {len(items)} items, expected at most {MAX_ITEMS}; used the first, shorten it")
+    if builder.last < first or not by_seq:
+        expected = "home and at least one more" if first else "at least one"
+        builder.remark(f"mission: found {len(items)} items, expected {expected}; nothing to fly, upload a mission")
+        return builder
+    n_missing = builder.last + 1 - len(by_seq)
+    if n_missing:
+        builder.remark(
+            f"mission: found {len(by_seq)} of {builder.last + 1} items; skipped {n_missing}, download the mission again"
+        )
+    builder.home = builder.last_point = _home(builder) if first else np.zeros(3)
+    lat, lon = (np.array([getattr(item, name) for item in by_seq.values()], float) for name in ("lat_e7", "lon_e7"))
+    builder.positions = dict(zip(by_seq, to_ned(origin, lat, lon, np.zeros(len(lat))), strict=True))
+    return builder
 
 
-def _home(walk: _Walk) -> np.ndarray:
-    item = walk.items.get(0)
-    if item is None or _fault(item) or _nowhere(item):
-        walk.say("mission item 0: found no usable position, expected home; used the origin, set home and upload again")
+def _home(builder: _RouteBuilder) -> np.ndarray:
+    item = builder.items.get(0)
+    if item is None or _position_error(item) or _is_zero_position(item):
+        builder.remark(
+            "mission item 0: found no usable position, expected home; used the origin, set home and upload again"
+        )
         return np.zeros(3)
-    return _ned(walk.origin, item, item.alt_m)
+    return _ned(builder.origin, item, item.alt_m)
 
 
 def _ned(origin: Origin, item: Item, altitude: float) -> np.ndarray:
     return to_ned(origin, np.array([item.lat_e7]), np.array([item.lon_e7]), np.array([altitude * 1e3]))[0]
 
 
-def _fault(item: Item) -> str:
+def _position_error(item: Item) -> str:
     """Describe the error in a position; empty for a valid one. A nan fails every comparison."""
     if not abs(item.lat_e7) <= 9e8:
         return f"latitude {item.lat_e7} (1e-7 deg), expected within 90 deg"
     if not abs(item.lon_e7) <= 1.8e9:
         return f"longitude {item.lon_e7} (1e-7 deg), expected within 180 deg"
-    if not abs(item.alt_m) <= _HIGHEST:
-        return f"altitude {item.alt_m}, expected within {_HIGHEST:.0f} m"
+    if not abs(item.alt_m) <= _MAX_ALTITUDE:
+        return f"altitude {item.alt_m}, expected within {_MAX_ALTITUDE:.0f} m"
     if item.frame not in GLOBAL_FRAMES:
         return f"frame {item.frame}, expected one of {GLOBAL_FRAMES}"
     return ""
 
 
-def _nowhere(item: Item) -> bool:
+def _is_zero_position(item: Item) -> bool:
     return item.lat_e7 == 0 and item.lon_e7 == 0
 
 
-def _number(value: float, otherwise: float = 0.0) -> float:
-    return value if isfinite(value) else otherwise
+def _finite(value: float, default: float = 0.0) -> float:
+    return value if isfinite(value) else default
 
 
-def _first(walk: _Walk, seq: int) -> int:
-    if walk.last >= walk.first and not 0 <= seq <= walk.last:
-        began = f"started at {walk.first}, request MISSION_CURRENT"
-        walk.say(f"mission: found current item {seq}, expected 0..{walk.last}; {began}")
-        return walk.first
-    return max(seq, walk.first)
+def _first_seq(builder: _RouteBuilder, seq: int) -> int:
+    if builder.last >= builder.first and not 0 <= seq <= builder.last:
+        fallback = f"started at {builder.first}, request MISSION_CURRENT"
+        builder.remark(f"mission: found current item {seq}, expected 0..{builder.last}; {fallback}")
+        return builder.first
+    return max(seq, builder.first)
 
 
-def _arrive(walk: _Walk, seq: int) -> int:
+def _advance_to(builder: _RouteBuilder, seq: int) -> int:
     """Advance to `seq` on the shortest path, to obtain the active speed, the previous point and the used jumps."""
-    at = walk.first
-    while at < seq:
-        item = walk.items.get(at)
+    item_seq = builder.first
+    while item_seq < seq:
+        item = builder.items.get(item_seq)
         if item is not None and item.command == _JUMP:
-            target = _target(walk, item)
-            count = _number(item.param2)
-            if at < target <= seq and count != 0:
-                walk.left[at] = count - 1 if count > 0 else count
-                at = target
+            target = _jump_target(builder, item)
+            count = _finite(item.param2)
+            if item_seq < target <= seq and count != 0:
+                builder.jumps_left[item_seq] = count - 1 if count > 0 else count
+                item_seq = target
                 continue
             if count > 0:
-                walk.left[at] = 0.0  # the aircraft has passed it
+                builder.jumps_left[item_seq] = 0.0  # the aircraft has passed it
         elif item is not None:
-            _visit(walk, item)
-        at += 1
-    return at
+            _apply_item(builder, item)
+        item_seq += 1
+    return item_seq
 
 
-def _unroll(walk: _Walk, at: int, limit: int) -> None:
+def _append_legs(builder: _RouteBuilder, item_seq: int, limit: int) -> None:
     """Append the legs from item `item_seq` on; return to launch follows the last item."""
-    while at <= walk.last and len(walk.legs) < limit:
-        item = walk.items.get(at)
-        jump = item is not None and item.command == _JUMP
-        if item is not None and not jump:
-            _visit(walk, item)
-        at = _jump(walk, item) if item is not None and jump else at + 1
-    if len(walk.legs) < limit and not _ends(walk):
-        walk.legs.append(_return(walk))
+    while item_seq <= builder.last and len(builder.legs) < limit:
+        item = builder.items.get(item_seq)
+        is_jump = item is not None and item.command == _JUMP
+        if item is not None and not is_jump:
+            _apply_item(builder, item)
+        item_seq = _seq_after_jump(builder, item) if item is not None and is_jump else item_seq + 1
+    if len(builder.legs) < limit and not _is_final(builder):
+        builder.legs.append(_return_leg(builder))
 
 
-def _ends(walk: _Walk) -> bool:
+def _is_final(builder: _RouteBuilder) -> bool:
     """Return whether the last leg is one without automatic successor."""
-    return bool(walk.legs) and int(walk.legs[-1][KIND]) in (LAND, LOITER_UNLIMITED)
+    return bool(builder.legs) and int(builder.legs[-1][KIND]) in (LAND, LOITER_UNLIMITED)
 
 
-def _target(walk: _Walk, item: Item) -> int:
+def _jump_target(builder: _RouteBuilder, item: Item) -> int:
     """Return the target item of a DO_JUMP; -1 when it is invalid."""
-    if walk.first <= item.param1 <= walk.last:
+    if builder.first <= item.param1 <= builder.last:
         return int(item.param1)
-    expected = f"expected {walk.first}..{walk.last}"
-    walk.say(f"mission item {item.seq}: found jump to {item.param1}, {expected}; skipped, upload again")
+    expected = f"expected {builder.first}..{builder.last}"
+    builder.remark(f"mission item {item.seq}: found jump to {item.param1}, {expected}; skipped, upload again")
     return -1
 
 
-def _jump(walk: _Walk, item: Item) -> int:
+def _seq_after_jump(builder: _RouteBuilder, item: Item) -> int:
     """Take a DO_JUMP while jumps remain, and return the next sequence number."""
-    target = _target(walk, item)
-    left = walk.left.get(item.seq, _number(item.param2))
-    if target < 0 or left == 0:
+    target = _jump_target(builder, item)
+    remaining = builder.jumps_left.get(item.seq, _finite(item.param2))
+    if target < 0 or remaining == 0:
         return item.seq + 1
-    if item.seq in walk.taken:
-        walk.say(f"mission item {item.seq}: found a jump loop without a leg; left the loop, add a waypoint inside it")
+    if item.seq in builder.jumps_taken:
+        builder.remark(
+            f"mission item {item.seq}: found a jump loop without a leg; left the loop, add a waypoint inside it"
+        )
         return item.seq + 1
-    walk.taken.add(item.seq)
-    walk.left[item.seq] = left - 1 if left > 0 else left
+    builder.jumps_taken.add(item.seq)
+    builder.jumps_left[item.seq] = remaining - 1 if remaining > 0 else remaining
     return target
 
 
-def _visit(walk: _Walk, item: Item) -> None:
+def _apply_item(builder: _RouteBuilder, item: Item) -> None:
     """Apply one item other than DO_JUMP: change the speed, add a leg, or add a remark."""
     if item.command == SPEED:
-        _change_speed(walk, item)
+        _change_speed(builder, item)
     elif item.command in _KINDS:
-        _add(walk, item)
+        _add_leg(builder, item)
     elif item.command < _LAST_NAV:
-        walk.say(f"mission item {item.seq}: found unsupported command {item.command}; skipped, use another item")
+        builder.remark(f"mission item {item.seq}: found unsupported command {item.command}; skipped, use another item")
 
 
-def _change_speed(walk: _Walk, item: Item) -> None:
+def _change_speed(builder: _RouteBuilder, item: Item) -> None:
     if item.param2 == -2:  # MAVLink: return to the default
-        walk.speed = 0.0
+        builder.speed = 0.0
     if not (isfinite(item.param2) and item.param2 > 0):
         return
-    if item.param2 > _FASTEST:
-        found = f"found a speed of {item.param2:g} m/s, expected at most {_FASTEST:.0f}"
-        walk.say(f"mission item {item.seq}: {found}; used the previous speed, correct it")
+    if item.param2 > _MAX_SPEED:
+        problem = f"found a speed of {item.param2:g} m/s, expected at most {_MAX_SPEED:.0f}"
+        builder.remark(f"mission item {item.seq}: {problem}; used the previous speed, correct it")
         return
-    walk.speed = item.param2
+    builder.speed = item.param2
     if item.param1 == 1:
-        walk.say(f"mission item {item.seq}: found a ground speed, expected an airspeed; used as airspeed, set type 0")
+        builder.remark(
+            f"mission item {item.seq}: found a ground speed, expected an airspeed; used as airspeed, set type 0"
+        )
 
 
-def _add(walk: _Walk, item: Item) -> None:
+def _add_leg(builder: _RouteBuilder, item: Item) -> None:
     """Add the leg of a navigation item, unless it is invalid or of zero length."""
     if item.command == _RETURN:
-        walk.legs.append(_return(walk))
-        walk.legs[-1][SEQ] = item.seq
-        walk.point, walk.kind = walk.legs[-1][P_N : P_D + 1], LOITER_UNLIMITED
-        walk.taken.clear()
+        builder.legs.append(_return_leg(builder))
+        builder.legs[-1][SEQ] = item.seq
+        builder.last_point, builder.last_kind = builder.legs[-1][P_N : P_D + 1], LOITER_UNLIMITED
+        builder.jumps_taken.clear()
         return
-    fault = _fault(item)
-    if fault:
-        walk.say(f"mission item {item.seq}: found {fault}; skipped, upload a corrected mission")
+    error = _position_error(item)
+    if error:
+        builder.remark(f"mission item {item.seq}: found {error}; skipped, upload a corrected mission")
         return
     kind = _KINDS[item.command]
-    target = _point(walk, item)
-    length = hypot(*(target - walk.point)[:2])
-    if length > _FAR:
-        found = f"found {length * 1e-3:,.0f} km from the previous point, expected {_FAR * 1e-3:.0f} km at most"
-        walk.say(f"mission item {item.seq}: {found}; used as it is, check its position")
-    near = length < _SHORTEST
-    if near and kind == WAYPOINT == walk.kind and (walk.legs or not _nowhere(item)):
-        walk.say(f"mission item {item.seq}: found a leg of zero length, expected {_SHORTEST:.0f} m; skipped, remove it")
+    target = _item_position(builder, item)
+    length = hypot(*(target - builder.last_point)[:2])
+    if length > _MAX_LEG:
+        problem = f"found {length * 1e-3:,.0f} km from the previous point, expected {_MAX_LEG * 1e-3:.0f} km at most"
+        builder.remark(f"mission item {item.seq}: {problem}; used as it is, check its position")
+    is_short = length < _MIN_LEG
+    if is_short and kind == WAYPOINT == builder.last_kind and (builder.legs or not _is_zero_position(item)):
+        builder.remark(
+            f"mission item {item.seq}: found a leg of zero length, expected {_MIN_LEG:.0f} m; skipped, remove it"
+        )
         return
-    walk.legs.append(_leg(walk, item, kind, target))
-    walk.point, walk.kind = target, kind
-    walk.taken.clear()
+    builder.legs.append(_make_leg(builder, item, kind, target))
+    builder.last_point, builder.last_kind = target, kind
+    builder.jumps_taken.clear()
 
 
-def _point(walk: _Walk, item: Item) -> np.ndarray:
+def _item_position(builder: _RouteBuilder, item: Item) -> np.ndarray:
     """Return the position of an item, NED (3,) [m]; zero latitude and longitude mean the current position."""
     if item.frame in _TERRAIN:
-        walk.say(
+        builder.remark(
             f"mission item {item.seq}: found altitude above terrain; used as above home, specify it relative to home"
         )
     absolute = item.frame in _ABSOLUTE
-    altitude = item.alt_m + (0.0 if absolute else walk.origin.alt_mm * 1e-3 - walk.home[2])
-    point = walk.places[item.seq].copy()
-    point[2] = walk.origin.alt_mm * 1e-3 - altitude
-    if _nowhere(item):
-        point[:2] = walk.point[:2]
+    altitude = item.alt_m + (0.0 if absolute else builder.origin.alt_mm * 1e-3 - builder.home[2])
+    point = builder.positions[item.seq].copy()
+    point[2] = builder.origin.alt_mm * 1e-3 - altitude
+    if _is_zero_position(item):
+        point[:2] = builder.last_point[:2]
     return point
 
 
-def _leg(walk: _Walk, item: Item, kind: int, target: np.ndarray) -> np.ndarray:
+def _make_leg(builder: _RouteBuilder, item: Item, kind: int, target: np.ndarray) -> np.ndarray:
     leg = np.zeros(N_COLUMNS)
-    leg[KIND], leg[P_N : P_D + 1], leg[VA_C], leg[SEQ] = kind, target, walk.speed, item.seq
+    leg[KIND], leg[P_N : P_D + 1], leg[VA_C], leg[SEQ] = kind, target, builder.speed, item.seq
     if kind == WAYPOINT:
-        past = _number(item.param3)
-        leg[ACCEPT] = -past if past > 0 else max(_number(item.param2), 0.0)
+        pass_by = _finite(item.param3)
+        leg[ACCEPT_RADIUS] = -pass_by if pass_by > 0 else max(_finite(item.param2), 0.0)
     elif kind in (LOITER_TURNS, LOITER_TIME):
-        leg[TURNS] = max(_number(item.param1), 0.0)
+        leg[TURNS] = max(_finite(item.param1), 0.0)
     if kind in (LOITER_TURNS, LOITER_UNLIMITED):
-        leg[RADIUS] = _number(item.param3)
+        leg[RADIUS] = _finite(item.param3)
     elif kind == LOITER_TO_ALT:
-        leg[RADIUS] = _number(item.param2)
-    elif kind == LOITER_TIME and not walk.first:
-        leg[RADIUS] = _number(item.param3)
-    elif kind == LOITER_TIME and _number(item.param3) < 0:  # ArduPlane reads the direction only
-        leg[RADIUS] = -abs(_number(walk.params.get("WP_LOITER_RAD", 60.0), 60.0))
-    if not walk.first and kind in (LOITER_TIME, LOITER_TO_ALT):
+        leg[RADIUS] = _finite(item.param2)
+    elif kind == LOITER_TIME and not builder.first:
+        leg[RADIUS] = _finite(item.param3)
+    elif kind == LOITER_TIME and _finite(item.param3) < 0:  # ArduPlane reads the direction only
+        leg[RADIUS] = -abs(_finite(builder.params.get("WP_LOITER_RAD", 60.0), 60.0))
+    if not builder.first and kind in (LOITER_TIME, LOITER_TO_ALT):
         heading = item.param2 if kind == LOITER_TIME else item.param1
-        leg[ACCEPT] = float(_number(heading) > 0)
+        leg[ACCEPT_RADIUS] = float(_finite(heading) > 0)
     return leg
 
 
-def _return(walk: _Walk) -> np.ndarray:
+def _return_leg(builder: _RouteBuilder) -> np.ndarray:
     """Return the leg after the last item: ArduPlane circles over home at RTL_ALTITUDE, PX4 at its position."""
     leg = np.zeros(N_COLUMNS)
-    if not walk.first:
-        leg[KIND], leg[SEQ], leg[P_N : P_D + 1] = LOITER_UNLIMITED, -1, walk.point
+    if not builder.first:
+        leg[KIND], leg[SEQ], leg[P_N : P_D + 1] = LOITER_UNLIMITED, -1, builder.last_point
         return leg
-    height = walk.params.get("RTL_ALTITUDE", walk.params.get("ALT_HOLD_RTL", 100.0 * _RTL_ALTITUDE) / 100.0)
-    height = _number(height, _RTL_ALTITUDE)
+    height = builder.params.get("RTL_ALTITUDE", builder.params.get("ALT_HOLD_RTL", 100.0 * _RTL_ALTITUDE) / 100.0)
+    height = _finite(height, _RTL_ALTITUDE)
     leg[KIND], leg[SEQ] = LOITER_UNLIMITED, -1
-    leg[P_N : P_D + 1] = walk.home
-    leg[P_D] = walk.home[2] - height if height >= 0 else walk.point[2]  # negative: stay at this altitude
-    leg[RADIUS] = _number(walk.params.get("RTL_RADIUS", 0.0))
+    leg[P_N : P_D + 1] = builder.home
+    leg[P_D] = builder.home[2] - height if height >= 0 else builder.last_point[2]  # negative: stay at this altitude
+    leg[RADIUS] = _finite(builder.params.get("RTL_RADIUS", 0.0))
     return leg

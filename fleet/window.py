@@ -64,8 +64,8 @@ class Window:
             return self.x[:, [STATES.index(name) for name in names]]
         phi = np.clip(self.x[:, STATES.index("phi")], -1.3, 1.3)
         bank = np.tan(phi) * np.sin(phi)  # pitch rate of a level turn: q = g / V tan(phi) sin(phi)
-        both, rows = (*STATES, *INPUTS, "bank"), np.column_stack([self.x, self.u, bank])
-        return rows[:, [both.index(name) for name in names]]
+        available, table = (*STATES, *INPUTS, "bank"), np.column_stack([self.x, self.u, bank])
+        return table[:, [available.index(name) for name in names]]
 
     def part(self, start: int, stop: int) -> "Window":
         """Return rows `start` to `stop` as a window."""

@@ -12,35 +12,37 @@ from rich.console import Console
 
 from fleet.access.roles import GATEWAY
 from fleet.bus.session import connect
-from fleet.cli import guarded, parser_for, stop_on_signal
-from fleet.config import entry, router_arguments
-from fleet.metrics import served
-from fleet.process.logs import log_arguments, say
-from fleet.process.malloc_trim import give_back
-from fleet.report.progress import shown
-from fleet.telemetry.mavlink.intake import MOST_UAVS
+from fleet.cli import make_parser, run_command, stop_on_signal
+from fleet.config import bus_config_from, router_arguments
+from fleet.metrics import serve
+from fleet.process.logs import log_arguments, report_status
+from fleet.process.malloc_trim import enable_malloc_trim
+from fleet.report.progress import show_progress
+from fleet.telemetry.mavlink.intake import MAX_UAVS
 from fleet.telemetry.mavlink.warm import warm_up
-from fleet.telemetry.recording.ids import Ids
-from gateway.admission.admission import gates_of
-from gateway.links.isolated_replay import divided, played_apart
-from gateway.links.link import Link
+from fleet.telemetry.recording.ids import IdAllocator
+from gateway.admission.admission import make_admissions
+from gateway.links.isolated_replay import replay_process, split_replays
+from gateway.links.link import Endpoint
 from gateway.links.opening import open_link
-from gateway.links.recorded import Replay
+from gateway.links.recorded import ReplayLink
 from gateway.onboard.cache import Cache
-from gateway.onboard.rates import BUDGET
-from gateway.pipeline import Pump
-from gateway.record.recorder import Recorder
+from gateway.onboard.rates import DEFAULT_BUDGET
+from gateway.pipeline import Pipeline
+from gateway.record.recorder import LinkRecorder
 from gateway.record.size import read_size
-from gateway.record.tape import Budget
+from gateway.record.tape import DiskBudget
 from gateway.settings.link_spec import read_forward, read_spec
 from gateway.status.metrics import counters
-from gateway.status.status_table import posted
+from gateway.status.status_table import status_display
 
 SWITCH_S = 5e-4  # longest wait of a receiving thread for the interpreter [s]
 COLD_S = 2.0  # compilation that takes longer is logged [s]
-COLD = "compiling the decoder for this machine, once; links open when that is done"
-GARBAGE = 50_000  # allocations between cycle collections; a tick allocates thousands of objects without cycles
-LARGE = 1 << 20  # larger allocations are returned to the system: batches of a flood, not those of every tick [bytes]
+COMPILING = "compiling the decoder for this machine, once; links open when that is done"
+GC_THRESHOLD = 50_000  # allocations between cycle collections; a tick allocates thousands of objects without cycles
+TRIM_BYTES = (
+    1 << 20
+)  # larger allocations are returned to the system: batches of a flood, not those of every tick [bytes]
 DEFAULT_LINK = "udpin:127.0.0.1:14550"
 EXAMPLES = """
   gateway                                              listen on loopback, port 14550
@@ -75,69 +77,75 @@ _log = logging.getLogger(__name__)
 def run(args: argparse.Namespace) -> int:
     """Open the links, connect to the bus, and run until a stop signal or the end of all recordings."""
     specs = [read_spec(text, args.offset) for text in args.link or [DEFAULT_LINK]]
-    specs, files = divided(specs)
+    specs, files = split_replays(specs)
     specs += [read_forward(text) for text in args.forward]
     if args.most_uavs < 1:
         raise ValueError(f"--most-uavs: found {args.most_uavs}, expected at least 1; write e.g. 250")
-    gates = gates_of(specs, len(args.forward), args.keys)
-    budget = Budget(args.record, read_size(args.record_budget, "--record-budget")) if args.record is not None else None
+    gates = make_admissions(specs, len(args.forward), args.keys)
+    budget = (
+        DiskBudget(args.record, read_size(args.record_budget, "--record-budget")) if args.record is not None else None
+    )
     stop = stop_on_signal()
     sys.setswitchinterval(SWITCH_S)
-    compiled()
+    compile_decoder()
     gc.freeze()
-    gc.set_threshold(GARBAGE, *gc.get_threshold()[1:])
-    give_back(LARGE)
-    with connect(entry(args, GATEWAY), patient=budget is not None) as bus, contextlib.ExitStack() as held:
-        held.enter_context(played_apart(files, args, _log.warning))
-        links: list[Link] = []
-        ids = Ids()
+    gc.set_threshold(GC_THRESHOLD, *gc.get_threshold()[1:])
+    enable_malloc_trim(TRIM_BYTES)
+    with connect(bus_config_from(args, GATEWAY), retry=budget is not None) as bus, contextlib.ExitStack() as stack:
+        stack.enter_context(replay_process(files, args, _log.warning))
+        links: list[Endpoint] = []
+        ids = IdAllocator()
         for spec in specs:
             link = open_link(spec, ids)
-            held.callback(link.close)
+            stack.callback(link.close)
             links.append(link)
-            _say(spec.text)
-        replays = [link for link in links if isinstance(link, Replay)]
-        with shown(replays, _say):
+            _report(spec.text)
+        replays = [link for link in links if isinstance(link, ReplayLink)]
+        with show_progress(replays, _report):
             for replay in replays:
-                replay.look(stop)
-            recorder = None if budget is None else held.enter_context(Recorder(budget, [spec.text for spec in specs]))
-            pump = Pump(
+                replay.read_ahead(stop)
+            recorder = (
+                None if budget is None else stack.enter_context(LinkRecorder(budget, [spec.text for spec in specs]))
+            )
+            pipeline = Pipeline(
                 links,
                 bus,
                 args.listen_only,
-                gates=gates,
+                admissions=gates,
                 stations=len(args.forward),
-                most=args.most_uavs,
+                max_uavs=args.most_uavs,
                 recorder=recorder,
                 budget=args.budget,
                 cache=None if args.listen_only else Cache(),
             )
             if len(replays) < len(links):
                 console = Console() if sys.stdout.isatty() and not replays else None
-                held.enter_context(posted(pump.publisher.newest, _say, console))
+                stack.enter_context(status_display(pipeline.publisher.snapshot, _report, console))
             if args.metrics:
-                _say(f"counters at {held.enter_context(served(args.metrics, counters(pump.publisher.newest)))}")
-            pump.run(stop)
+                _report(
+                    f"counters at {stack.enter_context(serve(args.metrics, counters(pipeline.publisher.snapshot)))}"
+                )
+            pipeline.run(stop)
     return 0
 
 
-def compiled() -> None:
+def compile_decoder() -> None:
     """Compile the decoder, or load it from the cache; log a warning if it takes long, once per machine."""
-    slow = threading.Timer(COLD_S, _log.warning, (COLD,))
-    slow.start()
+    timer = threading.Timer(COLD_S, _log.warning, (COMPILING,))
+    timer.start()
     try:
         warm_up()
     finally:
-        slow.cancel()
+        timer.cancel()
 
 
-def _say(line: str) -> None:
-    say("gateway", line)
+def _report(line: str) -> None:
+    report_status("gateway", line)
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the `gateway` command."""
-    parser = parser_for("gateway", (__doc__ or "").strip().splitlines()[0], EXAMPLES)
+    parser = make_parser("gateway", (__doc__ or "").strip().splitlines()[0], EXAMPLES)
     parser.add_argument(
         "--link", action="append", metavar="LINK", help=f"link to aircraft; may be repeated ({DEFAULT_LINK})"
     )
@@ -146,7 +154,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
     parser.add_argument(
-        "--most-uavs", type=int, default=MOST_UAVS, metavar="N", help=f"maximum number of aircraft ({MOST_UAVS})"
+        "--most-uavs", type=int, default=MAX_UAVS, metavar="N", help=f"maximum number of aircraft ({MAX_UAVS})"
     )
     parser.add_argument("--keys", type=Path, metavar="FILE", help="keys of signed links, readable only by the owner")
     router_arguments(parser)
@@ -155,7 +163,7 @@ def main(argv: list[str] | None = None) -> int:
         "--budget",
         default="",
         metavar="SIZE",
-        help=f"bytes/s aircraft may send on a link ({BUDGET}; serial: 70 %% of baud)",
+        help=f"bytes/s aircraft may send on a link ({DEFAULT_BUDGET}; serial: 70 %% of baud)",
     )
     parser.add_argument("--record", type=Path, metavar="DIR", help="write a .tlog of each link into this folder")
     parser.add_argument(
@@ -166,7 +174,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     log_arguments(parser)
     parser.add_argument("--metrics", metavar="HOST:PORT", help="counters for Prometheus, e.g. 127.0.0.1:9100")
-    return guarded("gateway", run, parser.parse_args(argv))
+    return run_command("gateway", run, parser.parse_args(argv))
 
 
 if __name__ == "__main__":

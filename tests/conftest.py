@@ -24,10 +24,10 @@ import pytest
 from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import open_router
 from fleet.contract import Message
-from twin_worker.confidence.tube_and_horizon import Record
-from twin_worker.evaluation.offline import run
-from twin_worker.prediction.method_selection import Contest
-from twin_worker.service.worker import Held, Worker
+from twin_worker.confidence.tube_and_horizon import ConfidenceTracker
+from twin_worker.evaluation.offline import run_offline
+from twin_worker.prediction.method_selection import MethodSelector
+from twin_worker.service.worker import OwnedTwin, Worker
 from twin_worker.twin.step import Twin
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -137,10 +137,10 @@ def twin(flown) -> Twin:
 def winged(request, twin) -> Twin:
     """The same, with one of its models and with none."""
     if request.param != "dynamics":
-        twin.plant = None
+        twin.models.active_model = None
     if request.param != "hybrid":
-        twin.hybrid = None
-    twin.contest = Contest()
+        twin.models.point_mass = None
+    twin.prediction.selector = MethodSelector()
     return twin
 
 
@@ -148,7 +148,7 @@ def winged(request, twin) -> Twin:
 def hovering() -> Twin:
     """A multirotor's twin in the middle of its mission."""
     twins: dict[int, Twin] = {}
-    for _ in run(hover.fly(3).messages[:500], twins):
+    for _ in run_offline(hover.fly(3).messages[:500], twins):
         pass
     return twins[7]
 
@@ -162,8 +162,10 @@ def hovered(hovering) -> Twin:
 @pytest.fixture
 def sighted(monkeypatch) -> float:
     """A confidence horizon of every prediction, whatever the tables say [s]."""
-    seconds, trust = 12.0, Record.trust
-    monkeypatch.setattr(Record, "trust", lambda *given: replace(trust(*given), horizon_s=seconds, horizon_open=False))
+    seconds, trust = 12.0, ConfidenceTracker.confidence_of
+    monkeypatch.setattr(
+        ConfidenceTracker, "confidence_of", lambda *given: replace(trust(*given), horizon_s=seconds, horizon_open=False)
+    )
     return seconds
 
 
@@ -171,6 +173,6 @@ def sighted(monkeypatch) -> float:
 def holder(twin) -> Worker:
     """A worker that holds that twin, on a bus in memory."""
     worker = Worker(MemoryBus(), range(1, 5), omega=0.0)
-    worker.listen()
-    worker._held[1] = Held(twin, epoch=9)
+    worker.connect()
+    worker._owned[1] = OwnedTwin(twin, epoch=9)
     return worker

@@ -11,7 +11,7 @@ from fleet.physics.actuators import TAU
 from fleet.physics.dynamics import step
 from fleet.physics.wrench import NAMES, OFFSETS, WIND
 from fleet.window import Window
-from twin_worker.identification.fixed_wing.derivatives_model import Coupled
+from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
 from twin_worker.identification.fixed_wing.derivatives_prior import prior
 
 V, W0 = 20.0, 1.0  # trim, forward and down the body [m/s]
@@ -79,8 +79,8 @@ def broken(window: Window, *holes: tuple[float, float]) -> Window:
     return replace(window, x=x, ok=window.ok & ~gone)
 
 
-def known(par: np.ndarray, t0: float = T0, t1: float = T0 + 20.0) -> Coupled:
+def known(par: np.ndarray, t0: float = T0, t1: float = T0 + 20.0) -> DerivativesModel:
     """A coupled model of these very parameters."""
     mean, sigma = prior(SMALL, AT, TRIM, par[WIND:])
     precision = np.diag(sigma**-2.0)
-    return Coupled(par, AT, np.zeros((37, 37)), mean, precision, 1 / NOISE**2, (mean, precision), t0, t1, 0)
+    return DerivativesModel(par, AT, np.zeros((37, 37)), mean, precision, 1 / NOISE**2, (mean, precision), t0, t1, 0)

@@ -10,7 +10,7 @@ import numpy as np
 from pymavlink import DFReader
 
 from fleet.contract import COLUMNS
-from fleet.telemetry.mavlink.onboard_log import Said, Table
+from fleet.telemetry.mavlink.onboard_log import FieldRows, OnboardEvent
 from fleet.telemetry.onboard_logs.dataflash.reader import DataflashLog
 
 LETTERS = DFReader.FORMAT_TO_STRUCT
@@ -58,13 +58,13 @@ def log_of(data: bytes, name: str = "a.bin") -> DataflashLog:
     return DataflashLog(partial(io.BytesIO, data), name)
 
 
-def read(log: DataflashLog) -> tuple[Table, list[Said], Counter]:
+def read(log: DataflashLog) -> tuple[FieldRows, list[OnboardEvent], Counter]:
     """Read it all, and hold what any reading must hold."""
     parts: dict[str, list] = {}
     said, counts = [], Counter()
     for chunk in log.chunks():
-        assert [s.t for s in chunk.said] == sorted(s.t for s in chunk.said)
-        said += chunk.said
+        assert [s.t for s in chunk.events] == sorted(s.t for s in chunk.events)
+        said += chunk.events
         counts.update(chunk.counts)
         for field, (t, values) in chunk.rows.items():
             assert len(t) == len(values) > 0 and values.shape[1] == len(COLUMNS[field])
@@ -75,10 +75,10 @@ def read(log: DataflashLog) -> tuple[Table, list[Said], Counter]:
     return rows, said, counts
 
 
-def values(said: list[Said], what: str) -> list[Any]:
-    return [s.value for s in said if s.what == what]
+def values(said: list[OnboardEvent], what: str) -> list[Any]:
+    return [s.value for s in said if s.kind == what]
 
 
-def rate(rows: Table, field: str) -> float:
+def rate(rows: FieldRows, field: str) -> float:
     t = rows[field][0]
     return (len(t) - 1) / (t[-1] - t[0])

@@ -3,8 +3,14 @@
 import numpy as np
 
 from fleet.effects import Onset, catalogue
-from twin_worker.diagnosis.data.fault_hypothesis import Guess, When
-from twin_worker.diagnosis.inference.report import Finding, Outcome, Report, Series, Tried
+from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis, OnsetProfile
+from twin_worker.diagnosis.inference.report import (
+    DiagnosisFinding,
+    FigureSeries,
+    RankedCandidate,
+    Report,
+    ReportOutcome,
+)
 from twin_worker.diagnosis.model.baseline import CHANNELS
 
 ONSET = 83.0
@@ -12,7 +18,9 @@ LENGTH = 200.0
 NAN = float("nan")
 
 
-def made(flight: str = "s07-lag", outcome: Outcome = Outcome.NAMED, seed: int = 6, effects: int = 1) -> Report:
+def made(
+    flight: str = "s07-lag", outcome: ReportOutcome = ReportOutcome.NAMED, seed: int = 6, effects: int = 1
+) -> Report:
     """A flight of four legs whose pitch and lift go wrong at 83 s."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, LENGTH, 0.2)
@@ -21,16 +29,18 @@ def made(flight: str = "s07-lag", outcome: Outcome = Outcome.NAMED, seed: int = 
     wrong = (t >= ONSET) * (np.sin(0.9 * t) + 0.5 * np.sin(2.3 * t))
     noise = _coloured(rng, len(t), len(CHANNELS))
     share = np.zeros(len(CHANNELS))
-    if outcome is not Outcome.NONE:
+    if outcome is not ReportOutcome.NONE:
         share[[CHANNELS.index(name) for name in ("pitch", "lift", "gps_z", "force_x", "airspeed")]] = 6, 4, 1.5, 1, 0.8
     before, after = noise + np.outer(wrong, share), noise + 0.08 * np.outer(wrong, share)
     ratio = [
         dict(zip(CHANNELS, (x[ok] ** 2).mean(axis=0) / (noise[ok] ** 2).mean(axis=0), strict=True))
         for x in (before, after)
     ]
-    base, model = _forces(rng, t, wrong, 0.0), _forces(rng, t, wrong, 0.9 if outcome is not Outcome.NONE else 0.0)
-    measured = _forces(rng, t, wrong, 1.0 if outcome is not Outcome.NONE else 0.0) + 0.12 * rng.normal(size=(len(t), 3))
-    found = _findings()[:effects] if outcome in (Outcome.NAMED, Outcome.SUSPECTED) else ()
+    base, model = _forces(rng, t, wrong, 0.0), _forces(rng, t, wrong, 0.9 if outcome is not ReportOutcome.NONE else 0.0)
+    measured = _forces(rng, t, wrong, 1.0 if outcome is not ReportOutcome.NONE else 0.0) + 0.12 * rng.normal(
+        size=(len(t), 3)
+    )
+    found = _findings()[:effects] if outcome in (ReportOutcome.NAMED, ReportOutcome.SUSPECTED) else ()
     errors = [float(np.sqrt(((measured - x)[held & ok] ** 2).mean())) for x in (base, model)]
     return Report(
         flight=flight,
@@ -43,14 +53,14 @@ def made(flight: str = "s07-lag", outcome: Outcome = Outcome.NAMED, seed: int = 
         fit_after=1.07 if found else NAN,
         force_before=errors[0],
         force_after=errors[1] if found else NAN,
-        stray_before=6.1,
-        stray_after=2.2,
-        where=("pitch", ((ONSET, 118.0), (130.0, LENGTH))) if outcome is Outcome.UNKNOWN else ("", ()),
-        odd={"pitch": 3.0},
-        terms={"q·V": -0.42, "sin(0.9 t)": 1.3e-5} if outcome is Outcome.UNKNOWN else {},
-        tried=() if outcome is Outcome.NONE else _tried(),
-        lacks=("the accelerometer comes at 5 Hz: gusts and small changes of lift are seen less well",),
-        series=Series(t, ok, _path(t), before, after, measured, base, model, held),
+        free_run_error_before=6.1,
+        free_run_error_after=2.2,
+        where=("pitch", ((ONSET, 118.0), (130.0, LENGTH))) if outcome is ReportOutcome.UNKNOWN else ("", ()),
+        anomaly_ratio={"pitch": 3.0},
+        terms={"q·V": -0.42, "sin(0.9 t)": 1.3e-5} if outcome is ReportOutcome.UNKNOWN else {},
+        ranking=() if outcome is ReportOutcome.NONE else _tried(),
+        limitations=("the accelerometer comes at 5 Hz: gusts and small changes of lift are seen less well",),
+        series=FigureSeries(t, ok, _path(t), before, after, measured, base, model, held),
         seconds=3.2,
     )
 
@@ -74,44 +84,44 @@ def _path(t: np.ndarray) -> np.ndarray:
     return np.stack([north, east, 100 - 40 * np.exp(-t / 12) + 6 * np.sin(0.11 * t)], axis=1)
 
 
-def _findings() -> tuple[Finding, ...]:
+def _findings() -> tuple[DiagnosisFinding, ...]:
     known = catalogue()
-    since = When(Onset.STEP, ONSET)
+    since = OnsetProfile(Onset.STEP, ONSET)
     return (
-        Finding(
-            guess=Guess(known["actuator_lag"], "elevator", (0.15,), since),
+        DiagnosisFinding(
+            hypothesis=FaultHypothesis(known["actuator_lag"], "elevator", (0.15,), since),
             gain=4213.0,
-            told={"tau_s": 0.253},
+            reported={"tau_s": 0.253},
             sigma={"tau_s": 0.0061},
-            doubt=(0.0061,),
+            parameter_sigma=(0.0061,),
             rivals=("actuator_delay", "actuator_rate_limit"),
-            apart=("elevator doublets: 2.0 times as telling as this flight was; 20 s of it should do",) * 2,
+            manoeuvres=("elevator doublets: 2.0 times as telling as this flight was; 20 s of it should do",) * 2,
             channel="actuator",
             surface="elevator",
             segments=((ONSET, LENGTH),),
-            held=0.62,
+            held_out_share=0.62,
         ),
-        Finding(
-            guess=Guess(known["drag_increase"], "", (0.02, 0.0)),
+        DiagnosisFinding(
+            hypothesis=FaultHypothesis(known["drag_increase"], "", (0.02, 0.0)),
             gain=688.0,
-            told={"dCD": 0.0214, "dCm": 0.0},
+            reported={"dCD": 0.0214, "dCm": 0.0},
             sigma={"dCD": 0.0012},
-            doubt=(0.0012, 0.0),
+            parameter_sigma=(0.0012, 0.0),
             rivals=(),
-            apart=(),
+            manoeuvres=(),
             channel="drag",
             surface="",
             segments=((0.0, LENGTH),),
-            held=0.21,
+            held_out_share=0.21,
         ),
-        Finding(
-            guess=Guess(known["gust_discrete"], "", (3.0, 2.0), When(Onset.BUMP, 140.0, 8.0)),
+        DiagnosisFinding(
+            hypothesis=FaultHypothesis(known["gust_discrete"], "", (3.0, 2.0), OnsetProfile(Onset.BUMP, 140.0, 8.0)),
             gain=455.0,
-            told={"speed_mps": 3.61, "from_deg": 213.7},
+            reported={"speed_mps": 3.61, "from_deg": 213.7},
             sigma={"speed_mps": 0.21, "from_deg": 4.4},
-            doubt=(0.2, 0.2),
+            parameter_sigma=(0.2, 0.2),
             rivals=("updraft",),
-            apart=("nothing flown here tells them apart",),
+            manoeuvres=("nothing flown here tells them apart",),
             channel="air",
             surface="",
             segments=((140.0, 148.0),),
@@ -119,7 +129,7 @@ def _findings() -> tuple[Finding, ...]:
     )
 
 
-def _tried() -> tuple[Tried, ...]:
+def _tried() -> tuple[RankedCandidate, ...]:
     gains = {
         ("actuator_lag:elevator", "since 83 s"): 4213.0,
         ("actuator_delay:elevator", "since 83 s"): 4180.0,
@@ -135,14 +145,14 @@ def _tried() -> tuple[Tried, ...]:
         ("slipstream_tail", "since 83 s"): 77.0,
         ("thrust_loss", "always"): 41.0,
     }
-    return tuple(Tried(label, since, gain) for (label, since), gain in gains.items())
+    return tuple(RankedCandidate(label, since, gain) for (label, since), gain in gains.items())
 
 
-def _sentence(outcome: Outcome) -> str:
+def _sentence(outcome: ReportOutcome) -> str:
     return {
-        Outcome.NONE: "No mismatch: the simulation explains this flight as well as it does nominal ones.",
-        Outcome.NAMED: "From 83 s on the elevator follows with a lag of 0.253 ± 0.006 s instead of 0.10 s; "
+        ReportOutcome.NONE: "No mismatch: the simulation explains this flight as well as it does nominal ones.",
+        ReportOutcome.NAMED: "From 83 s on the elevator follows with a lag of 0.253 ± 0.006 s instead of 0.10 s; "
         "a delay of the same length cannot be told from it.",
-        Outcome.SUSPECTED: "An elevator lag is suspected from 83 s on, but nothing is gained on data held out.",
-        Outcome.UNKNOWN: "Something in pitch from 83 s on that no effect of the catalogue explains.",
+        ReportOutcome.SUSPECTED: "An elevator lag is suspected from 83 s on, but nothing is gained on data held out.",
+        ReportOutcome.UNKNOWN: "Something in pitch from 83 s on that no effect of the catalogue explains.",
     }[outcome]

@@ -6,16 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.effects import Body, Effect, Flow, Parameter, Stage
-from twin_worker.diagnosis.data.card import Card
-from twin_worker.diagnosis.data.fault_hypothesis import Guess
-from twin_worker.diagnosis.data.flight import Flight
+from twin_worker.diagnosis.data.card import AircraftCard
+from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
+from twin_worker.diagnosis.data.flight import FlightData
 from twin_worker.diagnosis.data.smooth import DT
-from twin_worker.diagnosis.model.baseline import Baseline, Timing
+from twin_worker.diagnosis.model.baseline import ActuatorTiming, Baseline
 from twin_worker.diagnosis.model.residual import RHO_0
 from twin_worker.diagnosis.model.simulate import STATE, Runs, Simulation
 
 LONG_S = 80.0
-CARD = Card(
+CARD = AircraftCard(
     name="made up",
     body=Body(mass=115.0, S=4.0, b=5.5, c=0.75, D=0.95),
     inertia=(65.0, 59.0, 107.0, 0.0),
@@ -30,7 +30,9 @@ COEF = {  # of a light aircraft at half its size
     "L": (0.0, -0.09, -0.45, 0.02, 0.2, 0.025, -0.2, -0.04, 0.0),
     "N": (0.0, 0.048, -0.024, -0.073, -0.002, -0.044, 0.005, 0.019, 0.0),
 }
-CRAFT = Baseline(CARD, {k: np.array(x) for k, x in COEF.items()}, speed=33.0, timing=Timing(servo=0.06, engine=0.25))
+CRAFT = Baseline(
+    CARD, {k: np.array(x) for k, x in COEF.items()}, speed=33.0, timing=ActuatorTiming(servo=0.06, engine=0.25)
+)
 
 # from when [s]: bank [deg], height [m], airspeed [m/s]; hops off the ground, a climbing turn, slow, slower, a descent
 COURSE = np.array(
@@ -78,7 +80,7 @@ class Plan:
 
     name: str
     seed: int
-    guesses: tuple[Guess, ...] = ()
+    guesses: tuple[FaultHypothesis, ...] = ()
 
 
 class Hand:
@@ -99,7 +101,7 @@ class Hand:
         """Give commands, (4, runs)."""
         t = k * DT
         row = COURSE[np.searchsorted(COURSE[:, 0], t, side="right") - 1]
-        Va = self._simulation.airspeed(x, self._simulation.begins + t)
+        Va = self._simulation.airspeed(x, self._simulation.start_times + t)
         phi, theta, h, up = x[6], x[7], x[9], -x[2]
         climb = np.clip(0.8 * (row[2] - h), -5.0, 4.0) - up
         self._trim[0] = np.clip(self._trim[0] + 0.02 * climb * DT, -0.2, 0.35)
@@ -119,18 +121,18 @@ class Hand:
         return np.stack([*np.clip(u[:3], -1, 1), np.clip(u[3], 0.0, 1.0)])
 
 
-def flown(plans: Sequence[Plan], base: Baseline = CRAFT, seconds: float = LONG_S) -> list[Flight]:
+def flown(plans: Sequence[Plan], base: Baseline = CRAFT, seconds: float = LONG_S) -> list[FlightData]:
     """Fly all plans side by side and give what was recorded of them."""
-    day = [Guess(GUSTS, "", (GUSTS_MPS, float(plan.seed))) for plan in plans]
+    day = [FaultHypothesis(GUSTS, "", (GUSTS_MPS, float(plan.seed))) for plan in plans]
     acting = [(gusts, *plan.guesses) for gusts, plan in zip(day, plans, strict=True)]
     simulation = Simulation(base, acting, np.zeros(len(plans)))
     start = np.zeros((len(STATE), len(plans)))
     start[0], start[7], start[9] = 29.0, 0.07, 1.0
-    runs = simulation.fly(start, Hand(plans, simulation), int(seconds / DT))
+    runs = simulation.simulate(start, Hand(plans, simulation), int(seconds / DT))
     return [recorded(plan, runs, i) for i, plan in enumerate(plans)]
 
 
-def recorded(plan: Plan, runs: Runs, i: int) -> Flight:
+def recorded(plan: Plan, runs: Runs, i: int) -> FlightData:
     """Give run i as an ordinary set of sensors tells it, faulty ones as the plan says."""
     x, f = runs.states[:, :, i], runs.force[:, :, i]
     n = len(x)
@@ -149,7 +151,7 @@ def recorded(plan: Plan, runs: Runs, i: int) -> Flight:
         readings[name] = readings[name] + np.radians(0.1) * wander
     for guess in plan.guesses:
         if guess.effect.stage is Stage.SENSOR:
-            par = [value * guess.when.gate(t) for value in guess.par]
-            readings |= guess.effect.act({"t": t, **readings}, *par, **({"of": guess.of} if guess.of else {}))
+            par = [value * guess.onset.gate(t) for value in guess.par]
+            readings |= guess.effect.act({"t": t, **readings}, *par, **({"of": guess.target} if guess.target else {}))
     ok = (t > 2.0) & (t < t[-1] - 1.5)
-    return Flight(plan.name, t, 0.0, readings, runs.commands[:, :, i], place, 0.0, ok, vane=True)
+    return FlightData(plan.name, t, 0.0, readings, runs.commands[:, :, i], place, 0.0, ok, vane=True)

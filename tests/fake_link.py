@@ -6,7 +6,7 @@ from collections import defaultdict
 from talker import Ears
 
 from fleet.process import logs
-from gateway.__main__ import COLD
+from gateway.__main__ import COMPILING
 from gateway.links.link import Batch
 from gateway.settings.link_spec import read_spec
 
@@ -15,12 +15,12 @@ PATIENCE_S = 60.0  # an upper bound; every wait ends with its condition
 
 def beside_compiling(errors: str) -> str:
     """Give what a gateway said on standard error, but for what it says of compiling on a cold or busy machine."""
-    return "".join(line for line in untimed(errors) if line != f"gateway: {COLD}\n")
+    return "".join(line for line in untimed(errors) if line != f"gateway: {COMPILING}\n")
 
 
 def untimed(log: str) -> list[str]:
     """Give the lines of a log without their times; every line has one."""
-    found = [logs.untimed(line) for line in log.splitlines(keepends=True)]
+    found = [logs.strip_time(line) for line in log.splitlines(keepends=True)]
     assert all(one != line for one, line in zip(found, log.splitlines(keepends=True), strict=True)), log
     return found
 
@@ -28,10 +28,10 @@ def untimed(log: str) -> list[str]:
 class FakeLink:
     """It remembers what was sent, and to whom."""
 
-    def __init__(self, text: str = "udpin:127.0.0.1:1", greets: tuple = ()):
+    def __init__(self, text: str = "udpin:127.0.0.1:1", known_peers: tuple = ()):
         self.spec = read_spec(text)
         self.dropped = self.unsent = 0
-        self.greets = greets
+        self.known_peers = known_peers
         self.sent: list = []
 
     def start(self, number, out, stop):

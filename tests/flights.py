@@ -11,13 +11,13 @@ from fleet.bus.codec import decode, encode
 from fleet.contract import COLUMNS, Array, Item, Message, Prediction, Rows, Sample, Status
 from fleet.frames import Origin, to_geodetic, wrap
 from fleet.simulator.flight.drive import to_tlog
-from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.flight.uav import SimulatedUav
 from fleet.telemetry.recording.recordings import replay_messages
 from fleet.window import Window
-from twin_worker.evaluation.offline import run
-from twin_worker.identification.linear.linear_model import AXES, Axis
+from twin_worker.evaluation.offline import run_offline
+from twin_worker.identification.linear.linear_model import AXES, AxisModel
 from twin_worker.identification.linear.linear_prior import INPUTS, STATES, prior
-from twin_worker.telemetry.history import History
+from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.twin.step import Twin, advance
 
 T0 = 1_700_000_000.0
@@ -91,15 +91,15 @@ def messages(laid: Laid, uav: int = 1, every: float = 0.1) -> list[Sample]:
     return out
 
 
-def remembered(heard: Iterable[Message]) -> History:
-    history = History()
+def remembered(heard: Iterable[Message]) -> TelemetryHistory:
+    history = TelemetryHistory()
     for message in heard:
         assert isinstance(message, Sample)
         history.add(message)
     return history
 
 
-def truth(U0: float = SPEED, W0: float = 1.0, grow: float = 0.0) -> tuple[Axis, Axis]:
+def truth(U0: float = SPEED, W0: float = 1.0, grow: float = 0.0) -> tuple[AxisModel, AxisModel]:
     """Both axes of a made-up aircraft; `grow` pushes its poles outwards."""
     axes = []
     for name in AXES:
@@ -108,15 +108,15 @@ def truth(U0: float = SPEED, W0: float = 1.0, grow: float = 0.0) -> tuple[Axis, 
         D[:, :n] += grow * np.eye(n)
         trim = {"u": U0, "w": W0, "delta_t": 0.5}
         y_mean, u_mean = (np.array([trim.get(k, 0.0) for k in names[name]]) for names in (STATES, INPUTS))
-        axes.append(Axis(STATES[name], INPUTS[name], D, y_mean, np.ones(n), u_mean, np.ones(m), DT))
+        axes.append(AxisModel(STATES[name], INPUTS[name], D, y_mean, np.ones(n), u_mean, np.ones(m), DT))
     return axes[0], axes[1]
 
 
-def standstill(axes: tuple[Axis, Axis]) -> tuple[Axis, Axis]:
+def standstill(axes: tuple[AxisModel, AxisModel]) -> tuple[AxisModel, AxisModel]:
     """Models that say nothing ever changes."""
     still = [np.hstack([np.eye(len(a.D)), np.zeros((len(a.D), a.D.shape[1] - len(a.D)))]) for a in axes]
     lon, lat = (
-        Axis(a.states, a.inputs, D, a.y_mean, a.y_scale, a.u_mean, a.u_scale, a.dt)
+        AxisModel(a.states, a.inputs, D, a.y_mean, a.y_scale, a.u_mean, a.u_scale, a.dt)
         for a, D in zip(axes, still, strict=True)
     )
     return lon, lat
@@ -156,7 +156,7 @@ def item(seq: int, command: int = 16, north: float = 0.0, east: float = 0.0, **m
 def pretend(folder: Path, seconds: int = 100) -> tuple[Message, ...]:
     """One pretend aircraft over a lossy link, as the gateway would publish it: uav 1."""
     path = folder / "flight.tlog"
-    to_tlog(path, [PretendUav(0, 3, wind=3.0, turbulence=2)], seconds=seconds, loss=0.01, seed=3)
+    to_tlog(path, [SimulatedUav(0, 3, wind=3.0, turbulence=2)], seconds=seconds, loss=0.01, seed=3)
     return tuple(replay_messages(path))
 
 
@@ -164,7 +164,7 @@ def pretend(folder: Path, seconds: int = 100) -> tuple[Message, ...]:
 def learnt(folder: Path) -> tuple[Twin, list[Message]]:
     """The twin at the end of that flight, and everything it published."""
     twins: dict[int, Twin] = {}
-    results = list(run(pretend(folder), twins))
+    results = list(run_offline(pretend(folder), twins))
     assert list(twins) == [1]
     return twins[1], results
 
@@ -188,14 +188,14 @@ def numbers(thing: object) -> bool:
     if isinstance(thing, dict):
         if set(thing) == {"dtype", "shape", "data"}:
             return bool(np.isfinite(Array(**thing).numpy()).all())
-        return all(numbers(value) for name, value in thing.items() if name != "held")
+        return all(numbers(value) for name, value in thing.items() if name != "coverage")
     if isinstance(thing, list | tuple):
         return all(map(numbers, thing))
     return not isinstance(thing, float) or np.isfinite(thing)
 
 
 def drive(twin: Twin, heard: Iterable[Message]) -> list[Message]:
-    return published(result for m in heard for result in advance(twin, (m,), max(m.t, twin.history.newest)))
+    return published(result for m in heard for result in advance(twin, (m,), max(m.t, twin.telemetry.history.newest)))
 
 
 def shifted(heard: Iterable[Message], by: float, seconds: float) -> list[Message]:
@@ -215,5 +215,5 @@ def columns(name: str) -> int:
 
 def status(twin: Twin, **changes) -> Status:
     """What the gateway would say of the twin's aircraft now, changed."""
-    assert twin.status is not None
-    return msgspec.structs.replace(twin.status, t=twin.history.newest, **changes)
+    assert twin.onboard.status is not None
+    return msgspec.structs.replace(twin.onboard.status, t=twin.telemetry.history.newest, **changes)

@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fleet.bus.codec import Wire
+from fleet.bus.codec import EncodedMessage
 from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Alert, AlertKind, Message, Prediction, Sample, Status
-from fleet.simulator.flight.uav import PretendUav
-from fleet.telemetry.mavlink.intake import Intake, unpacked
+from fleet.simulator.flight.uav import SimulatedUav
+from fleet.telemetry.mavlink.intake import MavlinkReceiver, unpacked
 from twin_worker.service.worker import Worker
 
 T0 = 1_700_000_000.0  # arrival of the first datagram [s since 1970]
@@ -48,8 +48,8 @@ ARRIVALS = {
 
 def flight(seconds: float, seed: int = 1) -> list[Datagram]:
     """Simulate one fixed wing: what it sends, and when [s]."""
-    uav = PretendUav(0, seed)
-    sent = [(0.0, frame) for frame in uav.introduce()]
+    uav = SimulatedUav(0, seed)
+    sent = [(0.0, frame) for frame in uav.initial_frames()]
     for k in range(1, int(seconds / 0.05)):
         sent += [(0.05 * k, frame) for frame in uav.step(0.05 * k)]
     return sent
@@ -57,19 +57,21 @@ def flight(seconds: float, seed: int = 1) -> list[Datagram]:
 
 def relayed(sent: Iterable[Datagram], arrival: Arrival) -> Iterator[tuple[float, list[Message]]]:
     """Give what a gateway publishes of it, tick by tick: fleet time [s since 1970], messages."""
-    intake, now = Intake(), T0
+    intake, now = MavlinkReceiver(), T0
     for t, frame in sent:
         came = T0 + arrival.at(t)
         while now + TICK_S <= came:
             now += TICK_S
-            yield now, _parted(intake.pack(now))
-        intake.hear(came, frame)
-    yield now + TICK_S, _parted(intake.pack(now + TICK_S))
+            yield now, _parted(intake.flush_packed(now))
+        intake.receive(came, frame)
+    yield now + TICK_S, _parted(intake.flush_packed(now + TICK_S))
 
 
-def _parted(news: list[Message | Wire]) -> list[Message]:
+def _parted(news: list[Message | EncodedMessage]) -> list[Message]:
     """Put packed samples first, as a gateway does."""
-    return unpacked([n for n in news if isinstance(n, Wire)] + [n for n in news if not isinstance(n, Wire)])
+    return unpacked(
+        [n for n in news if isinstance(n, EncodedMessage)] + [n for n in news if not isinstance(n, EncodedMessage)]
+    )
 
 
 @dataclass
@@ -151,13 +153,13 @@ def lived(ticks: Iterable[tuple[float, list[Message]]], set_clock: Callable[[flo
         bus.subscribe(kind, lambda message, _: judge.hear(now[0], message))
     worker = Worker(bus, range(1, 256), omega=0.0)
     set_clock(T0)
-    worker.listen()
+    worker.connect()
     for at, messages in ticks:
         now[0] = at
         set_clock(at)
         for message in messages:
             bus.publish(message)
-        worker.turn()
+        worker.sweep()
         judge.tick(at)
-    assert not any(held.failed for held in worker.holding())
+    assert not any(held.defect for held in worker.owned_twins())
     return judge

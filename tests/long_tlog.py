@@ -12,8 +12,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import T0, Talker
 
 from fleet.telemetry.mavlink.parsing import scan as s
-from fleet.telemetry.mavlink.parsing.decode import IDS, frames_of, layout
-from fleet.telemetry.replay.rewrite_frames import seal
+from fleet.telemetry.mavlink.parsing.decode import IDS, find_frames, layout
+from fleet.telemetry.replay.rewrite_frames import write_checksums
 
 BLOCK_S = 60.0  # flown anew in bytes, then repeated with other times
 TICKS = {"ATTITUDE": ("time_boot_ms", 1), "GLOBAL_POSITION_INT": ("time_boot_ms", 1)}
@@ -47,7 +47,7 @@ def write(path: Path, megabytes: float) -> float:
     dated = told.copy()
     stamps = _stamps(told)
     _date(dated, stamps, 0.0)
-    at, _, _ = frames_of(dated, np.array([[0, len(dated), 0]]), np.zeros(s.COUNTS, np.int64), s.STAMP)
+    at, _, _ = find_frames(dated, np.array([[0, len(dated), 0]]), np.zeros(s.COUNTER_COUNT, np.int64), s.STAMP_SIZE)
     head = at[:, s.START], at[:, s.PAYLOAD], at[:, s.SIZE], s.EXTRA[at[:, s.ID]].astype(np.uint8)
     ticks = []
     for name, (field, per_ms) in TICKS.items():
@@ -60,7 +60,7 @@ def write(path: Path, megabytes: float) -> float:
             for place, own, per_ms in ticks:
                 later = (own + round(k * BLOCK_S * 1e3) * per_ms).astype("<u4")  # wraps, as on board
                 dated[place[:, None] + np.arange(4)] = later[:, None].view(np.uint8)
-            seal(dated[None], *head, s.CRC)
+            write_checksums(dated[None], *head, s.CRC)
             file.write(dated.tobytes())
     return repeats * BLOCK_S
 
@@ -74,7 +74,7 @@ def _stamps(told: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     at, place = 0, []
     while at < len(told):
         place.append(at)
-        at += s.STAMP + 12 + int(told[at + s.STAMP + 1])
+        at += s.STAMP_SIZE + 12 + int(told[at + s.STAMP_SIZE + 1])
     where = np.array(place)
     return where, told[where[:, None] + np.arange(8)].view(">u8")[:, 0].astype(np.int64)
 

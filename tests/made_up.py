@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from twin_worker.confidence.calibration.scored_predictions import Scored, revisions
-from twin_worker.confidence.calibration_table import Doubt
+from twin_worker.confidence.calibration.scored_predictions import ScoredPredictions, revisions
+from twin_worker.confidence.calibration_table import UncertaintyFeatures
 from twin_worker.numerics.prediction_errors import AHEAD, path_length
 
 V = 20.0  # over ground [m/s]
@@ -29,7 +29,7 @@ def errors(rng: np.random.Generator, spread: np.ndarray, loud: float = 1.0) -> n
     return loud * (2.0 * spread * normal(rng) + 0.2 * rng.standard_normal((1, 3)))
 
 
-def scored(flights: int, starts: int, seed: int, *, loud: float = 1.0, group: str = GROUP) -> Scored:
+def scored(flights: int, starts: int, seed: int, *, loud: float = 1.0, group: str = GROUP) -> ScoredPredictions:
     """Make up so many flights of so many predictions; a fifth of them is not followed to the end."""
     rng = np.random.default_rng(seed)
     n = flights * starts
@@ -42,10 +42,10 @@ def scored(flights: int, starts: int, seed: int, *, loud: float = 1.0, group: st
         flown[row, rng.integers(20, len(AHEAD)) :] = np.nan
     revision = revisions(t0, path, names)
     length = np.tile(path_length(LINE, V), (n, 1))
-    return Scored(
+    return ScoredPredictions(
         t0=t0,
         path=path,
-        doubt=Doubt(spread, np.where(np.isfinite(revision), revision, spread)),
+        features=UncertaintyFeatures(spread, np.where(np.isfinite(revision), revision, spread)),
         flown=flown,
         length=np.where(np.isfinite(flown[..., 0]), length, np.nan),
         predicted_length=length,

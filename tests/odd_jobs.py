@@ -3,12 +3,12 @@
 import os
 import signal
 
-from twin_worker.mismatch.job import Answer, Job
+from twin_worker.mismatch.job import DiagnosisJob, DiagnosisResult
 
 FINE, RAISES, ENDS, KILLED, HANGS, SPINS = range(6)
 
 
-def odd(job: Job) -> Answer:
+def odd(job: DiagnosisJob) -> DiagnosisResult:
     """Answer, or not, as the UAV id says."""
     if job.uav == RAISES:
         return job.rows["nothing of the kind"]  # type: ignore[return-value]
@@ -20,9 +20,9 @@ def odd(job: Job) -> Answer:
         signal.pause()
     while job.uav == SPINS:
         pass
-    return Answer(job.uav, 0.0, 1.0)
+    return DiagnosisResult(job.uav, 0.0, 1.0)
 
 
-def deaf(job: Job) -> Answer:
+def deaf(job: DiagnosisJob) -> DiagnosisResult:
     """Take what can only be read slowly."""
-    return Answer(job.uav, 0.0, float(sum(len(t) for t, _ in job.rows.values())))
+    return DiagnosisResult(job.uav, 0.0, float(sum(len(t) for t, _ in job.rows.values())))

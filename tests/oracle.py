@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from fleet.telemetry.mavlink.parsing.decode import Dealt, Decoder, Frames
-from fleet.telemetry.mavlink.parsing.received import Heard
+from fleet.telemetry.mavlink.parsing.decode import Decoder, Frames, GroupedFrames
+from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
 from fleet.telemetry.mavlink.parsing.scan import START, STOP
 
 V1, V2 = mav.PROTOCOL_MARKER_V1, mav.PROTOCOL_MARKER_V2
@@ -120,21 +120,23 @@ def length(stream: bytes, at: int) -> int:
 
 def ours(pieces: list[bytes], decoder: Decoder | None = None) -> Frames:
     """Hear the same with the batched decoder, all at once."""
-    return (decoder or Decoder()).feed(Heard.of([(float(i), None, piece) for i, piece in enumerate(pieces)]))
+    return (decoder or Decoder()).decode(
+        ReceivedBytes.from_pieces([(float(i), None, piece) for i, piece in enumerate(pieces)])
+    )
 
 
 def raw(frames: Frames) -> list[bytes]:
     """Give the bytes of every frame."""
     told = frames.buf.tobytes()
-    return [told[start:stop] for start, stop in frames.at[:, [START, STOP]].tolist()]
+    return [told[start:stop] for start, stop in frames.headers[:, [START, STOP]].tolist()]
 
 
 def assert_equal(frames: Frames, messages: list) -> None:
     """Compare everything, field by field."""
     assert raw(frames) == [bytes(m.get_msgbuf()) for m in messages]
     heads = [(m.get_msgId(), m.get_srcSystem(), m.get_srcComponent(), m.get_seq()) for m in messages]
-    assert list(map(tuple, frames.at[:, 4:8].tolist())) == heads
-    dealt = Dealt(frames)
+    assert list(map(tuple, frames.headers[:, 4:8].tolist())) == heads
+    dealt = GroupedFrames(frames)
     assert sorted(np.concatenate([dealt.fields(name)[0] for name in dealt.names()] or [np.empty(0, int)])) == list(
         range(len(messages))
     )

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fleet.contract import Array, Prediction, State
+from fleet.contract import Array, Prediction, TwinState
 from fleet.frames import Origin
 
 T = 1_700_000_000.0
@@ -23,5 +23,7 @@ def straight(
     """Fly straight on from `p` [m] at `v` [m/s]; the tube's half-axes grow by `grow` [m/s]."""
     path = np.asarray(p, float) + ahead[:, None] * np.asarray(v, float)
     tube = np.asarray(half, float) + grow * ahead[:, None]
-    what = {"t": T, "state": State.PREDICTING, "method": "dynamics", "origin": tuple(HERE)} | more
-    return Prediction(uav=uav, ahead=Array.of(ahead), path=Array.of(path), tube=Array.of(tube), **what)
+    what = {"t": T, "state": TwinState.PREDICTING, "method": "dynamics", "origin": tuple(HERE)} | more
+    return Prediction(
+        uav=uav, ahead=Array.of(ahead), path=Array.of(path), prediction_region_half_axes=Array.of(tube), **what
+    )

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from fleet.access.entry import ROUTER
-from fleet.access.knock import reachable
+from fleet.access.knock import accepts_connections
 from fleet.bus.bus_protocol import Bus
 from fleet.bus.codec import Stamp
 from fleet.bus.memory_bus import MemoryBus
@@ -24,10 +24,10 @@ from fleet.contract import (
     Array,
     Cause,
     Controller,
+    DiagnosisOutcome,
     Event,
     FleetRow,
     FleetState,
-    Found,
     Item,
     Link,
     Mismatch,
@@ -37,12 +37,12 @@ from fleet.contract import (
     Prediction,
     Rows,
     Sample,
-    State,
     Status,
+    TwinState,
     Verdict,
 )
 from fleet.frames import Origin, to_geodetic
-from viewer.store.store import Feed
+from viewer.store.store import FleetStore
 
 HOME = Origin(473977420, 85455940, 488_000)
 AHEAD = np.arange(0.0, 40.5, 0.5)
@@ -65,8 +65,8 @@ class PretendUav:
         self.rate = self.turn * self.Va / np.sqrt((self.a**2 + self.b**2) / 2)
         self.horizon = r.uniform(12, 28)
         self.drift = r.normal(0, 0.02, 3)
-        self.state = State.PREDICTING if uav % 7 < 4 else State.VERIFIED
-        self.state = {1: State.IDENTIFYING, 5: State.LINK_LOST}.get(uav % 8, self.state)
+        self.state = TwinState.PREDICTING if uav % 7 < 4 else TwinState.VERIFIED
+        self.state = {1: TwinState.IDENTIFYING, 5: TwinState.LINK_LOST}.get(uav % 8, self.state)
 
     def ned(self, t: np.ndarray | float) -> np.ndarray:
         """Give positions at times (n,) [s]: NED from HOME, (n, 3) [m]."""
@@ -114,7 +114,7 @@ class PretendUav:
         return Mission(uav=self.uav, t=t, items=tuple(items), seq=3, complete=True, sentence=self.text)
 
     def status(self, t: float) -> Status:
-        lost = self.state is State.LINK_LOST
+        lost = self.state is TwinState.LINK_LOST
         return Status(
             uav=self.uav,
             t=t,
@@ -130,10 +130,10 @@ class PretendUav:
 
     def model(self, t: float) -> Model:
         names = ("u", "w", "q", "theta", "phi", "p", "r", "v")
-        good = self.state is not State.IDENTIFYING
+        good = self.state is not TwinState.IDENTIFYING
         base = 88 if good else 45
         verdict = Verdict(
-            outcome=Outcome.VERIFIED if good else Outcome.STARVED,
+            outcome=Outcome.VERIFIED if good else Outcome.INSUFFICIENT_DATA,
             sentence=self.text
             or (
                 f"uav-{self.uav}: mean fit {base} % over 8.0 s, threshold 75 %"
@@ -141,17 +141,17 @@ class PretendUav:
                 else f"uav-{self.uav}: window has 41 samples, subspace order 8 needs 120; wait 1.6 s"
             ),
             fit={name: float(base + 5 * np.sin(t / 9 + k)) for k, name in enumerate(names)},
-            fit_hold={name: 20.0 + 3 * k for k, name in enumerate(names)},
+            fit_persistence={name: 20.0 + 3 * k for k, name in enumerate(names)},
             horizon_s=8.0,
             threshold=75.0,
-            tries=3,
+            attempts=3,
         )
         force = verdict if good else None
-        return Model(uav=self.uav, t=t, method="paper", verdict=verdict, in_force=force, window_s=40.0)
+        return Model(uav=self.uav, t=t, method="paper", verdict=verdict, active_verdict=force, window_s=40.0)
 
     def prediction(self, t: float, coast: float) -> Prediction | None:
         """Give the path ahead, a little wrong, the more the farther; None while identifying."""
-        if self.state is State.IDENTIFYING:
+        if self.state is TwinState.IDENTIFYING:
             return None
         error = self.drift * (AHEAD[:, None] ** 1.7) * np.array([1, 1, 0.3])
         cross = 1.5 + 0.55 * AHEAD**1.25
@@ -165,16 +165,16 @@ class PretendUav:
             origin=tuple(HOME),
             ahead=Array.of(AHEAD),
             path=Array.of(self.ned(t + AHEAD) + error),
-            tube=Array.of(tube),
+            prediction_region_half_axes=Array.of(tube),
             horizon_s=float(self.horizon + np.sin(t / 7)),
-            held=0.91,
-            held_n=412,
+            coverage=0.91,
+            coverage_n=412,
             coast_s=coast,
             seq=3,
             sentence=self.text,
             event=Event.PARAMETERS,
             event_t=t // 60 * 60,
-            event_said=self.text or "the autopilot flies with other parameters",
+            event_text=self.text or "the autopilot flies with other parameters",
             controller=Controller(
                 law=self.text or "arduplane: L1 + TECS",
                 received={self.text or "NAVL1_PERIOD": 17.0, "AIRSPEED_CRUISE": 22.0},
@@ -202,7 +202,7 @@ class PretendUav:
         return Mismatch(
             uav=self.uav,
             t=t,
-            outcome=Found.NAMED,
+            outcome=DiagnosisOutcome.NAMED,
             causes=(cause,),
             fit_before=1.94,
             fit_after=1.07,
@@ -236,7 +236,7 @@ class PretendFleet:
             Alert: lambda uav: uav.alert(self._t),
             Mismatch: lambda uav: uav.mismatch(self._t),
         }.items():
-            bus.answer(kind, self._reply(make))
+            bus.declare_queryable(kind, self._reply(make))
 
     def _reply(self, make: Any) -> Any:
         def reply(uav: int | None, *_: Any) -> Iterator[tuple[Any, Stamp]]:
@@ -248,13 +248,13 @@ class PretendFleet:
 
     @staticmethod
     def _coast(one: PretendUav, t: float, lost_since: float) -> float:
-        return max(t - lost_since, 0.0) if one.state is State.LINK_LOST else 0.0
+        return max(t - lost_since, 0.0) if one.state is TwinState.LINK_LOST else 0.0
 
     def advance(self, t: float, *, lost_since: float = 1e18) -> None:
         """Publish what is due until `t`; link-lost UAVs fall silent at `lost_since`."""
         t0, self._last, self._t = self._last or t - 0.2, t, t
         for one in self.uavs:
-            if one.state is not State.LINK_LOST or t < lost_since:
+            if one.state is not TwinState.LINK_LOST or t < lost_since:
                 self._bus.publish(one.sample(t0, t))
         if int(t) == self._second:
             return
@@ -284,9 +284,9 @@ class Clock:
         return self.now
 
 
-def feed_of(clock: Clock, uavs: int = 3, *, hostile: int | None = None) -> tuple[Feed, PretendFleet, MemoryBus]:
+def feed_of(clock: Clock, uavs: int = 3, *, hostile: int | None = None) -> tuple[FleetStore, PretendFleet, MemoryBus]:
     bus = MemoryBus()
-    feed = Feed(bus, clock)
+    feed = FleetStore(bus, clock)
     fleet = PretendFleet(bus, uavs, hostile=hostile)
     fleet.advance(T)
     return feed, fleet, bus
@@ -303,7 +303,7 @@ def main() -> int:
     parser.add_argument("--hostile", type=int)
     args = parser.parse_args()
     stop = stop_on_signal()
-    router = None if reachable(args.router) else open_router(args.router)
+    router = None if accepts_connections(args.router) else open_router(args.router)
     try:
         with connect(args.router) as bus:
             fleet = PretendFleet(bus, args.uavs, hostile=args.hostile)

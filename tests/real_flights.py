@@ -9,7 +9,7 @@ import numpy as np
 import scipy.io
 
 from fleet.frames import Origin, to_ned
-from twin_worker.diagnosis.data.flight import Flight
+from twin_worker.diagnosis.data.flight import FlightData
 from twin_worker.diagnosis.data.smooth import DT
 
 _THOR_S = 205.0, 590.0  # what is read; and in the air
@@ -18,7 +18,7 @@ _AUTO = 2  # mode in which the autopilot's commands are flown, else the pilot's
 _THROW = 0.4363  # 25 deg [rad]
 
 
-def streams(folder: Path) -> Iterator[tuple[str, Flight, float | None]]:
+def streams(folder: Path) -> Iterator[tuple[str, FlightData, float | None]]:
     """Give ALFA's five streams: fault, flight, and when it was injected [s], None where none was.
 
     No position, no rates and no surfaces are in them: rates are differences of angles, velocity is airspeed along the
@@ -33,7 +33,7 @@ def streams(folder: Path) -> Iterator[tuple[str, Flight, float | None]]:
                 yield fault, _stream(fault, rows), float(injected[0]) if len(injected) else None
 
 
-def _stream(fault: str, rows: np.ndarray) -> Flight:
+def _stream(fault: str, rows: np.ndarray) -> FlightData:
     ts, Va, climb = rows["t_sec"], rows["airspeed"], rows["climb"]
     t = np.arange(DT, ts[-1], DT)
     # resampled angles are wrong where they wrap, and these two wrap at different places
@@ -60,10 +60,12 @@ def _stream(fault: str, rows: np.ndarray) -> Flight:
     commands[:, 3] = np.interp(t, ts, rows["throttle"])
     ok = (t > 2.0) & (t < ts[-1] - 1.2)
     laid = {name: np.interp(t, ts, x) for name, x in readings.items()}
-    return Flight(fault, t, 0.0, laid, commands, np.zeros((len(t), 2)), float(rows["altitude"].min()), ok, vane=False)
+    return FlightData(
+        fault, t, 0.0, laid, commands, np.zeros((len(t), 2)), float(rows["altitude"].min()), ok, vane=False
+    )
 
 
-def thor(folder: Path) -> Flight:
+def thor(folder: Path) -> FlightData:
     """Give UMN's Thor: 50 Hz, gyros and accelerometers less the biases its own filter knew."""
     data = scipy.io.loadmat(folder / "real" / "thor_flight75.mat", squeeze_me=True, struct_as_record=False)
     rows = data["flight_data"]
@@ -89,13 +91,13 @@ def thor(folder: Path) -> Flight:
     def laid(x: np.ndarray) -> np.ndarray:
         return np.interp(t, ts, x)
 
-    return Flight(
+    return FlightData(
         name="thor",
         t=t,
-        zero=0.0,
+        t_start=0.0,
         readings={name: laid(x) for name, x in readings.items()},
         commands=np.column_stack([laid(x) for x in commands]),
-        place=np.column_stack([laid(ned[:, 0]), laid(ned[:, 1])]),
+        position=np.column_stack([laid(ned[:, 0]), laid(ned[:, 1])]),
         ground=float(readings["h"].min()),
         ok=(t >= _AIRBORNE_S[0]) & (t < _AIRBORNE_S[1]),
         vane=True,

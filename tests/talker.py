@@ -6,9 +6,9 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from fleet.contract import COLUMNS, Item, Mission, Params, Sample
-from fleet.simulator.flight.mavlink import Voice
+from fleet.simulator.flight.mavlink import MavlinkEndpoint
 from fleet.telemetry.mavlink.parsing.decode import Decoder
-from fleet.telemetry.mavlink.parsing.received import Heard
+from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
 
 T0 = 1_700_000_000.0  # fleet time at which the tests begin [s since 1970]
 PLANE, ARDU = mav.MAV_TYPE_FIXED_WING, mav.MAV_AUTOPILOT_ARDUPILOTMEGA
@@ -57,8 +57,8 @@ class Ears:
         self.decoder = Decoder()
 
     def feed(self, data: bytes) -> list:
-        frames = self.decoder.feed(Heard.of([(T0, None, data)]))
-        return frames.messages(np.arange(len(frames.at)))
+        frames = self.decoder.decode(ReceivedBytes.from_pieces([(T0, None, data)]))
+        return frames.messages(np.arange(len(frames.headers)))
 
 
 def of(kind, messages, uav=None) -> list:
@@ -86,7 +86,7 @@ class Aircraft:
     """A pretend aircraft's voice on a radio that loses a share of everything, both ways."""
 
     def __init__(self, loss, silent=(), system=7):
-        self.voice = Voice(system, ITEMS, {f"P{i:03d}": float(i) for i in range(300)})
+        self.voice = MavlinkEndpoint(system, ITEMS, {f"P{i:03d}": float(i) for i in range(300)})
         self.talker = Talker(system)
         self._loss, self._silent = loss, silent
         self._rng = np.random.default_rng(4)
@@ -100,10 +100,10 @@ class Aircraft:
         self.asked.append((t, question))
         if question.get_type() in self._silent:
             return []
-        return self._lossy(self.voice.hear(data, t))
+        return self._lossy(self.voice.receive(data, t))
 
     def stream(self) -> list[bytes]:
-        return self._lossy(self.voice.stream(20))
+        return self._lossy(self.voice.stream_parameters(20))
 
     def _lossy(self, frames: list[bytes]) -> list[bytes]:
         return [frame for frame in frames if self._rng.random() >= self._loss]

@@ -13,38 +13,38 @@ from ulog_writer import ulog
 
 from fleet.commands.offline import inspect
 from fleet.contract import Mission, Prediction, Status
-from fleet.process.sanitise import below
+from fleet.process.sanitise import format_below
 from fleet.telemetry.inspection import abilities as needs
-from fleet.telemetry.inspection.survey import ROTORS, ROTORS_HIGH, airborne, survey
+from fleet.telemetry.inspection.survey import ROTOR_AIRBORNE_HEIGHT, VERTICAL_TAKEOFF, airborne, survey_recording
 from twin_worker.diagnosis.baseline import own_past, past
 from twin_worker.diagnosis.data import flight, smooth
 from twin_worker.diagnosis.data.card import UNKNOWN
-from twin_worker.evaluation.offline import run
+from twin_worker.evaluation.offline import run_offline
 from twin_worker.prediction import turn_rate
 from twin_worker.telemetry import resample
-from twin_worker.telemetry.history import History
+from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.twin.state import flight_phase, state, vehicle_class
 from twin_worker.twin.steps import identify_step
 from twin_worker.validation import verify
 
 
 def test_the_figures_are_those_the_twin_works_by():
-    assert resample.LONGEST_GAP == needs.LONGEST_S
-    assert (identify_step.LEAST_S, identify_step.NO_WINGS) == (needs.LEAST_S, needs.NO_WINGS)
-    least, papers, most = identify_step._HELD_S  # held out beside what is identified
+    assert resample.LONGEST_GAP == needs.MAX_INTERVAL_S
+    assert (identify_step.MIN_WINDOW_S, identify_step.WINGLESS) == (needs.MIN_IDENTIFY_S, needs.WINGLESS)
+    least, papers, most = identify_step._HOLD_OUT_S  # held out beside what is identified
     assert (
-        max(identify_step._STRETCH_S[1] + most, identify_step._PAPER_S + papers) == needs.WINDOW_S
+        max(identify_step._WINDOW_LIMITS_S[1] + most, identify_step._PAPER_WINDOW_S + papers) == needs.MAX_IDENTIFY_S
         and least < papers < most
     )
     assert state.ROUTE_MODES == needs.ROUTE_MODES
-    assert min(verify.HORIZONS_S) == needs.UNBROKEN_S
-    assert verify._QUIET == needs.QUIET
-    assert max(4 * turn_rate.STEP, 50 * resample.DT) == needs.RECENT_S
-    assert (vehicle_class.NO_WINGS, vehicle_class.WINGS) == (needs.NO_WINGS, needs.WINGS)
-    assert (flight._LEAST_S, flight.VANE_HZ) == (needs.DIAGNOSE_S, needs.VANE_HZ)
-    assert (needs._BEGIN_S, needs._END_S) == flight._SETTLE_S
-    assert past.LEAST_S + own_past.LEAST_AFTER_S == needs.OWN_PAST_S
-    assert (flight_phase.ROTORS, flight_phase._LOW_M) == (ROTORS, ROTORS_HIGH)
+    assert min(verify.HORIZONS_S) == needs.MIN_STRETCH_S
+    assert verify._STEADY_STD == needs.MIN_EXCITATION
+    assert max(4 * turn_rate.STEP, 50 * resample.DT) == needs.TURN_RATE_S
+    assert (vehicle_class.WINGLESS, vehicle_class.WINGED) == (needs.WINGLESS, needs.WINGED)
+    assert (flight._MIN_FLIGHT_S, flight.VANE_HZ) == (needs.MIN_DIAGNOSE_S, needs.GUST_SENSING_HZ)
+    assert (needs._SKIP_BEGIN_S, needs._SKIP_END_S) == flight._TRANSIENT_S
+    assert past.MIN_PAST_S + own_past.MIN_AFTER_S == needs.MIN_OWN_PAST_S
+    assert (flight_phase.VTOL_TYPES, flight_phase._AIRBORNE_HEIGHT_M) == (VERTICAL_TAKEOFF, ROTOR_AIRBORNE_HEIGHT)
 
 
 @pytest.mark.parametrize(
@@ -52,11 +52,11 @@ def test_the_figures_are_those_the_twin_works_by():
 )
 def test_diagnose_is_promised_where_the_diagnosis_accepts_the_flight(seconds, without, can):
     laid = {name: rows for name, rows in lively(seconds).items() if name not in without}
-    history = History(keep_s=np.inf)
+    history = TelemetryHistory(keep_s=np.inf)
     for message in flights.messages(laid):
         history.add(message)
     with contextlib.nullcontext() if can else pytest.raises(ValueError):
-        flight.lay("it", history, {}, UNKNOWN)
+        flight.resample_flight("it", history, {}, UNKNOWN)
     assert judged(known(laid))["diagnose"][0] is can
 
 
@@ -81,9 +81,9 @@ def test_a_quadrotor_on_its_route_is_predicted_as_the_twin_does():
     status = Status(uav=1, t=T0, mode="AUTO", armed=True, vehicle="multirotor", autopilot="ardupilot")
     mission = Mission(uav=1, t=T0, items=tuple(flights.item(n, north=200.0 * n) for n in range(4)), complete=True)
     messages = [status, mission, *flights.messages(laid)]
-    made = [m for m in run(messages, {}) if isinstance(m, Prediction)]
+    made = [m for m in run_offline(messages, {}) if isinstance(m, Prediction)]
     assert made[-1].method == "copter"
-    can, why = judged(survey(messages)[1])["predict on the route"]
+    can, why = judged(survey_recording(messages)[1])["predict on the route"]
     assert can and "40 s on the route" in why
 
 
@@ -97,14 +97,14 @@ def test_a_wing_that_cannot_be_identified_is_still_predicted_on_its_route():
 )
 def test_the_remedy_for_a_missing_mission_list_fits_the_recording(kind, words):
     messages = [Status(uav=1, t=T0, mode="AUTO", armed=True, vehicle="fixed_wing"), *flights.messages(lively())]
-    can, why = judged(survey(messages, kind)[1])["predict on the route"]
+    can, why = judged(survey_recording(messages, kind)[1])["predict on the route"]
     assert not can and words in why
 
 
 def test_a_ulog_is_surveyed_as_one(tmp_path):
     path = tmp_path / "flight.ulg"
     path.write_bytes(ulog(flight_of((1, 14))))
-    (one,) = inspect.read(path).surveys.values()
+    (one,) = inspect.inspect_file(path).surveys.values()
     assert one.kind == "ULog"
 
 
@@ -112,16 +112,16 @@ def test_a_ulog_is_surveyed_as_one(tmp_path):
     ("found", "needed", "text"), [(39.96, 40, "39.96"), (12.3, 40, "12"), (39.4, 40, "39"), (40 - 1e-9, 40, "39.999")]
 )
 def test_a_number_below_a_limit_never_reads_as_the_limit(found, needed, text):
-    assert below(found, needed) == text
+    assert format_below(found, needed) == text
 
 
 def test_a_past_that_is_a_little_too_short_is_not_said_to_be_enough():
     laid = lively(46.6)  # less 6.5 s at its ends and a step of the grid
-    history = History(keep_s=np.inf)
+    history = TelemetryHistory(keep_s=np.inf)
     for message in flights.messages(laid):
         history.add(message)
-    lain = flight.lay("it", history, {}, UNKNOWN)
-    ok = lain.ok & (np.cumsum(lain.ok) <= round(past.LEAST_S / smooth.DT) - 2)
+    lain = flight.resample_flight("it", history, {}, UNKNOWN)
+    ok = lain.ok & (np.cumsum(lain.ok) <= round(past.MIN_PAST_S / smooth.DT) - 2)
     with pytest.raises(ValueError, match=r"found 39\.\d+ s of trusted flight before .* expected 40 s"):
         past.calibrate_past(dataclasses.replace(lain, ok=ok), 1e3, UNKNOWN)
 

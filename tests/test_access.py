@@ -12,13 +12,13 @@ import pytest
 from conftest import ROOT, unused_port
 
 from fleet import cli
-from fleet.access.entry import ROUTER, Entry
-from fleet.access.knock import answers
-from fleet.access.papers import ending, papers_of, password_of
+from fleet.access.entry import ROUTER, BusConfig
+from fleet.access.knock import probe_router
+from fleet.access.papers import expiry_of, find_certificate, read_password
 from fleet.access.roles import ROLES, ROUTER_ROLE
 from fleet.access.rules import PASSWORD, access_control
 from fleet.bus.session import connect, open_router
-from fleet.config import entry, passed_on, router_arguments
+from fleet.config import bus_config_from, router_arguments, router_options
 from gateway import __main__ as gateway
 from tests.bench.security.site import SCRIPT, expired, make_papers, make_passwords
 from twin_worker import __main__ as twin_worker
@@ -48,22 +48,24 @@ def written(folder: Path, text: str) -> str:
 
 
 def test_without_options_it_is_loopback_in_the_clear() -> None:
-    assert entry(told()) == Entry(ROUTER, "tools", None, None)
-    assert passed_on(told()) == []
+    assert bus_config_from(told()) == BusConfig(ROUTER, "tools", None, None)
+    assert router_options(told()) == []
 
 
 def test_the_example_of_deploy_says_what_it_explains(papers: Path) -> None:
     given = told(f"--config={ROOT / 'deploy' / 'fleet.toml'}")
-    assert entry(given, "worker") == Entry("tls/127.0.0.1:7447", "worker", ROOT / "deploy" / "certificates")
-    assert passed_on(given) == [f"--config={ROOT / 'deploy' / 'fleet.toml'}"]
+    assert bus_config_from(given, "worker") == BusConfig(
+        "tls/127.0.0.1:7447", "worker", ROOT / "deploy" / "certificates"
+    )
+    assert router_options(given) == [f"--config={ROOT / 'deploy' / 'fleet.toml'}"]
 
 
 def test_the_command_line_wins_over_the_file(tmp_path: Path) -> None:
     file = written(tmp_path, '[router]\nat = "tcp/10.0.0.1:7447"\npasswords = "words"\n')
-    assert entry(told(file)) == Entry("tcp/10.0.0.1:7447", "tools", None, tmp_path / "words")
+    assert bus_config_from(told(file)) == BusConfig("tcp/10.0.0.1:7447", "tools", None, tmp_path / "words")
     both = told(file, "--router=tcp/10.0.0.2:7447")
-    assert entry(both).at == "tcp/10.0.0.2:7447"
-    assert passed_on(both) == ["--router=tcp/10.0.0.2:7447", file]
+    assert bus_config_from(both).endpoint == "tcp/10.0.0.2:7447"
+    assert router_options(both) == ["--router=tcp/10.0.0.2:7447", file]
 
 
 def test_paths_hold_wherever_what_is_written_with_them_is_read(
@@ -91,7 +93,7 @@ def test_paths_hold_wherever_what_is_written_with_them_is_read(
 )
 def test_a_file_that_makes_no_sense_is_refused_in_a_sentence(tmp_path: Path, text: str, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
-        entry(told(written(tmp_path, text)))
+        bus_config_from(told(written(tmp_path, text)))
 
 
 def parsers() -> dict[str, argparse.ArgumentParser]:
@@ -118,49 +120,49 @@ def test_every_command_on_the_bus_takes_the_same_two_options(monkeypatch: pytest
 
 
 def test_papers_are_found_private_and_in_time(papers: Path, tmp_path: Path) -> None:
-    found = papers_of(papers, "worker")
+    found = find_certificate(papers, "worker")
     assert found.certificate == papers / "worker.pem"
-    assert timedelta(days=89) < ending(found.certificate) - datetime.now(UTC) < timedelta(days=91)
+    assert timedelta(days=89) < expiry_of(found.certificate) - datetime.now(UTC) < timedelta(days=91)
     with pytest.raises(ValueError, match=r"found no .*pilot\.pem, expected it for the role pilot"):
-        papers_of(papers, "pilot")
+        find_certificate(papers, "pilot")
     mine = Path(shutil.copytree(papers, tmp_path / "mine"))
     (mine / "worker.key").chmod(0o644)
     with pytest.raises(ValueError, match=r"worker\.key with mode 0644, .* chmod 640"):
-        papers_of(mine, "worker")
+        find_certificate(mine, "worker")
     (mine / "worker.key").chmod(0o640)
-    assert papers_of(mine, "worker")
+    assert find_certificate(mine, "worker")
     with pytest.raises(ValueError, match=r"expired on .* renew it: certificates\.sh role"):
-        papers_of(expired(papers, "worker", tmp_path / "old"), "worker")
+        find_certificate(expired(papers, "worker", tmp_path / "old"), "worker")
     (mine / "viewer.pem").write_text("no certificate")
     with pytest.raises(ValueError, match="found no certificate in"):
-        papers_of(mine, "viewer")
+        find_certificate(mine, "viewer")
 
 
 def test_a_password_is_a_line_of_a_private_file(tmp_path: Path) -> None:
     file = make_passwords(tmp_path)
-    assert len({password_of(file, role) for role in (*ROLES, ROUTER_ROLE)}) == 5
+    assert len({read_password(file, role) for role in (*ROLES, ROUTER_ROLE)}) == 5
     with pytest.raises(ValueError, match="found none for the role pilot"):
-        password_of(file, "pilot")
+        read_password(file, "pilot")
     file.chmod(0o604)
     with pytest.raises(ValueError, match="mode 0604"):
-        password_of(file, "worker")
+        read_password(file, "worker")
 
 
 def test_a_secret_is_in_no_representation(papers: Path) -> None:
     passwords = make_passwords(papers)
-    at = Entry("tcp/127.0.0.1:7447", "worker", None, passwords)
-    assert password_of(passwords, "worker") not in repr(at)
-    assert at.session()["transport/auth/usrpwd/password"] == password_of(passwords, "worker")
-    assert at.router()["access_control"] == access_control(PASSWORD)
+    at = BusConfig("tcp/127.0.0.1:7447", "worker", None, passwords)
+    assert read_password(passwords, "worker") not in repr(at)
+    assert at.session_settings()["transport/auth/usrpwd/password"] == read_password(passwords, "worker")
+    assert at.router_settings()["access_control"] == access_control(PASSWORD)
 
 
 def test_a_wrong_password_is_said(papers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fleet.access.entry._REFUSED_MS", 300)
+    monkeypatch.setattr("fleet.access.entry._CONNECT_TIMEOUT_MS", 300)
     at = f"tcp/127.0.0.1:{unused_port()}"
     site, other = make_passwords(papers), make_passwords(tmp_path)
     refused = pytest.raises(ConnectionError, match="expected it to accept the password of viewer")
-    with open_router(Entry(at, passwords=site)), refused:
-        connect(Entry(at, "viewer", None, other))
+    with open_router(BusConfig(at, passwords=site)), refused:
+        connect(BusConfig(at, "viewer", None, other))
 
 
 # --- the script ------------------------------------------------------------------------------------------------------
@@ -177,17 +179,17 @@ def test_an_authority_is_replaced_without_anyone_being_shut_out(tmp_path: Path) 
     assert script("next-ca", site).returncode == 0
     assert (site / "ca.pem").read_text().count("BEGIN CERTIFICATE") == 2
     assert script("role", site, "viewer", "worker").returncode == 0
-    with open_router(Entry(at, certificates=site)):  # the router trusts both, shows its old certificate
-        assert answers(Entry(at, "worker", old))
-        assert answers(Entry(at, "worker", site))
+    with open_router(BusConfig(at, certificates=site)):  # the router trusts both, shows its old certificate
+        assert probe_router(BusConfig(at, "worker", old))
+        assert probe_router(BusConfig(at, "worker", site))
     assert script("router", site, "127.0.0.1").returncode == 0 and script("drop-ca", site).returncode == 0
-    with open_router(Entry(at, certificates=site)):
-        assert answers(Entry(at, "worker", site))
+    with open_router(BusConfig(at, certificates=site)):
+        assert probe_router(BusConfig(at, "worker", site))
         with pytest.raises(ConnectionError, match="found its certificate not valid"):
-            answers(Entry(at, "worker", old))
+            probe_router(BusConfig(at, "worker", old))
         shutil.copy(site / "ca.pem", old)
         with pytest.raises(ConnectionError, match="certificate of worker rejected"):
-            answers(Entry(at, "worker", old))
+            probe_router(BusConfig(at, "worker", old))
 
 
 def test_the_script_refuses_what_would_lose_something(papers: Path, tmp_path: Path) -> None:

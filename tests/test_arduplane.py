@@ -105,8 +105,8 @@ def test_switching_distance_shrinks_with_the_turn():
 
 def test_acceptance_of_the_item_the_l1_distance_and_the_largest_radius():
     start = (-500.0, 0.0, -100.0)
-    assert over(route(leg(accept=120.0), leg(e=500.0)), (-119.0, 0.0, -100.0), start)
-    past = route(leg(accept=-30.0), leg(e=500.0))
+    assert over(route(leg(accept_radius=120.0), leg(e=500.0)), (-119.0, 0.0, -100.0), start)
+    past = route(leg(accept_radius=-30.0), leg(e=500.0))
     assert not over(past, (29.0, 0.0, -100.0), start)
     assert over(past, (31.0, 0.0, -100.0), start)
     right = route(leg(), leg(e=500.0))
@@ -168,7 +168,7 @@ def test_underspeed_pushes_the_throttle_and_lowers_the_nose():
     ctl = begin(legs, plane, start=(0, 0, -200))
     for _ in range(50):
         _, theta_c, delta_t = ap.guide(ctl, PAR, legs, plane.p, plane.v, plane.euler, 9.0, 0.0, 0.1)
-    assert ctl[S.SLOW] == 1.0
+    assert ctl[S.UNDERSPEED] == 1.0
     assert delta_t == 1.0
     assert theta_c < 0
 

@@ -10,7 +10,7 @@ from fleet import mission as m
 from fleet.autopilots import arduplane as ap
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.common import controller_state as S
-from fleet.autopilots.shadow import shadow
+from fleet.autopilots.shadow import replay_controller
 
 LAP = [(800.0, 0.0, 100.0), (800.0, 700.0, 130.0), (0.0, 700.0, 130.0), (0.0, 0.0, 90.0), (800.0, 0.0, 100.0)]
 
@@ -34,7 +34,7 @@ def shadowed(legs, rows, deltas, begin_s, start=HERE, **changed):
     r, d = rows[part], deltas[part]
     columns = {"phi_c": r[:, 11].copy(), "theta_c": r[:, 12].copy(), "delta": d.copy(), "p": r[:, 1:4].copy()} | changed
     ahead = legs[int(np.argmax(legs[:, m.SEQ] == r[0, 14])) :]
-    ctl, rms = shadow(
+    ctl, rms = replay_controller(
         PAR, ahead, np.array(start, float), r[:, 0].copy(), columns["p"], r[:, 4:7].copy(), r[:, 7:10].copy(),
         np.zeros((len(r), 3)), r[:, 10].copy(), columns["phi_c"], columns["theta_c"], columns["delta"], r[:, 14].copy(),
     )  # fmt: skip

@@ -12,19 +12,19 @@ import pytest
 from flights import T0, item, messages, turn
 
 from fleet.cli import main as fleet
-from fleet.commands.offline.assess import METHODS
+from fleet.commands.offline.assess import BASELINE_METHODS
 from fleet.contract import Message, Mission, Params, Prediction, Status
 from fleet.simulator.flight.drive import to_tlog
-from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.flight.uav import SimulatedUav
 from fleet.telemetry.recording.recordings import replay_messages
 from twin_worker.evaluation.__main__ import main
 from twin_worker.evaluation.baselines.methods import BASELINES
-from twin_worker.evaluation.drive import Drive, Plan
+from twin_worker.evaluation.drive import EvaluationPlan, RecordingDriver
 from twin_worker.evaluation.keep import KEYS, covariance
 from twin_worker.evaluation.scoring.case import OURS
-from twin_worker.evaluation.scoring.log import Log
-from twin_worker.evaluation.scoring.truth import FIRST_S, WHOLE_S
-from twin_worker.evaluation.share import assess
+from twin_worker.evaluation.scoring.log import ReferenceFlight
+from twin_worker.evaluation.scoring.truth import MIN_EVENT_FREE_S, MIN_FIRST_S
+from twin_worker.evaluation.share import assess_recordings
 from twin_worker.evaluation.table import notes
 
 KEYS_OF_A_METHOD = {
@@ -45,14 +45,14 @@ KEYS_OF_A_METHOD = {
     "phases",
 }
 SECONDS = 200.0
-FEW = Plan(every_s=20.0, methods=("cv", "route_wind", "dynamics", "paper"))
+FEW = EvaluationPlan(every_s=20.0, methods=("cv", "route_wind", "dynamics", "paper"))
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     """Two aircraft, long enough for a few starts to count."""
     path = tmp_path_factory.mktemp("assess") / "flight.tlog"
-    to_tlog(path, [PretendUav(i, 3, wind=3.0, turbulence=2) for i in (0, 1)], seconds=SECONDS, loss=0.01, seed=3)
+    to_tlog(path, [SimulatedUav(i, 3, wind=3.0, turbulence=2) for i in (0, 1)], seconds=SECONDS, loss=0.01, seed=3)
     return path
 
 
@@ -60,7 +60,7 @@ def recorded(tmp_path_factory):
 def short(tmp_path_factory):
     """Two aircraft, too short for a start to count."""
     path = tmp_path_factory.mktemp("short") / "short.tlog"
-    to_tlog(path, [PretendUav(i, 3) for i in (0, 1)], seconds=40, loss=0.0, seed=3)
+    to_tlog(path, [SimulatedUav(i, 3) for i in (0, 1)], seconds=40, loss=0.0, seed=3)
     return path
 
 
@@ -73,12 +73,12 @@ def one(recorded):
 @pytest.fixture(scope="module")
 def driven(one):
     """Its starts, and how many messages had been heard at each."""
-    drive, heard = Drive("flight", FEW), []
+    drive, heard = RecordingDriver("flight", FEW), []
 
     def counted():
         for number, message in enumerate(one):
-            known = drive.examined.get(1)
-            heard.extend([number] * (len(known.asked) - len(heard) if known else 0))
+            known = drive.uavs.get(1)
+            heard.extend([number] * (len(known.starts) - len(heard) if known else 0))
             yield message
 
     return list(drive.run(counted())), heard
@@ -95,22 +95,22 @@ def cases(driven):
 def test_every_method_is_asked_at_every_start(cases):
     assert 8 <= len(cases) <= 10
     for case in cases:
-        assert set(case.asked.told) == {OURS, *FEW.methods}
-        assert all(one.path.shape == (len(case.asked.ahead), 3) for one in case.asked.told.values())
-    late = cases[-1].asked.told
-    assert late["cv"].made_by == "cv" and late["route_wind"].made_by == "route_wind"
-    assert late["paper"].made_by == "paper" and late["dynamics"].made_by == "dynamics"
-    assert cases[0].asked.told["dynamics"].made_by == "imm"  # nothing identified yet: it stands in and is counted
+        assert set(case.start.forecasts) == {OURS, *FEW.methods}
+        assert all(one.path.shape == (len(case.start.ahead), 3) for one in case.start.forecasts.values())
+    late = cases[-1].start.forecasts
+    assert late["cv"].source == "cv" and late["route_wind"].source == "route_wind"
+    assert late["paper"].source == "paper" and late["dynamics"].source == "dynamics"
+    assert cases[0].start.forecasts["dynamics"].source == "imm"  # nothing identified yet: it stands in and is counted
 
 
 def test_starts_count_after_the_window_and_with_a_minute_to_follow(cases):
-    counted = [case for case in cases if not case.apart]
-    times = [case.asked.first_s for case in counted]
-    assert len(counted) == 1 and min(times) >= FIRST_S and max(times) <= SECONDS - WHOLE_S
-    assert {case.apart for case in cases} == {"", "within 120 s of the first sample", "recording ends within 60 s"}
-    assert all(np.isfinite(case.flown[case.asked.ahead <= WHOLE_S]).all() for case in counted)
+    counted = [case for case in cases if not case.exclusion]
+    times = [case.start.first_s for case in counted]
+    assert len(counted) == 1 and min(times) >= MIN_FIRST_S and max(times) <= SECONDS - MIN_EVENT_FREE_S
+    assert {case.exclusion for case in cases} == {"", "within 120 s of the first sample", "recording ends within 60 s"}
+    assert all(np.isfinite(case.positions[case.start.ahead <= MIN_EVENT_FREE_S]).all() for case in counted)
     last = cases[-1]
-    known = np.isfinite(last.flown[:, 0])
+    known = np.isfinite(last.positions[:, 0])
     assert 0 < known.sum() < len(known) and not known[-1]  # the recording ended first
 
 
@@ -118,32 +118,32 @@ def test_nothing_later_is_known_at_a_start(one, driven):
     """Cut the recording where a start was asked: every method says the same to the last bit."""
     cases, heard = driven
     chosen = 5
-    cut = list(Drive("flight", FEW).run(islice(one, heard[chosen])))
+    cut = list(RecordingDriver("flight", FEW).run(islice(one, heard[chosen])))
     assert len(cut) == chosen + 1 and 0 < heard[chosen] < 0.6 * len(one)
-    for name, told in cases[chosen].asked.told.items():
-        again = cut[-1].asked.told[name]
-        assert np.array_equal(told.path, again.path) and told.made_by == again.made_by, name
-    assert np.array_equal(cut[-1].asked.told[OURS].tube, cases[chosen].asked.told[OURS].tube)
-    assert np.isnan(cut[-1].flown[2:]).all() and cut[-1].apart
+    for name, told in cases[chosen].start.forecasts.items():
+        again = cut[-1].start.forecasts[name]
+        assert np.array_equal(told.path, again.path) and told.source == again.source, name
+    assert np.array_equal(cut[-1].start.forecasts[OURS].tube, cases[chosen].start.forecasts[OURS].tube)
+    assert np.isnan(cut[-1].positions[2:]).all() and cut[-1].exclusion
 
 
 def test_ours_is_what_a_twin_publishes(one, cases):
-    from twin_worker.evaluation.offline import run
+    from twin_worker.evaluation.offline import run_offline
 
-    by_t = {p.t: p.path.numpy() for p in run(one[: len(one) // 3], {}) if isinstance(p, Prediction)}
+    by_t = {p.t: p.path.numpy() for p in run_offline(one[: len(one) // 3], {}) if isinstance(p, Prediction)}
     for case in cases[:3]:
-        assert np.array_equal(by_t[case.asked.t], case.asked.told[OURS].path)
+        assert np.array_equal(by_t[case.start.t], case.start.forecasts[OURS].path)
 
 
 def test_parameters_can_be_withheld(one):
-    plan = Plan(every_s=10.0, methods=(), without_params=True)
-    drive = Drive("flight", plan)
-    groups = [case.asked.group for case in drive.run(one[: len(one) // 5])]
+    plan = EvaluationPlan(every_s=10.0, methods=(), without_params=True)
+    drive = RecordingDriver("flight", plan)
+    groups = [case.start.group for case in drive.run(one[: len(one) // 5])]
     without = {group.rpartition("/")[2] for group in groups if not group.startswith("imm")}
     assert without and without <= {"absent", "identified"}
-    assert drive.examined[1] is not None and drive.examined[1].twin.params is None
-    known = list(Drive("flight", Plan(every_s=30.0, methods=())).run(one[: len(one) // 5]))
-    assert known and all(case.asked.group.endswith("/known") for case in known)
+    assert drive.uavs[1] is not None and drive.uavs[1].twin.onboard.params is None
+    known = list(RecordingDriver("flight", EvaluationPlan(every_s=30.0, methods=())).run(one[: len(one) // 5]))
+    assert known and all(case.start.group.endswith("/known") for case in known)
 
 
 # --- what ends a prediction ------------------------------------------------------------------------------------------
@@ -157,11 +157,11 @@ ROUTE = Mission(uav=1, t=T0, items=(item(0), item(1, north=500.0)), seq=1, compl
 LANDING = Mission(uav=1, t=T0, items=(item(0), item(1, 21, north=500.0)), seq=1, complete=True)
 
 
-def logged(*news: Message) -> Log:
+def logged(*news: Message) -> ReferenceFlight:
     """A log of 100 s of flight with news at their times."""
-    log = Log()
+    log = ReferenceFlight()
     for message in sorted((*messages(turn(100.0)), *news), key=lambda message: message.t):
-        log.hear(message)
+        log.add(message)
     return log
 
 
@@ -177,7 +177,7 @@ def logged(*news: Message) -> Log:
     ],
 )  # fmt: skip
 def test_an_event_ends_what_can_be_asked(news, at, why):
-    end, said = logged(*news).until(T0 + 10.0)
+    end, said = logged(*news).next_event(T0 + 10.0)
     assert said == why and end - T0 == pytest.approx(at, abs=0.2)
 
 
@@ -187,30 +187,30 @@ def test_what_only_arrives_is_no_event():
     half = Mission(uav=1, t=T0 + 20, items=ROUTE.items[:1], complete=False)
     params = [Params(uav=1, t=T0 + k, values={"WP_RADIUS": 30.0, "STAT_RUNTIME": float(k)}) for k in (5, 30)]
     log = logged(status(T0), ROUTE, half, again, *params, status(T0 + 50))
-    assert log.until(T0 + 10.0)[1] == "recording ends"
+    assert log.next_event(T0 + 10.0)[1] == "recording ends"
 
 
 def test_a_landing_counts_from_its_item_on():
-    assert logged(LANDING).until(T0 + 10.0) == (T0 + 11.0, "landing")
+    assert logged(LANDING).next_event(T0 + 10.0) == (T0 + 11.0, "landing")
 
 
 def test_a_hole_in_the_positions_is_not_filled():
     laid = turn(100.0)
     t, x = laid["position"]
     keep = (t - T0 < 40.0) | (t - T0 > 52.0)
-    log = Log()
+    log = ReferenceFlight()
     for message in messages(laid | {"position": (t[keep], x[keep])}):
-        log.hear(message)
-    assert log.seen(T0 + np.array([30.0, 41.0, 45.0, 51.0, 60.0, 140.0])).tolist() == [
+        log.add(message)
+    assert log.has_position(T0 + np.array([30.0, 41.0, 45.0, 51.0, 60.0, 140.0])).tolist() == [
         True, True, False, True, True, False,
     ]  # fmt: skip
 
 
 def test_what_flies_without_a_mission_is_told_apart():
-    drive = Drive("flight", Plan(every_s=20.0, methods=("route",)))
+    drive = RecordingDriver("flight", EvaluationPlan(every_s=20.0, methods=("route",)))
     found = list(drive.run(sorted((status(T0, "FBWB"), *messages(turn(100.0))), key=lambda m: m.t)))
-    assert found and {case.apart for case in found} == {"mode FBWB follows no mission"}
-    assert all(case.asked.told["route"].made_by == "imm" for case in found)
+    assert found and {case.exclusion for case in found} == {"mode FBWB follows no mission"}
+    assert all(case.start.forecasts["route"].source == "imm" for case in found)
 
 
 # --- what is written -------------------------------------------------------------------------------------------------
@@ -222,8 +222,8 @@ def test_the_command_scores_draws_and_writes(recorded, tmp_path, capfd):
     assert fleet(["assess", str(recorded), *options]) == 0
     said = capfd.readouterr()
     told = json.loads(numbers.read_text())
-    assert set(told) == {OURS, *METHODS, "compare", "apart", "run"}
-    for name in (OURS, *METHODS):
+    assert set(told) == {OURS, *BASELINE_METHODS, "compare", "apart", "run"}
+    for name in (OURS, *BASELINE_METHODS):
         assert set(told[name]) >= KEYS_OF_A_METHOD, name
         assert told[name]["flights"] == 2 and told[name]["starts"] == told[OURS]["starts"] >= 4
         assert set(told[name]["p50_m"]) >= {"5", "10", "16", "30", "60"}
@@ -231,7 +231,7 @@ def test_the_command_scores_draws_and_writes(recorded, tmp_path, capfd):
     assert all(len(axes) == 3 for axes in told[OURS]["half_axes_m"].values())
     assert told["run"]["counted"] == told[OURS]["starts"] and told["run"]["silent"] == 0
     assert told[OURS]["p50_m"]["16"] < told["cv"]["p50_m"]["16"]
-    assert set(told["compare"]) == set(METHODS)
+    assert set(told["compare"]) == set(BASELINE_METHODS)
     for words in ("starts of 2 flights", "[s]", "[m]", "method of the paper", "excluded:", "ours minus each"):
         assert words in said.out
     for name in (
@@ -260,7 +260,7 @@ def _check_file(path, starts: int) -> None:
     assert np.allclose(held["t"], held["t0"][:, None] + held["ahead"])
     assert np.isnan(held["spread"]).all() or (held["spread"] >= 0).all()
     assert all(word.count("/") == 3 for word in held["group"]) and set(held["uav"]) == {1, 2}
-    assert not any(held["apart"]) and np.isfinite(held["flown"][:, : int(WHOLE_S)]).all()
+    assert not any(held["apart"]) and np.isfinite(held["flown"][:, : int(MIN_EVENT_FREE_S)]).all()
     metres = np.hypot(*(np.diff(held["latitude"][0, [0, 1]]) * 111_000, np.diff(held["path"][0, [0, 1], 0])))
     assert metres[0] < 60.0  # one second apart
 
@@ -275,13 +275,13 @@ def test_the_covariance_lies_along_the_path():
 
 
 def test_processes_share_the_aircraft_and_change_nothing(short):
-    plan = Plan(every_s=10.0, methods=("cv",))
-    alone, shared = (assess([short], plan, jobs=jobs).cases for jobs in (1, 2))
-    assert [case.asked.uav for case in alone] == [case.asked.uav for case in shared]
-    assert {case.asked.uav for case in alone} == {1, 2}
+    plan = EvaluationPlan(every_s=10.0, methods=("cv",))
+    alone, shared = (assess_recordings([short], plan, jobs=jobs).cases for jobs in (1, 2))
+    assert [case.start.uav for case in alone] == [case.start.uav for case in shared]
+    assert {case.start.uav for case in alone} == {1, 2}
     for one, other in zip(alone, shared, strict=True):
-        assert np.array_equal(one.asked.told[OURS].path, other.asked.told[OURS].path)
-        assert np.array_equal(one.flown, other.flown, equal_nan=True)
+        assert np.array_equal(one.start.forecasts[OURS].path, other.start.forecasts[OURS].path)
+        assert np.array_equal(one.positions, other.positions, equal_nan=True)
 
 
 def test_the_papers_experiment_asks_the_papers_way_beside_ours(short, tmp_path):
@@ -353,4 +353,4 @@ def test_ctrl_c_ends_it_cleanly(recorded, tmp_path):
 
 
 def test_the_methods_of_the_command_are_those_there_are():
-    assert set(METHODS) == {*BASELINES, "paper"}
+    assert set(BASELINE_METHODS) == {*BASELINES, "paper"}

@@ -5,27 +5,27 @@ import pytest
 from flights import HERE, T0, item, messages, turn
 
 from fleet.contract import Message, Mission, Params, Status
-from fleet.mission import route
-from twin_worker.evaluation.baselines.methods import BASELINES, Now
-from twin_worker.evaluation.baselines.route_line import Ride, line
-from twin_worker.twin.state.state import Twin, hear
-from twin_worker.twin.state.vehicle_class import seen
+from fleet.mission import unroll_route
+from twin_worker.evaluation.baselines.methods import BASELINES, BaselineInput
+from twin_worker.evaluation.baselines.route_line import LineInputs, route_line
+from twin_worker.twin.state.state import Twin, ingest
+from twin_worker.twin.state.vehicle_class import recent_track
 from twin_worker.twin.step import advance
 
 AHEAD = np.arange(0.0, 61.0)
 VA = 20.0
 
 
-def told(*more: Message, **how) -> Now:
+def told(*more: Message, **how) -> BaselineInput:
     """Half a minute of a made-up flight as the methods see it; `more` was heard before."""
-    twin = Twin(1)
+    twin = Twin.of(1)
     for message in (*more, *messages(turn(30.0, Va=VA, **how))):
-        hear(twin, message)
+        ingest(twin, message)
     for _ in range(8):  # the wind filter takes ten seconds a turn
-        advance(twin, (), twin.history.newest)
-    flown = seen(twin, 40.0)
+        advance(twin, (), twin.telemetry.history.newest)
+    flown = recent_track(twin, 40.0)
     assert flown is not None
-    return Now(twin, flown, AHEAD)
+    return BaselineInput(twin, flown, AHEAD)
 
 
 def mission(*items) -> tuple[Message, ...]:
@@ -33,8 +33,8 @@ def mission(*items) -> tuple[Message, ...]:
     return status, Mission(uav=1, t=T0, items=(item(0), *items), seq=1, complete=True)
 
 
-def truth(now: Now, north: float, east: float) -> np.ndarray:
-    return now.p + np.outer(AHEAD, [north, east, 0.0])
+def truth(now: BaselineInput, north: float, east: float) -> np.ndarray:
+    return now.position + np.outer(AHEAD, [north, east, 0.0])
 
 
 def test_straight_flight_is_exact_for_all_that_hold_something():
@@ -47,8 +47,8 @@ def test_straight_flight_is_exact_for_all_that_hold_something():
 
 def test_a_steady_turn_is_exact_at_a_constant_rate_only():
     now = told(rate=0.2)
-    course = 2.0 + 0.2 * (now.flown.t[-1] - T0)
-    wanted = now.p[:2] + VA / 0.2 * np.column_stack(
+    course = 2.0 + 0.2 * (now.track.t[-1] - T0)
+    wanted = now.position[:2] + VA / 0.2 * np.column_stack(
         [np.sin(course + 0.2 * AHEAD) - np.sin(course), np.cos(course) - np.cos(course + 0.2 * AHEAD)]
     )
     ct, cv = BASELINES["ct"](now), BASELINES["cv"](now)
@@ -66,11 +66,11 @@ def test_the_route_is_followed_through_the_wind():
     corner = 1500.0
     heard = mission(item(1, north=corner), item(2, north=corner, east=9000.0))
     now = told(*heard, rate=0.0, psi=0.0, wind=(5.0, 0.0))
-    assert now.p[0] == pytest.approx(749.0, abs=3.0)
+    assert now.position[0] == pytest.approx(749.0, abs=3.0)
     path = BASELINES["route_wind"](now)
     assert path is not None
-    after = 60.0 - (corner - now.p[0]) / 25.0
-    assert path[10, :2] == pytest.approx([now.p[0] + 250.0, 0.0], abs=6.0)
+    after = 60.0 - (corner - now.position[0]) / 25.0
+    assert path[10, :2] == pytest.approx([now.position[0] + 250.0, 0.0], abs=6.0)
     assert path[60, :2] == pytest.approx([corner, after * np.sqrt(400.0 - 25.0)], abs=25.0)
     plain = BASELINES["route"](now)
     assert plain is not None and plain[60, 1] == pytest.approx(after * 25.0, abs=25.0)  # it knows no wind
@@ -83,7 +83,9 @@ def test_a_commanded_speed_is_flown_where_it_is_known():
     )
     now = told(*heard, rate=0.0, psi=0.0)
     path = BASELINES["route_wind"](now)
-    assert path is not None and path[60, 0] - now.p[0] == pytest.approx(60 * 26.0, rel=0.06)  # it speeds up first
+    assert path is not None and path[60, 0] - now.position[0] == pytest.approx(
+        60 * 26.0, rel=0.06
+    )  # it speeds up first
 
 
 # --- the line itself -------------------------------------------------------------------------------------------------
@@ -92,10 +94,10 @@ def test_a_commanded_speed_is_flown_where_it_is_known():
 def drawn(*items, p=(0.0, 0.0, -100.0), past=None, seq: int = 1) -> np.ndarray:
     from fleet.autopilots import arduplane
 
-    way = route((item(0), *items), seq=seq, origin=HERE, params={})
+    way = unroll_route((item(0), *items), seq=seq, origin=HERE, params={})
     here = np.array(p)
     past = here[None] if past is None else past
-    return line(way, Ride(here, past, 20.0, arduplane.parameters({})[0], 3000.0))
+    return route_line(way, LineInputs(here, past, 20.0, arduplane.parameters({})[0], 3000.0))
 
 
 def test_the_line_climbs_with_its_legs_and_begins_abreast():
@@ -151,10 +153,10 @@ def test_no_mission_makes_a_line_without_end_or_without_numbers(items):
 def test_an_aircraft_that_says_not_which_item_it_flies_has_no_route():
     heard = mission(item(1, north=9000.0))
     unsaid = (heard[0], Mission(uav=1, t=T0, items=heard[1].items, seq=-1, complete=True))  # type: ignore[attr-defined]
-    twin = Twin(1)
+    twin = Twin.of(1)
     laid = turn(30.0, rate=0.0, psi=0.0)
     del laid["leg"]
     for message in (*unsaid, *messages(laid)):
-        hear(twin, message)
-    flown = seen(twin, 40.0)
-    assert flown is not None and BASELINES["route"](Now(twin, flown, AHEAD)) is None
+        ingest(twin, message)
+    flown = recent_track(twin, 40.0)
+    assert flown is not None and BASELINES["route"](BaselineInput(twin, flown, AHEAD)) is None

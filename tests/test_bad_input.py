@@ -9,9 +9,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import T0, Talker, of
 
 from fleet.contract import MAX_ITEMS, Mission, Params, Sample, Status
-from fleet.telemetry.mavlink.arrays.pack import MOST_ROWS
-from fleet.telemetry.mavlink.intake import Intake
-from fleet.telemetry.mavlink.parsing.decode import MOST_SENDERS
+from fleet.telemetry.mavlink.arrays.pack import MAX_ROWS
+from fleet.telemetry.mavlink.intake import MavlinkReceiver
+from fleet.telemetry.mavlink.parsing.decode import MAX_SENDERS
 
 DO_JUMP, LAND = 177, 21
 NAN = math.nan
@@ -21,15 +21,15 @@ class Air:
     """One link with a good aircraft 8 that must keep flowing, and a bad one, 7."""
 
     def __init__(self):
-        self.intake, self.bad, self.good = Intake(), Talker(7), Talker(8)
+        self.intake, self.bad, self.good = MavlinkReceiver(), Talker(7), Talker(8)
         self.t, self.news = T0, []
         self.hear(self.bad.heartbeat(), 0.0)
 
     def hear(self, data: bytes, passed: float = 0.1, source=None) -> list:
         """Let bytes arrive from the bad one, then the good one's, then publish."""
         self.t += passed
-        self.intake.hear(self.t, data, source)
-        self.intake.hear(self.t, self.good.heartbeat() + self.good.attitude(self.t - T0), "good")
+        self.intake.receive(self.t, data, source)
+        self.intake.receive(self.t, self.good.heartbeat() + self.good.attitude(self.t - T0), "good")
         news = self.intake.flush(self.t)
         self.news += news
         assert of(Sample, news, 8), "the good aircraft stopped flowing"
@@ -55,18 +55,18 @@ def test_random_bytes_between_the_frames_of_one_stream():
 
 
 def test_endless_senders_do_not_fill_the_memory():
-    intake = Intake()
-    for port in range(3 * MOST_SENDERS):
-        intake.hear(T0, b"\xfd\xff\0", ("10.0.0.9", port))
+    intake = MavlinkReceiver()
+    for port in range(3 * MAX_SENDERS):
+        intake.receive(T0, b"\xfd\xff\0", ("10.0.0.9", port))
     intake.flush(T0)
-    assert len(intake.decoder._carry) == MOST_SENDERS
+    assert len(intake.decoder._carry) == MAX_SENDERS
 
 
 def test_a_flood_from_one_aircraft_is_cut():
     air = Air()
     for step in range(20):
         air.hear(air.bad.attitude(1 + step * 0.1))
-    flood = b"".join(air.bad.attitude(3 + i * 1e-3) for i in range(MOST_ROWS + 500))
+    flood = b"".join(air.bad.attitude(3 + i * 1e-3) for i in range(MAX_ROWS + 500))
     air.hear(flood)
     (status,) = of(Status, air.hear(b"", 1.0), 7)
     assert status.rejected == 500

@@ -51,5 +51,5 @@ def test_over_a_bad_link_predictions_keep_coming_and_hold(recorded, tmp_path):
     fly(through(recorded, tmp_path, Radio(0.3, 10.0, 45.0, 1.0, 0.2)), truth, tally, since=25.0)
     found = tally.row()
     assert found["predictions"] > 40 and tally.gap_s < 13.0
-    assert tally.events[Event.LINK_LOST.value] >= tally.events[Event.LINK_BACK.value] == 1
+    assert tally.events[Event.LINK_LOST.value] >= tally.events[Event.LINK_RESTORED.value] == 1
     assert found["coverage"] >= 0.85

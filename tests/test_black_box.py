@@ -10,7 +10,7 @@ from twin_worker.identification.linear.black_box_prediction_error import (
     refine_black_box,
     squared_errors,
 )
-from twin_worker.identification.linear.order_selection import choose
+from twin_worker.identification.linear.order_selection import select_order
 from twin_worker.identification.linear.state_space import StateSpace
 from twin_worker.identification.linear.subspace import pbsid
 from twin_worker.identification.linear.subspace_open_loop import projection
@@ -29,7 +29,7 @@ def known(order: int, seed: int = 0) -> StateSpace:
         A[at : at + size, at : at + size] = np.array(block)[:size, :size]
         at += size
     model = StateSpace.of(A, rng.standard_normal((order, 2)), rng.standard_normal((2, order)))
-    return model.turned(np.eye(order) + 0.3 * rng.standard_normal((order, order)))
+    return model.transformed(np.eye(order) + 0.3 * rng.standard_normal((order, order)))
 
 
 def recorded(model: StateSpace, n: int, noise: float, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -70,13 +70,13 @@ def test_in_a_closed_loop_the_projection_is_biased_and_pbsid_is_not():
 def test_the_data_choose_the_order(order):
     truth = known(order)
     y, u = recorded(truth, 700, 0.1)
-    found = choose(y, u, orders=range(1, 7))
-    model, recipe = found.model, found.recipe
+    found = select_order(y, u, orders=range(1, 7))
+    model, recipe = found.model, found.structure
     assert order <= recipe.order <= order + 1 and not recipe.feedthrough
     assert missed(model, truth) < 0.05
     assert not model.D.any()
     fresh = np.random.default_rng(7).standard_normal((300, 2))
-    runs = [member.run(fresh, np.zeros(member.order)) for member in found.committee]
+    runs = [member.run(fresh, np.zeros(member.order)) for member in found.ensemble]
     wanted = truth.run(fresh)
     assert np.linalg.norm(np.median(runs, axis=0) - wanted) < 0.05 * np.linalg.norm(wanted)
 
@@ -85,13 +85,13 @@ def test_feedthrough_is_found_where_there_is_one_and_it_may_be_tried():
     plant = known(2)  # whose input acts a sample sooner
     truth = StateSpace.of(plant.A, plant.A @ plant.B, plant.C, D=plant.C @ plant.B)
     y, u = recorded(truth, 700, 0.05)
-    found = choose(y, u, orders=(1, 2, 3), feedthrough=True)
-    model, recipe = found.model, found.recipe
+    found = select_order(y, u, orders=(1, 2, 3), feedthrough=True)
+    model, recipe = found.model, found.structure
     assert recipe.feedthrough and np.abs(model.D - truth.D).max() < 0.05 * np.abs(truth.D).max()
     assert missed(model, truth) < 0.05
     fitted = np.linalg.norm(y - model.run(u)) / np.linalg.norm(y)
     assert fitted < 0.06  # x0 too
-    assert not choose(y, u, orders=(1, 2, 3)).model.D.any()
+    assert not select_order(y, u, orders=(1, 2, 3)).model.D.any()
 
 
 def test_similarity_keeps_what_the_model_does():
@@ -114,7 +114,7 @@ def test_the_state_at_the_start_is_found_from_a_few_samples():
     truth, u = known(4), np.random.default_rng(0).standard_normal((300, 2))
     x0 = np.array([3.0, -2.0, 1.0, 4.0])
     y = truth.run(u, x0)
-    assert truth.begin(y[:30], u[:30], len(y)) == pytest.approx(x0, rel=0.05)
+    assert truth.estimate_x0(y[:30], u[:30], len(y)) == pytest.approx(x0, rel=0.05)
 
 
 def test_one_step_watches_the_output():
@@ -202,7 +202,7 @@ def test_what_was_not_measured_has_no_say():
 def test_inputs_offset_and_start_are_solved_exactly():
     truth, u = known(3), np.random.default_rng(0).standard_normal((200, 2))
     truth = StateSpace.of(truth.A, truth.B, truth.C, c=np.array([0.1, -0.2, 0.3]), x0=np.array([1.0, 2.0, -3.0]))
-    found = fit_inputs(StateSpace.of(truth.A, 0 * truth.B, truth.C), truth.run(u), u, pushed=True)
+    found = fit_inputs(StateSpace.of(truth.A, 0 * truth.B, truth.C), truth.run(u), u, with_bias=True)
     assert np.allclose(found.B, truth.B, atol=1e-6)
     assert np.allclose(found.run(u), truth.run(u), atol=1e-4)  # of three pushes two outputs show two
 
@@ -214,7 +214,7 @@ POOR = {
     "copied input": (lambda y, u: u.__setitem__((slice(None), 1), 2.0 * u[:, 0] + 1.0), "input 1 repeats"),
     "copied output": (lambda y, u: y.__setitem__((slice(None), 1), -y[:, 0]), "output 1 repeats"),
 }
-FIRST = {"pbsid": lambda y, u: pbsid(y, u, 2), "projection": lambda y, u: projection(y, u, 2), "choose": choose}
+FIRST = {"pbsid": lambda y, u: pbsid(y, u, 2), "projection": lambda y, u: projection(y, u, 2), "choose": select_order}
 
 
 @pytest.mark.parametrize("kind", POOR)

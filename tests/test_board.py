@@ -15,24 +15,24 @@ from talker import T0, Talker
 from test_gateway import PATIENCE_S, Ear
 
 from fleet.bus.memory_bus import MemoryBus
-from fleet.contract import Account, Status
-from fleet.metrics import served
+from fleet.contract import GatewayCounters, Status
+from fleet.metrics import serve, with_unit
 from gateway.links.udp import Udp
-from gateway.pipeline import Pump
-from gateway.record.recorder import Recorder
-from gateway.record.tape import Budget
+from gateway.pipeline import Pipeline
+from gateway.record.recorder import LinkRecorder
+from gateway.record.tape import DiskBudget
 from gateway.settings.link_spec import read_spec
 from gateway.status import status_table
 from gateway.status.link_statistics import overruns
 from gateway.status.metrics import counters
-from gateway.status.status_table import drawn, in_line, posted
+from gateway.status.status_table import format_line, render, status_display
 
-ACCOUNT, STATUS = EXAMPLES[Account], EXAMPLES[Status]
+ACCOUNT, STATUS = EXAMPLES[GatewayCounters], EXAMPLES[Status]
 
 
 def drawing(account, statuses):
     console = Console(file=io.StringIO(), width=180)
-    console.print(drawn(account, statuses))
+    console.print(render(account, statuses))
     return console.file.getvalue()
 
 
@@ -55,35 +55,37 @@ def test_plain_lines_come_at_news_and_now_and_then(monkeypatch):
 
     def say(line):
         said.append(line)
-        if in_line(ACCOUNT, [STATUS]) in said and said.count("fine") == 1:
+        if format_line(ACCOUNT, [STATUS]) in said and said.count("fine") == 1:
             enough.set()
 
-    with posted(lambda: (ACCOUNT, [STATUS]), say):
+    with status_display(lambda: (ACCOUNT, [STATUS]), say):
         assert enough.wait(PATIENCE_S)
 
 
 def test_prometheus_reads_every_number_of_the_account(free_port):
-    with served(f"127.0.0.1:{free_port}", counters(lambda: (ACCOUNT, [STATUS]))) as address:
+    with serve(f"127.0.0.1:{free_port}", counters(lambda: (ACCOUNT, [STATUS]))) as address:
         with urllib.request.urlopen(address, timeout=PATIENCE_S) as reply:
             families = list(text_string_to_metric_families(reply.read().decode()))
-        with pytest.raises(OSError, match="is not free"), served(f"127.0.0.1:{free_port}", list):
+        with pytest.raises(OSError, match="is not free"), serve(f"127.0.0.1:{free_port}", list):
             pass
     found = {(s.name.removesuffix("_total"), *sorted(s.labels.values())): s.value for f in families for s in f.samples}
     link = ACCOUNT.per_link[0]
     for name, value in msgspec.structs.asdict(link).items():
         if isinstance(value, int | float):
             named = {"overrun": "overrun_datagrams", "dropped": "dropped_datagrams", "sent": "sent_datagrams"}
-            assert found["parauav_link_" + named.get(name, name), link.link] == value
+            named |= {"bytes_s": "bytes_per_second"}
+            metric = named.get(name) or with_unit(name)
+            assert found[f"parauav_link_{metric}", link.link] == value
     assert found["parauav_gateway_unsent",] == 6 and found["parauav_gateway_router",] == 0
     assert found["parauav_gateway_refused", "stale"] == 1
-    assert found["parauav_uav_missed", "7"] == 3 and found["parauav_uav_rate_hz", "7", "ATTITUDE"] == 25.0
+    assert found["parauav_uav_missed", "7"] == 3 and found["parauav_uav_rate_hertz", "7", "ATTITUDE"] == 25.0
     assert {f.type for f in families if f.name == "parauav_link_bytes_in"} == {"counter"}
     assert all(family.documentation for family in families)
 
 
 @pytest.mark.parametrize("where", ["9100", "127.0.0.1:", "127.0.0.1:x", "127.0.0.1:99999"])
 def test_what_is_no_address_stops_at_start(where):
-    with pytest.raises(ValueError, match=r"^--metrics: found .*; correct it$"), served(where, list):
+    with pytest.raises(ValueError, match=r"^--metrics: found .*; correct it$"), serve(where, list):
         pass
 
 
@@ -106,10 +108,12 @@ def test_everything_sent_is_received_overrun_or_dropped_and_what_was_heard_is_re
     bus, stop, sent = MemoryBus(), threading.Event(), 0
 
     def found(ear):
-        return [one.datagrams + one.overrun + one.dropped for one in (m.per_link[0] for m in ear.of(Account)[-1:])]
+        return [
+            one.datagrams + one.overrun + one.dropped for one in (m.per_link[0] for m in ear.of(GatewayCounters)[-1:])
+        ]
 
-    with Recorder(Budget(tmp_path, 10**9), [link.spec.text]) as recorder:
-        ear, pump = Ear(bus), Pump([link], bus, recorder=recorder)
+    with LinkRecorder(DiskBudget(tmp_path, 10**9), [link.spec.text]) as recorder:
+        ear, pump = Ear(bus), Pipeline([link], bus, recorder=recorder)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as air:
             for data in said:  # nobody reads yet
                 sent += air.sendto(data, ("127.0.0.1", free_port)) > 0
@@ -121,9 +125,9 @@ def test_everything_sent_is_received_overrun_or_dropped_and_what_was_heard_is_re
             ear.wait(lambda e: found(e) == [sent])
         stop.set()
         thread.join(PATIENCE_S)
-    (final,) = pump.publisher.told.per_link
-    (taped,) = recorder.account()
+    (final,) = pump.publisher.newest_account.per_link
+    (taped,) = recorder.counters()
     assert final.overrun > 100 and final.datagrams > 2
-    assert taped.heard == final.bytes_in + final.bytes_out
-    assert taped.heard == taped.recorded + taped.noise + taped.lost + taped.dropped + taped.waiting
+    assert taped.received == final.bytes_in + final.bytes_out
+    assert taped.received == taped.recorded + taped.noise + taped.lost + taped.dropped + taped.waiting
     assert taped.recorded == sum(p.stat().st_size for p in tmp_path.glob("*.tlog")) - 8 * taped.frames

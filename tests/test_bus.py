@@ -15,13 +15,13 @@ import zenoh
 from conftest import ROOT, unused_port
 from examples import EXAMPLES
 
-from fleet.access.entry import endpoint
-from fleet.access.knock import reachable
-from fleet.bus.bus_protocol import Bus, key, newest, uav_in
+from fleet.access.entry import parse_endpoint
+from fleet.access.knock import accepts_connections
+from fleet.bus.bus_protocol import Bus, key_of, select_latest, uav_of_key
 from fleet.bus.codec import Stamp, encode, encoding
 from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import connect, open_router
-from fleet.contract import Account, Alert, AlertKind, FleetState, Handover, Prediction, Sample, Status
+from fleet.contract import Alert, AlertKind, FleetState, GatewayCounters, Handover, Prediction, Sample, Status
 from tests.bench.referee.forwarder import Forwarder
 
 PATIENCE_S = 10.0
@@ -54,7 +54,7 @@ def pair(request: pytest.FixtureRequest) -> Iterator[Pair]:
             return
         at, raw = request.getfixturevalue("router")
         here, there = (stack.enter_context(connect(at)) for _ in range(2))
-        yield Pair(here, there, lambda kind, payload, named: raw.put(key(kind, 7), payload, encoding=named))
+        yield Pair(here, there, lambda kind, payload, named: raw.put(key_of(kind, 7), payload, encoding=named))
 
 
 def told(heard: SimpleQueue, tell: Callable[[], None]) -> Any:
@@ -75,7 +75,7 @@ def asked(bus: Bus, kind: type, who: int | str, count: int = 1) -> list[tuple[An
     timer.start()
     try:
         while not deadline.is_set():
-            found = bus.ask(kind, who)
+            found = bus.get(kind, who)
             if len(found) >= count:
                 return found
     finally:
@@ -96,16 +96,16 @@ def test_what_is_published_is_heard_with_its_stamp(pair: Pair, kind: type, stamp
 
 def test_what_is_put_aside_is_handed_out_in_order_with_whose_it_is(pair: Pair) -> None:
     heard: SimpleQueue = SimpleQueue()
-    pair.there.collect(Status, lambda letters: [heard.put(letter) for letter in letters])
-    pair.there.hand_out()  # nothing waits
+    pair.there.subscribe_buffered(Status, lambda letters: [heard.put(letter) for letter in letters])
+    pair.there.dispatch()  # nothing waits
 
     def tell(stamp: Stamp | None = STAMP) -> None:
         pair.here.publish(EXAMPLES[Status], stamp)
-        pair.there.hand_out()
+        pair.there.dispatch()
 
     uav, payload, named = EXAMPLES[Status].uav, encode(EXAMPLES[Status]), encoding(Status)
     assert told(heard, tell) == (uav, payload, named, STAMP)
-    assert told(heard, lambda: (pair.inject(Status, b"", "odd"), pair.there.hand_out()))[1] in (b"", payload)
+    assert told(heard, lambda: (pair.inject(Status, b"", "odd"), pair.there.dispatch()))[1] in (b"", payload)
     *_, last = [told(heard, lambda: tell(None)) for _ in range(3)]
     assert last[3] is None or last[2] == "odd" or last[1] == payload
 
@@ -158,16 +158,16 @@ def test_who_is_slow_with_one_class_still_hears_the_others_asks_and_is_asked(rou
         try:
             there.subscribe(Sample, slow)
             there.subscribe(Status, lambda message, _: heard.put(message))
-            there.answer(Account, lambda *_: [(EXAMPLES[Account], None)])
-            here.answer(Alert, lambda *_: [(EXAMPLES[Alert], None)])
+            there.declare_queryable(GatewayCounters, lambda *_: [(EXAMPLES[GatewayCounters], None)])
+            here.declare_queryable(Alert, lambda *_: [(EXAMPLES[Alert], None)])
             told(heard, lambda: (here.publish(EXAMPLES[Sample]), here.publish(EXAMPLES[Status])))
-            assert begun.wait(PATIENCE_S) and asked(here, Account, "*") and asked(there, Alert, "*")
+            assert begun.wait(PATIENCE_S) and asked(here, GatewayCounters, "*") and asked(there, Alert, "*")
             for _ in range(MANY):
                 here.publish(EXAMPLES[Sample])
             while not heard.empty():
                 heard.get()
             assert told(heard, lambda: here.publish(EXAMPLES[Status])) == EXAMPLES[Status]
-            assert asked(here, Account, "*") and asked(there, Alert, "*")
+            assert asked(here, GatewayCounters, "*") and asked(there, Alert, "*")
         finally:
             go_on.set()
 
@@ -175,20 +175,20 @@ def test_who_is_slow_with_one_class_still_hears_the_others_asks_and_is_asked(rou
 def test_who_reads_no_large_answer_holds_up_nobody(router: tuple[str, zenoh.Session]) -> None:
     """A process is frozen while copies come to it: others hear whoever sends them, where the router waited for 5 s."""
     heard: SimpleQueue = SimpleQueue()
-    large = [Handover(t=0.0, uav=uav, epoch=1, code="", load=os.urandom(1_000_000)) for uav in range(60)]
-    with Forwarder(endpoint(router[0])) as way, connect(router[0]) as here, connect(router[0]) as other:
+    large = [Handover(t=0.0, uav=uav, epoch=1, code="", snapshot=os.urandom(1_000_000)) for uav in range(60)]
+    with Forwarder(parse_endpoint(router[0])) as way, connect(router[0]) as here, connect(router[0]) as other:
 
         def copies(_: int | None, asked_for: dict[str, str], payload: bytes) -> Iterator[tuple[Handover, None]]:
             way.stalled = bool(payload)
             return ((each, None) for each in (large if payload else [EXAMPLES[Handover]]))
 
-        here.answer(Handover, copies)
+        here.declare_queryable(Handover, copies)
         other.subscribe(Status, lambda message, _: heard.put(time.monotonic()))
         told(heard, lambda: here.publish(EXAMPLES[Status]))
         with connect(f"tcp/127.0.0.1:{way.port}") as frozen:
-            while not list(frozen.gather(Handover, "*", b"", 1.0)):
+            while not list(frozen.get_stream(Handover, "*", b"", 1.0)):
                 pass
-            asking = threading.Thread(target=lambda: list(frozen.gather(Handover, "*", b"all", PATIENCE_S)))
+            asking = threading.Thread(target=lambda: list(frozen.get_stream(Handover, "*", b"all", PATIENCE_S)))
             asking.start()
             begun, pause = time.monotonic(), threading.Event()
             while time.monotonic() < begun + 1.5 * LEAST_S or not way.stalled:
@@ -215,17 +215,17 @@ def test_one_wildcard_queryable_answers_for_all_and_for_one(pair: Pair) -> None:
         seen.append((uav, parameters, payload))
         return [(about(n), Stamp(n, 1)) for n in (3, 1, 2)]
 
-    pair.there.answer(Prediction, reply)
+    pair.there.declare_queryable(Prediction, reply)
     assert asked(pair.here, Prediction, "*", 3) == [(about(n), Stamp(n, 1)) for n in (1, 2, 3)]
     assert asked(pair.here, Prediction, 2) == [(about(2), Stamp(2, 1))], "answers about others are left out"
-    assert pair.here.ask(Prediction, 9) == []
+    assert pair.here.get(Prediction, 9) == []
     assert [uav for uav, _, _ in seen[-3:]] == [None, 2, 9]
     assert seen[-1] == (9, {}, b"")
 
 
 def test_the_highest_epoch_wins_whoever_answers_first(pair: Pair) -> None:
-    pair.there.answer(Prediction, lambda *_: [(about(1, t=50.0), Stamp(8, 1)), (about(2), Stamp(1, 1))])
-    pair.here.answer(Prediction, lambda *_: [(about(1, t=10.0), Stamp(9, 2)), (about(3), None)])
+    pair.there.declare_queryable(Prediction, lambda *_: [(about(1, t=50.0), Stamp(8, 1)), (about(2), Stamp(1, 1))])
+    pair.here.declare_queryable(Prediction, lambda *_: [(about(1, t=10.0), Stamp(9, 2)), (about(3), None)])
     found = asked(pair.here, Prediction, "*", 3)
     assert found == [(about(1, t=10.0), Stamp(9, 2)), (about(2), Stamp(1, 1)), (about(3), None)]
 
@@ -234,8 +234,8 @@ def test_a_refusal_does_not_silence_the_others(pair: Pair) -> None:
     def refuse(*_: object) -> list[tuple[Prediction, Stamp | None]]:
         raise ValueError("prediction: found horizon=x, expected a number; write horizon=30")
 
-    pair.here.answer(Prediction, refuse)
-    pair.there.answer(Prediction, lambda *_: [(about(4), STAMP)])
+    pair.here.declare_queryable(Prediction, refuse)
+    pair.there.declare_queryable(Prediction, lambda *_: [(about(4), STAMP)])
     assert asked(pair.here, Prediction, "*") == [(about(4), STAMP)]
 
 
@@ -245,37 +245,37 @@ def test_a_question_with_a_payload_is_answered_or_refused_in_words(pair: Pair) -
             raise ValueError("what if: found odd, expected even; correct it")
         return [(about(uav or 0), STAMP)] if payload == b"even" else []
 
-    pair.there.answer(Prediction, reply)
+    pair.there.declare_queryable(Prediction, reply)
     heard: SimpleQueue = SimpleQueue()
-    assert told(heard, lambda: heard.put(found) if (found := pair.here.inquire(Prediction, 4, b"even")) else None)
+    assert told(heard, lambda: heard.put(found) if (found := pair.here.get_one(Prediction, 4, b"even")) else None)
     with pytest.raises(ValueError, match=r"^what if: found odd, expected even; correct it$"):
-        pair.here.inquire(Prediction, 4, b"odd")
-    assert pair.here.inquire(Prediction, 4, b"nobody knows") is None
+        pair.here.get_one(Prediction, 4, b"odd")
+    assert pair.here.get_one(Prediction, 4, b"nobody knows") is None
 
 
 def test_control_messages_are_answered_by_every_process(pair: Pair) -> None:
-    pair.there.answer(FleetState, lambda *_: [(EXAMPLES[FleetState], None)])
-    pair.here.answer(FleetState, lambda *_: [(EXAMPLES[FleetState], None)])
+    pair.there.declare_queryable(FleetState, lambda *_: [(EXAMPLES[FleetState], None)])
+    pair.here.declare_queryable(FleetState, lambda *_: [(EXAMPLES[FleetState], None)])
     assert asked(pair.here, FleetState, "*", 2) == [(EXAMPLES[FleetState], None)] * 2
 
 
 def test_nobody_to_ask_is_an_empty_answer(pair: Pair) -> None:
-    assert pair.here.ask(Account) == []
+    assert pair.here.get(GatewayCounters) == []
 
 
 def test_newest_prefers_the_epoch_then_the_time() -> None:
     early, late = about(1, t=1.0), about(1, t=2.0)
-    assert newest([(late, Stamp(1, 1)), (early, Stamp(2, 1))]) == [(early, Stamp(2, 1))]
-    assert newest([(early, Stamp(2, 1)), (late, Stamp(2, 2))]) == [(late, Stamp(2, 2))]
-    assert newest([(late, None), (early, Stamp(1, 1))]) == [(early, Stamp(1, 1))]
-    assert newest([]) == []
+    assert select_latest([(late, Stamp(1, 1)), (early, Stamp(2, 1))]) == [(early, Stamp(2, 1))]
+    assert select_latest([(early, Stamp(2, 1)), (late, Stamp(2, 2))]) == [(late, Stamp(2, 2))]
+    assert select_latest([(late, None), (early, Stamp(1, 1))]) == [(early, Stamp(1, 1))]
+    assert select_latest([]) == []
 
 
 def test_newest_keeps_every_kind_of_alert() -> None:
     both = [(Alert(uav=1, t=1.0, kind=kind), None) for kind in (AlertKind.CONFLICT, AlertKind.GROUND)]
-    assert newest(both) == both
+    assert select_latest(both) == both
     near = [(Alert(uav=1, t=1.0, kind=AlertKind.CONFLICT, other=other), None) for other in (2, 3)]
-    assert newest(near) == near
+    assert select_latest(near) == near
 
 
 # --- zenoh alone -----------------------------------------------------------------------------------------------------
@@ -290,9 +290,9 @@ def test_selector_parameters_and_payload_reach_the_queryable_and_a_refusal_its_a
 
     at, raw = router
     with connect(at) as bus:
-        bus.answer(Prediction, reply)
+        bus.declare_queryable(Prediction, reply)
         replies: list[zenoh.Reply] = []
-        asked = key(Prediction, 7) + "?horizon=30;step=0.5"
+        asked = key_of(Prediction, 7) + "?horizon=30;step=0.5"
         given = told(seen, lambda: replies.extend(raw.get(asked, payload=b"route")))
         assert given == (7, {"horizon": "30", "step": "0.5"}, b"route")
         assert replies[0].err is not None and replies[0].err.payload.to_string().endswith("ask for less")
@@ -307,7 +307,7 @@ def test_a_process_is_present_until_it_leaves(router: tuple) -> None:
 
     watch = raw.liveliness().declare_subscriber("parauav/@live/**", changed)
     with connect(at) as bus:
-        bus.present("worker/w1")
+        bus.declare_liveliness("worker/w1")
         assert came.wait(PATIENCE_S) and not gone.is_set()
     assert gone.wait(PATIENCE_S)
     watch.undeclare()
@@ -324,30 +324,32 @@ def test_the_router_of_deploy_listens_on_loopback_alone() -> None:
 
 
 def test_keys() -> None:
-    assert key(Sample, 7) == "parauav/7/sample" and key(Sample, "*") == "parauav/*/sample"
-    assert key(FleetState, "ab") == "parauav/@fleet/state/ab" and key(Account, "*") == "parauav/@gateway/*"
-    assert uav_in("parauav/7/sample") == 7
+    assert key_of(Sample, 7) == "parauav/7/sample" and key_of(Sample, "*") == "parauav/*/sample"
+    assert (
+        key_of(FleetState, "ab") == "parauav/@fleet/state/ab" and key_of(GatewayCounters, "*") == "parauav/@gateway/*"
+    )
+    assert uav_of_key("parauav/7/sample") == 7
     for name in ("parauav/*/sample", "parauav/@fleet/state/7", "parauav/-7/sample", "parauav/²/sample", "7", ""):
-        assert uav_in(name) is None, name
+        assert uav_of_key(name) is None, name
 
 
 @pytest.mark.parametrize("text", ["", "udp/127.0.0.1:7447", "tcp/:7447", "tcp/h:0", "tcp/h:65536", "tcp/h:x", "h:7447"])
 def test_an_endpoint_that_is_none_is_refused_in_a_sentence(text: str) -> None:
-    for use in (endpoint, reachable, connect, open_router):
+    for use in (parse_endpoint, accepts_connections, connect, open_router):
         with pytest.raises(ValueError, match=r"--router: found .*, expected e\.g\. tcp/127\.0\.0\.1:7447; name"):
             use(text)
 
 
 def test_endpoints() -> None:
-    assert endpoint("tcp/127.0.0.1:7447") == ("127.0.0.1", 7447)
-    assert endpoint("tls/[::1]:7447") == ("::1", 7447)
+    assert parse_endpoint("tcp/127.0.0.1:7447") == ("127.0.0.1", 7447)
+    assert parse_endpoint("tls/[::1]:7447") == ("::1", 7447)
 
 
 def test_reachable_follows_the_router(free_port: int) -> None:
     router = f"tcp/127.0.0.1:{free_port}"
-    assert not reachable(router)
+    assert not accepts_connections(router)
     with pytest.raises(ConnectionError, match=r"no response; start `zenohd` or `fleet up`"):
         connect(router)
     with open_router(router):
-        assert reachable(router)
-    assert not reachable(router)
+        assert accepts_connections(router)
+    assert not accepts_connections(router)

@@ -10,17 +10,24 @@ from made_up import GROUP, V
 from scipy.stats import norm
 
 from twin_worker.confidence.calibration.__main__ import main
-from twin_worker.confidence.calibration.conformal import factors_of
-from twin_worker.confidence.calibration.evaluate_table import claimed, figures, left_out
+from twin_worker.confidence.calibration.conformal import conformal_factors
+from twin_worker.confidence.calibration.evaluate_table import figures, regions_cross_fitted, regions_of_table
 from twin_worker.confidence.calibration.fit_table import fit, fit_sigma
-from twin_worker.confidence.calibration.scored_predictions import Scored, joined
-from twin_worker.confidence.calibration_table import INDEPENDENT, KNOTS, Doubt, doubt_of, law_of_growth, untaught
-from twin_worker.confidence.groups import airframe_class, group_of, wider
-from twin_worker.confidence.lagged_ensemble import Earlier
-from twin_worker.confidence.table_files import Source, Tables, load, read_tables, write
+from twin_worker.confidence.calibration.scored_predictions import ScoredPredictions, concatenate
+from twin_worker.confidence.calibration_table import (
+    INDEPENDENT,
+    KNOTS,
+    UncertaintyFeatures,
+    default_table,
+    error_growth,
+    uncertainty_features,
+)
+from twin_worker.confidence.groups import airframe_class, group_chain, group_name
+from twin_worker.confidence.lagged_ensemble import LaggedForecasts
+from twin_worker.confidence.table_files import TableSet, TableSource, load, read_tables, write
 from twin_worker.confidence.weighted_quantile import (
     censored_quantile,
-    masses,
+    kaplan_meier_masses,
     median_passage,
     survival,
     weighted_quantile,
@@ -29,7 +36,7 @@ from twin_worker.numerics.prediction_errors import AHEAD, axes_error, first_pass
 
 
 @pytest.fixture(scope="module")
-def past() -> Scored:
+def past() -> ScoredPredictions:
     return made_up.scored(10, 30, seed=1)
 
 
@@ -61,7 +68,7 @@ def test_a_flight_that_was_not_followed_to_the_end_is_censored_where_it_was_lost
 
 
 def test_a_path_that_begins_later_has_a_length_behind_it():
-    assert path_length(made_up.LINE, V, before=500.0)[0] == 500.0
+    assert path_length(made_up.LINE, V, length_before=500.0)[0] == 500.0
     assert path_length(made_up.LINE, V)[-1] == pytest.approx(180 * V)
 
 
@@ -81,8 +88,10 @@ def test_weighted_quantiles_are_quantiles_and_heed_the_weights():
 
 def test_bounds_from_above_give_their_weight_to_what_lies_below():
     x = np.array([4.0, 3.0, 2.0, 1.0])
-    assert masses(x, np.ones(4), np.ones(4, bool)) == pytest.approx([0.25] * 4)
-    assert masses(x, np.ones(4), np.array([True, False, True, True])) == pytest.approx([0.25, 0.0, 0.375, 0.375])
+    assert kaplan_meier_masses(x, np.ones(4), np.ones(4, bool)) == pytest.approx([0.25] * 4)
+    assert kaplan_meier_masses(x, np.ones(4), np.array([True, False, True, True])) == pytest.approx(
+        [0.25, 0.0, 0.375, 0.375]
+    )
     assert censored_quantile(x, np.ones(4), np.zeros(4, bool), 0.9) == 0.0
 
 
@@ -98,13 +107,13 @@ def test_survival_by_hand():
 
 
 def test_the_fit_finds_how_much_wider_errors_are_than_the_ensemble(past):
-    scale, _, _ = fit_sigma(past.doubt, past.errors()[..., :3])
+    scale, _, _ = fit_sigma(past.features, past.errors()[..., :3])
     assert np.median(scale[4:, 0]) == pytest.approx(0.8 * 2.0, rel=0.15)  # heavy tails take a normal law for narrower
 
 
 def test_nine_of_ten_are_held_at_every_look_ahead(table):
     fresh = made_up.scored(40, 50, seed=2)  # 2,000 predictions it has not seen
-    got = figures(fresh, claimed(table, fresh))
+    got = figures(fresh, regions_of_table(table, fresh))
     assert got["coverage"] == pytest.approx(0.9, abs=0.03)
     for at in (5, 16, 30, 60, 120):
         assert got[f"coverage_{at}"] == pytest.approx(0.9, abs=0.04)
@@ -112,7 +121,7 @@ def test_nine_of_ten_are_held_at_every_look_ahead(table):
 
 
 def test_what_is_left_out_says_the_same(past):
-    got = figures(past, left_out(past, GROUP))
+    got = figures(past, regions_cross_fitted(past, GROUP))
     assert got["coverage"] == pytest.approx(0.9, abs=0.04)
 
 
@@ -121,7 +130,7 @@ def test_how_much_each_axis_alone_holds_is_measured_with_the_factors(together, a
     """Normal errors in each axis, of one size in all three or of three."""
     rng = np.random.default_rng(9)
     size = np.abs(rng.standard_normal((20_000, 1, 1 if together else 3))) * np.ones(3)
-    factor, found = factors_of(size, np.ones(20_000))
+    factor, found = conformal_factors(size, np.ones(20_000))
     assert found == pytest.approx(alone, abs=0.004)
     assert factor == pytest.approx(np.full(3, norm.ppf((1 + alone) / 2)), abs=0.05)
     assert (size <= factor).all(axis=2).mean() == pytest.approx(0.9, abs=0.005)
@@ -140,27 +149,29 @@ def test_a_table_tells_how_much_an_axis_alone_holds_also_from_a_file(table, tmp_
 
 def test_a_table_is_not_honest_of_errors_twice_as_large(table):
     fresh = made_up.scored(10, 30, seed=3, loud=2.0)
-    assert figures(fresh, claimed(table, fresh))["coverage"] < 0.75
+    assert figures(fresh, regions_of_table(table, fresh))["coverage"] < 0.75
 
 
 def test_horizons_hold_and_tell_easy_minutes_from_hard_ones(table):
     fresh = made_up.scored(40, 50, seed=4)
-    got = figures(fresh, claimed(table, fresh))
+    got = figures(fresh, regions_of_table(table, fresh))
     assert 0.9 <= got["hit_rate"] <= 0.99
     assert got["rank_correlation"] >= 0.5
-    horizon = claimed(table, fresh)[1]
+    horizon = regions_of_table(table, fresh)[1]
     assert np.mean(horizon > 60) > 0.5 and np.mean(horizon < 60) > 0.1
-    hard = fresh.doubt.spread[:, 40, 0] > np.quantile(fresh.doubt.spread[:, 40, 0], 0.8)
-    assert figures(fresh.part(hard), claimed(table, fresh.part(hard)))["hit_rate"] >= 0.82  # the hard ones hold too
+    hard = fresh.features.spread[:, 40, 0] > np.quantile(fresh.features.spread[:, 40, 0], 0.8)
+    assert (
+        figures(fresh.select(hard), regions_of_table(table, fresh.select(hard)))["hit_rate"] >= 0.82
+    )  # the hard ones hold too
 
 
 def test_without_an_ensemble_the_law_of_growth_is_calibrated_instead(past):
-    law = doubt_of(None, None, "hybrid", AHEAD)
+    law = uncertainty_features(None, None, "hybrid", AHEAD)
     bare, fresh = (
-        replace(of, doubt=Doubt(np.array([law.spread] * len(of)), of.doubt.revision))
+        replace(of, features=UncertaintyFeatures(np.array([law.spread] * len(of)), of.features.revision))
         for of in (past, made_up.scored(20, 30, seed=5))
     )
-    assert figures(fresh, claimed(fit(bare, GROUP), fresh))["coverage"] == pytest.approx(0.9, abs=0.04)
+    assert figures(fresh, regions_of_table(fit(bare, GROUP), fresh))["coverage"] == pytest.approx(0.9, abs=0.04)
 
 
 def test_nobody_followed_beyond_a_minute(past):
@@ -169,15 +180,15 @@ def test_nobody_followed_beyond_a_minute(past):
     short = fit(replace(past, flown=flown, length=length), GROUP)
     for part in (short.scale, short.lag, short.floor, short.factor, short.scores, short.risks):
         assert np.isfinite(part).all()
-    assert (short.half_axes(past.doubt, AHEAD)[:, -1] > 0).all()
+    assert (short.half_axes(past.features, AHEAD)[:, -1] > 0).all()
 
 
 def test_a_wider_table_is_left_out_by_groups(past):
     other = replace(made_up.scored(4, 30, seed=6, loud=3.0), group=np.full(120, "both/arduplane/c172p/known"))
-    both = joined([past, other])
+    both = concatenate([past, other])
     wide = both.folds("route/arduplane/*/known")
     assert wide.max() == 1 and both.folds(GROUP).max() == 13
-    assert (fit(both, "route/arduplane/*/known").half_axes(past.doubt, AHEAD)[:, 30] > 10.0).any()
+    assert (fit(both, "route/arduplane/*/known").half_axes(past.features, AHEAD)[:, 30] > 10.0).any()
 
 
 # --- groups and tables -----------------------------------------------------------------------------------------------
@@ -187,20 +198,20 @@ def test_a_stray_prediction_is_no_setting_of_its_own(past):
     stray = replace(
         made_up.scored(1, 3, seed=15, loud=50.0), group=np.full(3, "hybrid/arduplane/fixed_wing_fast/known")
     )
-    both, group = joined([past, stray]), "route/arduplane/*/known"
-    assert not both.several(group) and both.folds(group).max() == 10
-    apart, alone = (fit(one, group).half_axes(past.doubt, AHEAD).mean() for one in (both, past))
+    both, group = concatenate([past, stray]), "route/arduplane/*/known"
+    assert not both.spans_settings(group) and both.folds(group).max() == 10
+    apart, alone = (fit(one, group).half_axes(past.features, AHEAD).mean() for one in (both, past))
     assert apart == pytest.approx(alone, rel=0.15)
 
 
 def test_the_chain_of_groups_keeps_parameters_longer_than_the_airframe():
     chain = ["a/b/c/known", "a/b/*/known", "a/b/*/*", "a/*/*/*"]
-    assert list(wider("a/b/c/known")) == chain
-    assert wider("a") == wider("a/*/*/*") == ("a/*/*/*",)
+    assert list(group_chain("a/b/c/known")) == chain
+    assert group_chain("a") == group_chain("a/*/*/*") == ("a/*/*/*",)
     ways = ["route/arduplane/fixed_wing/known", "route/arduplane/*/known", "route/arduplane/*/*", "route/*/*/*"]
-    assert list(wider(GROUP)) == [GROUP, *ways] and list(wider("both" + GROUP[6:]))[1:] == ways
-    assert group_of("hybrid", "arduplane: L1 + TECS", "fixed_wing", "known") == GROUP
-    assert group_of("imm", "", "", "a/b") == "imm/none/none/a b"
+    assert list(group_chain(GROUP)) == [GROUP, *ways] and list(group_chain("both" + GROUP[6:]))[1:] == ways
+    assert group_name("hybrid", "arduplane: L1 + TECS", "fixed_wing", "known") == GROUP
+    assert group_name("imm", "", "", "a/b") == "imm/none/none/a b"
     assert [airframe_class("fixed_wing", v) for v in (22.0, 36.0, 50.0)] == [
         "fixed_wing",
         "fixed_wing",
@@ -211,7 +222,7 @@ def test_the_chain_of_groups_keeps_parameters_longer_than_the_airframe():
 
 def test_the_narrowest_table_is_chosen_and_said(table):
     names = [GROUP, "route/arduplane/*/known", "route/*/*/*"]
-    tables = Tables({name: replace(table, group=name) for name in names})
+    tables = TableSet({name: replace(table, group=name) for name in names})
     for group, chosen in (
         (GROUP, names[0]),
         ("hybrid/arduplane/c172p/known", names[1]),
@@ -229,9 +240,9 @@ def test_the_narrowest_table_is_chosen_and_said(table):
 @pytest.mark.parametrize("method", ["dynamics", "hybrid", "paper", "copter", "greybox", "imm", "unheard of"])
 def test_an_untaught_table_is_never_narrower_than_the_law_of_growth(method):
     ahead = np.concatenate([AHEAD, [200.0, 300.0]])
-    law = law_of_growth(method, ahead)
+    law = error_growth(method, ahead)
     for spread in (None, np.zeros((93, 3)), np.full((93, 3), 5.0)):
-        axes = untaught(method).half_axes(doubt_of(spread, None, method, ahead), ahead)
+        axes = default_table(method).half_axes(uncertainty_features(spread, None, method, ahead), ahead)
         assert np.isfinite(axes).all() and (axes >= law * 0.99)[1:91].all() and (axes[-1] > axes[-2]).all()
 
 
@@ -239,31 +250,31 @@ def test_an_untaught_table_is_never_narrower_than_the_law_of_growth(method):
 def test_a_spread_that_is_nonsense_is_replaced_where_it_is(noise):
     spread = np.ones((91, 3))
     spread[30:40, 1] = noise
-    got = doubt_of(spread, spread, "hybrid", AHEAD)
+    got = uncertainty_features(spread, spread, "hybrid", AHEAD)
     assert np.isfinite(got.spread).all() and got.spread[29, 1] == 1.0
-    assert np.allclose(got.spread[30:40, 1], law_of_growth("hybrid", AHEAD)[30:40, 1])
+    assert np.allclose(got.spread[30:40, 1], error_growth("hybrid", AHEAD)[30:40, 1])
     assert np.array_equal(got.revision, got.spread)
 
 
 def test_a_prediction_that_was_revised_is_in_doubt():
-    earlier = Earlier()
-    assert earlier.revised(0.0, AHEAD, made_up.LINE) is None
+    earlier = LaggedForecasts()
+    assert earlier.revision(0.0, AHEAD, made_up.LINE) is None
     turn = 80.0 * np.column_stack([np.sin(AHEAD / 4), 1 - np.cos(AHEAD / 4), 0 * AHEAD])
     at = (AHEAD + 5.0) / 4
     earlier.add(0.0, AHEAD, turn)
     later = 80.0 * np.column_stack([np.sin(at), 1 - np.cos(at), 0 * at])
-    assert earlier.revised(3.0, AHEAD, later) is None  # so soon it says nothing
-    assert earlier.revised(5.0, AHEAD, later).max() < 3.0  # the same turn: what is left is the interpolation's
-    revised = earlier.revised(5.0, AHEAD, later + np.outer(AHEAD, [0.0, 0.0, 2.0]))
+    assert earlier.revision(3.0, AHEAD, later) is None  # so soon it says nothing
+    assert earlier.revision(5.0, AHEAD, later).max() < 3.0  # the same turn: what is left is the interpolation's
+    revised = earlier.revision(5.0, AHEAD, later + np.outer(AHEAD, [0.0, 0.0, 2.0]))
     assert np.allclose(revised[:80, 2], 2.0 * AHEAD[:80]) and revised[-1, 2] == revised[-2, 2]  # its end stays
-    assert earlier.revised(30.0, AHEAD, later) is None and earlier.revised(5.0, AHEAD + 176.0, later) is None
+    assert earlier.revision(30.0, AHEAD, later) is None and earlier.revision(5.0, AHEAD + 176.0, later) is None
     earlier.clear()
-    assert earlier.revised(5.0, AHEAD, later) is None
+    assert earlier.revision(5.0, AHEAD, later) is None
 
 
 def test_tables_are_written_and_read_back(tmp_path, table):
     path = tmp_path / "a.json"
-    write(path, [table], [Source("p.npz", 300, ("seed-1",))], "2024-05-01", "fit p.npz")
+    write(path, [table], [TableSource("p.npz", 300, ("seed-1",))], "2024-05-01", "fit p.npz")
     back = read_tables(path).by_group[GROUP]
     for name in ("scale", "lag", "floor", "factor", "scores", "risks"):
         assert np.allclose(getattr(back, name), getattr(table, name), rtol=1e-3)
@@ -308,17 +319,17 @@ def test_the_tables_that_come_along_are_whole():
 # --- the command -----------------------------------------------------------------------------------------------------
 
 
-def arrays(scored: Scored) -> dict[str, np.ndarray]:
+def arrays(scored: ScoredPredictions) -> dict[str, np.ndarray]:
     names = ("t0", "path", "flown", "length", "predicted_length", "group", "method", "flight")
-    return {"ahead": AHEAD, "spread": scored.doubt.spread} | {name: getattr(scored, name) for name in names}
+    return {"ahead": AHEAD, "spread": scored.features.spread} | {name: getattr(scored, name) for name in names}
 
 
-def as_npz(path, scored: Scored) -> None:
+def as_npz(path, scored: ScoredPredictions) -> None:
     np.savez(path, **arrays(scored))
 
 
 def test_the_command_fits_and_checks(tmp_path, capsys, past):
-    as_npz(tmp_path / "p.npz", past.part(np.arange(150)))
+    as_npz(tmp_path / "p.npz", past.select(np.arange(150)))
     as_npz(tmp_path / "few.npz", made_up.scored(2, 12, seed=7, group="imm/none/fixed_wing/known"))
     out = tmp_path / "t.json"
     assert main(["fit", str(tmp_path / "p.npz"), str(tmp_path / "few.npz"), "--out", str(out)]) == 0
@@ -328,7 +339,7 @@ def test_the_command_fits_and_checks(tmp_path, capsys, past):
     sheet = json.loads(out.read_text())
     folder = tmp_path.name
     assert sheet["command"].endswith(f"fit {folder}/p.npz {folder}/few.npz") and str(tmp_path) not in out.read_text()
-    assert {t["group"] for t in sheet["tables"]} == set(wider(GROUP))
+    assert {t["group"] for t in sheet["tables"]} == set(group_chain(GROUP))
     assert main(["check", str(tmp_path / "p.npz"), "--with", str(out)]) == 0
     told = capsys.readouterr().out
     assert "table alone: coverage" in told and "adapted in flight: coverage" in told
@@ -343,7 +354,7 @@ def test_few_flights_of_one_way_are_told_by_those_of_all(tmp_path, capsys, past)
     told = capsys.readouterr().out
     assert "no table from 60 predictions, 4 flights; with those of route/arduplane/fixed_wing/known there are" in told
     found = read_tables(out).by_group
-    assert set(found) == set(wider(GROUP)) and found["route/*/*/*"].starts == 360
+    assert set(found) == set(group_chain(GROUP)) and found["route/*/*/*"].starts == 360
     assert "route/arduplane/fixed_wing/known: 360 predictions of 14 flights; flights left out" in told
 
 
@@ -357,5 +368,5 @@ def test_the_command_says_what_is_wrong(tmp_path, capsys, past):
     assert main(["fit", str(bad), *out]) == 2 and "another look-ahead grid" in capsys.readouterr().err
     as_npz(bad, replace(past, flown=past.flown[:, :61]))
     assert main(["fit", str(bad), *out]) == 2 and "found flown of shape" in capsys.readouterr().err
-    as_npz(bad, past.part(np.arange(3)))
+    as_npz(bad, past.select(np.arange(3)))
     assert main(["fit", str(bad), *out]) == 2 and "give more flights" in capsys.readouterr().err

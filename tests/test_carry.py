@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.contract import Message, Model, Prediction, Sample
-from twin_worker.ownership.cold_start import go_on, revive
-from twin_worker.ownership.handover import CARRIED, Load, packed, unpacked
-from twin_worker.ownership.typed_serialization import pack, unpack
-from twin_worker.twin.state.state import Twin, hear
+from twin_worker.ownership.cold_start import continue_prediction, restore_model
+from twin_worker.ownership.handover import REGISTRY, Snapshot, decode_snapshot, encode_snapshot
+from twin_worker.ownership.typed_serialization import deserialise, serialise
+from twin_worker.twin.state.state import Twin, ingest
 from twin_worker.twin.step import advance
 
 
@@ -29,9 +29,9 @@ def said(twin: Twin, messages: list[Message]) -> list[Message]:
 
 
 def test_who_takes_over_says_what_the_other_would_have_said(twin: Twin, heard: tuple[Message, ...]) -> None:
-    data = packed(Load(twin, inbox=[heard[-1]]))
-    carried = unpacked(data, 1)
-    assert packed(carried) == data and carried.inbox == [heard[-1]]
+    data = encode_snapshot(Snapshot(twin, inbox=[heard[-1]]))
+    carried = decode_snapshot(data, 1)
+    assert encode_snapshot(carried) == data and carried.inbox == [heard[-1]]
     rest = later(heard)
     assert len(rest) > 100
     one, other = said(copy.deepcopy(twin), rest), said(carried.twin, rest)
@@ -40,44 +40,47 @@ def test_who_takes_over_says_what_the_other_would_have_said(twin: Twin, heard: t
 
 
 def test_what_was_one_thing_stays_one(twin: Twin) -> None:
-    assert any(twin.plant is one.plant for one in twin.pool), "the model in force is one of the pool"
-    carried = unpacked(packed(Load(twin)), 1).twin
-    assert any(carried.plant is one.plant for one in carried.pool)
+    assert any(twin.models.active_model is one.plant for one in twin.models.verified_models), (
+        "the model in force is one of the pool"
+    )
+    carried = decode_snapshot(encode_snapshot(Snapshot(twin)), 1).twin
+    assert any(carried.models.active_model is one.plant for one in carried.models.verified_models)
 
 
 def test_a_multirotor_travels_too(hovered: Twin) -> None:
-    assert packed(unpacked(packed(Load(hovered)), 7)) == packed(Load(hovered))
+    assert encode_snapshot(decode_snapshot(encode_snapshot(Snapshot(hovered)), 7)) == encode_snapshot(Snapshot(hovered))
 
 
 def test_a_twin_is_a_few_megabytes_at_most(twin: Twin) -> None:
-    assert len(packed(Load(twin))) < 3_000_000
+    assert len(encode_snapshot(Snapshot(twin))) < 3_000_000
 
 
 def test_another_aircraft_s_twin_is_refused(twin: Twin) -> None:
     with pytest.raises(ValueError, match=r"uav-2: found another object, expected its twin; it starts without"):
-        unpacked(packed(Load(twin)), 2)
+        decode_snapshot(encode_snapshot(Snapshot(twin)), 2)
     with pytest.raises(ValueError, match="found another object"):
-        unpacked(pack([1, 2], CARRIED), 1)
+        decode_snapshot(serialise([1, 2], REGISTRY), 1)
 
 
 def test_telemetry_of_other_columns_is_refused(twin: Twin) -> None:
     narrow = copy.deepcopy(twin)
-    narrow.history.put("velocity", np.array([1e9]), np.zeros((1, 2)))
+    narrow.telemetry.history.replace_rows("velocity", np.array([1e9]), np.zeros((1, 2)))
     with pytest.raises(ValueError, match="uav-1: found other telemetry columns, expected ours; it starts without"):
-        unpacked(packed(Load(narrow)), 1)
+        decode_snapshot(encode_snapshot(Snapshot(narrow)), 1)
 
 
 HOSTILE = (
     ["o", "os.system", "x", 1],
     ["o", "Twin"],
-    ["o", "Note", "event", None, "t", 0.0, "said", "", "more", 1],
+    ["o", "FlightEvent", "event", None, "t", 0.0, "message", "", "more", 1],
     ["s", "Twin", b"\x80"],
+    ["o", "Timer", "last", 0.0, "more", 1],
     ["s", "Status", b"\x80"],
     ["e", "Twin", 1],
-    ["e", "State", "no such"],
-    ["n", "State", 1],
+    ["e", "TwinState", "no such"],
+    ["n", "TwinState", 1],
     ["x", "CubicSpline", ["t", ["a", "<f8", [2], bytes(16)], ["a", "<f8", [9, 9], bytes(648)]]],
-    ["x", "Kept", ["t", ["a", "<f8", [2], bytes(16)], ["a", "<f8", [1, 3], bytes(24)]]],
+    ["x", "RowBuffer", ["t", ["a", "<f8", [2], bytes(16)], ["a", "<f8", [1, 3], bytes(24)]]],
     ["x", "Twin", None],
     ["a", "|O8", [1], bytes(8)],
     ["a", "<f8", [1 << 60], b""],
@@ -97,7 +100,7 @@ HOSTILE = (
 @pytest.mark.parametrize("told", HOSTILE, ids=lambda told: repr(told)[:30])
 def test_hostile_trees_are_refused(told: object) -> None:
     with pytest.raises(ValueError):
-        unpack(msgspec.msgpack.encode(told), CARRIED)
+        deserialise(msgspec.msgpack.encode(told), REGISTRY)
 
 
 def test_depth_is_limited() -> None:
@@ -105,18 +108,18 @@ def test_depth_is_limited() -> None:
     for _ in range(60):
         deep = ["l", deep]
     with pytest.raises(ValueError, match="deep"):
-        unpack(msgspec.msgpack.encode(deep), CARRIED)
+        deserialise(msgspec.msgpack.encode(deep), REGISTRY)
 
 
 @given(st.binary(max_size=200))
 def test_random_bytes_are_refused_or_harmless(data: bytes) -> None:
     with pytest.raises(ValueError):
-        unpacked(data, 1)
+        decode_snapshot(data, 1)
 
 
 def test_what_nobody_named_is_not_carried() -> None:
     with pytest.raises(TypeError, match=r"complex: is not serialisable; add it"):
-        pack([1j], CARRIED)
+        serialise([1j], REGISTRY)
 
 
 # --- cold ------------------------------------------------------------------------------------------------------------
@@ -125,41 +128,51 @@ def test_what_nobody_named_is_not_carried() -> None:
 @pytest.fixture
 def cold(heard: tuple[Message, ...]) -> Twin:
     """A twin that has heard everything and learnt nothing."""
-    twin = Twin(1)
+    twin = Twin.of(1)
     for message in heard:
-        hear(twin, message)
+        ingest(twin, message)
     return twin
 
 
 def test_a_published_model_flies_at_once_and_about_as_well(twin: Twin, cold: Twin, heard: tuple) -> None:
-    assert twin.model is not None and revive(cold, twin.model)
-    assert cold.in_force.fit == twin.in_force.fit and "taken over" in cold.in_force.sentence
+    assert twin.identification.message is not None and restore_model(cold, twin.identification.message)
+    assert (
+        cold.models.active_verdict.fit == twin.models.active_verdict.fit
+        and "taken over" in cold.models.active_verdict.sentence
+    )
     made = next(m for m in said(cold, later(heard, 3.0)) if isinstance(m, Prediction))
-    before = twin.prediction
+    before = twin.prediction.latest
     assert made.method in f.ROUTE, made.sentence
     assert made.t - before.t < 3.0 and made.path.shape[1] == 3
 
 
 def test_the_last_prediction_of_another_is_said_to_be_that_and_trusted_less(twin: Twin) -> None:
-    fresh, last = Twin(1), twin.prediction
-    assert go_on(fresh, last) and fresh.base is not None and fresh.base.sentence.endswith("from another worker")
-    before, after = last.tube.numpy(), fresh.base.tube.numpy()
+    fresh, last = Twin.of(1), twin.prediction.latest
+    assert (
+        continue_prediction(fresh, last)
+        and fresh.prediction.last_rollout is not None
+        and fresh.prediction.last_rollout.sentence.endswith("from another worker")
+    )
+    before, after = (
+        last.prediction_region_half_axes.numpy(),
+        fresh.prediction.last_rollout.prediction_region_half_axes.numpy(),
+    )
     assert (after >= before).all() and (after[0] > before[0]).any()
-    assert fresh.base.horizon_s == max(last.horizon_s - fresh.pace.predict, 0.0)
-    assert (fresh.base.path.numpy() == last.path.numpy()).all()
-    assert not go_on(fresh, msgspec.structs.replace(last, tube=last.ahead))
+    assert fresh.prediction.last_rollout.horizon_s == max(last.horizon_s - fresh.config.schedule.predict, 0.0)
+    assert (fresh.prediction.last_rollout.path.numpy() == last.path.numpy()).all()
+    assert not continue_prediction(fresh, msgspec.structs.replace(last, prediction_region_half_axes=last.ahead))
 
 
 def test_a_model_that_cannot_be_is_not_believed(twin: Twin, cold: Twin) -> None:
-    model, told = twin.model, twin.model.derivatives
+    model, told = twin.identification.message, twin.identification.message.derivatives
     replace = msgspec.structs.replace
     for odd in (
         replace(model, derivatives=None),
-        replace(model, in_force=None),
+        replace(model, active_verdict=None),
         replace(model, derivatives=replace(told, names=told.names[::-1])),
         replace(model, derivatives=replace(told, prior="airliner")),
         replace(model, derivatives=replace(told, U0=0.0)),
         replace(model, derivatives=replace(told, value=replace(told.value, shape=(5,)))),
         replace(model, derivatives=replace(told, covariance=told.value)),
     ):
-        assert not revive(cold, odd) and cold.plant is None
+        assert not restore_model(cold, odd) and cold.models.active_model is None

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from fleet.bus.codec import Stamp
-from fleet.bus.epoch_fence import GIVE_UP_S, Fence
-from twin_worker.ownership.protocol_state import PAUSE_S, SETTLE_S, SILENT_S, Claims, Rank
+from fleet.bus.epoch_fence import WRITER_TIMEOUT_S, EpochFence
+from twin_worker.ownership.protocol_state import CLAIM_DELAY_S, PAUSE_S, SILENT_S, FencingToken, OwnershipState
 from twin_worker.ownership.rendezvous import owners
 
 UAVS = range(5)
@@ -26,7 +26,7 @@ LEASE_S, TURN_S, ANNOUNCE_S, HAND_S = 1.6, 0.1, 0.25, 3.0  # a lease of 1 s is o
 class Node:
     """One worker process and its link."""
 
-    claims: Claims
+    claims: OwnershipState
     skew_ms: int
     born: int
     inbox: deque[Callable[[], None]] = field(default_factory=deque)  # on its way, in order
@@ -50,8 +50,8 @@ class Fleet(RuleBasedStateMachine):
         self.now, self.count = 100.0, 0
         self.nodes: dict[str, Node] = {}
         self.calm = False  # nothing has happened since there was peace
-        self.fence = Fence(lambda: self.now)
-        self.ranks: dict[int, set[Rank]] = {uav: set() for uav in UAVS}  # ever taken
+        self.fence = EpochFence(lambda: self.now)
+        self.ranks: dict[int, set[FencingToken]] = {uav: set() for uav in UAVS}  # ever taken
         self.accepted: dict[int, tuple[Stamp, float]] = {}
 
     # --- what happens to workers -------------------------------------------------------------------------------------
@@ -62,7 +62,7 @@ class Fleet(RuleBasedStateMachine):
         self.calm = False
         self.count += 1
         name = f"{self.count:016x}"
-        node = self.nodes[name] = Node(Claims(name, ids), 1000 * skew_s, self.count)
+        node = self.nodes[name] = Node(OwnershipState(name, ids), 1000 * skew_s, self.count)
         node.claims.known.update(uav for uav in UAVS if uav in ids)
         self._connect(node)
         self._turn(node)
@@ -95,7 +95,7 @@ class Fleet(RuleBasedStateMachine):
         before = self._taken() if self.calm else None
         self._restart()
         if before is not None:
-            self._pass_time(int((SETTLE_S + 1.0) / TURN_S))
+            self._pass_time(int((CLAIM_DELAY_S + 1.0) / TURN_S))
             assert self._taken() == before
             self.calm = True
 
@@ -123,7 +123,7 @@ class Fleet(RuleBasedStateMachine):
     @invariant()
     def nobody_holds_what_it_may_not(self) -> None:
         for node in getattr(self, "nodes", {}).values():
-            assert all(uav in node.claims.ids for uav in node.claims.held)
+            assert all(uav in node.claims.ids for uav in node.claims.owned)
 
     @rule()
     def peace_comes(self) -> None:
@@ -132,35 +132,35 @@ class Fleet(RuleBasedStateMachine):
             node.frozen = False
             if not node.link:
                 self._plug(node)
-        self._pass_time(int((SETTLE_S + LEASE_S + 3.0) / TURN_S))
+        self._pass_time(int((CLAIM_DELAY_S + LEASE_S + 3.0) / TURN_S))
         for node in [node for node in self.nodes.values() if node.claims.leaving]:
             others = [other.claims.ids for other in self.nodes.values() if not other.claims.leaving]
-            left = [uav for uav in node.claims.held if any(uav in ids for ids in others)]
+            left = [uav for uav in node.claims.owned if any(uav in ids for ids in others)]
             assert not left, "a leaver hands everything over"
-            del self.nodes[node.claims.me]
+            del self.nodes[node.claims.worker_id]
             self._forget(node)
         self._pass_time(10)
         self._who_is_known_of_is_outdone()
-        self.now += GIVE_UP_S  # everyone stands still for so long
+        self.now += WRITER_TIMEOUT_S  # everyone stands still for so long
         self._pass_time(10)
         self.calm = True
         live = {name: node.claims.ids for name, node in self.nodes.items()}
         expected = owners(UAVS, live)
         for uav in UAVS:
-            holders = [name for name, node in self.nodes.items() if uav in node.claims.held]
+            holders = [name for name, node in self.nodes.items() if uav in node.claims.owned]
             assert holders == [expected[uav]] if uav in expected else not holders
             if uav in expected:
                 stamp, heard = self.accepted[uav]
                 assert self.now - heard < 0.5, "the holder is read"
-                assert stamp == Stamp(self.nodes[expected[uav]].claims.held[uav], int(expected[uav], 16))
+                assert stamp == Stamp(self.nodes[expected[uav]].claims.owned[uav], int(expected[uav], 16))
 
     def _who_is_known_of_is_outdone(self) -> None:
         """Hold that readers need not wait where any worker knows the claim they believe."""
         for name, node in self.nodes.items():
-            for uav, epoch in node.claims.held.items():
+            for uav, epoch in node.claims.owned.items():
                 stamp, _ = self.accepted.get(uav, (Stamp(0, 0), 0.0))
-                believed = Rank(stamp.epoch, f"{stamp.writer:016x}")
-                if any(other.claims.seen.get(uav, Rank(0, "")) >= believed for other in self.nodes.values()):
+                believed = FencingToken(stamp.epoch, f"{stamp.writer:016x}")
+                if any(other.claims.highest.get(uav, FencingToken(0, "")) >= believed for other in self.nodes.values()):
                     assert stamp == Stamp(epoch, int(name, 16))
 
     def _taken(self) -> int:
@@ -179,7 +179,7 @@ class Fleet(RuleBasedStateMachine):
                     self._forget(node)
                 if node.frozen:
                     continue
-                node.claims.hears |= node.link  # telemetry
+                node.claims.receiving |= node.link  # telemetry
                 if node.link and not node.token:
                     self._connect(node)
                 if turn >= late:
@@ -200,14 +200,14 @@ class Fleet(RuleBasedStateMachine):
 
     def _lose_sight(self, node: Node) -> None:
         for name, peer in list(node.claims.peers.items()):
-            node.claims.vanished(name, peer.incarnation)
+            node.claims.on_leave(name, peer.incarnation)
 
     def _connect(self, node: Node) -> None:
         node.token, node.silent_s = True, 0.0
         for other in self.nodes.values():
             if other is not node and other.token:
-                self._send(other, lambda o=other: o.claims.appeared(node.claims.me, node.claims.ids, node.born))
-                self._send(node, lambda o=other: node.claims.appeared(o.claims.me, o.claims.ids, o.born))
+                self._send(other, lambda o=other: o.claims.on_join(node.claims.worker_id, node.claims.ids, node.born))
+                self._send(node, lambda o=other: node.claims.on_join(o.claims.worker_id, o.claims.ids, o.born))
 
     def _forget(self, node: Node) -> None:
         """End a session at the router: its token goes, and it has to connect anew."""
@@ -216,7 +216,7 @@ class Fleet(RuleBasedStateMachine):
         self._lose_sight(node)
         for other in self.nodes.values():
             if other is not node:
-                self._send(other, lambda o=other: o.claims.vanished(node.claims.me, node.born))
+                self._send(other, lambda o=other: o.claims.on_leave(node.claims.worker_id, node.born))
 
     def _send(self, to: Node, act: Callable[[], None]) -> None:
         if to.link and to.token:
@@ -229,11 +229,11 @@ class Fleet(RuleBasedStateMachine):
         claims.tick(self.now, node.sees)
         if not node.sees:
             return
-        if claims.unsure:
+        if claims.unsynchronised:
             self._synchronise(node)
         waiting = {uav for uav, until in node.asked.items() if until > self.now}
         plan = claims.plan(self.now)
-        for worker, uavs in plan.ask.items():
+        for worker, uavs in plan.request.items():
             for uav in set(uavs) - waiting:
                 if uav in node.asked:  # in vain
                     self._take(node, uav)
@@ -242,47 +242,47 @@ class Fleet(RuleBasedStateMachine):
                 holder = self.nodes.get(worker)
                 if holder is not None:
                     self._send(holder, lambda h=holder, u=uav: self._hand_over(h, node, u))
-        for uav in plan.take:
+        for uav in plan.acquire:
             self._take(node, uav)
-        if plan.take or self.now - node.said >= ANNOUNCE_S:
+        if plan.acquire or self.now - node.said >= ANNOUNCE_S:
             node.said = self.now
-            held, leaving = dict(claims.held), claims.leaving
+            held, leaving = dict(claims.owned), claims.leaving
             for other in self.nodes.values():
                 if other is not node:
-                    self._send(other, lambda o=other: o.claims.heard(claims.me, held, leaving))
+                    self._send(other, lambda o=other: o.claims.on_claim(claims.worker_id, held, leaving))
 
     def _synchronise(self, node: Node) -> None:
         for other in self.nodes.values():
             if other is not node and other.sees and other.token:
-                node.claims.heard(other.claims.me, other.claims.held, other.claims.leaving)
-                for uav, rank in other.claims.seen.items():
-                    node.claims.note(uav, rank)
-        before = dict(node.claims.held)
-        node.claims.synced(self._wall(node))
-        for uav, epoch in node.claims.held.items():
+                node.claims.on_claim(other.claims.worker_id, other.claims.owned, other.claims.leaving)
+                for uav, rank in other.claims.highest.items():
+                    node.claims.record(uav, rank)
+        before = dict(node.claims.owned)
+        node.claims.resynchronise(self._wall(node))
+        for uav, epoch in node.claims.owned.items():
             if before[uav] != epoch:
                 self._unheard_of(node, uav)
 
     def _take(self, node: Node, uav: int) -> None:
         assert node.sees, "nobody claims anything without a router in sight"
         node.asked.pop(uav, None)
-        node.claims.take(uav, self._wall(node))
+        node.claims.acquire(uav, self._wall(node))
         self._unheard_of(node, uav)
 
     def _unheard_of(self, node: Node, uav: int) -> None:
         """Hold that no claim is made twice."""
-        rank = Rank(node.claims.held[uav], node.claims.me)
+        rank = FencingToken(node.claims.owned[uav], node.claims.worker_id)
         assert rank not in self.ranks[uav]
         self.ranks[uav].add(rank)
 
     def _hand_over(self, holder: Node, asker: Node, uav: int) -> None:
-        epoch = holder.claims.held.get(uav)
+        epoch = holder.claims.owned.get(uav)
         if epoch is not None:
             self._send(asker, lambda: self._receive(asker, holder, uav, epoch))
 
     def _receive(self, asker: Node, holder: Node, uav: int, epoch: int) -> None:
         if uav in asker.asked:
-            asker.claims.note(uav, Rank(epoch, holder.claims.me))
+            asker.claims.record(uav, FencingToken(epoch, holder.claims.worker_id))
             self._take(asker, uav)
 
     def _wall(self, node: Node) -> int:
@@ -293,14 +293,16 @@ class Fleet(RuleBasedStateMachine):
         for name, node in self.nodes.items():
             if not node.sees or not node.claims.may_write(self.now):
                 continue
-            for uav, epoch in node.claims.held.items():
+            for uav, epoch in node.claims.owned.items():
                 stamp = Stamp(epoch, int(name, 16))
                 for other in self.nodes.values():
                     if other is not node:
-                        self._send(other, lambda o=other, u=uav, e=epoch, n=name: o.claims.note(u, Rank(e, n)))
-                if self.fence.believes(uav, stamp):
+                        self._send(
+                            other, lambda o=other, u=uav, e=epoch, n=name: o.claims.record(u, FencingToken(e, n))
+                        )
+                if self.fence.accepts(uav, stamp):
                     before, heard = self.accepted.get(uav, (Stamp(0, 0), 0.0))
-                    assert stamp >= before or self.now - heard >= GIVE_UP_S
+                    assert stamp >= before or self.now - heard >= WRITER_TIMEOUT_S
                     self.accepted[uav] = stamp, self.now
 
 

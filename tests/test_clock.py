@@ -13,7 +13,7 @@ class Clock:
         self.state = c.new_clock(wrap_s)
 
     def fleet(self, raw_s, arrival):
-        t = c.read(self.state, raw_s, arrival, -np.inf)
+        t = c.fleet_time(self.state, raw_s, arrival, -np.inf)
         return None if np.isnan(t) else t
 
     @property
@@ -28,7 +28,7 @@ class Clocks:
         self.states = c.new_clocks()
 
     def fleet(self, tick, raw_s, arrival):
-        return c.tell(self.states, tick, raw_s, arrival)
+        return c.message_time(self.states, tick, raw_s, arrival)
 
     @property
     def jumps(self):

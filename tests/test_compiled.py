@@ -7,13 +7,13 @@ from fleet.autopilots import laws
 from fleet.contract import Mission
 from fleet.frames import Origin, _radii, to_ned
 from twin_worker.confidence import adaptive_conformal
-from twin_worker.confidence.prediction_log import ROWS, Ledger
-from twin_worker.confidence.prediction_log_kernel import run_on
-from twin_worker.estimation.airspeed_setpoint import _middle
-from twin_worker.numerics.interpolation import straight
+from twin_worker.confidence.prediction_log import CAPACITY, PredictionLog
+from twin_worker.confidence.prediction_log_kernel import accumulate_length
+from twin_worker.estimation.airspeed_setpoint import _median
+from twin_worker.numerics.interpolation import interpolate_rows
 from twin_worker.numerics.prediction_errors import AHEAD, track_frame
 from twin_worker.prediction.multirotor.rollout import item_in_force, items_in_force
-from twin_worker.twin.state.flight_phase import moves
+from twin_worker.twin.state.flight_phase import speed_extremes
 
 
 @pytest.mark.parametrize("beyond", [None, np.nan])
@@ -25,7 +25,7 @@ def test_straight_lines_are_those_of_numpy(n: int, beyond: float | None) -> None
     at = np.concatenate([rng.uniform(-5.0, t[-1] + 5.0, 60), t])
     rng.shuffle(at)
     wanted = np.column_stack([np.interp(at, t, column, right=beyond) for column in x.T])
-    assert np.array_equal(straight(at, t, x, beyond), wanted, equal_nan=True)
+    assert np.array_equal(interpolate_rows(at, t, x, beyond), wanted, equal_nan=True)
 
 
 def test_a_track_frame_is_the_slope_of_second_order() -> None:
@@ -56,7 +56,7 @@ def test_how_it_moves_is_what_numpy_sees(n: int) -> None:
     v = 9.0 * np.random.default_rng(n).standard_normal((n, 3))
     level = np.hypot(*v[:, :2].T)
     wanted = level.min(), level.max(), np.abs(v[:, 2]).max(), np.linalg.norm(v, axis=1).max()
-    assert moves(v) == wanted
+    assert speed_extremes(v) == wanted
 
 
 @pytest.mark.parametrize("seq", [None, -1, 0, 5])
@@ -68,13 +68,13 @@ def test_the_item_in_force_now_is_that_of_any_time(ages: list[float], seq: int |
     assert np.array_equal([item_in_force(1e9, leg, mission)], want, equal_nan=True)
 
 
-def book(rng: np.random.Generator) -> Ledger:
+def book(rng: np.random.Generator) -> PredictionLog:
     """A ledger in the middle of things."""
-    made, n = Ledger(), len(AHEAD)
-    made.group[:] = rng.choice(["a", "b", ""], ROWS)
-    made.score[:] = np.where(rng.random((ROWS, n)) < 0.2, np.nan, rng.uniform(0.0, 2.0, (ROWS, n)))
-    made.claimed, made.passed = rng.random(ROWS) < 0.8, rng.random(ROWS) < 0.3
-    made.followed, made.horizon = np.round(rng.uniform(0, 9, (2, ROWS)))
+    made, n = PredictionLog(), len(AHEAD)
+    made.group[:] = rng.choice(["a", "b", ""], CAPACITY)
+    made.score[:] = np.where(rng.random((CAPACITY, n)) < 0.2, np.nan, rng.uniform(0.0, 2.0, (CAPACITY, n)))
+    made.horizon_pending, made.exceeded = rng.random(CAPACITY) < 0.8, rng.random(CAPACITY) < 0.3
+    made.followed, made.horizon = np.round(rng.uniform(0, 9, (2, CAPACITY)))
     return made
 
 
@@ -82,37 +82,39 @@ def book(rng: np.random.Generator) -> Ledger:
 def test_levels_learn_what_numpy_would_have_learnt(seed: int) -> None:
     rng = np.random.default_rng(seed)
     found, tube, horizon = (
-        adaptive_conformal.Levels(),
-        np.full(len(adaptive_conformal.KNOTS), adaptive_conformal.QUANTILE),
-        adaptive_conformal.QUANTILE,
+        adaptive_conformal.AdaptiveLevels(),
+        np.full(len(adaptive_conformal.KNOTS), adaptive_conformal.NOMINAL_COVERAGE),
+        adaptive_conformal.NOMINAL_COVERAGE,
     )
     ends = np.zeros(2)
     for _ in range(30):
         made, n = book(rng), int(rng.integers(0, 60))
-        r, j = rng.integers(ROWS, size=n), rng.integers(len(AHEAD), size=n)
-        mine, claimed = made.group == "a", made.claimed.copy()
+        r, j = rng.integers(CAPACITY, size=n), rng.integers(len(AHEAD), size=n)
+        mine, claimed = made.group == "a", made.horizon_pending.copy()
         knot, score = adaptive_conformal._COLUMN_OF[j], made.score[r, j]
         new = mine[r] & (knot >= 0) & np.isfinite(score)
         step = (
             adaptive_conformal._TUBE_STEP
-            * adaptive_conformal._SHARE[knot[new]]
-            * ((score[new] > 1.0) - (1.0 - adaptive_conformal.QUANTILE))
+            * adaptive_conformal._WEIGHT[knot[new]]
+            * ((score[new] > 1.0) - (1.0 - adaptive_conformal.NOMINAL_COVERAGE))
         )
         np.add.at(tube, knot[new], step)
-        np.clip(tube, adaptive_conformal._LEAST_LEVEL, adaptive_conformal._MOST_LEVEL, out=tube)
+        np.clip(tube, adaptive_conformal._MIN_LEVEL, adaptive_conformal._MAX_LEVEL, out=tube)
         held = mine & claimed & (made.followed >= made.horizon)
-        failed = mine & claimed & made.passed & ~held
-        moved = failed.sum() * adaptive_conformal.QUANTILE - held.sum() * (1.0 - adaptive_conformal.QUANTILE)
+        failed = mine & claimed & made.exceeded & ~held
+        moved = failed.sum() * adaptive_conformal.NOMINAL_COVERAGE - held.sum() * (
+            1.0 - adaptive_conformal.NOMINAL_COVERAGE
+        )
         horizon = float(
             np.clip(
                 horizon + adaptive_conformal._HORIZON_STEP * moved,
-                adaptive_conformal.QUANTILE,
-                adaptive_conformal._MOST_LEVEL,
+                adaptive_conformal.NOMINAL_COVERAGE,
+                adaptive_conformal._MAX_LEVEL,
             )
         )
-        found.learn(made, r, j, mine)
+        found.update(made, r, j, mine)
         assert np.array_equal(found.tube, tube) and found.horizon == horizon
-        assert np.array_equal(made.claimed, claimed & ~(held | failed))
+        assert np.array_equal(made.horizon_pending, claimed & ~(held | failed))
         ends += held.sum(), failed.sum()
     assert len(set(tube.tolist())) > 5 and ends.all(), "or nothing was learnt"
 
@@ -121,7 +123,7 @@ def test_levels_learn_what_numpy_would_have_learnt(seed: int) -> None:
 def test_the_odometer_runs_as_numpy_lets_it(n: int) -> None:
     rng = np.random.default_rng(n)
     at, points, begin, out = np.cumsum(rng.random(n)), 1e3 * rng.random((n, 3)), rng.random(3), np.empty((n, 2))
-    run_on(at, points, begin, 123.4, out)
+    accumulate_length(at, points, begin, 123.4, out)
     strides = np.linalg.norm(np.diff(np.vstack([begin, points]), axis=0), axis=1)
     assert np.array_equal(out, np.column_stack([at, 123.4 + np.cumsum(strides)]))
 
@@ -142,6 +144,6 @@ def test_what_a_law_has_read_need_not_be_read_again(law: str) -> None:
 @pytest.mark.parametrize("n", [1, 2, 3, 10, 31])
 def test_the_middle_is_numpy_s_median(n: int) -> None:
     x = np.random.default_rng(n).standard_normal(n)
-    assert _middle(x) == np.median(x)
+    assert _median(x) == np.median(x)
     x[n // 2] = np.nan
-    assert np.isnan(_middle(x))
+    assert np.isnan(_median(x))

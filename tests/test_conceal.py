@@ -14,10 +14,10 @@ from fleet.simulator.conceal import exam as examination
 from fleet.simulator.conceal import plan as planning
 from fleet.simulator.conceal import record as recording
 from fleet.simulator.conceal.effects import BOTH, HIDDEN, UNKNOWN
-from fleet.simulator.conceal.exam import exam, jobs_of
-from fleet.simulator.conceal.plan import Job, Planned, draw
-from fleet.simulator.conceal.record import fly, why_not_sane
-from fleet.simulator.conceal.roles import counts, go_together
+from fleet.simulator.conceal.exam import draw_jobs, simulate_exam
+from fleet.simulator.conceal.plan import FlightJob, PlannedFlight, draw_flight
+from fleet.simulator.conceal.record import fly, rejection_reason
+from fleet.simulator.conceal.roles import are_separable, counts
 from fleet.telemetry.recording.recordings import replay_messages
 
 KINDS = HIDDEN | UNKNOWN
@@ -30,12 +30,12 @@ def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (planning, recording):
         monkeypatch.setattr(module, "SETTLE_S", 4.0)
     monkeypatch.setattr(planning, "_ONSET_S", (2.0, 2.0))
-    monkeypatch.setattr(planning, "_PASSES_S", (1.0, 1.0))
+    monkeypatch.setattr(planning, "_TRANSIENT_START_S", (1.0, 1.0))
 
 
-def short(name: str, airframe: str, attempt: int = 0) -> Planned:
+def short(name: str, airframe: str, attempt: int = 0) -> PlannedFlight:
     number = list(KINDS).index(name) if name else 99
-    planned = draw(Job("x", airframe, "single", (name,) if name else (), number), 5, attempt)
+    planned = draw_flight(FlightJob("x", airframe, "single", (name,) if name else (), number), 5, attempt)
     return planned._replace(seconds=SHORT_S)
 
 
@@ -44,10 +44,10 @@ def test_every_effect_acts(name: str, soon: None) -> None:
     airframe = KINDS[name].airframes[-1]
     for attempt in range(8):  # one that acts too little is drawn again
         planned = short(name, airframe, attempt)
-        (fault,) = planned.hidden
-        log, _ = fly(planned, planned.hidden)
-        found = acting.acts(planned, fault, log)
-        if found["over_noise"] > acting.LEAST:  # type: ignore[operator]
+        (fault,) = planned.hidden_faults
+        log, _ = fly(planned, planned.hidden_faults)
+        found = acting.effect_strength(planned, fault, log)
+        if found["over_noise"] > acting.MIN_OVER_NOISE:  # type: ignore[operator]
             break
     else:
         pytest.fail(f"{name} acts {found}")
@@ -55,11 +55,11 @@ def test_every_effect_acts(name: str, soon: None) -> None:
 
 def test_an_effect_of_size_nothing_does_not_act(soon: None) -> None:
     planned = short("drag_increase", "small")
-    (fault,) = planned.hidden
+    (fault,) = planned.hidden_faults
     nothing = fault._replace(values={"dCD": 0.0})
-    planned = planned._replace(hidden=(nothing,))
-    found = acting.acts(planned, nothing, fly(planned, planned.hidden)[0])
-    assert found["over_noise"] < acting.LEAST / 2 and found["flown_over_noise"] == 0.0  # type: ignore[operator]
+    planned = planned._replace(hidden_faults=(nothing,))
+    found = acting.effect_strength(planned, nothing, fly(planned, planned.hidden_faults)[0])
+    assert found["over_noise"] < acting.MIN_OVER_NOISE / 2 and found["flown_over_noise"] == 0.0  # type: ignore[operator]
 
 
 @pytest.mark.parametrize("airframe", BOTH)
@@ -72,7 +72,7 @@ def test_one_seed_one_recording(airframe: str, soon: None, tmp_path: Path) -> No
 
 
 def test_flights_share_the_aircraft_and_nothing_else() -> None:
-    first, second = (draw(Job("x", "small", "control", (), k), 5, 0).uav(()) for k in (1, 2))
+    first, second = (draw_flight(FlightJob("x", "small", "control", (), k), 5, 0).build_uav(()) for k in (1, 2))
     own = ["vary/C_m_alpha", "vary/thrust", "inertia/weight-lbs"]
     assert [first.aircraft[x] for x in own] == [second.aircraft[x] for x in own]
     assert first.params == second.params
@@ -92,7 +92,7 @@ def test_names_and_order_say_nothing() -> None:
     """Over many examinations each place in the order of names holds each role as often as any other place."""
     places: dict[str, list[float]] = {}
     for seed in range(60):
-        jobs = [job for job in jobs_of(seed, 24) if job.role != "nominal"]
+        jobs = [job for job in draw_jobs(seed, 24) if job.role != "nominal"]
         assert [job.name for job in jobs] == sorted({job.name for job in jobs})
         for place, job in enumerate(jobs):
             places.setdefault(job.role, []).append(place / (len(jobs) - 1))
@@ -102,20 +102,20 @@ def test_names_and_order_say_nothing() -> None:
 
 
 def test_a_large_examination_asks_everything() -> None:
-    jobs = jobs_of(3, 140)
+    jobs = draw_jobs(3, 140)
     assert len({job.name for job in jobs}) == len(jobs) == 150
-    assert {name for job in jobs if job.role == "single" for name in job.wanted} > set(HIDDEN) - {"nothing"} - lone(
+    assert {name for job in jobs if job.role == "single" for name in job.effects} > set(HIDDEN) - {"nothing"} - lone(
         jobs
     )
-    assert len({job.wanted for job in jobs if job.role == "unknown"}) >= 6
-    assert all(go_together(*job.wanted) for job in jobs if job.role == "compound")
-    assert all(job.airframe in KINDS[name].airframes for job in jobs for name in job.wanted)
+    assert len({job.effects for job in jobs if job.role == "unknown"}) >= 6
+    assert all(are_separable(*job.effects) for job in jobs if job.role == "compound")
+    assert all(job.airframe in KINDS[name].airframes for job in jobs for name in job.effects)
     halves = Counter(job.airframe for job in jobs)
     assert abs(halves["small"] - halves["c172p"]) <= 2
-    assert all(not draw(job, 3, 0).hidden for job in jobs if job.role in ("control", "nominal"))
+    assert all(not draw_flight(job, 3, 0).hidden_faults for job in jobs if job.role in ("control", "nominal"))
 
 
-def lone(jobs: list[Job]) -> set[str]:
+def lone(jobs: list[FlightJob]) -> set[str]:
     """Effects of one airframe only: there may be more of them than single flights."""
     return {name for name, hidden in HIDDEN.items() if len(hidden.airframes) == 1}
 
@@ -131,17 +131,17 @@ def lone(jobs: list[Job]) -> set[str]:
     ],
 )
 def test_effects_that_hide_each_other_do_not_go_together(a: str, b: str) -> None:
-    assert not go_together(a, b)
-    assert go_together("wind_steady", "actuator_offset")
+    assert not are_separable(a, b)
+    assert are_separable("wind_steady", "actuator_offset")
 
 
 def test_a_dive_is_not_sane(soon: None) -> None:
     planned = short("", "small")
     log, _ = fly(planned, ())
-    assert why_not_sane(planned, log) == ""
-    assert why_not_sane(planned, log._replace(height=log.height - 100)) == "too low"
-    assert why_not_sane(planned, log._replace(alpha=log.alpha + 0.2)) == "stalled"
-    assert why_not_sane(planned, log._replace(t=log.t[:40])) == "too short"
+    assert rejection_reason(planned, log) == ""
+    assert rejection_reason(planned, log._replace(height=log.height - 100)) == "too low"
+    assert rejection_reason(planned, log._replace(alpha=log.alpha + 0.2)) == "stalled"
+    assert rejection_reason(planned, log._replace(t=log.t[:40])) == "too short"
 
 
 # --- a whole one -----------------------------------------------------------------------------------------------------
@@ -162,9 +162,9 @@ def held(tmp_path_factory: pytest.TempPathFactory) -> Held:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in (("NOMINAL_S", 30.0), ("EXAMINED_S", 45.0), ("_ONSET_S", (12.0, 20.0))):
             patch.setattr(planning, name, value)
-        patch.setattr(planning, "_PASSES_S", (5.0, 12.0))
-        patch.setattr(examination, "EXCITED", (1.0,))
-        labels = exam(4, 6, folder, lambda name, done, of: said.append(f"{name} {done}/{of}"), jobs=1)
+        patch.setattr(planning, "_TRANSIENT_START_S", (5.0, 12.0))
+        patch.setattr(examination, "NOMINAL_EXCITATION", (1.0,))
+        labels = simulate_exam(4, 6, folder, lambda name, done, of: said.append(f"{name} {done}/{of}"), processes=1)
     return Held(labels, folder, said)
 
 
@@ -183,7 +183,7 @@ def test_labels_say_what_when_and_how_strongly(held: Held) -> None:
         hides = label["role"] in ("single", "compound", "unknown")
         assert bool(label["effects"]) == bool(label["acts"]) == hides
         assert all(0 < x.get("t0", 15.0) < label["flown_s"] for x in label["effects"])
-        assert all(x["over_noise"] >= acting.LEAST for x in label["acts"])
+        assert all(x["over_noise"] >= acting.MIN_OVER_NOISE for x in label["acts"])
 
 
 def test_recordings_hold_all_telemetry(held: Held) -> None:
@@ -209,4 +209,4 @@ def test_the_card_is_what_an_operator_knows(airframe: str, held: Held) -> None:
 
 def test_wrong_use_is_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="found 3, expected 6 at least"):
-        examination.exam(1, 3, tmp_path)
+        examination.simulate_exam(1, 3, tmp_path)

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from fleet.cli import main
-from fleet.simulator.conceal.effects import SERVO_LAG_S, told
-from fleet.simulator.conceal.paths import FIELD
-from fleet.simulator.conceal.plan import quiet
+from fleet.simulator.conceal.effects import SERVO_LAG_S, reported_values
+from fleet.simulator.conceal.paths import EXAM_HOME
+from fleet.simulator.conceal.plan import baseline_type
 from fleet.simulator.faults.fault import Fault
-from fleet.simulator.faults.kinds import KINDS, read
-from fleet.simulator.faults.physics import World
-from fleet.simulator.faults.sensing import SPOILS
-from fleet.simulator.faults.servos import MOVES
-from fleet.simulator.vehicle.altered import altered
+from fleet.simulator.faults.kinds import KINDS, parse_fault
+from fleet.simulator.faults.physics import FaultyPhysics
+from fleet.simulator.faults.sensing import SENSOR_FAULTS
+from fleet.simulator.faults.servos import SERVO_FAULTS
+from fleet.simulator.vehicle.altered import instrumented_type
 from fleet.simulator.vehicle.jsbsim import DT, KG_TO_LB, Aircraft
 from fleet.simulator.vehicle.sensors import Estimate, pressure_at, pressure_height
 from fleet.simulator.vehicle.types import TYPES
@@ -25,10 +25,10 @@ INCH, FT = 0.0254, 0.3048
 
 
 def flying(airframe: str, still: bool = True) -> Aircraft:
-    kind = quiet(airframe) if still else altered(airframe)
-    aircraft = Aircraft(FIELD, 3, kind=kind)
+    kind = baseline_type(airframe) if still else instrumented_type(airframe)
+    aircraft = Aircraft(EXAM_HOME, 3, kind=kind)
     _, delta_e, delta_t = aircraft.start(ALOFT, 0.4, kind.cruise, (0.0, 0.0))
-    aircraft.drive(0.0, delta_e, 0.0, delta_t)
+    aircraft.set_controls(0.0, delta_e, 0.0, delta_t)
     for _ in range(50):
         aircraft.step()
     return aircraft
@@ -36,9 +36,9 @@ def flying(airframe: str, still: bool = True) -> Aircraft:
 
 def pressed(aircraft: Aircraft, name: str, **values: float) -> np.ndarray:
     """What a whole fault changes at once: moments over inertia [rad/s2], specific force [m/s2]."""
-    before = aircraft.ponder()
-    World([Fault(name, "", values)], aircraft).press(1.0)
-    return np.asarray(aircraft.ponder() - before)
+    before = aircraft.evaluate_accelerations()
+    FaultyPhysics([Fault(name, "", values)], aircraft).apply(1.0)
+    return np.asarray(aircraft.evaluate_accelerations() - before)
 
 
 def loads(aircraft: Aircraft) -> tuple[float, float]:
@@ -59,17 +59,17 @@ def along_wind(aircraft: Aircraft, force: np.ndarray) -> tuple[float, float]:
 def test_a_fault_steps_grows_or_passes() -> None:
     step, ramp = Fault("x", "", {}, 10.0), Fault("x", "", {}, 10.0, 20.0)
     gust, held = Fault("x", "", {}, 10.0, 0.0, 30.0), Fault("x", "", {}, 10.0, 4.0, 30.0)
-    assert [step.share(t) for t in (9.99, 10.0, 1e6)] == [0, 1, 1]
-    assert [ramp.share(t) for t in (9.0, 15.0, 30.0, 99.0)] == [0, 0.25, 1, 1]
-    assert [round(gust.share(t), 6) for t in (10.0, 15.0, 20.0, 25.0, 30.0)] == [0, 0.5, 1, 0.5, 0]
-    assert [round(held.share(t), 6) for t in (12.0, 14.0, 26.0, 28.0)] == [0.5, 1, 1, 0.5]
+    assert [step.intensity(t) for t in (9.99, 10.0, 1e6)] == [0, 1, 1]
+    assert [ramp.intensity(t) for t in (9.0, 15.0, 30.0, 99.0)] == [0, 0.25, 1, 1]
+    assert [round(gust.intensity(t), 6) for t in (10.0, 15.0, 20.0, 25.0, 30.0)] == [0, 0.5, 1, 0.5, 0]
+    assert [round(held.intensity(t), 6) for t in (12.0, 14.0, 26.0, 28.0)] == [0.5, 1, 1, 0.5]
 
 
 # --- servos ----------------------------------------------------------------------------------------------------------
 
 
 def moved(name: str, commands: np.ndarray, share: float = 1.0, **values: float) -> np.ndarray:
-    move = MOVES[name](values, DT)
+    move = SERVO_FAULTS[name](values, DT)
     return np.array([move(float(u), share) for u in commands])
 
 
@@ -93,7 +93,7 @@ def test_servo_faults_do_what_they_say() -> None:
     assert moved("actuator_stuck", wave[30:]) == pytest.approx(wave[30])  # where it happens to be
 
 
-@pytest.mark.parametrize("name", MOVES)
+@pytest.mark.parametrize("name", SERVO_FAULTS)
 def test_servos_are_healthy_before(name: str) -> None:
     values = {"tau_s": 0.2, "delay_s": 0.2, "rate_per_s": 0.1, "half_width": 0.1, "limit": 0.1, "offset": 0.1}
     assert moved(name, STEP, 0.0, **values, loss=0.5) == pytest.approx(STEP)
@@ -109,7 +109,7 @@ GOOD = Estimate(
 
 
 def spoilt(name: str, of: str = "", share: float = 1.0, **values: float) -> Estimate:
-    return SPOILS[name](Fault(name, of, values), 2 * DT)(GOOD, share)
+    return SENSOR_FAULTS[name](Fault(name, of, values), 2 * DT)(GOOD, share)
 
 
 def test_sensor_faults_do_what_they_say() -> None:
@@ -120,7 +120,7 @@ def test_sensor_faults_do_what_they_say() -> None:
     assert degrees(spoilt("heading_bias", bias_deg=9.0).euler[2] - 2.0) == pytest.approx(9.0)
     low = spoilt("baro_bias", bias_m=-12.0)
     assert pressure_height(low.pressure) == pytest.approx(143.0) and low.p[2] == pytest.approx(-138.0)
-    assert low.satellites == GOOD.satellites
+    assert low.gps_height == GOOD.gps_height
 
 
 def test_a_unit_turned_to_the_right_feels_weight_on_its_left() -> None:
@@ -133,7 +133,7 @@ def test_a_unit_turned_to_the_right_feels_weight_on_its_left() -> None:
 
 
 def test_late_satellites_tell_the_past() -> None:
-    spoil = SPOILS["gps_latency"](Fault("gps_latency", "", {"latency_s": 0.3}), 0.02)
+    spoil = SENSOR_FAULTS["gps_latency"](Fault("gps_latency", "", {"latency_s": 0.3}), 0.02)
     told_v = [spoil(GOOD._replace(v=np.full(3, float(k))), 1.0).v[0] for k in range(40)]
     assert told_v[39] == 39 - 15
 
@@ -143,7 +143,7 @@ def test_late_satellites_tell_the_past() -> None:
 
 @pytest.mark.parametrize("airframe", ["small", "c172p"])
 def test_knobs_alone_change_nothing(airframe: str) -> None:
-    stock = Aircraft(FIELD, 3, kind=TYPES[airframe])
+    stock = Aircraft(EXAM_HOME, 3, kind=TYPES[airframe])
     stock.start(ALOFT, 0.4, TYPES[airframe].cruise, (0.0, 0.0))
     knobbed = flying(airframe, still=False)
     for _ in range(50):
@@ -183,7 +183,7 @@ def test_a_centre_of_gravity_moved_forward_pitches_down() -> None:
 @pytest.mark.parametrize("airframe", ["small", "c172p"])
 def test_forces_are_measured_where_the_mass_is(airframe: str) -> None:
     aircraft = flying(airframe)
-    assert aircraft.truth().force == pytest.approx(aircraft.ponder()[3:], abs=0.02)
+    assert aircraft.truth().force == pytest.approx(aircraft.evaluate_accelerations()[3:], abs=0.02)
 
 
 def test_the_small_engine_loses_the_share_it_is_told_to() -> None:
@@ -226,24 +226,24 @@ def test_the_propeller_rolls_left_yaws_left_and_wets_the_tail() -> None:
     ],
 )
 def test_winds_blow_from_where_they_say(text: str, height: float, wind: tuple[float, float, float]) -> None:
-    world = World([read(text, "c172p")], flying("c172p"))
+    world = FaultyPhysics([parse_fault(text, "c172p")], flying("c172p"))
     assert world.wind(10.0, height) == pytest.approx(wind)
 
 
 def test_a_label_tells_the_whole_servo() -> None:
-    assert told("actuator_lag", "small", {"tau_s": 0.2}) == {"tau_s": 0.2 + SERVO_LAG_S["small"]}
+    assert reported_values("actuator_lag", "small", {"tau_s": 0.2}) == {"tau_s": 0.2 + SERVO_LAG_S["small"]}
     small = Path("fleet/simulator/vehicle/aircraft/aerosonde/aerosonde.xml").read_text()
     assert f"<lag>{1 / SERVO_LAG_S['small']:.0f}</lag>" in small
-    assert told("actuator_lag", "c172p", {"tau_s": 0.2}) == {"tau_s": 0.2}
+    assert reported_values("actuator_lag", "c172p", {"tau_s": 0.2}) == {"tau_s": 0.2}
 
 
 # --- the command line ------------------------------------------------------------------------------------------------
 
 
 def test_a_fault_is_read_as_written() -> None:
-    fault = read("actuator_lag:elevator,tau_s=0.3,at=120,ramp=5", "small")
+    fault = parse_fault("actuator_lag:elevator,tau_s=0.3,at=120,ramp=5", "small")
     assert fault == Fault("actuator_lag", "elevator", {"tau_s": 0.3}, 120.0, 5.0, inf)
-    assert read("gust_discrete,speed_mps=5,from_deg=90,at=20,for=12", "small").t1 == 32.0
+    assert parse_fault("gust_discrete,speed_mps=5,from_deg=90,at=20,for=12", "small").t1 == 32.0
 
 
 @pytest.mark.parametrize(

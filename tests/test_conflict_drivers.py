@@ -12,8 +12,8 @@ from rich.console import Console
 
 from fleet.bus.codec import Stamp
 from fleet.bus.memory_bus import MemoryBus
-from fleet.commands.live.status import fleet_rows, table
-from fleet.contract import Alert, AlertKind, FleetRow, FleetState, Message, Prediction, State
+from fleet.commands.live.status import fleet_rows, fleet_table
+from fleet.contract import Alert, AlertKind, FleetRow, FleetState, Message, Prediction, TwinState
 from fleet.frames import to_geodetic
 from twin_worker.__main__ import main
 from twin_worker.alerts.conflict_probability import Separation
@@ -48,23 +48,23 @@ def clock(monkeypatch) -> list[float]:
 
 
 def test_offline_judges_every_pair() -> None:
-    alerts = conflicts(offline.run(opposite(), {}))
+    alerts = conflicts(offline.run_offline(opposite(), {}))
     assert alerts and (alerts[0].uav, alerts[0].other, alerts[0].active) == (1, 2, True)
-    assert alerts[0].at == pytest.approx(f.T0 + 35.0, abs=6.0)
-    assert alerts[0].t < alerts[0].at - 5.0  # a turn rate alone sees no farther
+    assert alerts[0].predicted_t == pytest.approx(f.T0 + 35.0, abs=6.0)
+    assert alerts[0].t < alerts[0].predicted_t - 5.0  # a turn rate alone sees no farther
 
 
 def test_a_worker_of_both_says_it_once_and_shows_it(clock) -> None:
     bus, told = MemoryBus(), []
     bus.subscribe(Alert, lambda message, stamp: told.append((message, stamp)))
     worker = Worker(bus, range(1, 3), omega=0.0)
-    worker.listen()
+    worker.connect()
     for message in opposite():
         bus.publish(message)
-        worker.turn()
+        worker.sweep()
     (raised,) = conflicts(m for m, _ in told if m.active)
     assert {stamp.writer for _, stamp in told} == {bus.writer}
-    ((asked, stamp),) = bus.ask(Alert)
+    ((asked, stamp),) = bus.get(Alert)
     assert asked == raised and stamp.writer == bus.writer
     rows = {row.uav: row.alerts for row in worker.state().rows}
     assert rows == {1: (raised.sentence,), 2: ()}
@@ -75,26 +75,26 @@ def test_of_two_workers_the_lower_id_s_owner_judges(clock, held: range, says: bo
     """The other aircraft's prediction comes from elsewhere."""
     mine = held.start
     other = 3 - mine
-    flown = [m for m in offline.run(opposite(), {}) if isinstance(m, Prediction) and m.uav == other]
+    flown = [m for m in offline.run_offline(opposite(), {}) if isinstance(m, Prediction) and m.uav == other]
     heard = [m for m in opposite() if m.uav == mine]
     bus, told = MemoryBus(), []
     bus.subscribe(Alert, lambda message, _: told.append(message))
     worker = Worker(bus, held, omega=0.0)
-    worker.listen()
+    worker.connect()
     for message in sorted([*flown, *heard], key=lambda message: message.t):
         bus.publish(message, Stamp(5, 77) if isinstance(message, Prediction) else None)
-        worker.turn()
+        worker.sweep()
     assert [a.active for a in conflicts(told)][:1] == ([True] if says else [])
 
 
 def test_of_two_writers_the_higher_epoch_is_believed(clock) -> None:
     worker = Worker(MemoryBus(), range(1, 2), omega=0.0)
-    worker.listen()
+    worker.connect()
     new, old = straight(2), straight(2, (0.0, 9e3, 0.0))
     worker.bus.publish(new, Stamp(9, 1))
     worker.bus.publish(old, Stamp(8, 2))
-    worker.traffic.board.settle()
-    assert worker.traffic.board.of(2)[1].made.path == new.path
+    worker.traffic.picture.update_slots()
+    assert worker.traffic.picture.slot_of(2)[1].prediction.path == new.path
 
 
 def test_a_separation_of_one_s_own_is_used() -> None:
@@ -111,15 +111,15 @@ def test_an_absurd_separation_is_refused_in_a_sentence(text: str, capsys) -> Non
 
 def test_fleet_status_shows_alerts_as_written() -> None:
     bus = MemoryBus()
-    row = FleetRow(uav=3, state=State.PREDICTING, verdict="all is [well]", alerts=("uav-3: near [b]uav-4[/b]",))
-    bus.answer(FleetState, lambda *_: [(FleetState(t=T, rows=(row,)), None)])
+    row = FleetRow(uav=3, state=TwinState.PREDICTING, verdict="all is [well]", alerts=("uav-3: near [b]uav-4[/b]",))
+    bus.declare_queryable(FleetState, lambda *_: [(FleetState(t=T, rows=(row,)), None)])
     console = Console(width=120, record=True, file=io.StringIO())
-    console.print(table(fleet_rows(bus)))
+    console.print(fleet_table(fleet_rows(bus)))
     text = console.export_text()
     assert "! uav-3: near [b]uav-4[/b]" in text and "all is [well]" in text
 
 
 def test_alerts_are_strict_json() -> None:
     """A foreign tool may put them into JSON: no nan."""
-    alerts = conflicts(offline.run(opposite(), {}))
+    alerts = conflicts(offline.run_offline(opposite(), {}))
     assert all(json.loads(json.dumps(msgspec.to_builtins(a), allow_nan=False)) for a in alerts)

@@ -13,19 +13,19 @@ from scipy.stats import norm
 from fleet.contract import Alert, AlertKind, Array, Prediction
 from fleet.frames import Origin, to_geodetic, to_ned
 from twin_worker.alerts.conflict_probability import Separation
-from twin_worker.alerts.gaussian_forecast import axis_z, forecast
-from twin_worker.alerts.traffic import Traffic
-from twin_worker.confidence.calibration.conformal import factors_of
+from twin_worker.alerts.gaussian_forecast import axis_z, to_gaussian
+from twin_worker.alerts.traffic import TrafficMonitor
+from twin_worker.confidence.calibration.conformal import conformal_factors
 
 Z = axis_z(0.9)
 
 
 def probability(a: Prediction, b: Prediction, separation: Separation = Separation()) -> float:  # noqa: B008
     """What the lower id's judge finds; 0 where it follows nothing up."""
-    traffic = Traffic(separation)
+    traffic = TrafficMonitor(separation)
     for made in (a, b):
-        traffic.hear(made)
-    found = traffic._meetings(min(a.uav, b.uav), T)
+        traffic.receive(made)
+    found = traffic._conflicts(min(a.uav, b.uav), T)
     return found[0].probability if found else 0.0
 
 
@@ -63,7 +63,7 @@ def test_the_probability_is_that_of_the_errors_the_region_was_calibrated_on(miss
     rng, sigma, n = np.random.default_rng(4), np.array([60.0, 70.0, 3.0]), 40_000
     size = np.abs(rng.standard_normal((2, n, 1 if together else 3))) * np.ones(3)
     error = rng.choice([-1.0, 1.0], (2, n, 3)) * size * sigma
-    factor, alone = factors_of(size[0][:, None], np.ones(n))
+    factor, alone = conformal_factors(size[0][:, None], np.ones(n))
     assert (size[0] <= factor).all(axis=1).mean() == pytest.approx(0.9, abs=0.01)  # it is the region's quantile
     half = {"half": factor * sigma, "axis_quantile": alone}
     a, b = straight(1, **half), straight(2, (-900.0, miss, -100.0), (30.0, 0.0, 0.0), **half)
@@ -104,7 +104,7 @@ def test_origins_do_not_matter(lat: float, lon: float, north: float, east: float
     assert probability(a, moved) == pytest.approx(probability(a, b), abs=0.02)
     (near,) = judged(a, moved)
     (same,) = judged(a, b)
-    assert abs(near.at - same.at) < 0.5 and near.other == 2
+    assert abs(near.predicted_t - same.predicted_t) < 0.5 and near.other == 2
     assert abs(near.lat - same.lat) <= 2 and abs(near.alt - same.alt) <= 2
 
 
@@ -126,11 +126,11 @@ def remade(one: Prediction, **changes) -> Prediction:
 
 def judged(a: Prediction, b: Prediction, seconds: int = 9) -> list[Alert]:
     """What is raised when both predictions are repeated for a while."""
-    traffic, out = Traffic(), []
+    traffic, out = TrafficMonitor(), []
     for one in (a, b):
-        traffic.hear(one)
+        traffic.receive(one)
     for k in range(seconds):
-        out += traffic.judge(1, T + k)
+        out += traffic.assess(1, T + k)
     return out
 
 
@@ -152,14 +152,16 @@ class Two:
     sigma_per_s: float = 0.5
 
     def alerts(self, seconds: int, uav: int = 1) -> list[Alert]:
-        traffic, out = Traffic(), []
+        traffic, out = TrafficMonitor(), []
         for k in range(seconds):
             for one in (self.a, self.b):
                 path = one.path.numpy().astype(float)
                 step = path[1] - path[0]
                 tube = 2.0 + self.sigma_per_s * Z * AHEAD[:, None] * np.ones(3) * [1.0, 0.2, 0.1]
-                traffic.hear(remade(one, t=T + k, path=Array.of(path + k * step), tube=Array.of(tube)))
-            out += traffic.judge(uav, T + k + 0.3)
+                traffic.receive(
+                    remade(one, t=T + k, path=Array.of(path + k * step), prediction_region_half_axes=Array.of(tube))
+                )
+            out += traffic.assess(uav, T + k + 0.3)
         return out
 
 
@@ -167,11 +169,11 @@ def test_a_crossing_is_told_once_before_and_taken_back_once_after() -> None:
     raised, over = Two(*crossing(10.0, 2.0, 1.0, at=90.0)).alerts(120)
     assert raised.active and not over.active and (raised.uav, raised.other, raised.kind) == (1, 2, AlertKind.CONFLICT)
     assert raised.t < T + 60 and T + 90 < over.t < T + 102
-    assert raised.at == pytest.approx(T + 90, abs=1.5) and 0.2 <= raised.probability <= 1
+    assert raised.predicted_t == pytest.approx(T + 90, abs=1.5) and 0.2 <= raised.probability <= 1
     place = to_geodetic(HERE, np.array([0.0, 0.0, -100.0]))
     assert abs(raised.lat - place[0]) < 400 and abs(raised.lon - place[1]) < 600 and abs(raised.alt - place[2]) < 2_000
     assert raised.sentence.startswith("uav-1: ") and "uav-2" in raised.sentence and "50 m" in raised.sentence
-    assert over.at is None and over.lat is None and over.probability is None and "uav-2" in over.sentence
+    assert over.predicted_t is None and over.lat is None and over.probability is None and "uav-2" in over.sentence
 
 
 def test_a_clear_pass_is_never_told() -> None:
@@ -185,23 +187,23 @@ def test_the_higher_id_says_nothing() -> None:
 
 def test_predictions_that_cease_withdraw_the_alert() -> None:
     a, b = crossing(0.0, 0.0, 5.0)
-    traffic, out = Traffic(), []
+    traffic, out = TrafficMonitor(), []
     for one in (a, b):
-        traffic.hear(one)
+        traffic.receive(one)
     for k in range(30):
-        out += traffic.judge(1, T + k)
+        out += traffic.assess(1, T + k)
     assert [x.active for x in out] == [True, False] and 10 < out[1].t - T < 18
     assert traffic.active(1) == []
 
 
 def test_a_judge_that_is_asked_often_judges_once_a_second() -> None:
-    traffic = Traffic()
+    traffic = TrafficMonitor()
     for one in crossing(0.0, 0.0, 5.0, at=30.0):
-        traffic.hear(one)
-    assert [traffic.judge(1, T + 0.05 * k) for k in range(40)] == [[]] * 40  # 2 s, and it must last
-    assert len(traffic.judge(1, T + 2.0)) == 1
+        traffic.receive(one)
+    assert [traffic.assess(1, T + 0.05 * k) for k in range(40)] == [[]] * 40  # 2 s, and it must last
+    assert len(traffic.assess(1, T + 2.0)) == 1
     assert [alert.other for alert in traffic.active(1)] == [2]
-    assert traffic.judge(1, float("nan")) == [] and traffic.judge(9, T) == []
+    assert traffic.assess(1, float("nan")) == [] and traffic.assess(9, T) == []
 
 
 # --- hostile --------------------------------------------------------------------------------------------------------
@@ -210,13 +212,17 @@ NAN, INF = float("nan"), float("inf")
 BAD = {
     "nan path": {"path": Array.of(np.full((len(AHEAD), 3), NAN))},
     "far path": {"path": Array.of(np.full((len(AHEAD), 3), 1e20))},
-    "nan tube": {"tube": Array.of(np.full((len(AHEAD), 3), NAN))},
-    "negative tube": {"tube": Array.of(np.full((len(AHEAD), 3), -1.0))},
+    "nan tube": {"prediction_region_half_axes": Array.of(np.full((len(AHEAD), 3), NAN))},
+    "negative tube": {"prediction_region_half_axes": Array.of(np.full((len(AHEAD), 3), -1.0))},
     "times that stand still": {"ahead": Array.of(np.zeros(len(AHEAD)))},
     "nan times": {"ahead": Array.of(np.full(len(AHEAD), NAN))},
     "shapes that disagree": {"path": Array.of(np.zeros((5, 3)))},
     "flat arrays": {"path": Array.of(np.zeros(3))},
-    "nothing": {"ahead": Array.of([]), "path": Array.of(np.zeros((0, 3))), "tube": Array.of(np.zeros((0, 3)))},
+    "nothing": {
+        "ahead": Array.of([]),
+        "path": Array.of(np.zeros((0, 3))),
+        "prediction_region_half_axes": Array.of(np.zeros((0, 3))),
+    },
     "broken bytes": {"path": Array("<f4", (3, 3), b"")},
     "quantile 1": {"quantile": 1.0},
     "quantile nan": {"quantile": NAN},
@@ -231,12 +237,12 @@ BAD = {
 def test_a_prediction_that_cannot_be_judged_raises_nothing_and_harms_nobody(changes: dict) -> None:
     a, b = crossing(0.0, 0.0, 5.0)
     c = remade(straight(3, (0.0, 0.0, -100.0)), **changes)
-    assert forecast(c) is None
-    traffic, out = Traffic(), []
+    assert to_gaussian(c) is None
+    traffic, out = TrafficMonitor(), []
     for one in (a, b, c):
-        traffic.hear(one)
+        traffic.receive(one)
     for k in range(9):
-        out += traffic.judge(1, T + k) + traffic.judge(3, T + k)
+        out += traffic.assess(1, T + k) + traffic.assess(3, T + k)
     assert [(x.uav, x.other) for x in out] == [(1, 2)]
 
 
@@ -248,17 +254,17 @@ def test_a_prediction_of_one_point_is_judged() -> None:
 
 
 def test_strangers_do_not_fill_the_memory() -> None:
-    traffic = Traffic()
+    traffic = TrafficMonitor()
     made = straight(1, ahead=np.array([0.0, 1.0, 2.0]))
     for uav in range(5_000):
-        traffic.hear(remade(made, uav=uav))
-    traffic.judge(1, T)
-    assert len(traffic.board.uav) <= 8_192
+        traffic.receive(remade(made, uav=uav))
+    traffic.assess(1, T)
+    assert len(traffic.picture.uav) <= 8_192
 
 
 def test_a_forecast_is_the_prediction_on_whole_steps() -> None:
     made = straight(1, t=T + 0.7, grow=0.5)
-    found = forecast(made)
+    found = to_gaussian(made)
     assert found is not None and found.t[0] == T + 2.0 and (np.diff(found.t) == 2.0).all()
     assert found.t[-1] <= T + 0.7 + 180
     np.testing.assert_allclose(found.path[:, 0], 20.0 * (found.t - T - 0.7), atol=1e-3)
@@ -276,7 +282,7 @@ def test_a_half_axis_is_as_many_sigma_as_an_axis_alone_holds() -> None:
 
 
 def test_covariance_turns_with_the_path() -> None:
-    found = forecast(straight(1, v=(15.0, 15.0, 0.0), half=(20.0, 5.0, 3.0)))
+    found = to_gaussian(straight(1, v=(15.0, 15.0, 0.0), half=(20.0, 5.0, 3.0)))
     assert found is not None
     nn, ne, ee, dd = found.covariance()[5]
     assert np.allclose(np.linalg.eigvalsh([[nn, ne], [ne, ee]]), np.array([5.0, 20.0]) ** 2 / Z**2) and ne > 0

@@ -19,16 +19,16 @@ from talker import T0, Talker, of
 
 from fleet.bus.codec import decode, encode
 from fleet.bus.memory_bus import MemoryBus
-from fleet.contract import COLUMNS, Account, Array, Item, Mission, Params, Rows, Sample, Status
+from fleet.contract import COLUMNS, Array, GatewayCounters, Item, Mission, Params, Rows, Sample, Status
 from fleet.frames import Origin, to_geodetic, to_ned
-from fleet.telemetry.mavlink.intake import Intake
+from fleet.telemetry.mavlink.intake import MavlinkReceiver
 from fleet.telemetry.mavlink.steps import STEP_S
-from fleet.telemetry.recording.ids import Ids
-from fleet.telemetry.replay.broadcaster import Airing, address
-from fleet.telemetry.replay.offset import SPACING_M, Aside
-from fleet.telemetry.replay.offset_copies import GROUPS, Copies, Group, Prepared
-from gateway.links.recorded import Replay
-from gateway.pipeline import Pump
+from fleet.telemetry.recording.ids import IdAllocator
+from fleet.telemetry.replay.broadcaster import Broadcaster, loopback_address
+from fleet.telemetry.replay.offset import SPACING_M, GridOffset
+from fleet.telemetry.replay.offset_copies import GROUP_COUNT, CopyGroup, MessageTemplate, OffsetCopies
+from gateway.links.recorded import ReplayLink
+from gateway.pipeline import Pipeline
 from gateway.settings.link_spec import read_spec
 
 HOME = Origin(470_000_000, 80_000_000, 500_000)
@@ -55,9 +55,9 @@ def sample(uav, t0, dtype="<i4"):
 def test_patched_bytes_are_those_of_a_message_made_anew(dtype):
     message = sample(7, T0, dtype)
     ids, lag = np.array([8, 300, 70_000]), 0.4
-    aside = Aside(np.array([1, 2, 3]), 4, HOME)
+    aside = GridOffset(np.array([1, 2, 3]), 4, HOME)
     there = aside.move(*message.position.x.numpy()[:, :2].T)
-    for k, payload in enumerate(Prepared(message).copies(Group(ids, aside, lag))):
+    for k, payload in enumerate(MessageTemplate(message).copies(CopyGroup(ids, aside, lag))):
         copy = decode(Sample, payload)
         assert (copy.uav, copy.t) == (ids[k], message.t + lag)
         assert (copy.attitude.t.numpy() == message.attitude.t.numpy() + lag).all()
@@ -71,13 +71,13 @@ def test_patched_bytes_are_those_of_a_message_made_anew(dtype):
 @pytest.mark.parametrize("kind", [Sample, Status, Params], ids=lambda kind: kind.__name__)
 def test_every_kind_keeps_everything_but_id_and_times(kind):
     message = EXAMPLES[kind]
-    (payload,) = Prepared(message).copies(Group(np.array([123_456]), None, 0.0))
+    (payload,) = MessageTemplate(message).copies(CopyGroup(np.array([123_456]), None, 0.0))
     assert encode(msgspec.structs.replace(decode(kind, payload), uav=message.uav)) == encode(message)
 
 
 def test_copies_fly_the_same_shape_half_a_kilometre_apart():
     total = 100
-    aside = Aside(np.arange(total), total, HOME)
+    aside = GridOffset(np.arange(total), total, HOME)
     t = np.linspace(0, 60, 50)
     flown = to_geodetic(HOME, path_of(t))
     lat, lon = aside.move(flown[:, 0], flown[:, 1])
@@ -95,7 +95,7 @@ def test_copies_fly_the_same_shape_half_a_kilometre_apart():
 @pytest.mark.parametrize("lon", [1_799_999_000, -1_799_999_000, 0])
 def test_the_date_line_and_nowhere_are_minded(lon):
     home = Origin(470_000_000, lon, 0)
-    lat, moved = Aside(np.arange(9), 9, home).move(np.array([home.lat_e7, 0]), np.array([lon, 0]))
+    lat, moved = GridOffset(np.arange(9), 9, home).move(np.array([home.lat_e7, 0]), np.array([lon, 0]))
     assert (np.abs(moved) <= 1_800_000_000).all()
     assert (lat[:, 1] == 0).all() and (moved[:, 1] == 0).all()
     back = to_ned(home, lat[:, 0], moved[:, 0], np.zeros(9))
@@ -103,17 +103,17 @@ def test_the_date_line_and_nowhere_are_minded(lon):
 
 
 def test_ids_are_nobody_elses():
-    ids = Ids(1, 5)
-    assert [ids.give(who, wanted) for who, wanted in (("a", 4), ("b", 4), ("c", 4), ("a", 9), ("d", 0))] == [
+    ids = IdAllocator(1, 5)
+    assert [ids.allocate(who, wanted) for who, wanted in (("a", 4), ("b", 4), ("c", 4), ("a", 9), ("d", 0))] == [
         4,
         5,
         1,
         4,
         2,
     ]
-    assert ids.give("e", 2) == 3
+    assert ids.allocate("e", 2) == 3
     with pytest.raises(ValueError, match="all 5 taken"):
-        ids.give("f", 2)
+        ids.allocate("f", 2)
 
 
 # --- on the bus ------------------------------------------------------------------------------------------------------
@@ -121,18 +121,18 @@ def test_ids_are_nobody_elses():
 
 def test_copies_lag_behind_move_their_missions_and_say_their_own_names():
     n = 25
-    copies = Copies(n)
-    copies.name(7, range(8, 7 + n))
+    copies = OffsetCopies(n)
+    copies.set_ids(7, range(8, 7 + n))
     items = (Item(seq=0, command=16, frame=0, lat_e7=470_000_000, lon_e7=80_000_000), Item(seq=1, command=177))
     local = Item(seq=2, command=16, frame=1, lat_e7=5, lon_e7=6)
     mission = Mission(uav=7, t=T0, items=(*items, local), seq=1, complete=True, sentence="uav-7: fine")
     said = copies.step([mission]) + copies.step([sample(7, T0)])
     said += [wire for k in range(5) for wire in copies.step([sample(7, T0 + (k + 1) * STEP_S)])]
-    said += [wire for step in copies.last() for wire in step]
+    said += [wire for step in copies.remaining() for wire in step]
     told = [wire.message() for wire in said]
     samples = {uav: of(Sample, told, uav) for uav in range(8, 7 + n)}
     for uav, mine in samples.items():
-        lag = (uav - 8) % GROUPS * STEP_S
+        lag = (uav - 8) % GROUP_COUNT * STEP_S
         assert [m.t for m in mine] == pytest.approx([T0 + 0.06 + k * STEP_S + lag for k in range(6)])
     missions = {m.uav: m for m in of(Mission, told)}  # the last of each: said before it was known where they fly
     assert set(missions) == set(samples)
@@ -162,7 +162,7 @@ def log_of(system=7, seconds=12.0):
 class Ear:
     def __init__(self, bus):
         self.news = []
-        for kind in (Sample, Status, Mission, Params, Account):
+        for kind in (Sample, Status, Mission, Params, GatewayCounters):
             bus.subscribe(kind, lambda message, _: self.news.append(message))
 
 
@@ -171,27 +171,27 @@ def test_a_recording_with_copies_is_played_by_as_many_aircraft(tmp_path):
     path.write_bytes(log_of())
     bus, n = MemoryBus(), 12
     ear = Ear(bus)
-    Pump([Replay(read_spec(f"replay:{path}?speed=max&copies={n}"))], bus).run(threading.Event())
+    Pipeline([ReplayLink(read_spec(f"replay:{path}?speed=max&copies={n}"))], bus).run(threading.Event())
     rows = {
         uav: sum(len(getattr(s, f).t.numpy()) for s in of(Sample, ear.news, uav) for f in COLUMNS if getattr(s, f))
         for uav in range(7, 7 + n)
     }
     assert len(set(rows.values())) == 1 and rows[7] > 400
-    assert [m for m in ear.news if isinstance(m, Account)][-1].uavs == tuple(range(7, 7 + n))
-    assert {m.uav for m, _ in bus.ask(Mission)} == {m.uav for m, _ in bus.ask(Params)} == set(range(7, 7 + n))
-    assert len({bus.ask(Mission, uav)[0][0].items[0].lat_e7 * 10**9 + uav for uav in rows}) == n
+    assert [m for m in ear.news if isinstance(m, GatewayCounters)][-1].uavs == tuple(range(7, 7 + n))
+    assert {m.uav for m, _ in bus.get(Mission)} == {m.uav for m, _ in bus.get(Params)} == set(range(7, 7 + n))
+    assert len({bus.get(Mission, uav)[0][0].items[0].lat_e7 * 10**9 + uav for uav in rows}) == n
     places = [of(Sample, ear.news, uav)[1].position.x.numpy()[0, :2].tolist() for uav in rows]
     assert len({tuple(place) for place in places}) == n
 
 
 def test_two_recordings_of_one_id_are_two_aircraft(tmp_path, caplog):
-    links, ids = [], Ids()
+    links, ids = [], IdAllocator()
     for name in ("one.tlog", "two.tlog"):
         (tmp_path / name).write_bytes(log_of())
-        links.append(Replay(read_spec(f"replay:{tmp_path / name}?speed=max&copies=2"), ids))
+        links.append(ReplayLink(read_spec(f"replay:{tmp_path / name}?speed=max&copies=2"), ids))
     bus = MemoryBus()
     ear = Ear(bus)
-    Pump(links, bus).run(threading.Event())
+    Pipeline(links, bus).run(threading.Event())
     counts = {uav: len(of(Sample, ear.news, uav)) for uav in (7, 8, 9, 10)}
     assert len(set(counts.values())) == 1 and counts[7] > 100
     assert {m.uav for m in of(Sample, ear.news)} == set(counts)
@@ -200,10 +200,10 @@ def test_two_recordings_of_one_id_are_two_aircraft(tmp_path, caplog):
 
 @pytest.mark.recordings
 def test_copies_of_a_recorded_flight_of_three_keep_formation(recordings):
-    replay = Replay(read_spec(f"replay:{recordings / 'sitl/s10_multi3_nominal.tlog.xz'}?speed=max&copies=3"))
+    replay = ReplayLink(read_spec(f"replay:{recordings / 'sitl/s10_multi3_nominal.tlog.xz'}?speed=max&copies=3"))
     stop = threading.Event()
-    replay.look(stop)
-    assert replay._known == {21: 21, 22: 22, 23: 23}
+    replay.read_ahead(stop)
+    assert replay._uav_ids == {21: 21, 22: 22, 23: 23}
     assert {uav: ids.tolist() for uav, ids in replay._copies._ids.items()} == {
         21: [24, 27],
         22: [25, 28],
@@ -220,7 +220,7 @@ def aired(path, copies):
         ear.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 24)
         ear.bind(("127.0.0.1", 0))
         ear.settimeout(0.5)
-        airing, heard = Airing(path, 8.0, range(copies), copies, Ids(1, 250)), []
+        airing, heard = Broadcaster(path, 8.0, range(copies), copies, IdAllocator(1, 250)), []
         thread = threading.Thread(target=airing.send, args=(ear.getsockname(), threading.Event()))
         thread.start()
         while True:
@@ -231,7 +231,7 @@ def aired(path, copies):
                     break
         thread.join()
     assert len(heard) == airing.sent
-    assert airing.trouble == ""
+    assert airing.problem == ""
     return airing, heard
 
 
@@ -244,7 +244,7 @@ def test_datagrams_are_sound_mavlink_of_as_many_systems(tmp_path):
     for datagram in heard:
         system = datagram[5]
         said[system] += ears[system].parse_buffer(datagram) or []
-    assert len(heard) == airing.sent and "30 aircraft" in airing.words()
+    assert len(heard) == airing.sent and "30 aircraft" in airing.progress_text()
     assert all(m.get_type() != "BAD_DATA" and m.get_srcSystem() == s for s, mine in said.items() for m in mine)
     names = {s: [m.get_type() for m in mine] for s, mine in said.items()}
     whole = names[7]
@@ -261,9 +261,9 @@ def test_a_gateway_that_hears_them_tells_them_apart(tmp_path):
     path = tmp_path / "one.tlog"
     path.write_bytes(log_of(seconds=4.0))
     _, heard = aired(path, 5)
-    intake = Intake()
+    intake = MavlinkReceiver()
     for k, datagram in enumerate(heard):
-        intake.hear(T0 + k * 0.01, datagram, "one socket")
+        intake.receive(T0 + k * 0.01, datagram, "one socket")
     news = intake.flush(T0 + 100)
     assert {m.uav for m in of(Sample, news)} == {7, 8, 9, 10, 11}
     assert intake.counters()["bad_bytes"] == intake.counters()["bad_frames"] == 0
@@ -286,26 +286,26 @@ def test_signatures_are_left_out_for_whoever_signed_did_not_sign_this(tmp_path):
 def test_more_aircraft_than_system_ids_are_refused(tmp_path):
     path = tmp_path / "one.tlog"
     path.write_bytes(log_of(seconds=1.0))
-    airing = Airing(path, 100.0, range(251), 251, Ids(1, 250))
+    airing = Broadcaster(path, 100.0, range(251), 251, IdAllocator(1, 250))
     airing.send(("127.0.0.1", 9), threading.Event())
-    assert "found all 250 taken" in airing.trouble
+    assert "found all 250 taken" in airing.problem
 
 
 @pytest.mark.parametrize("to", ["192.0.2.7:14550", "0.0.0.0:14550", "[2001:db8::1]:14550"])
 def test_only_this_machine_is_sent_to(to):
     with pytest.raises(ValueError, match=r"--to: found .* another machine, expected a loopback address.*;"):
-        address(to)
+        loopback_address(to)
 
 
 @pytest.mark.parametrize("to", ["14550", "127.0.0.1:", "127.0.0.1:0", "no.such.host.invalid:14550"])
 def test_what_is_no_address_is_refused(to):
     with pytest.raises(ValueError, match=r"--to: found"):
-        address(to)
+        loopback_address(to)
 
 
 def test_loopback_has_several_names():
-    assert address("127.0.0.1:14550") == ("127.0.0.1", 14550)
-    assert ipaddress.ip_address(address("localhost:14550")[0]).is_loopback
+    assert loopback_address("127.0.0.1:14550") == ("127.0.0.1", 14550)
+    assert ipaddress.ip_address(loopback_address("localhost:14550")[0]).is_loopback
 
 
 # --- the command -----------------------------------------------------------------------------------------------------

@@ -8,7 +8,13 @@ from flights import HERE, item
 
 from fleet.autopilots import copter
 from fleet.autopilots.copter import corner_speed, limits
-from twin_worker.prediction.multirotor.route import home_again, lay, numbered_from_one, paced, stop_from
+from twin_worker.prediction.multirotor.route import (
+    limit_speeds,
+    numbered_from_one,
+    return_segments,
+    segments_from_mission,
+    stopping_segment,
+)
 
 PARAMS = {"WPNAV_SPEED": 800.0, "WPNAV_ACCEL": 250.0, "WPNAV_SPEED_UP": 250.0, "WPNAV_SPEED_DN": 150.0}
 LIMIT, _ = limits(PARAMS)
@@ -25,8 +31,8 @@ def fly(segments, seconds: float = 120.0, *, wn: float = 2.0, air=(np.nan, 0.0, 
 
 
 def way(*items, seq: int = 1, p=P) -> np.ndarray:
-    laid, _ = lay((item(0), *items), seq, HERE, p, PARAMS)
-    return paced(laid, LIMIT)
+    laid, _ = segments_from_mission((item(0), *items), seq, HERE, p, PARAMS)
+    return limit_speeds(laid, LIMIT)
 
 
 def test_limits_come_in_the_autopilots_own_units():
@@ -111,16 +117,16 @@ def test_it_stays_after_the_last_item_and_returns_when_told():
     assert np.allclose(fly(way(item(1, 16, 40.0)), 90.0)[-1], [40.0, 0.0, -100.0], atol=0.3)
     back = fly(way(item(1, 16, 40.0), item(2, 20)), 240.0)[-1]
     assert np.allclose(back, [0.0, 0.0, 0.0], atol=0.5)
-    home = paced(home_again((item(0),), HERE, np.array([30.0, 0.0, -5.0]), PARAMS), LIMIT)
+    home = limit_speeds(return_segments((item(0),), HERE, np.array([30.0, 0.0, -5.0]), PARAMS), LIMIT)
     path = fly(home, 120.0)
     assert path[:, 2].min() == pytest.approx(-15.0, abs=0.5) and np.allclose(path[-1], 0.0, atol=0.5)
-    assert not len(home_again((), HERE, P, PARAMS))
+    assert not len(return_segments((), HERE, P, PARAMS))
 
 
 def test_holding_is_a_stop_ahead_not_behind():
-    laid = stop_from(P, np.array([6.0, 0.0, 0.0]), LIMIT)
+    laid = stopping_segment(P, np.array([6.0, 0.0, 0.0]), LIMIT)
     assert 6.0 < laid[-1, copter.B_N] < 25.0 and laid[-1, copter.HOLD] == inf
-    assert np.allclose(stop_from(P, np.zeros(3), LIMIT)[-1, 3:6], P)
+    assert np.allclose(stopping_segment(P, np.zeros(3), LIMIT)[-1, 3:6], P)
 
 
 def test_a_mission_without_home_is_numbered_anew():
@@ -141,6 +147,8 @@ def test_hostile_items_give_segments_of_numbers(value):
         item(6, 21),
     )
     for seq in (0, 1, 5, 99, -3):
-        laid, _ = lay(items, seq, HERE, P, {"CIRCLE_RATE": value, "RTL_ALT": value, "CIRCLE_RADIUS": value})
+        laid, _ = segments_from_mission(
+            items, seq, HERE, P, {"CIRCLE_RATE": value, "RTL_ALT": value, "CIRCLE_RADIUS": value}
+        )
         if len(laid):
-            assert np.isfinite(fly(paced(laid, LIMIT), 30.0)).all()
+            assert np.isfinite(fly(limit_speeds(laid, LIMIT), 30.0)).all()

@@ -10,9 +10,9 @@ from flights import DT
 from fleet.physics.wrench import NAMES, OFFSETS, WIND
 from fleet.window import Window
 from twin_worker.identification.fixed_wing import derivatives_model
-from twin_worker.identification.fixed_wing.derivatives_model import Coupled, identify
-from twin_worker.validation.held_out import Unseen
-from twin_worker.validation.verify import fits_at, mean
+from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel, identify
+from twin_worker.validation.held_out import HeldOut
+from twin_worker.validation.verify import fit_and_persistence, mean_fit
 
 KNOWN_S = 40.0
 SPLIT = round(KNOWN_S / DT)
@@ -24,15 +24,15 @@ def flight(seed: int = 0, seconds: float = KNOWN_S + 20.0, **more) -> Window:
     return fly(aircraft(seed), seconds, seed=seed, **more)
 
 
-def fit(plant: Coupled, window: Window, horizon: float = 16.0, split: int = SPLIT) -> float:
-    return mean(fits_at(Unseen(plant, window, split), horizon)[0])
+def fit(plant: DerivativesModel, window: Window, horizon: float = 16.0, split: int = SPLIT) -> float:
+    return mean_fit(fit_and_persistence(HeldOut(plant, window, split), horizon)[0])
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_cold_search_finds_nearly_what_the_truth_would_fit(seed):
     window = flight(seed)
     found = identify(window.part(0, SPLIT), ASKED, SMALL)
-    truth, prior = known(aircraft(seed)), replace(found, par=found.mean)
+    truth, prior = known(aircraft(seed)), replace(found, par=found.prior_mean)
     assert fit(found, window) > fit(truth, window) - 6.0
     assert fit(found, window) > fit(prior, window) + 10.0
     assert np.allclose(found.par[WIND:], [3.0, -2.0], atol=0.15)
@@ -41,7 +41,7 @@ def test_a_cold_search_finds_nearly_what_the_truth_would_fit(seed):
 
 def test_its_covariance_is_one_and_smaller_than_the_prior():
     found = identify(flight().part(0, SPLIT), ASKED, SMALL)
-    cov, before = found.covariance, np.linalg.inv(found.precision)
+    cov, before = found.covariance, np.linalg.inv(found.prior_precision)
     assert np.linalg.eigvalsh(cov / np.sqrt(np.outer(np.diag(cov), np.diag(cov)))).min() > 0
     assert (np.diag(cov) < np.diag(before)).all()
     sigma = np.sqrt(np.diag(cov))[DERIVED]
@@ -57,9 +57,9 @@ def test_a_warm_step_from_near_goes_on_where_the_search_was():
     window = flight()
     near = identify(window.part(0, SPLIT), ASKED, SMALL)
     moved = window.part(25, SPLIT + 25)
-    warm, cold = identify(moved, ASKED, SMALL, near=near), identify(moved, ASKED, SMALL)
-    assert warm.steps <= derivatives_model.WARM < cold.steps
-    for name in ("at", "mean", "precision"):  # it is where the search begins and holds nothing
+    warm, cold = identify(moved, ASKED, SMALL, warm_start=near), identify(moved, ASKED, SMALL)
+    assert warm.steps <= derivatives_model.WARM_STEPS < cold.steps
+    for name in ("trim_velocity", "prior_mean", "prior_precision"):  # it is where the search begins and holds nothing
         assert np.array_equal(getattr(warm, name), getattr(cold, name))
     assert fit(warm, window, split=SPLIT + 25) > fit(cold, window, split=SPLIT + 25) - 2.0
     assert (warm.t0, warm.t1) == (moved.t[0], moved.t[-1])
@@ -70,7 +70,7 @@ def test_warm_steps_close_in_from_afar():
     near = replace(identify(window.part(0, SPLIT), ASKED, SMALL), par=identify(window.part(0, 100), ASKED, SMALL).par)
     fits = []
     for _ in range(4):
-        near = identify(window.part(0, SPLIT), ASKED, SMALL, near=near)
+        near = identify(window.part(0, SPLIT), ASKED, SMALL, warm_start=near)
         fits.append(fit(near, window))
     assert fits[-1] > fit(known(aircraft(1)), window) - 6.0 and fits[-1] >= fits[0] - 0.5
 
@@ -81,32 +81,34 @@ def test_a_verified_model_holds_the_next_stretch():
     last = identify(fly(par, 60.0, seed=5), ASKED, SMALL)
     quiet = later(fly(par, 30.0, seed=6, lively=0.2), 60.0)
     part = quiet.part(0, 200)
-    fresh, held = identify(part, ASKED, SMALL), identify(part, ASKED, SMALL, last=last)
+    fresh, held = identify(part, ASKED, SMALL), identify(part, ASKED, SMALL, prior_model=last)
     miss = [
-        np.median(np.abs((one.par - par)[DERIVED] / fresh.precision.diagonal()[DERIVED] ** -0.5))
+        np.median(np.abs((one.par - par)[DERIVED] / fresh.prior_precision.diagonal()[DERIVED] ** -0.5))
         for one in (held, fresh)
     ]
     assert miss[0] < 0.6 * miss[1]
     assert fit(held, quiet, split=200) > fit(fresh, quiet, split=200)
-    assert np.array_equal(held.at, last.at) and held.airframe is last.airframe
+    assert np.array_equal(held.trim_velocity, last.trim_velocity) and held.airframe_prior is last.airframe_prior
 
 
 def test_what_is_held_is_partly_forgotten_never_all():
     par = aircraft(2)
     last = identify(fly(par, 60.0, seed=5), ASKED, SMALL)
-    held = identify(later(fly(par, 20.0, seed=6), 60.0), ASKED, SMALL, last=last)
-    before, nominal = last.information + last.precision, last.airframe[1]
-    assert np.trace(held.precision) < np.trace(before)
-    assert np.linalg.eigvalsh(held.precision - 0.29 * nominal).min() > -1e-6 * np.trace(nominal)
-    assert held.precision[WIND, WIND] < before[WIND, WIND]
+    held = identify(later(fly(par, 20.0, seed=6), 60.0), ASKED, SMALL, prior_model=last)
+    before, nominal = last.fisher_information + last.prior_precision, last.airframe_prior[1]
+    assert np.trace(held.prior_precision) < np.trace(before)
+    assert np.linalg.eigvalsh(held.prior_precision - 0.29 * nominal).min() > -1e-6 * np.trace(nominal)
+    assert held.prior_precision[WIND, WIND] < before[WIND, WIND]
 
 
 def test_what_was_learnt_of_this_very_window_is_not_held_again():
     """Else each hop over nearly the same rows would grow surer of what the first one said."""
     known_part = flight().part(0, SPLIT)
     once = identify(known_part, ASKED, SMALL)
-    again = identify(known_part, ASKED, SMALL, last=once)
-    assert np.array_equal(again.precision, once.precision) and np.allclose(again.mean, once.mean)
+    again = identify(known_part, ASKED, SMALL, prior_model=once)
+    assert np.array_equal(again.prior_precision, once.prior_precision) and np.allclose(
+        again.prior_mean, once.prior_mean
+    )
     assert np.allclose(again.par, once.par, rtol=1e-6)
 
 
@@ -114,10 +116,12 @@ def test_of_an_overlap_only_the_share_from_before_it_is_held():
     """The information held rises with the share of the last stretch that lies before this one, and no further."""
     window = flight()
     last = identify(window.part(0, 500), ASKED, SMALL)
-    last = replace(last, information=1e3 * last.information)  # so that it is all that counts
-    held = [identify(window.part(k, k + 500), ASKED, SMALL, last=last).precision for k in (0, 100, 250, 400)]
-    held.append(identify(later(window.part(500, 1000), 600.0), ASKED, SMALL, last=last).precision)
-    shares = [np.median(np.diag(one)[DERIVED] / np.diag(last.information)[DERIVED]) for one in held]
+    last = replace(last, fisher_information=1e3 * last.fisher_information)  # so that it is all that counts
+    held = [
+        identify(window.part(k, k + 500), ASKED, SMALL, prior_model=last).prior_precision for k in (0, 100, 250, 400)
+    ]
+    held.append(identify(later(window.part(500, 1000), 600.0), ASKED, SMALL, prior_model=last).prior_precision)
+    shares = [np.median(np.diag(one)[DERIVED] / np.diag(last.fisher_information)[DERIVED]) for one in held]
     moved = np.array([0.0, 0.2, 0.5, 0.8, 1.0])
     kept = shares[-1]  # of a stretch wholly before
     assert 0.3 < kept < 1.0
@@ -129,10 +133,10 @@ def test_an_earlier_flight_that_misleads_is_left_behind():
     truth = known(aircraft(0), *(window.t[0] - [60.0, 40.0]))
     wrong = truth.par.copy()
     wrong[NAMES.index("M_q")] = 300.0
-    liar = replace(truth, par=wrong, information=1e6 * truth.precision)
-    found = identify(window.part(0, SPLIT), ASKED, SMALL, last=liar)
+    liar = replace(truth, par=wrong, fisher_information=1e6 * truth.prior_precision)
+    found = identify(window.part(0, SPLIT), ASKED, SMALL, prior_model=liar)
     anew = identify(window.part(0, SPLIT), ASKED, SMALL)
-    assert np.array_equal(found.par, anew.par) and np.array_equal(found.precision, anew.precision)
+    assert np.array_equal(found.par, anew.par) and np.array_equal(found.prior_precision, anew.prior_precision)
 
 
 @pytest.mark.parametrize("value", [np.nan, 300.0])
@@ -142,10 +146,13 @@ def test_a_search_that_cannot_begin_begins_anew(value):
     lost = truth.par.copy()
     lost[NAMES.index("M_q")] = value
     anew = identify(window.part(0, SPLIT), ASKED, SMALL)
-    near = identify(window.part(0, SPLIT), ASKED, SMALL, near=replace(truth, par=lost))
-    assert near.steps > derivatives_model.WARM and fit(near, window) > fit(anew, window) - 3.0
+    near = identify(window.part(0, SPLIT), ASKED, SMALL, warm_start=replace(truth, par=lost))
+    assert near.steps > derivatives_model.WARM_STEPS and fit(near, window) > fit(anew, window) - 3.0
     last = identify(
-        window.part(0, SPLIT), ASKED, SMALL, last=replace(truth, par=lost, information=1e6 * truth.precision)
+        window.part(0, SPLIT),
+        ASKED,
+        SMALL,
+        prior_model=replace(truth, par=lost, fisher_information=1e6 * truth.prior_precision),
     )
     assert np.array_equal(last.par, anew.par)
 

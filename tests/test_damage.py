@@ -12,8 +12,8 @@ import pytest
 
 from fleet.bus.codec import encode, encoding
 from fleet.contract import COLUMNS, Sample
-from fleet.telemetry.recording.fleet_log import Record
-from fleet.telemetry.recording.opening import Source
+from fleet.telemetry.recording.fleet_log import BusRecord
+from fleet.telemetry.recording.opening import RecordingFile
 from fleet.telemetry.recording.recordings import Recording
 from tests.bench.peak_memory import peak_mb, reset_peak
 
@@ -48,7 +48,7 @@ def good(request, recordings) -> tuple[str, bytes]:
     path = recordings / FILES[request.param]
     if request.param == "parauav":
         return request.param, said(path)
-    with Source(path).open() as stream:
+    with RecordingFile(path).open() as stream:
         return request.param, stream.read(MOST)
 
 
@@ -57,7 +57,7 @@ def said(path: Path) -> bytes:
     out = bytearray()
     for now, news in Recording(path).steps():
         for message in news:
-            out += Record(now, encoding(type(message)), encode(message)).pack()
+            out += BusRecord(now, encoding(type(message)), encode(message)).pack()
         if len(out) > MOST:
             break
     return bytes(out)

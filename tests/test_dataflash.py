@@ -12,7 +12,7 @@ from pymavlink import DFReader
 
 from fleet.contract import COLUMNS
 from fleet.telemetry.onboard_logs.dataflash.clock import counted_times
-from fleet.telemetry.onboard_logs.dataflash.reader import DataflashLog, utc
+from fleet.telemetry.onboard_logs.dataflash.reader import DataflashLog, gps_to_utc
 from fleet.telemetry.onboard_logs.dataflash.rows import rates_between
 
 SITL = {"s01_nominal_calm": 2, "s02_nominal_light_wind": 3, "s05_engine_75": 6, "s09_quadplane_nominal": 9}
@@ -243,7 +243,7 @@ def test_the_vehicle_is_guessed_from_what_only_one_kind_logs() -> None:
     [(1448150400.0, 17), (1388989200.0, 16), (1763600000.0, 18), (1483228817.0, 17), (1483228818.0, 18)],
 )
 def test_leap_seconds_are_those_of_the_day(gps: float, leap: int) -> None:
-    assert gps - utc(gps) == leap
+    assert gps - gps_to_utc(gps) == leap
 
 
 def test_counted_messages_lie_evenly_between_stamps() -> None:

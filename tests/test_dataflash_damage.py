@@ -12,7 +12,7 @@ import pytest
 from dataflash_writer import Writer, log_of, read
 
 from fleet.telemetry.onboard_logs.dataflash.reader import DataflashLog
-from fleet.telemetry.onboard_logs.dataflash.records import MOST_KINDS, MOST_PLACES, Damage
+from fleet.telemetry.onboard_logs.dataflash.records import MAX_DAMAGE_KINDS, MAX_PLACES, Damage
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,10 @@ def test_a_hundred_flipped_bits_cost_few_messages(s02: bytes, seed: int) -> None
     assert sum(counts.values()) - sum(found.values()) < 60
     assert all(len(rows[f][0]) > 0.98 * len(whole[f][0]) for f in whole if f != "leg")
     assert log.epoch_s == pytest.approx(log_of(s02).epoch_s, abs=0.01)
-    assert any("damaged bytes" in s and "first at byte" in s for s in log.skipped) and len(log.skipped) < MOST_KINDS + 3
+    assert (
+        any("damaged bytes" in s and "first at byte" in s for s in log.skipped)
+        and len(log.skipped) < MAX_DAMAGE_KINDS + 3
+    )
 
 
 def test_a_message_goes_when_its_own_header_breaks_and_no_other() -> None:
@@ -123,7 +126,7 @@ def test_nothing_hostile_raises_or_grows(name: str, suffix: str) -> None:
     log = log_of(HOSTILE[name](), "hostile" + suffix)
     rows, _, _ = read(log)
     assert not rows and log.epoch_s is None and log.vehicle == "unknown" and log.system == 1
-    assert len(log.skipped) <= MOST_KINDS + 3 and all(len(s) < 300 for s in log.skipped)
+    assert len(log.skipped) <= MAX_DAMAGE_KINDS + 3 and all(len(s) < 300 for s in log.skipped)
 
 
 def test_a_damaged_text_log_loses_the_lines_that_are_damaged(recordings: Path) -> None:
@@ -141,8 +144,8 @@ def test_a_damaged_text_log_loses_the_lines_that_are_damaged(recordings: Path) -
 def test_damage_is_merged_and_bounded() -> None:
     damage = Damage("byte")
     for i in range(1000):
-        damage.note("bad bytes", i)
-        damage.note(f"kind {i}", i)
-    said = damage.sentences()
-    assert said[0] == "bad bytes: 1000, first at byte 0, 1, 2; skipped" and MOST_PLACES == 3
-    assert len(said) == MOST_KINDS + 1
+        damage.count("bad bytes", i)
+        damage.count(f"kind {i}", i)
+    said = damage.messages()
+    assert said[0] == "bad bytes: 1000, first at byte 0, 1, 2; skipped" and MAX_PLACES == 3
+    assert len(said) == MAX_DAMAGE_KINDS + 1

@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import oracle
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from pymavlink.dialects.v20 import common
 
 from fleet.telemetry.mavlink.parsing.decode import IDS, Decoder, layout
-from fleet.telemetry.mavlink.parsing.received import Heard
+from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
 from fleet.telemetry.mavlink.parsing.scan import STOP
-from fleet.telemetry.recording.opening import Source
+from fleet.telemetry.recording.opening import RecordingFile
 from fleet.telemetry.recording.tlog import Tlog
 from tests.bench.gateway import fuzz
 
@@ -62,13 +62,18 @@ def test_pieces_of_any_size_give_what_the_whole_gives(seed, sizes, damaged):
     pieces = [stream[a:b] for a, b in zip([0, *cuts], [*cuts, len(stream)], strict=True)] + [b"\0" * 600]
     decoder, one_by_one = Decoder(), []
     for piece in pieces:
-        one_by_one += oracle.raw(decoder.feed(Heard.of([(0.0, "a", piece)])))
+        one_by_one += oracle.raw(decoder.decode(ReceivedBytes.from_pieces([(0.0, "a", piece)])))
     whole = oracle.ours([*pieces])
     assert oracle.raw(whole) == one_by_one == [bytes(m.get_msgbuf()) for m in oracle.searched(stream)]
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 6))
+@example(44, 4)  # these four: a frame wholly in the carried bytes got the arrival of another sender's piece
+@example(65, 4)
+@example(69, 4)
+@example(235, 4)
+@example(830, 2)  # a false unknown frame up to the end of a batch swallowed the start of the next frame
 def test_senders_do_not_disturb_each_other(seed, senders):
     rng = np.random.default_rng(seed)
     streams = [oracle.worsened(rng, b"".join(oracle.frames(rng, 12))) + b"\0" * 600 for _ in range(senders)]
@@ -80,7 +85,7 @@ def test_senders_do_not_disturb_each_other(seed, senders):
         left[who] = left[who][size:]
     decoder, heard = Decoder(), {who: [] for who in range(senders)}
     for batch in np.array_split(np.arange(len(pieces)), 3):
-        frames = decoder.feed(Heard.of([pieces[i] for i in batch.tolist()]))
+        frames = decoder.decode(ReceivedBytes.from_pieces([pieces[i] for i in batch.tolist()]))
         assert (np.diff(frames.arrival) >= 0).all()
         for data, sender in zip(oracle.raw(frames), frames.sender.tolist(), strict=True):
             heard[frames.senders[sender]].append(data)
@@ -105,7 +110,7 @@ def test_messages_unknown_here_are_counted_and_passed_over_whole():
         told = b"".join(pieces)
         assert oracle.raw(frames) == [good] * (told.count(good) - told.count(tunnel))
         unknown = told.count(strange) + told.count(tunnel)
-        want = {"messages": len(frames.at), "bad_bytes": 0, "bad_frames": 0, "unknown": unknown}
+        want = {"messages": len(frames.headers), "bad_bytes": 0, "bad_frames": 0, "unknown": unknown}
         assert decoder.counters() == want
 
 
@@ -121,7 +126,7 @@ def test_incompatible_flags_are_no_frame():
     good[2] = 2
     crc = mav.x25crc(bytes(good[1:-2]) + bytes([50])).crc
     good[-2:] = crc.to_bytes(2, "little")
-    assert len(oracle.ours([bytes(good)]).at) == 0
+    assert len(oracle.ours([bytes(good)]).headers) == 0
 
 
 def test_junk_neither_raises_nor_hangs_nor_hides_a_good_aircraft():
@@ -133,8 +138,8 @@ def test_junk_neither_raises_nor_hangs_nor_hides_a_good_aircraft():
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", ["sitl/s02_nominal_light_wind.tlog.xz", "real/cuav_quadplane_20161112.tlog"])
 def test_recordings_field_by_field(recordings: Path, name):
-    batch = next(Tlog(Source(recordings / name)).batches())
-    some = batch._replace(at=batch.at[:6_000], arrival=batch.arrival[:6_000], sender=batch.sender[:6_000])
+    batch = next(Tlog(RecordingFile(recordings / name)).batches())
+    some = batch._replace(headers=batch.headers[:6_000], arrival=batch.arrival[:6_000], sender=batch.sender[:6_000])
     frames = oracle.raw(some)
     oracle.assert_equal(oracle.ours(frames), oracle.by_pymavlink(frames))
-    assert len(some.at) == 6_000 and some.at[-1, STOP] <= len(batch.buf)
+    assert len(some.headers) == 6_000 and some.headers[-1, STOP] <= len(batch.buf)

@@ -26,7 +26,7 @@ from fleet.access.roles import ROLES, ROUTER_ROLE
 from fleet.bus.codec import decode, encode
 from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import connect
-from fleet.contract import Account, FleetState, Prediction, Status
+from fleet.contract import FleetState, GatewayCounters, Prediction, Status
 from gateway.status import metrics as gateway
 from tests.bench.security.site import REAL, Site, make_papers, routed, zenohd
 from tests.bench.security.trying import until
@@ -196,7 +196,7 @@ def test_files_that_are_mounted_or_named_exist() -> None:
 
 def test_metrics_worth_an_alarm_are_told_by_exactly_these_names() -> None:
     worker = twin_worker.counters(lambda: EXAMPLES[FleetState], MemoryBus())
-    link = gateway.counters(lambda: (EXAMPLES[Account], [EXAMPLES[Status]]))
+    link = gateway.counters(lambda: (EXAMPLES[GatewayCounters], [EXAMPLES[Status]]))
     told = {sample.name for metric in (*worker(), *link()) for sample in metric.samples}
     named = set(re.findall(r"`(parauav_\w+)`", README))
     assert len(named) > 4 and named <= told, named - told
@@ -302,7 +302,7 @@ def test_predictions_answer_over_http_and_what_it_is_asked_to_write_is_dropped(t
         held.callback(child.terminate)
         worker, tools = (held.enter_context(connect(site.entry(role))) for role in ("worker", "tools"))
         worker.answer(Prediction, lambda *_: [(EXAMPLES[Prediction], None)])
-        tools.overhear(Prediction, lambda payload, *_: heard.append(payload))
+        tools.subscribe_raw(Prediction, lambda payload, *_: heard.append(payload))
         found: list[dict[str, str]] = []
 
         def asked() -> bool:

@@ -12,13 +12,13 @@ from fleet.commands.offline import diagnose as verb
 from twin_worker.diagnosis import __main__ as diagnosis
 from twin_worker.diagnosis import learn
 from twin_worker.diagnosis.baseline.calibrate import calibrate
-from twin_worker.diagnosis.data.card import UNKNOWN, Card, read
-from twin_worker.diagnosis.data.flight import Flight, lay, read_flights
+from twin_worker.diagnosis.data.card import UNKNOWN, AircraftCard, read_card
+from twin_worker.diagnosis.data.flight import FlightData, read_flights, resample_flight
 from twin_worker.diagnosis.inference.diagnose import diagnose
-from twin_worker.diagnosis.inference.report import Outcome
+from twin_worker.diagnosis.inference.report import ReportOutcome
 from twin_worker.diagnosis.model.baseline import Baseline
 from twin_worker.diagnosis.output import keep
-from twin_worker.telemetry.history import History
+from twin_worker.telemetry.history import TelemetryHistory
 
 T0 = 1.7e9
 
@@ -29,53 +29,55 @@ def folder(recordings: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def card(folder: Path) -> Card:
-    return read(folder / "card.json")
+def card(folder: Path) -> AircraftCard:
+    return read_card(folder / "card.json")
 
 
 @pytest.fixture(scope="module")
-def nominal(folder: Path, card: Card) -> list[Flight]:
+def nominal(folder: Path, card: AircraftCard) -> list[FlightData]:
     return [read_flights(path, card)[0] for path in sorted(folder.glob("cal_*.tlog"))[:3]]
 
 
 @pytest.fixture(scope="module")
-def base(nominal: list[Flight], card: Card) -> Baseline:
+def base(nominal: list[FlightData], card: AircraftCard) -> Baseline:
     return calibrate(nominal, card)
 
 
-def history(seconds: float, speed: float) -> History:
+def history(seconds: float, speed: float) -> TelemetryHistory:
     """Telemetry of an aircraft that does nothing, as far as it has rows."""
-    out = History(keep_s=np.inf)
+    out = TelemetryHistory(keep_s=np.inf)
     t = T0 + np.arange(0.0, seconds, 0.04)
     still = np.zeros(len(t))
-    out.put("attitude", t, np.zeros((len(t), 6)))
-    out.put("velocity", t, np.stack([still + speed, still, still], axis=1))
-    out.put("position", t, np.stack([still + 4.7e8, still + 8.5e7 + speed * 100 * (t - T0), still + 5e5], axis=1))
-    out.put("servo", t, np.full((len(t), 8), 1500.0))
+    out.replace_rows("attitude", t, np.zeros((len(t), 6)))
+    out.replace_rows("velocity", t, np.stack([still + speed, still, still], axis=1))
+    out.replace_rows(
+        "position", t, np.stack([still + 4.7e8, still + 8.5e7 + speed * 100 * (t - T0), still + 5e5], axis=1)
+    )
+    out.replace_rows("servo", t, np.full((len(t), 8), 1500.0))
     return out
 
 
 def test_a_flight_of_ten_seconds_is_too_short() -> None:
     with pytest.raises(ValueError, match="found 10 s, expected 25 s of flight at least; record longer"):
-        lay("hop", history(10.0, 20.0), {}, UNKNOWN)
+        resample_flight("hop", history(10.0, 20.0), {}, UNKNOWN)
 
 
 def test_standing_on_the_ground_is_no_flight() -> None:
     with pytest.raises(ValueError, match=r"found 0 s in the air.*check that the aircraft flew"):
-        lay("parked", history(120.0, 0.0), {}, UNKNOWN)
+        resample_flight("parked", history(120.0, 0.0), {}, UNKNOWN)
 
 
 def test_what_is_missing_is_named() -> None:
     told = history(120.0, 20.0)
-    told.put("servo", np.empty(0), np.empty((0, 8)))
+    told.replace_rows("servo", np.empty(0), np.empty((0, 8)))
     with pytest.raises(ValueError, match=r"found no servo in it.*record that message too"):
-        lay("mute", told, {}, UNKNOWN)
+        resample_flight("mute", told, {}, UNKNOWN)
 
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("lost", [("Va",), ("a_x", "a_y", "a_z")])
 def test_without_airspeed_or_accelerometer_nothing_is_invented(
-    lost: tuple[str, ...], nominal: list[Flight], card: Card
+    lost: tuple[str, ...], nominal: list[FlightData], card: AircraftCard
 ) -> None:
     vane = "a_x" not in lost
     blind = [
@@ -83,38 +85,38 @@ def test_without_airspeed_or_accelerometer_nothing_is_invented(
         for flight in nominal
     ]
     report = diagnose(blind[0], calibrate(blind, card))
-    assert report.outcome in (Outcome.NONE, Outcome.SUSPECTED), report.sentence
+    assert report.outcome in (ReportOutcome.NONE, ReportOutcome.SUSPECTED), report.sentence
 
 
 @pytest.mark.recordings
-def test_without_accelerometer_the_model_asks_for_flights_like_it(nominal: list[Flight], base: Baseline) -> None:
+def test_without_accelerometer_the_model_asks_for_flights_like_it(nominal: list[FlightData], base: Baseline) -> None:
     with pytest.raises(ValueError, match=r"found no accelerometer.*calibrate on flights recorded like this one"):
         diagnose(replace(nominal[0], vane=False), base)
 
 
 @pytest.mark.recordings
-def test_another_aircraft_is_refused(nominal: list[Flight], base: Baseline) -> None:
+def test_another_aircraft_is_refused(nominal: list[FlightData], base: Baseline) -> None:
     slow = {name: x / 2.5 if name in ("v_n", "v_e", "Va") else x for name, x in nominal[0].readings.items()}
     with pytest.raises(ValueError, match=r"expected about 47 m/s.*use the model of this aircraft"):
         diagnose(replace(nominal[0], readings=slow), base)
 
 
 @pytest.mark.recordings
-def test_the_card_of_another_aircraft_is_refused(folder: Path, nominal: list[Flight]) -> None:
+def test_the_card_of_another_aircraft_is_refused(folder: Path, nominal: list[FlightData]) -> None:
     with pytest.raises(ValueError, match=r"Aerosonde.*lift slope.*use the card of this aircraft"):
         calibrate(
-            [read_flights(folder / f"{flight.name}.tlog", read(Path("aerosonde")))[0] for flight in nominal],
-            read(Path("aerosonde")),
+            [read_flights(folder / f"{flight.name}.tlog", read_card(Path("aerosonde")))[0] for flight in nominal],
+            read_card(Path("aerosonde")),
         )
 
 
 @pytest.mark.recordings
-def test_nominal_flights_that_are_none_are_refused(folder: Path, nominal: list[Flight], card: Card) -> None:
+def test_nominal_flights_that_are_none_are_refused(folder: Path, nominal: list[FlightData], card: AircraftCard) -> None:
     faulty = read_flights(folder / "rec_7c39cb85.tlog", card)[0]
     with pytest.raises(ValueError, match=r"rec_7c39cb85: found roll .* expected nominal flights; leave it out"):
         calibrate([*nominal, faulty], card)
     windy = [read_flights(folder / f"rec_{name}.tlog", card)[0] for name in ("2e0d2cd3", "80835fb9")]
-    with pytest.raises(ValueError, match="expected nominal flights"):
+    with pytest.raises(ValueError, match="expected consistent nominal flights"):
         calibrate([*windy, nominal[0]], card)
 
 
@@ -151,7 +153,7 @@ def test_a_card_that_is_none_is_refused(text: str, expected: str, tmp_path: Path
     path = tmp_path / "card.json"
     path.write_text(text)
     with pytest.raises(ValueError, match=expected):
-        read(path)
+        read_card(path)
 
 
 @pytest.mark.parametrize("text", ["nothing", "[]", '{"format": "other"}', '{"format": "parauav.simulation.1"}'])

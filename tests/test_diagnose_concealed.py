@@ -12,10 +12,10 @@ from left_out import left_out
 
 from twin_worker.diagnosis import __main__ as diagnose
 from twin_worker.diagnosis import learn
-from twin_worker.diagnosis.data.card import read
+from twin_worker.diagnosis.data.card import read_card
 from twin_worker.diagnosis.data.flight import read_flights
 from twin_worker.diagnosis.inference.diagnose import diagnose as diagnose_one
-from twin_worker.diagnosis.inference.report import Outcome
+from twin_worker.diagnosis.inference.report import ReportOutcome
 from twin_worker.diagnosis.output import keep
 
 pytestmark = pytest.mark.recordings
@@ -82,18 +82,18 @@ def test_a_model_corrected_by_what_was_found_is_loaded_again(model: Path, folder
     assert not guesses and base.card.name.startswith("FW-A")
     flight = read_flights(folder / "rec_2e0d2cd3.tlog", base.card)[0]
     report = diagnose_one(flight, base)
-    assert report.outcome is Outcome.NAMED and report.stray_after < 0.5 * report.stray_before
+    assert report.outcome is ReportOutcome.NAMED and report.free_run_error_after < 0.5 * report.free_run_error_before
     keep.save(tmp_path / "corrected.json", base, report.findings)
     again, guesses = keep.load(tmp_path / "corrected.json")
-    assert [guess.effect.name for guess in guesses] == ["wind_steady"] and guesses[0] == report.findings[0].guess
+    assert [guess.effect.name for guess in guesses] == ["wind_steady"] and guesses[0] == report.findings[0].hypothesis
     assert all(np.array_equal(again.coef[name], x) for name, x in base.coef.items())
 
 
 def test_nominal_flights_left_out_in_turn_show_no_mismatch(folder: Path) -> None:
-    card = read(folder / "card.json")
+    card = read_card(folder / "card.json")
     flights = [flight for path in sorted(folder.glob("cal_*.tlog")) for flight in read_flights(path, card)]
     for report in left_out(flights, card):
-        assert report.outcome is Outcome.NONE, report.sentence
+        assert report.outcome is ReportOutcome.NONE, report.sentence
 
 
 def test_a_recording_of_a_simulator_is_a_baseline_too(folder: Path, tmp_path: Path) -> None:

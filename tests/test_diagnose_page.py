@@ -11,12 +11,12 @@ from diagnosed import LENGTH, NAN, made
 from PIL import Image
 
 from fleet.effects import catalogue
-from twin_worker.diagnosis.inference.report import Outcome, Series
+from twin_worker.diagnosis.inference.report import FigureSeries, ReportOutcome
 from twin_worker.diagnosis.model.baseline import CHANNELS
 from twin_worker.diagnosis.output.figures import KINDS, draw, stems
-from twin_worker.diagnosis.output.marks import MEANING, marks, runs, times
+from twin_worker.diagnosis.output.marks import CHANNEL_TEXT, format_segments, marks, true_segments
 from twin_worker.diagnosis.output.page import amount, unit, write
-from twin_worker.diagnosis.output.traces import chosen
+from twin_worker.diagnosis.output.traces import choose_channels
 
 
 class Reader(HTMLParser):
@@ -53,8 +53,8 @@ def read(path: Path) -> Reader:
     return Reader(path.read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize("outcome", Outcome)
-def test_every_outcome_makes_four_pictures_and_a_page(outcome: Outcome, tmp_path: Path) -> None:
+@pytest.mark.parametrize("outcome", ReportOutcome)
+def test_every_outcome_makes_four_pictures_and_a_page(outcome: ReportOutcome, tmp_path: Path) -> None:
     report = made(outcome=outcome)
     page = read(write([report], tmp_path))
     files = [tmp_path / f"s07-lag-{kind}.png" for kind in KINDS]
@@ -66,8 +66,8 @@ def test_every_outcome_makes_four_pictures_and_a_page(outcome: Outcome, tmp_path
     assert len(page.images) == 4 and all(src.startswith("data:image/png;base64,") for src in page.images)
     words = " ".join(page.words)
     assert report.sentence in words
-    assert ("free-form" in words) == (outcome is Outcome.UNKNOWN)
-    assert ("0.2530 ± 0.0061" in words) == (outcome in (Outcome.NAMED, Outcome.SUSPECTED))
+    assert ("free-form" in words) == (outcome is ReportOutcome.UNKNOWN)
+    assert ("0.2530 ± 0.0061" in words) == (outcome in (ReportOutcome.NAMED, ReportOutcome.SUSPECTED))
     assert "5 Hz" in words
 
 
@@ -79,7 +79,7 @@ def test_nothing_is_fetched_and_nothing_runs(tmp_path: Path) -> None:
 
 def test_a_hostile_name_is_only_a_name(tmp_path: Path) -> None:
     name = "../../<script>alert('$x$')</script>\x1b[31m\udc80"
-    hostile = replace(made(name), sentence="<img src=x onerror=alert(1)>", lacks=("<b>", "&amp;"))
+    hostile = replace(made(name), sentence="<img src=x onerror=alert(1)>", limitations=("<b>", "&amp;"))
     folder = tmp_path / "in" / "here"
     page = read(write([hostile], folder))
     assert "script" not in page.tags and page.tags.count("img") == 4
@@ -97,7 +97,11 @@ def test_files_of_flights_are_never_the_same_nor_elsewhere() -> None:
 
 
 def test_several_flights_have_a_page_each_and_an_overview(tmp_path: Path) -> None:
-    reports = [made("one", seed=1), made("one", Outcome.NONE, seed=2), made("index", Outcome.UNKNOWN, seed=3)]
+    reports = [
+        made("one", seed=1),
+        made("one", ReportOutcome.NONE, seed=2),
+        made("index", ReportOutcome.UNKNOWN, seed=3),
+    ]
     overview = write(reports, tmp_path).read_text()
     read(tmp_path / "index.html")
     for stem, report in zip(("one", "one-2", "index-2"), reports, strict=True):
@@ -122,40 +126,40 @@ def test_what_is_not_there_is_left_blank(tmp_path: Path) -> None:
     for k, less in enumerate(
         (
             replace(series, before=channel, after=channel),
-            replace(series, before=blank, after=blank, measured=nothing, place=nothing),
-            replace(series, ok=np.zeros_like(series.ok), held=np.zeros_like(series.held)),
-            Series(*(x[:0] for x in vars(series).values())),
+            replace(series, before=blank, after=blank, measured=nothing, position=nothing),
+            replace(series, ok=np.zeros_like(series.ok), held_out=np.zeros_like(series.held_out)),
+            FigureSeries(*(x[:0] for x in vars(series).values())),
         )
     ):
         assert all(path.exists() for path in draw(replace(report, series=less), tmp_path, f"less-{k}"))
-    names, title = chosen(replace(report, series=replace(series, before=channel)))
+    names, title = choose_channels(replace(report, series=replace(series, before=channel)))
     assert "force_x" not in names and "1 without data" in title
 
 
 def test_only_channels_that_differ_are_drawn_and_the_others_counted(tmp_path: Path) -> None:
     report = made()
     ratios = dict.fromkeys(CHANNELS, 1.0)
-    names, title = chosen(replace(report, ratio_before=ratios | {"pitch": 9.0, "lift": 12.0}))
+    names, title = choose_channels(replace(report, ratio_before=ratios | {"pitch": 9.0, "lift": 12.0}))
     assert names == ["lift", "pitch"] and title == "12 of 14 channels at their usual"
     wide = replace(report, ratio_before=dict.fromkeys(CHANNELS, 2.0))
     assert all(path.stat().st_size < 300_000 for path in draw(wide, tmp_path))
-    names, title = chosen(wide)
+    names, title = choose_channels(wide)
     assert len(names) == 8 and "0 of 14" in title and "worst 8 of the other 14" in title
-    names, title = chosen(replace(report, ratio_before=ratios))
+    names, title = choose_channels(replace(report, ratio_before=ratios))
     assert len(names) == 4 and "14 of 14" in title
 
 
 def test_every_channel_has_a_meaning() -> None:
-    assert set(MEANING) == set(CHANNELS)
+    assert set(CHANNEL_TEXT) == set(CHANNELS)
 
 
 def test_onsets_and_segments() -> None:
     found = marks(made(effects=3))
-    assert [mark.begins((0.0, LENGTH)) for mark in found] == [[83.0], [], [140.0]]
+    assert [mark.onset_times((0.0, LENGTH)) for mark in found] == [[83.0], [], [140.0]]
     assert len({mark.colour for mark in found}) == 3
-    assert [mark.name for mark in marks(made(outcome=Outcome.UNKNOWN))] == ["unknown, pitch acceleration"]
-    assert times([(1.0, 2.0), (3.0, 4.4), (5.0, 6.0), (7.0, 8.0)]) == "1–2, 3–4, 5–6 s and 1 more"
-    assert runs(np.arange(6.0), np.array([1, 1, 0, 0, 1, 1], bool)) == [(0.0, 1.0), (4.0, 5.0)]
+    assert [mark.name for mark in marks(made(outcome=ReportOutcome.UNKNOWN))] == ["unknown, pitch acceleration"]
+    assert format_segments([(1.0, 2.0), (3.0, 4.4), (5.0, 6.0), (7.0, 8.0)]) == "1–2, 3–4, 5–6 s and 1 more"
+    assert true_segments(np.arange(6.0), np.array([1, 1, 0, 0, 1, 1], bool)) == [(0.0, 1.0), (4.0, 5.0)]
 
 
 @pytest.mark.parametrize(

@@ -8,15 +8,15 @@ import pytest
 from twin_worker.diagnosis import __main__ as diagnosis
 from twin_worker.diagnosis import learn
 from twin_worker.diagnosis.baseline.own_past import OwnPast
-from twin_worker.diagnosis.baseline.past import before, calibrate_past, since, split
-from twin_worker.diagnosis.data.card import read
-from twin_worker.diagnosis.data.flight import Flight, read_flights
-from twin_worker.diagnosis.inference.report import Outcome, Report
+from twin_worker.diagnosis.baseline.past import calibrate_past, part_after, part_before, split
+from twin_worker.diagnosis.data.card import read_card
+from twin_worker.diagnosis.data.flight import FlightData, read_flights
+from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.output import keep
-from twin_worker.diagnosis.share import shared
+from twin_worker.diagnosis.share import diagnose_all
 
 pytestmark = pytest.mark.recordings
-CARD = read(Path("skywalker"))
+CARD = read_card(Path("skywalker"))
 UNTIL_S = 130.0
 ZERO_S = 2.045  # boot time of each flight's first attitude [s]
 CHANGED = {  # flight -> effect and what it is not told from, boot time of the change [s]
@@ -35,11 +35,11 @@ def sitl(recordings: Path) -> Path:
 @pytest.fixture(scope="module")
 def reports(sitl: Path) -> dict[str, Report]:
     files = [sitl / f"{name}.tlog.xz" for name in (*CHANGED, NOMINAL)]
-    return {one.flight: one for found, _ in shared(files, OwnPast(UNTIL_S, CARD), 1, print) for one in found}
+    return {one.flight: one for found, _ in diagnose_all(files, OwnPast(UNTIL_S, CARD), 1, print) for one in found}
 
 
 @pytest.fixture(scope="module")
-def flight(sitl: Path) -> Flight:
+def flight(sitl: Path) -> FlightData:
     return read_flights(sitl / "s07_servo_slow.tlog.xz", CARD)[0]
 
 
@@ -47,39 +47,39 @@ def flight(sitl: Path) -> Flight:
 def test_a_change_is_named_and_dated_by_the_flights_own_past(name: str, reports: dict[str, Report]) -> None:
     effects, boot = CHANGED[name]
     report = reports[name]
-    assert report.outcome is Outcome.NAMED and len(report.findings) == 1, report.sentence
+    assert report.outcome is ReportOutcome.NAMED and len(report.findings) == 1, report.sentence
     found = report.findings[0]
-    assert {found.guess.effect.name, *found.rivals} <= effects, report.sentence
+    assert {found.hypothesis.effect.name, *found.rivals} <= effects, report.sentence
     assert abs(found.segments[0][0] - (boot - ZERO_S)) <= 1.5, report.sentence
-    assert any("of its own past: effects present from the start" in word for word in report.lacks)
+    assert any("of its own past: effects present from the start" in word for word in report.limitations)
 
 
 def test_nominal_flights_are_left_in_peace(reports: dict[str, Report]) -> None:
     nominal = [report for name, report in reports.items() if name.startswith(NOMINAL)]
     assert len(nominal) == 3
     for report in nominal:
-        assert report.outcome in (Outcome.NONE, Outcome.SUSPECTED), report.sentence
+        assert report.outcome in (ReportOutcome.NONE, ReportOutcome.SUSPECTED), report.sentence
 
 
 def test_axes_the_past_does_not_foretell_are_said(reports: dict[str, Report]) -> None:
-    assert any("yaw not covered" in word for word in reports["s10_multi3_nominal-uav21"].lacks)
+    assert any("yaw not covered" in word for word in reports["s10_multi3_nominal-uav21"].limitations)
 
 
-def test_pieces_share_no_instant_and_leave_none_out(flight: Flight) -> None:
-    past = before(flight, UNTIL_S)
+def test_pieces_share_no_instant_and_leave_none_out(flight: FlightData) -> None:
+    past = part_before(flight, UNTIL_S)
     count = np.sum([piece.ok for piece in split(past)], axis=0)
     assert (count[past.ok] == 1).all() and not count[~past.ok].any()
-    assert past.t[-1] < UNTIL_S <= since(flight, UNTIL_S).t[0]
-    assert len(past.t) + len(since(flight, UNTIL_S).t) == len(flight.t)
+    assert past.t[-1] < UNTIL_S <= part_after(flight, UNTIL_S).t[0]
+    assert len(past.t) + len(part_after(flight, UNTIL_S).t) == len(flight.t)
 
 
-def test_the_part_to_diagnose_keeps_the_flights_clock(flight: Flight) -> None:
-    later = since(flight, 100.0)
-    assert later.t[0] >= 100.0 and later.zero == flight.zero and len(later.readings["phi"]) == len(later.t)
-    assert later.commands.shape == (len(later.t), 4) and later.place.shape == (len(later.t), 2)
+def test_the_part_to_diagnose_keeps_the_flights_clock(flight: FlightData) -> None:
+    later = part_after(flight, 100.0)
+    assert later.t[0] >= 100.0 and later.t_start == flight.t_start and len(later.readings["phi"]) == len(later.t)
+    assert later.commands.shape == (len(later.t), 4) and later.position.shape == (len(later.t), 2)
 
 
-def test_a_past_too_short_is_refused(flight: Flight) -> None:
+def test_a_past_too_short_is_refused(flight: FlightData) -> None:
     with pytest.raises(ValueError, match=r"found 25 s of trusted flight before 65 s, expected 40 s at least"):
         calibrate_past(flight, 65.0, CARD)
     with pytest.raises(ValueError, match=r"found 0 s of trusted flight after 589 s.*trust a shorter past"):

@@ -15,15 +15,15 @@ from conftest import unused_port
 from rich.console import Console
 
 from fleet import SOURCES, cli
-from fleet.access.entry import Entry
-from fleet.access.knock import _cure
+from fleet.access.entry import BusConfig
+from fleet.access.knock import _remedy
 from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import open_router
 from fleet.commands.live.status import machines, processes
-from fleet.contract import Account, Claim, FleetRow, FleetState, LinkAccount, State, Status
+from fleet.contract import Claim, FleetRow, FleetState, GatewayCounters, LinkCounters, Status, TwinState
 from fleet.health import claims, door, machine
 from fleet.health.finding import BAD, NOTE, OK
-from fleet.report.report_text import spans
+from fleet.report.report_text import id_ranges
 from tests.bench.security.bombs import ESCAPES
 from tests.bench.security.site import expired, make_papers, make_passwords
 
@@ -32,7 +32,7 @@ ONE, TWO = "0" * 15 + "1", "0" * 15 + "2"
 
 def claim(worker: str, held: Iterable[int], **said: object) -> Claim:
     given = {"t": time.time(), "machine": f"m{worker[-1]}", "code": SOURCES} | said
-    return Claim(worker=worker, held=tuple((uav, 5) for uav in held), **given)
+    return Claim(worker=worker, owned=tuple((uav, 5) for uav in held), **given)
 
 
 def fleet(
@@ -41,23 +41,23 @@ def fleet(
     """A bus where these claims are answered, these aircraft heard, and these workers present."""
     bus = MemoryBus()
     heard = tuple(uavs)
-    told = Account(t=1.0, uavs=heard, links=("udpin:x",), **({"machine": "gs", "code": SOURCES} | account))
-    bus.answer(Claim, lambda *_: [(one, None) for one in said])
-    bus.answer(Account, lambda *_: [(told, None)])
-    bus.answer(Status, lambda *_: [(Status(uav=uav, t=1.0), None) for uav in heard])
+    told = GatewayCounters(t=1.0, uavs=heard, links=("udpin:x",), **({"machine": "gs", "code": SOURCES} | account))
+    bus.declare_queryable(Claim, lambda *_: [(one, None) for one in said])
+    bus.declare_queryable(GatewayCounters, lambda *_: [(told, None)])
+    bus.declare_queryable(Status, lambda *_: [(Status(uav=uav, t=1.0), None) for uav in heard])
     for name in live:
         worker, _, ids = name.partition("/")
-        bus.present(f"worker/{worker.zfill(16)}/{ids}/1")
+        bus.declare_liveliness(f"worker/{worker.zfill(16)}/{ids}/1")
     return bus
 
 
 @pytest.fixture(autouse=True)
 def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(claims, "SETTLE_S", 0.0)
+    monkeypatch.setattr(claims, "RECHECK_S", 0.0)
 
 
 def found(bus: MemoryBus, grade: str) -> list[str]:
-    return [f"{one.what}: {one.sentence}" for one in claims.look(bus) if one.grade == grade]
+    return [f"{one.what}: {one.sentence}" for one in claims.check_fleet(bus) if one.grade == grade]
 
 
 def test_a_healthy_fleet_is_told_line_by_line() -> None:
@@ -86,7 +86,7 @@ WRONG: list[tuple[Callable[[], MemoryBus], str, str]] = [  # made when they are 
     (lambda: of(claim(ONE, (0, 1)), uavs=(0, 1, 77, 78)), BAD, "uav 77-78: in no worker range; start"),
     (lambda: fleet(claim(ONE, FOUR)), BAD, f"{TWO} is live but does not answer: process or machine frozen"),
     (lambda: fleet(claim(ONE, FOUR), live=[]), BAD, f"{ONE}: claims without a liveliness token; restart"),
-    (lambda: of(claim(ONE, FOUR, bare=(2,))), NOTE, "uav 2 without past telemetry"),
+    (lambda: of(claim(ONE, FOUR, without_history=(2,))), NOTE, "uav 2 without past telemetry"),
     (lambda: of(claim(ONE, FOUR, t=time.time() - 9.0)), BAD, "m1: 9.0 s behind .*; synchronise both"),
     (lambda: of(claim(ONE, FOUR, t=time.time() + 0.6)), NOTE, "m1: 0.6 s ahead of this machine's"),
     (lambda: of(claim(ONE, FOUR, code="other")), NOTE, "twin_worker on m1: other release .* install"),
@@ -116,28 +116,30 @@ def test_the_port_our_own_gateway_has_is_no_finding() -> None:
 
 
 def test_the_clock_of_a_gateways_machine_counts_too() -> None:
-    assert any("gs: 30.0 s behind" in line for line in found(of(claim(ONE, FOUR), now=time.time() - 30.0), BAD))
+    assert any("gs: 30.0 s behind" in line for line in found(of(claim(ONE, FOUR), wall_t=time.time() - 30.0), BAD))
 
 
 def test_two_gateways_of_one_aircraft_and_none_at_all() -> None:
     bus = of(claim(ONE, FOUR))
-    bus.answer(Account, lambda *_: [(Account(t=1.0, uavs=(3, 9), machine="gs2", code=SOURCES), None)])
+    bus.declare_queryable(
+        GatewayCounters, lambda *_: [(GatewayCounters(t=1.0, uavs=(3, 9), machine="gs2", code=SOURCES), None)]
+    )
     assert found(bus, BAD) == ["gateways: two gateways publish uav 3; change the offset of one (#offset=), or stop it"]
     assert found(MemoryBus(), NOTE)[0].startswith("gateways: none found; start `gateway`")
 
 
 def test_a_handover_under_way_is_no_fault() -> None:
     bus, turn = MemoryBus(), iter([((0, 1), (1,)), ((0,), (1,))])
-    bus.present(f"worker/{ONE}/0-9/1")
-    bus.present(f"worker/{TWO}/0-9/1")
-    bus.answer(Claim, lambda *_: [(claim(w, h), None) for w, h in zip((ONE, TWO), next(turn), strict=True)])
-    bus.answer(Status, lambda *_: [(Status(uav=uav, t=1.0), None) for uav in (0, 1)])
+    bus.declare_liveliness(f"worker/{ONE}/0-9/1")
+    bus.declare_liveliness(f"worker/{TWO}/0-9/1")
+    bus.declare_queryable(Claim, lambda *_: [(claim(w, h), None) for w, h in zip((ONE, TWO), next(turn), strict=True)])
+    bus.declare_queryable(Status, lambda *_: [(Status(uav=uav, t=1.0), None) for uav in (0, 1)])
     assert found(bus, BAD) == []
 
 
 def test_names_from_the_wire_are_only_names() -> None:
     bus = fleet(claim(ONE, range(4), machine=ESCAPES), live=["1/0-9", "1/x-y", "9" * 5000 + "/1-2", "3/0-" + "9" * 99])
-    assert len(list(claims.look(bus))) < 12
+    assert len(list(claims.check_fleet(bus))) < 12
 
 
 # --- certificates ----------------------------------------------------------------------------------------------------
@@ -158,7 +160,7 @@ def test_certificates_are_judged_by_their_end_and_the_fleet_behind_them_is_seen(
     at = f"tls/127.0.0.1:{unused_port()}"
     file = tmp_path / "fleet.toml"
     file.write_text(f'[router]\nat = "{at}"\ncertificates = "{site}"\n')
-    with open_router(Entry(at, certificates=site)):
+    with open_router(BusConfig(at, certificates=site)):
         code, out = shown(capsys, f"--config={file}")
     assert code == 0
     assert out.count("certificates") >= 7 and "router: valid until" in out and "offline" in out
@@ -166,13 +168,15 @@ def test_certificates_are_judged_by_their_end_and_the_fleet_behind_them_is_seen(
 
     soon = expired(site, "viewer", tmp_path / "soon", ended=timedelta(days=-3))
     (soon / "worker.key").chmod(0o644)
-    old = {line.sentence: line.grade for line in door.papers(Entry(at, "tools", soon))}
+    old = {line.sentence: line.grade for line in door.check_certificates(BusConfig(at, "tools", soon))}
     assert any(
         g == NOTE and "viewer: expires on" in s and "renew it: certificates.sh role" in s for s, g in old.items()
     )
     assert any(g == BAD and "chmod 640" in s for s, g in old.items())
     gone = [
-        one for one in door.papers(Entry(at, "viewer", expired(site, "viewer", tmp_path / "old"))) if one.grade == BAD
+        one
+        for one in door.check_certificates(BusConfig(at, "viewer", expired(site, "viewer", tmp_path / "old")))
+        if one.grade == BAD
     ]
     assert "expired on" in gone[0].sentence and "renew it: certificates.sh role FOLDER viewer" in gone[0].sentence
 
@@ -180,7 +184,7 @@ def test_certificates_are_judged_by_their_end_and_the_fleet_behind_them_is_seen(
 def test_a_routers_certificate_is_renewed_as_one(site: Path, tmp_path: Path) -> None:
     for name, ended in (("past", timedelta(days=1)), ("soon", timedelta(days=-3))):
         folder = expired(site, "router", tmp_path / name, ended=ended)
-        lines = [one.sentence for one in door.papers(Entry("tls/127.0.0.1:1", "tools", folder))]
+        lines = [one.sentence for one in door.check_certificates(BusConfig("tls/127.0.0.1:1", "tools", folder))]
         assert any("renew it: certificates.sh router FOLDER NAME" in line for line in lines), name
 
 
@@ -188,15 +192,17 @@ def test_why_a_router_is_not_believed_decides_what_helps(site: Path, tmp_path: P
     named = tmp_path / "named"
     make_papers(named, "router.example", authority=site)
     at = f"tls/127.0.0.1:{unused_port()}"
-    with open_router(Entry(at, certificates=named)):
-        (bad,) = [one for one in door.router(Entry(at, "tools", site)) if one.grade == BAD]
-    assert "make one for this name too (certificates.sh router FOLDER NAME...)" in bad.sentence
-    assert "set the clock" in _cure("certificate is not yet valid") and "restart" in _cure("certificate has expired")
+    with open_router(BusConfig(at, certificates=named)):
+        (bad,) = [one for one in door.check_router(BusConfig(at, "tools", site)) if one.grade == BAD]
+    assert "create one for this name too (certificates.sh router FOLDER NAME...)" in bad.sentence
+    assert "set the clock" in _remedy("certificate is not yet valid") and "restart" in _remedy(
+        "certificate has expired"
+    )
 
 
 def test_a_network_in_the_clear_is_noted(site: Path) -> None:
-    assert [one.grade for one in door.papers(Entry())] == [OK]
-    (note,) = door.papers(Entry("tcp/10.1.2.3:7447", passwords=make_passwords(site)))
+    assert [one.grade for one in door.check_certificates(BusConfig())] == [OK]
+    (note,) = door.check_certificates(BusConfig("tcp/10.1.2.3:7447", passwords=make_passwords(site)))
     assert note.grade == NOTE and "unencrypted, password authentication; use --config" in note.sentence
 
 
@@ -209,9 +215,9 @@ def test_findings_are_json_too(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_status_tells_which_machine_does_what() -> None:
-    bus = fleet(claim(ONE, (0, 1, 2, 5), leaving=True), per_link=(LinkAccount(link="udpin:x", messages_hz=40.0),))
-    row = FleetRow(uav=0, state=State.WAITING, verdict="", worker=ONE)
-    bus.answer(FleetState, lambda *_: [(FleetState(t=1.0, rows=(row,), sentence=f"busy{ESCAPES}"), None)])
+    bus = fleet(claim(ONE, (0, 1, 2, 5), leaving=True), per_link=(LinkCounters(link="udpin:x", messages_hz=40.0),))
+    row = FleetRow(uav=0, state=TwinState.WAITING, verdict="", worker=ONE)
+    bus.declare_queryable(FleetState, lambda *_: [(FleetState(t=1.0, rows=(row,), sentence=f"busy{ESCAPES}"), None)])
     console = Console(file=io.StringIO(), width=160)
     with console.capture() as captured:
         console.print(machines(processes(bus)))
@@ -222,4 +228,4 @@ def test_status_tells_which_machine_does_what() -> None:
 
 
 def test_ids_are_written_as_spans() -> None:
-    assert [spans(ids) for ids in ((), (3,), (2, 1, 0), (9, 1, 2, 5))] == ["", "3", "0-2", "1-2, 5, 9"]
+    assert [id_ranges(ids) for ids in ((), (3,), (2, 1, 0), (9, 1, 2, 5))] == ["", "3", "0-2", "1-2, 5, 9"]

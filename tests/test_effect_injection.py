@@ -10,10 +10,10 @@ from effect_flights import CARD, Plan, flown
 
 from fleet.effects import Effect, Onset, catalogue
 from twin_worker.diagnosis.baseline.calibrate import calibrate
-from twin_worker.diagnosis.data.fault_hypothesis import Guess, When
-from twin_worker.diagnosis.inference.report import Finding, Outcome, Report
+from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis, OnsetProfile
+from twin_worker.diagnosis.inference.report import DiagnosisFinding, Report, ReportOutcome
 from twin_worker.diagnosis.model.baseline import Baseline
-from twin_worker.diagnosis.share import shared
+from twin_worker.diagnosis.share import diagnose_all
 
 ALL = catalogue("")
 SINCE_S = 35.0
@@ -40,14 +40,14 @@ class Flown:
     reports: dict[str, Report]
 
 
-def injected(effect: Effect, size: int) -> Guess:
+def injected(effect: Effect, size: int) -> FaultHypothesis:
     """Give an effect at work, coming in flight where it can."""
-    when = When()
+    when = OnsetProfile()
     if Onset.STEP in effect.onsets:
-        when = When(Onset.STEP, SINCE_S)
+        when = OnsetProfile(Onset.STEP, SINCE_S)
     elif Onset.ALWAYS not in effect.onsets:
-        when = When(Onset.BUMP, *BUMP_S)
-    return Guess(effect, ON.get(effect.name, ""), effect.examples[size], when)
+        when = OnsetProfile(Onset.BUMP, *BUMP_S)
+    return FaultHypothesis(effect, ON.get(effect.name, ""), effect.examples[size], when)
 
 
 @cache
@@ -57,7 +57,7 @@ def fly() -> Flown:
     plans = [Plan(f"control {seed}", seed) for seed in CONTROLS]
     for i, (name, effect) in enumerate(ALL.items()):
         plans += [Plan(f"{name} {size}", 10 + 3 * i + size, (injected(effect, size),)) for size in range(3)]
-    told = shared(flown(plans), base, 1, print)
+    told = diagnose_all(flown(plans), base, 1, print)
     return Flown(base, {report.flight: report for reports, _ in told for report in reports})
 
 
@@ -72,25 +72,25 @@ def test_an_effect_flown_is_the_effect_named(name: str, size: int, made: Flown) 
     report = made.reports[f"{name} {size}"]
     assert report.findings, report.sentence
     first = report.findings[0]
-    assert name in (first.guess.effect.name, *first.rivals), report.sentence
+    assert name in (first.hypothesis.effect.name, *first.rivals), report.sentence
     if size > 0:
-        assert report.outcome is Outcome.NAMED, report.sentence
+        assert report.outcome is ReportOutcome.NAMED, report.sentence
     if size == 2:
-        assert first.guess.effect.name == name, report.sentence
-        assert first.guess.of == ON.get(name, ""), report.sentence
+        assert first.hypothesis.effect.name == name, report.sentence
+        assert first.hypothesis.target == ON.get(name, ""), report.sentence
         assert_close(first, made.base)
 
 
-def assert_close(found: Finding, base: Baseline) -> None:
+def assert_close(found: DiagnosisFinding, base: Baseline) -> None:
     """Hold the first number of what was found against what was flown."""
-    effect, body = found.guess.effect, base.card.body
-    name, truth = next(iter(effect.told(effect, np.array(effect.examples[2]), body).items()))
-    nothing = effect.told(effect, np.zeros(effect.size), body)[name]
+    effect, body = found.hypothesis.effect, base.card.body
+    name, truth = next(iter(effect.reported(effect, np.array(effect.examples[2]), body).items()))
+    nothing = effect.reported(effect, np.zeros(effect.n_parameters), body)[name]
     change = abs(truth - nothing) if isfinite(nothing) else abs(truth)
-    assert abs(found.told[name] - truth) <= max(WITHIN * change, 3.0 * found.sigma[name]), found.told
+    assert abs(found.reported[name] - truth) <= max(WITHIN * change, 3.0 * found.sigma[name]), found.reported
 
 
 @pytest.mark.parametrize("seed", CONTROLS)
 def test_nothing_flown_is_nothing_named(seed: int, made: Flown) -> None:
     report = made.reports[f"control {seed}"]
-    assert report.outcome in (Outcome.NONE, Outcome.SUSPECTED), report.sentence
+    assert report.outcome in (ReportOutcome.NONE, ReportOutcome.SUSPECTED), report.sentence

@@ -63,7 +63,7 @@ def flow() -> Flow:
     height = np.linspace(0.0, 300.0, ROWS)
     positive = {"Va": 40.0, "q_bar": 900.0, "T": 1500.0, "rho": 1.2}
     series |= {name: middle * (1.0 + 0.1 * series[name]) for name, middle in positive.items()}
-    series |= {"t": DT * np.arange(ROWS), "h": height + 400.0, "height": height, "used": DT * np.arange(ROWS)}
+    series |= {"t": DT * np.arange(ROWS), "h": height + 400.0, "height": height, "throttle_time": DT * np.arange(ROWS)}
     return Flow(**series | {"alpha": 0.1 + 0.1 * series["alpha"]}, body=BODY)
 
 
@@ -97,7 +97,7 @@ def served(effect: Effect, u: np.ndarray, par: np.ndarray, pieces: int = 1) -> n
 
 def variants(effect: Effect) -> list[dict[str, str]]:
     """List the keywords for everything it may befall."""
-    return [{"of": one} for one in effect.of] or [{}]
+    return [{"of": one} for one in effect.targets] or [{}]
 
 
 def outcome(effect: Effect, par: tuple[float, ...], **of: str) -> np.ndarray:
@@ -121,7 +121,7 @@ def test_all_zero_adds_nothing_to_numbers_and_series(effect: Effect) -> None:
     whole = flow()
     for of in kinds(effect):
         for seen, zero in ((whole, 0.0), (whole, np.zeros(ROWS)), (at(whole, 7), 0.0)):
-            said = effect.act(seen, *[zero] * effect.size, **of)
+            said = effect.act(seen, *[zero] * effect.n_parameters, **of)
             assert said and all(np.all(np.asarray(value) == 0.0) for value in said.values())
 
 
@@ -130,7 +130,7 @@ def test_all_zero_leaves_readings_bit_for_bit(effect: Effect) -> None:
     true = readings()
     for of in kinds(effect):
         for zero in (0.0, np.zeros(ROWS)):
-            said = effect.act(true, *[zero] * effect.size, **of)
+            said = effect.act(true, *[zero] * effect.n_parameters, **of)
             assert said and all(np.array_equal(value, true[name]) for name, value in said.items())
 
 
@@ -138,7 +138,7 @@ def test_all_zero_leaves_readings_bit_for_bit(effect: Effect) -> None:
 def test_all_zero_leaves_commands_bit_for_bit(effect: Effect) -> None:
     u = commands()
     assert np.abs(u).max() > 1.0  # beyond what any servo is asked for
-    assert np.array_equal(served(effect, u, np.zeros((effect.size, ROWS))), u)
+    assert np.array_equal(served(effect, u, np.zeros((effect.n_parameters, ROWS))), u)
 
 
 # --- away from zero --------------------------------------------------------------------------------------------------
@@ -146,13 +146,13 @@ def test_all_zero_leaves_commands_bit_for_bit(effect: Effect) -> None:
 
 @EVERY
 def test_each_parameter_has_a_slope_at_zero_or_the_effect_says_where_to_start(effect: Effect) -> None:
-    zero = (0.0,) * effect.size
+    zero = (0.0,) * effect.n_parameters
     for of in kinds(effect):
         nothing = outcome(effect, zero, **of)
-        for start in effect.starts:
+        for start in effect.initial_guesses:
             change = outcome(effect, start, **of) - nothing
             assert np.isfinite(change).all() and np.abs(change).max() > 1e-3
-        for i, p in enumerate(effect.parameters if not effect.starts else ()):
+        for i, p in enumerate(effect.parameters if not effect.initial_guesses else ()):
             steps = (1e-3 * p.step, 1e-4 * p.step)
             coarse, fine = ((outcome(effect, _unit(effect, i, s), **of) - nothing) / s for s in steps)
             assert np.isfinite(fine).all() and np.abs(fine).max() > 0.0
@@ -160,7 +160,7 @@ def test_each_parameter_has_a_slope_at_zero_or_the_effect_says_where_to_start(ef
 
 
 def _unit(effect: Effect, i: int, step: float) -> tuple[float, ...]:
-    return tuple(step if j == i else 0.0 for j in range(effect.size))
+    return tuple(step if j == i else 0.0 for j in range(effect.n_parameters))
 
 
 @EVERY
@@ -168,10 +168,10 @@ def test_examples_and_starts_are_possible_and_do_something(effect: Effect) -> No
     assert len(effect.examples) == 3 and effect.onsets
     sizes = [sum(abs(x) / p.step for x, p in zip(e, effect.parameters, strict=True)) for e in effect.examples]
     assert sizes == sorted(sizes)
-    for values in (*effect.examples, *effect.starts):
+    for values in (*effect.examples, *effect.initial_guesses):
         assert all(p.low <= x <= p.high for p, x in zip(effect.parameters, values, strict=True))
     for example in effect.examples:
-        nothing = outcome(effect, (0.0,) * effect.size, **kinds(effect)[0])
+        nothing = outcome(effect, (0.0,) * effect.n_parameters, **kinds(effect)[0])
         assert np.abs(outcome(effect, example, **kinds(effect)[0]) - nothing).max() > 0.0
     assert all(p.low <= 0.0 < p.step <= p.high for p in effect.parameters)
 
@@ -219,7 +219,7 @@ def test_a_servo_forgets_nothing_between_calls(effect: Effect) -> None:
 
 @EVERY
 def test_rivals_are_of_the_catalogue_and_every_word_is_there(effect: Effect) -> None:
-    assert set(effect.confused) <= set(ALL) - {effect.name} and all(effect.confused.values())
+    assert set(effect.confusable_with) <= set(ALL) - {effect.name} and all(effect.confusable_with.values())
     words = (effect.equation, effect.source, effect.channel, *(p.meaning for p in effect.parameters))
     assert all(words) and all(p.unit for p in effect.parameters)
     assert any(year.isdigit() and 1900 < int(year) < 2100 for year in effect.source.replace(",", " ").split())
@@ -227,7 +227,7 @@ def test_rivals_are_of_the_catalogue_and_every_word_is_there(effect: Effect) -> 
 
 @EVERY
 def test_told_numbers_have_the_names_people_want(effect: Effect) -> None:
-    told = effect.told(effect, np.array(effect.examples[1]), BODY)
+    told = effect.reported(effect, np.array(effect.examples[1]), BODY)
     assert set(told) == TOLD.get(effect.name, {p.name for p in effect.parameters})
     assert all(np.isfinite(x) for x in told.values())
 

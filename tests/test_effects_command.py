@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fleet import cli
-from fleet.effects import FOLDERS, Effect, catalogue
+from fleet.effects import FOLDERS_ENV, Effect, catalogue
 
 ALL = catalogue("")
 
@@ -25,7 +25,7 @@ EFFECT = Effect(
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A folder of one's own effects, which the environment names."""
-    monkeypatch.setenv(FOLDERS, str(tmp_path))
+    monkeypatch.setenv(FOLDERS_ENV, str(tmp_path))
     catalogue.cache_clear()
     yield tmp_path
     catalogue.cache_clear()
@@ -69,7 +69,7 @@ def test_one_effect_shows_everything(effect: Effect, capsys: pytest.CaptureFixtu
     plain = " ".join(text.split())
     assert max(map(len, text.splitlines())) <= 118
     assert all(p.meaning in plain and f"{p.low:g} to {p.high:g}" in plain for p in effect.parameters)
-    assert all(f"{rival} {how}" in plain for rival, how in effect.confused.items())
+    assert all(f"{rival} {how}" in plain for rival, how in effect.confusable_with.items())
     assert effect.equation in plain and effect.source in plain
 
 
@@ -77,7 +77,7 @@ def test_json_holds_all_of_it(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["effects", "--json"]) == 0
     described = json.loads(capsys.readouterr().out)
     assert set(described) == set(ALL) and all(one["summary"].endswith(".") for one in described.values())
-    assert described["icing"]["told"] == ["lift_loss", "dCD", "dCm"] and described["stall"]["of"][0] == "8 deg"
+    assert described["icing"]["told"] == ["lift_loss", "dCD", "dCm"] and described["stall"]["targets"][0] == "8 deg"
     assert described["gyro_bias"]["parameters"][0]["unit"] == "rad/s" and described["turbulence"]["variance"]
 
 

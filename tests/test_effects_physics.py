@@ -99,14 +99,14 @@ def test_the_engine_turns_with_its_throttle_and_the_propeller_pulls_with_thrust_
 
 def test_the_tail_does_more_in_the_slipstream_and_windmilling_takes_at_most_half() -> None:
     act, disc = ALL["slipstream_tail"].act, np.pi * 1.9**2 / 4.0
-    blown = act(flow(T=900.0 * disc, q_bar=900.0, pitch=-0.05, yaw=0.02), 0.5)
+    blown = act(flow(T=900.0 * disc, q_bar=900.0, C_m_elevator=-0.05, C_n_rudder=0.02), 0.5)
     assert blown == pytest.approx({"C_m": -0.025, "C_n": 0.01})
-    assert act(flow(T=-1e6, q_bar=900.0, pitch=-0.05), 1.0)["C_m"] == pytest.approx(0.025)
-    assert np.isfinite(act(flow(T=1000.0, q_bar=0.0, pitch=-0.05), 1.0)["C_m"])
+    assert act(flow(T=-1e6, q_bar=900.0, C_m_elevator=-0.05), 1.0)["C_m"] == pytest.approx(0.025)
+    assert np.isfinite(act(flow(T=1000.0, q_bar=0.0, C_m_elevator=-0.05), 1.0)["C_m"])
 
 
 def test_a_battery_loses_with_what_was_used() -> None:
-    assert ALL["battery_sag"].act(flow(used=50.0), 0.2) == pytest.approx({"thrust": -0.1})
+    assert ALL["battery_sag"].act(flow(throttle_time=50.0), 0.2) == pytest.approx({"thrust": -0.1})
 
 
 @pytest.mark.parametrize(("of", "over"), [("8 deg", 5.0), ("10 deg", 3.0), ("12 deg", 1.0), ("14 deg", 0.0)])
@@ -186,4 +186,4 @@ def test_a_bias_is_added_to_its_own_reading(name: str, of: dict[str, str], readi
     ],
 )
 def test_told_numbers_are_right(name: str, par: tuple[float, ...], expected: dict[str, float]) -> None:
-    assert ALL[name].told(ALL[name], np.array(par), Body(mass=912.0)) == pytest.approx(expected)
+    assert ALL[name].reported(ALL[name], np.array(par), Body(mass=912.0)) == pytest.approx(expected)

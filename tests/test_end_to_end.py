@@ -22,7 +22,18 @@ from fleet import cli
 from fleet.bus.bus_protocol import Bus
 from fleet.bus.session import connect
 from fleet.commands.live.status import fleet_rows
-from fleet.contract import Account, FleetState, Mission, Model, Outcome, Params, Prediction, Sample, State, Status
+from fleet.contract import (
+    FleetState,
+    GatewayCounters,
+    Mission,
+    Model,
+    Outcome,
+    Params,
+    Prediction,
+    Sample,
+    Status,
+    TwinState,
+)
 from fleet.process import logs
 
 PATIENCE_S = 300.0  # an upper bound on a cold machine; every wait ends with its condition
@@ -172,7 +183,7 @@ def test_what_makes_no_sense_is_refused_in_one_sentence(
     else:
         with process("fleet.cli", "up", *ports, *options) as up:
             code, _, errors = ended(up)
-    last = logs.untimed(errors.splitlines()[-1])
+    last = logs.strip_time(errors.splitlines()[-1])
     assert code == 2
     assert last.startswith("fleet up: ") and (REFUSED | REFUSED_LATER)[options] in last and ";" in last
     assert "Traceback" not in errors
@@ -199,7 +210,7 @@ def test_a_flight_of_another_autopilot_is_predicted_on_its_own_mission(router: s
     models: list[Model] = []
 
     def by_model(p: Prediction) -> bool:
-        return p.state is State.PREDICTING and p.method in ("dynamics", "hybrid", "both")
+        return p.state is TwinState.PREDICTING and p.method in ("dynamics", "hybrid", "both")
 
     with connect(router) as bus, process("twin_worker", "--uavs", f"{uav}-{uav + 99}", "--router", router) as worker:
         wait(lambda: "serves UAV ids" in worker.stdout.readline(), worker)
@@ -208,14 +219,14 @@ def test_a_flight_of_another_autopilot_is_predicted_on_its_own_mission(router: s
         link = f"replay:{flight}?speed=30"
         with process("gateway", "--link", link, f"--offset={uav}", "--router", router) as gateway:
             wait(lambda: any(by_model(p) for p in predicted), gateway)
-            ((mission, _),), ((params, _),) = bus.ask(Mission), bus.ask(Params)
+            ((mission, _),), ((params, _),) = bus.get(Mission), bus.get(Params)
     good = next(filter(by_model, predicted))
     assert mission.complete and len(mission.items) == 17
     assert params.complete and "NAVL1_PERIOD" in params.values
     verified = [m.verdict for m in models if m.verdict.outcome is Outcome.VERIFIED]
     assert verified and all(v.horizon_s >= 4.0 for v in verified), [m.verdict.sentence for m in models]
     assert good.horizon_s > 0 and 0 <= good.seq < 17
-    assert np.isfinite(good.path.numpy()).all() and np.isfinite(good.tube.numpy()).all()
+    assert np.isfinite(good.path.numpy()).all() and np.isfinite(good.prediction_region_half_axes.numpy()).all()
 
 
 # --- hostile input ---------------------------------------------------------------------------------------------------
@@ -228,10 +239,10 @@ class Listener:
         self.samples: dict[int, int] = {}
         self.said: dict[type, dict[int, object]] = {Status: {}, Mission: {}, Params: {}}
         self.sentences: set[str] = set()
-        self.account = Account(t=0.0)
+        self.account = GatewayCounters(t=0.0)
         self.worker: FleetState | None = None
         bus.subscribe(Sample, self._sample)
-        bus.subscribe(Account, lambda message, _: setattr(self, "account", message))
+        bus.subscribe(GatewayCounters, lambda message, _: setattr(self, "account", message))
         bus.subscribe(FleetState, lambda message, _: setattr(self, "worker", message))
         for kind in self.said:
             bus.subscribe(kind, lambda message, _: self.sentences.add(message.sentence))
@@ -271,7 +282,7 @@ def test_hostile_bytes_and_missions_leave_the_others_flying(router: str) -> None
         wait(lambda: heard.worker and {0, 1} <= {row.uav for row in heard.worker.rows}, worker)
         assert [child.poll() for child in (gateway, worker, aircraft)] == [None] * 3
         assert heard.account.datagrams > 1000 and set(heard.account.uavs) >= {0, 1}
-        statuses = {status.uav: status for status, _ in bus.ask(Status)}
+        statuses = {status.uav: status for status, _ in bus.get(Status)}
         assert statuses[0].clock_jumps == statuses[1].clock_jumps == 0
         for child in (gateway, worker, aircraft):
             child.send_signal(signal.SIGINT)

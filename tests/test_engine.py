@@ -13,25 +13,25 @@ import pytest
 
 from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Prediction, Sample
-from twin_worker.__main__ import BEHIND, _get_ready
+from twin_worker.__main__ import NICE_INCREMENT, _prepare
 from twin_worker.confidence.tube_and_horizon import AHEAD
-from twin_worker.service.busy_fallback import said_already, stand_in_for
-from twin_worker.service.cpu_share import LEAST, Beside
-from twin_worker.service.work_rates import OVER_S, Rates
-from twin_worker.service.worker import Held, Worker, _advance_all
+from twin_worker.service.busy_fallback import is_superseded, publish_fallbacks
+from twin_worker.service.cpu_share import MIN_SHARE, CpuShareLimiter
+from twin_worker.service.work_rates import RATE_WINDOW_S, WorkRates
+from twin_worker.service.worker import OwnedTwin, Worker, _advance_all
 from twin_worker.twin import step as loop
 from twin_worker.twin.state import budget as clocked
-from twin_worker.twin.state.budget import EARNED, LEAST_S, SWEEP_S, Quota
-from twin_worker.twin.state.schedule import Pace, Work, read_pace
+from twin_worker.twin.state.budget import LATE_CPU_FRACTION, MIN_WORK_S, WORK_PER_SWEEP_S, ComputeBudget
+from twin_worker.twin.state.schedule import Schedule, Work, parse_schedule
 from twin_worker.twin.step import Twin, advance
 
 
 def test_a_pace_is_read_and_refused_in_a_sentence() -> None:
-    assert read_pace("identify=5,renew=0.1") == Pace(identify=5.0, renew=0.1)
-    assert read_pace("members=50,span=60") == Pace(members=50, span=60.0)
+    assert parse_schedule("identify=5,renew=0.1") == Schedule(identify=5.0, renew=0.1)
+    assert parse_schedule("members=50,span=60") == Schedule(members=50, span=60.0)
     for odd in ("", "identify", "identify=0", "identify=x", "identify=nan", "speed=5", "predict=1e9", "span=200"):
         with pytest.raises(argparse.ArgumentTypeError, match=r"found .*, expected one of predict, identify"):
-            read_pace(odd)
+            parse_schedule(odd)
 
 
 @pytest.fixture
@@ -42,52 +42,54 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 def test_ensembles_give_way_before_flights_ahead_and_time_of_others_does_not_count(clock: list[float]) -> None:
-    quota = Quota(limit=1.0)
-    quota.sweep()
-    assert quota.grants(Work.ENSEMBLE)
+    quota = ComputeBudget(limit=1.0)
+    quota.begin_sweep()
+    assert quota.try_acquire(Work.ENSEMBLE)
     clock[0] += 0.55
-    quota.settle()
+    quota.end_work()
     clock[0] += 5.0  # telemetry
-    assert not quota.grants(Work.ENSEMBLE) and quota.grants(Work.IDENTIFY)
+    assert not quota.try_acquire(Work.ENSEMBLE) and quota.try_acquire(Work.IDENTIFY)
     clock[0] += 0.2
-    assert not quota.grants(Work.IDENTIFY) and quota.grants(Work.PREDICT)
+    assert not quota.try_acquire(Work.IDENTIFY) and quota.try_acquire(Work.PREDICT)
     clock[0] += 0.3
-    assert not quota.grants(Work.PREDICT)
-    quota.sweep()
-    assert quota.grants(Work.PREDICT)
+    assert not quota.try_acquire(Work.PREDICT)
+    quota.begin_sweep()
+    assert quota.try_acquire(Work.PREDICT)
     assert quota.refused == {Work.ENSEMBLE: 1, Work.IDENTIFY: 1, Work.PREDICT: 1}
 
 
 def test_who_has_no_prediction_yet_comes_first_and_without_a_limit_nobody_waits(clock: list[float]) -> None:
-    limited, free = Quota(limit=1.0), Quota()
+    limited, free = ComputeBudget(limit=1.0), ComputeBudget()
     for quota in (limited, free):
-        quota.sweep(hurry=True)
-        assert quota.grants(Work.PREDICT)
-    assert not limited.grants(Work.IDENTIFY) and free.grants(Work.IDENTIFY)
+        quota.begin_sweep(first_prediction_pending=True)
+        assert quota.try_acquire(Work.PREDICT)
+    assert not limited.try_acquire(Work.IDENTIFY) and free.try_acquire(Work.IDENTIFY)
     clock[0] += 1e6
-    assert free.grants(Work.ENSEMBLE)
-    free.aside = frozenset({Work.IDENTIFY})
-    assert not free.grants(Work.IDENTIFY)
+    assert free.try_acquire(Work.ENSEMBLE)
+    free.offloaded = frozenset({Work.IDENTIFY})
+    assert not free.try_acquire(Work.IDENTIFY)
 
 
 def test_what_is_old_already_is_not_foreseen_where_telemetry_waits(clock: list[float]) -> None:
-    limited, free = Quota(limit=1.0, behind=True), Quota(behind=True)
-    assert not limited.grants(Work.PREDICT) and not limited.grants(Work.RENEW)
-    assert free.grants(Work.PREDICT) and free.grants(Work.RENEW)  # a recording sheds nothing
-    limited.behind = False
-    assert limited.grants(Work.RENEW) and limited.grants(Work.PREDICT)
+    limited, free = ComputeBudget(limit=1.0, backlog=True), ComputeBudget(backlog=True)
+    assert not limited.try_acquire(Work.PREDICT) and not limited.try_acquire(Work.RENEW)
+    assert free.try_acquire(Work.PREDICT) and free.try_acquire(Work.RENEW)  # a recording sheds nothing
+    limited.backlog = False
+    assert limited.try_acquire(Work.RENEW) and limited.try_acquire(Work.PREDICT)
     clock[0] += 2.0
-    assert limited.grants(Work.RENEW) and not limited.grants(Work.PREDICT)
+    assert limited.try_acquire(Work.RENEW) and not limited.try_acquire(Work.PREDICT)
 
 
 def test_heavy_work_earns_a_share_of_the_cpu_time_while_telemetry_is_late_and_comes_back(clock: list[float]) -> None:
-    quota, limits = Quota(), []
+    quota, limits = ComputeBudget(), []
     for late, used in ((False, 0.0), (True, 0.02), (True, 0.01), (True, 0.0), (True, 9.0), *[(False, 0.01)] * 40):
         clock[0] += used
         quota.yield_to_telemetry(late)
         limits.append(quota.limit)
-    assert limits[:5] == pytest.approx([SWEEP_S, EARNED * 0.02, EARNED * 0.01, LEAST_S, SWEEP_S])
-    assert limits[-1] == SWEEP_S
+    assert limits[:5] == pytest.approx(
+        [WORK_PER_SWEEP_S, LATE_CPU_FRACTION * 0.02, LATE_CPU_FRACTION * 0.01, MIN_WORK_S, WORK_PER_SWEEP_S]
+    )
+    assert limits[-1] == WORK_PER_SWEEP_S
 
 
 @pytest.mark.parametrize("piece_s", [0.002, 0.007, 0.03])
@@ -95,13 +97,13 @@ def test_heavy_work_falls_in_proportion_to_the_cpu_time_that_is_granted(clock: l
     """A tenth of a core makes every sweep late by the wall clock, whatever is done in it."""
 
     def done_per_cpu_s(granted: float, late_s: float = 0.12, telemetry_s: float = 0.008) -> float:
-        quota, pieces, swept, begun = Quota(limit=SWEEP_S), 0, clock[0], clock[0]
+        quota, pieces, swept, begun = ComputeBudget(limit=WORK_PER_SWEEP_S), 0, clock[0], clock[0]
         while clock[0] < begun + 20.0:
             late, swept = (clock[0] - swept) / granted > late_s, clock[0]
             quota.yield_to_telemetry(late)
-            quota.sweep()
+            quota.begin_sweep()
             clock[0] += telemetry_s
-            while quota.grants(Work.PREDICT):
+            while quota.try_acquire(Work.PREDICT):
                 clock[0] += piece_s
                 pieces += 1
         return pieces * piece_s / (clock[0] - begun)
@@ -111,25 +113,25 @@ def test_heavy_work_falls_in_proportion_to_the_cpu_time_that_is_granted(clock: l
 
 
 def test_in_late_sweeps_no_ensemble_is_begun_while_flights_ahead_wait(clock: list[float]) -> None:
-    quota, granted = Quota(limit=0.01), []
+    quota, granted = ComputeBudget(limit=0.01), []
     for late, wanted in ((True, 9), (True, 9), (False, 9), (True, 9), (True, 1), (True, 1)):
         quota.yield_to_telemetry(late)
-        quota.sweep()
-        granted.append(quota.grants(Work.ENSEMBLE))
+        quota.begin_sweep()
+        granted.append(quota.try_acquire(Work.ENSEMBLE))
         clock[0] += 0.001
         for _ in range(wanted):
-            quota.grants(Work.PREDICT)
+            quota.try_acquire(Work.PREDICT)
             clock[0] += 0.005 if wanted > 1 else 0.0001
     assert granted == [True, False, True, False, False, True]
 
 
 def test_what_one_piece_of_work_took_too_much_is_missing_in_the_next_sweeps(clock: list[float]) -> None:
-    quota, granted = Quota(limit=2.0**-7), []
+    quota, granted = ComputeBudget(limit=2.0**-7), []
     for _ in range(12):
-        quota.sweep()
-        granted.append(quota.grants(Work.PREDICT))
+        quota.begin_sweep()
+        granted.append(quota.try_acquire(Work.PREDICT))
         clock[0] += 2.0**-5 if granted[-1] else 0.0
-        quota.settle()
+        quota.end_work()
     assert granted == [True, False, False, False] * 3
 
 
@@ -138,7 +140,7 @@ def test_work_beside_the_sweep_rests_until_the_others_had_their_cpu_time(monkeyp
     names = {"monotonic": "wall", "thread_time": "mine", "process_time": "all"}
     for name, clock in names.items():
         monkeypatch.setattr(f"twin_worker.service.cpu_share.time.{name}", lambda clock=clock: now[clock])
-    beside, granted = Beside(), 0.0
+    beside, granted = CpuShareLimiter(), 0.0
 
     class Stop:
         def wait(self, seconds: float) -> bool:
@@ -153,15 +155,15 @@ def test_work_beside_the_sweep_rests_until_the_others_had_their_cpu_time(monkeyp
 
     def rested() -> float:
         before = now["wall"]
-        beside.do(work, Stop())  # type: ignore[arg-type]
+        beside.run(work, Stop())  # type: ignore[arg-type]
         return now["wall"] - before - 2.0
 
     assert rested() == 0.0
     for _ in range(9):
         beside.yield_to_telemetry(late=True)
-    assert beside.share == LEAST
+    assert beside.share == MIN_SHARE
     granted = 0.1
-    share = 1.2 * LEAST
+    share = 1.2 * MIN_SHARE
     assert rested() == pytest.approx(0.2 * (1 / share - 1) / granted, abs=0.06), "CPU time of the others"
     granted = 0.0
     assert rested() == pytest.approx(2.0 * (1 / (1.2 * share) - 1), abs=0.06), "idle, they do not want any"
@@ -170,60 +172,65 @@ def test_work_beside_the_sweep_rests_until_the_others_had_their_cpu_time(monkeyp
 def test_a_flight_ahead_that_waits_for_cpu_time_is_replaced_by_renewals(
     heard: tuple, twin: Twin, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    twin.pace, twin.quota = Pace(predict=1.0, identify=1000.0), Quota(limit=1.0)
-    twin.identify_t = twin.data_t
-    monkeypatch.setattr(twin.quota, "grants", lambda work: work is Work.RENEW)
-    twin.base, begun = twin.prediction, twin.prediction.t
+    twin.config = msgspec.structs.replace(twin.config, schedule=Schedule(predict=1.0, identify=1000.0))
+    twin.budget = ComputeBudget(limit=1.0)
+    twin.identification.timer.restart(twin.telemetry.data_t)
+    monkeypatch.setattr(twin.budget, "try_acquire", lambda work: work is Work.RENEW)
+    twin.prediction.last_rollout, begun = twin.prediction.latest, twin.prediction.latest.t
     rest = f.shifted([m for m in heard if isinstance(m, Sample) and m.t > heard[-1].t - 40.0], 40.0, 1e9)
     made = [m for message in rest for m in advance(twin, (message,)) if isinstance(m, Prediction)]
     times = [begun, *(one.t for one in made)]
-    assert max(np.diff(times)) < 1.5 and times[-1] > begun + 35.0 and twin.base.t == begun
+    assert max(np.diff(times)) < 1.5 and times[-1] > begun + 35.0 and twin.prediction.last_rollout.t == begun
 
 
 def test_what_has_waited_is_taken_in_at_once_and_the_loop_turns_once_a_second(
     heard: tuple, twin: Twin, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     turned: list[float] = []
-    monkeypatch.setattr(loop, "_turn", lambda twin, now: turned.append(now) or setattr(twin, "turned_t", now) or [])
+    monkeypatch.setattr(loop, "_step", lambda twin, now: turned.append(now) or twin.telemetry.step(now) or [])
     rest = f.shifted([m for m in heard if isinstance(m, Sample) and m.t > heard[-1].t - 12.0], 12.0, 1e9)
     worker = Worker(MemoryBus(), range(4), omega=0.0)
-    worker.quota.limit, twin.quota = 0.05, worker.quota
-    held = Held(twin, 1)
+    worker.quota.limit, twin.budget = 0.05, worker.quota
+    held = OwnedTwin(twin, 1)
     held.inbox.extend(rest)
     list(_advance_all(held, len(rest), worker.traffic))
-    assert not held.inbox and twin.history.newest == pytest.approx(rest[-1].t, abs=0.2)
+    assert not held.inbox and twin.telemetry.history.newest == pytest.approx(rest[-1].t, abs=0.2)
     assert 10 <= len(turned) <= 15 < len(rest) and max(np.diff(turned)) < 1.3
 
 
 def test_who_is_not_reached_in_time_is_renewed_from_the_position_received_last(heard: tuple, twin: Twin) -> None:
-    twin.base, told = twin.prediction, []
-    held = Held(twin, 1)
+    twin.prediction.last_rollout, told = twin.prediction.latest, []
+    held = OwnedTwin(twin, 1)
     for message in f.shifted([m for m in heard if isinstance(m, Sample) and m.t > heard[-1].t - 31.0], 31.0, 1e9):
-        held.placed = message.position or held.placed
-        held.published = time.monotonic() - (2.0 if message.t > twin.prediction.t + 30.0 else 0.0)
-        stand_in_for([held], lambda made, _: told.append(made))
+        held.last_position = message.position or held.last_position
+        held.published_at = time.monotonic() - (2.0 if message.t > twin.prediction.latest.t + 30.0 else 0.0)
+        publish_fallbacks([held], lambda made, _: told.append(made))
     times = np.array([made.t for made in told])
-    assert len(times) and times[0] > twin.prediction.t + 29.5 and (np.diff(times) > 0.8).all()
-    late = msgspec.structs.replace(twin.prediction, t=times[0] - 20.0)
-    assert said_already(late, held) and not said_already(msgspec.structs.replace(late, t=times[-1] + 1.0), held)
-    held.placed = f.rows([times[0] - 25.0], [[0.0, 0.0, 0.0]])
-    assert not said_already(late, held), "the clock was set back"
+    assert len(times) and times[0] > twin.prediction.latest.t + 29.5 and (np.diff(times) > 0.8).all()
+    late = msgspec.structs.replace(twin.prediction.latest, t=times[0] - 20.0)
+    assert is_superseded(late, held) and not is_superseded(msgspec.structs.replace(late, t=times[-1] + 1.0), held)
+    held.last_position = f.rows([times[0] - 25.0], [[0.0, 0.0, 0.0]])
+    assert not is_superseded(late, held), "the clock was set back"
 
 
 def test_what_is_shed_is_said() -> None:
-    rates, pace = Rates(), Pace(predict=1.0, identify=5.0)
+    rates, pace = WorkRates(), Schedule(predict=1.0, identify=5.0)
     for k in range(61):
-        rates.note(Work.PREDICT, float(k), 10)
+        rates.record(Work.PREDICT, float(k), 10)
         if k % 3 == 0:
-            rates.note(Work.IDENTIFY, float(k))
-    assert rates.said(pace, 10, 60.0) == ["too many UAVs for this worker: identify every 27.3 s instead of 5.0 s"]
-    assert rates.said(pace, 2, 60.0) == []
-    assert Rates().said(pace, 10, 60.0) == [] and rates.period(Work.IDENTIFY, 10, 60.0 + 2 * OVER_S) == float("inf")
+            rates.record(Work.IDENTIFY, float(k))
+    assert rates.overload_messages(pace, 10, 60.0) == [
+        "too many UAVs for this worker: identify every 27.3 s instead of 5.0 s"
+    ]
+    assert rates.overload_messages(pace, 2, 60.0) == []
+    assert WorkRates().overload_messages(pace, 10, 60.0) == [] and rates.period(
+        Work.IDENTIFY, 10, 60.0 + 2 * RATE_WINDOW_S
+    ) == float("inf")
 
 
 def test_predictions_come_ten_times_a_second_where_that_is_asked_for(heard: tuple, twin: Twin) -> None:
-    twin.pace = Pace(predict=5.0, identify=1000.0, renew=0.1)
-    twin.identify_t = twin.data_t
+    twin.config = msgspec.structs.replace(twin.config, schedule=Schedule(predict=5.0, identify=1000.0, renew=0.1))
+    twin.identification.timer.restart(twin.telemetry.data_t)
     rest = f.shifted([m for m in heard if isinstance(m, Sample) and m.t > heard[-1].t - 12.0], 12.0, 1e9)
     made = [m for message in rest for m in advance(twin, (message,)) if isinstance(m, Prediction)]
     per_s = len(made) / (made[-1].t - made[0].t)
@@ -232,43 +239,51 @@ def test_predictions_come_ten_times_a_second_where_that_is_asked_for(heard: tupl
 
 @pytest.mark.parametrize("change", [{"coast_s": 2.0}, {"t": f.T0 - 100.0}])
 def test_a_path_that_cannot_be_renewed_is_flown_anew_before_long(heard: tuple, twin: Twin, change: dict) -> None:
-    twin.pace = Pace(predict=60.0, identify=1000.0, renew=0.1)
-    twin.identify_t = twin.data_t
-    twin.base = msgspec.structs.replace(twin.prediction, **change)
+    twin.config = msgspec.structs.replace(twin.config, schedule=Schedule(predict=60.0, identify=1000.0, renew=0.1))
+    twin.identification.timer.restart(twin.telemetry.data_t)
+    twin.prediction.last_rollout = msgspec.structs.replace(twin.prediction.latest, **change)
     rest = f.shifted([m for m in heard if isinstance(m, Sample) and m.t > heard[-1].t - 3.0], 3.0, 1e9)
     made = [m for message in rest for m in advance(twin, (message,)) if isinstance(m, Prediction)]
-    assert made and made[0].t < heard[-1].t + 1.5 and twin.base.coast_s == 0.0
+    assert made and made[0].t < heard[-1].t + 1.5 and twin.prediction.last_rollout.coast_s == 0.0
 
 
 def test_an_ensemble_that_had_to_wait_is_flown_before_the_next_flight_and_keeps_the_beat(
     heard: tuple, twin: Twin, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    twin.pace = Pace(predict=2.0, identify=1000.0, ensemble=2.0, members=16, span=60.0)
-    twin.identify_t = twin.data_t
+    twin.config = msgspec.structs.replace(
+        twin.config, schedule=Schedule(predict=2.0, identify=1000.0, ensemble=2.0, members=16, span=60.0)
+    )
+    twin.identification.timer.restart(twin.telemetry.data_t)
     asked: list[Work] = []
     flown: list[float] = []
-    twin.quota = Quota()
+    twin.budget = ComputeBudget()
 
     def grants(work: Work) -> bool:
         asked.extend([work] if work is Work.ENSEMBLE else [])
         return work is not Work.ENSEMBLE or len(asked) % 4 == 0  # three times in four others are preferred
 
-    monkeypatch.setattr(twin.quota, "grants", grants)
+    monkeypatch.setattr(twin.budget, "try_acquire", grants)
     rest = f.shifted([m for m in heard if isinstance(m, Sample) and m.t > heard[-1].t - 12.0], 12.0, 1e9)
     for message in rest:
         advance(twin, (message,))
-        if not flown or flown[-1] != twin.spread_t:
-            flown.append(twin.spread_t)
-    assert twin.spread is not None and np.diff(flown[1:]) == pytest.approx(2.0, abs=0.3) and len(flown) > 5
+        if not flown or flown[-1] != twin.prediction.ensemble_timer.last:
+            flown.append(twin.prediction.ensemble_timer.last)
+    assert (
+        twin.prediction.ensemble_spread is not None
+        and np.diff(flown[1:]) == pytest.approx(2.0, abs=0.3)
+        and len(flown) > 5
+    )
     beyond = AHEAD > 60.0
-    assert (np.diff(twin.spread[beyond], axis=0) > 0).all() and twin.spread.shape == (len(AHEAD), 3)
+    assert (
+        np.diff(twin.prediction.ensemble_spread[beyond], axis=0) > 0
+    ).all() and twin.prediction.ensemble_spread.shape == (len(AHEAD), 3)
 
 
 def test_who_renews_often_does_less_heavy_work_in_one_sweep() -> None:
-    paces = [Pace(renew=renew) for renew in (1e-3, 0.1, 0.15, 9.0)]
-    most = [Worker(MemoryBus(), range(1), omega=0.0, pace=pace).quota.most for pace in paces]
-    assert most == pytest.approx([0.03, 0.03, 0.045, SWEEP_S])
-    assert Worker(MemoryBus(), range(1), omega=0.0).quota.most == SWEEP_S
+    paces = [Schedule(renew=renew) for renew in (1e-3, 0.1, 0.15, 9.0)]
+    most = [Worker(MemoryBus(), range(1), omega=0.0, schedule=pace).quota.max_limit for pace in paces]
+    assert most == pytest.approx([0.03, 0.03, 0.045, WORK_PER_SWEEP_S])
+    assert Worker(MemoryBus(), range(1), omega=0.0).quota.max_limit == WORK_PER_SWEEP_S
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere threads have no priority of their own")
@@ -280,18 +295,18 @@ def test_who_gets_ready_gives_way_to_those_that_hold_aircraft(monkeypatch: pytes
         nice.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
 
     monkeypatch.setattr("twin_worker.service.warm_up.warm_up", found)
-    thread = threading.Thread(target=_get_ready)
+    thread = threading.Thread(target=_prepare)
     thread.start()
     thread.join()
     found()
-    assert nice == [min(before + BEHIND, 19), before]
+    assert nice == [min(before + NICE_INCREMENT, 19), before]
 
 
 def test_who_could_not_even_be_renewed_is_the_first_to_be_flown_ahead() -> None:
     worker, now = Worker(MemoryBus(), range(4), omega=0.0), time.monotonic()
     for uav in range(4):
-        worker._twins.adopt(uav, 1, None)
-        held = worker._held[uav]
-        held.ready, held.published = True, now - (60.0 if uav == 2 else 0.0)
-    found = [[held.twin.uav for held in worker._in_turn()] for _ in range(4)]
+        worker._twins.acquire(uav, 1, None)
+        held = worker._owned[uav]
+        held.ready, held.published_at = True, now - (60.0 if uav == 2 else 0.0)
+    found = [[held.twin.config.uav for held in worker._sweep_order()] for _ in range(4)]
     assert [order[0] for order in found] == [2] * 4 and sorted(order[1] for order in found) == [0, 1, 3, 3]

@@ -10,28 +10,28 @@ import pytest
 from fleet.contract import Array, Prediction, Sample
 from fleet.frames import Origin, to_geodetic
 from twin_worker.confidence.tube_and_horizon import AHEAD
-from twin_worker.prediction.closed_loop import LEAST_AHEAD_S
-from twin_worker.twin.state.schedule import Pace
+from twin_worker.prediction.closed_loop import MIN_ROLLOUT_S
+from twin_worker.twin.state.schedule import Schedule
 from twin_worker.twin.step import Twin, advance
-from twin_worker.twin.steps.extrapolate import LATEST_S, OVERDUE_S, renew, widened
+from twin_worker.twin.steps.extrapolate import MAX_OVERDUE_AGE_S, MAX_ROLLOUT_AGE_S, extrapolate, widen_tube
 
 
 def on(twin: Twin, seconds: float, off: np.ndarray) -> None:
     """Let the aircraft be so far off the path that was foreseen."""
-    base = twin.base
+    base = twin.prediction.last_rollout
     path = [np.interp(seconds, base.ahead.numpy(), column) for column in base.path.numpy().T]
-    lat_lon_alt = to_geodetic(twin.origin, np.array([np.array(path) + off]))
+    lat_lon_alt = to_geodetic(twin.telemetry.origin, np.array([np.array(path) + off]))
     t = base.t + seconds
-    twin.history.add(Sample(uav=1, t=t, position=f.rows([t], lat_lon_alt)))
+    twin.telemetry.history.add(Sample(uav=1, t=t, position=f.rows([t], lat_lon_alt)))
 
 
 def test_a_renewed_prediction_begins_where_the_aircraft_is_and_comes_back_to_the_path(twin: Twin) -> None:
-    twin.base = twin.prediction
+    twin.prediction.last_rollout = twin.prediction.latest
     off = np.array([3.0, -4.0, 1.0])
     on(twin, 2.5, off)
-    (made,) = renew(twin)
-    base = twin.base
-    assert made is twin.prediction and made.t == pytest.approx(base.t + 2.5)
+    (made,) = extrapolate(twin)
+    base = twin.prediction.last_rollout
+    assert made is twin.prediction.latest and made.t == pytest.approx(base.t + 2.5)
     far = made.ahead.numpy()[-1]
     foreseen = np.column_stack(
         [np.interp(2.5 + made.ahead.numpy(), base.ahead.numpy(), c) for c in base.path.numpy().T]
@@ -39,19 +39,19 @@ def test_a_renewed_prediction_begins_where_the_aircraft_is_and_comes_back_to_the
     apart = made.path.numpy() - foreseen
     assert apart[0] == pytest.approx(off, abs=0.05) and np.abs(apart[-1]).max() < 0.1
     assert base.ahead.numpy()[-1] - 2.5 - 5.0 < far <= base.ahead.numpy()[-1] - 2.5
-    assert made.tube.shape == made.path.shape == (len(made.ahead.numpy()), 3)
+    assert made.prediction_region_half_axes.shape == made.path.shape == (len(made.ahead.numpy()), 3)
 
 
 def test_a_renewed_prediction_is_as_wide_as_the_age_of_its_rollout_demands(twin: Twin) -> None:
     """Half-axes of a rollout whose error is a random walk: c sqrt(look-ahead), and so much more for what fades."""
-    base = twin.prediction
+    base = twin.prediction.latest
     ahead = base.ahead.numpy().astype(float)
     grown = Array.of(np.outer(np.sqrt(ahead) + 0.1, [3.0, 2.0, 1.0]))
-    twin.base = msgspec.structs.replace(base, tube=grown, horizon_s=30.0)
+    twin.prediction.last_rollout = msgspec.structs.replace(base, prediction_region_half_axes=grown, horizon_s=30.0)
     for age in (2.0, 5.0, 9.0):
         on(twin, age, np.zeros(3))
-        (made,) = renew(twin)
-        at, half = made.ahead.numpy().astype(float), made.tube.numpy() / [3.0, 2.0, 1.0]
+        (made,) = extrapolate(twin)
+        at, half = made.ahead.numpy().astype(float), made.prediction_region_half_axes.numpy() / [3.0, 2.0, 1.0]
         fade = np.exp(-at / 10.0)
         wanted = np.sqrt((np.sqrt(at + age) + 0.1) ** 2 - (np.sqrt(age) + 0.1) ** 2 * fade * (2.0 - fade))
         wanted = np.maximum(wanted, np.sqrt(at) + 0.1)
@@ -65,7 +65,7 @@ def test_errors_of_a_random_walk_are_held_as_often_by_renewed_tubes_as_by_new_on
     walk = np.cumsum(rng.standard_normal((n, len(AHEAD[:61]), 3)), axis=1)
     half = np.outer(np.sqrt(np.arange(61.0) + 1.0), np.full(3, 2.114))  # of 0.9 in all three at once
     tube = np.empty((50, 3), np.float32)
-    widened(AHEAD[:61], half, float(age), tube)
+    widen_tube(AHEAD[:61], half, float(age), tube)
     fade = np.exp(-AHEAD[:50] / 10.0)[:, None]
     error = walk[:, age : age + 50] - fade * walk[:, [age]]
     held = (np.abs(error) <= tube).all(axis=2).mean(axis=0)
@@ -75,57 +75,69 @@ def test_errors_of_a_random_walk_are_held_as_often_by_renewed_tubes_as_by_new_on
 
 
 def test_renewed_predictions_are_scored_and_their_coverage_is_published(heard: tuple, twin: Twin) -> None:
-    twin.pace = Pace(predict=5.0, identify=1000.0, renew=0.5)
-    twin.identify_t = twin.data_t
+    twin.config = msgspec.structs.replace(twin.config, schedule=Schedule(predict=5.0, identify=1000.0, renew=0.5))
+    twin.identification.timer.restart(twin.telemetry.data_t)
     rest = f.shifted([m for m in heard if isinstance(m, Sample) and m.t > heard[-1].t - 40.0], 40.0, 1e9)
     made = [m for message in rest for m in advance(twin, (message,)) if isinstance(m, Prediction)]
-    coverage, n = twin.record.coverage_renewed
+    coverage, n = twin.confidence.tracker.extrapolated_coverage
     assert 4 <= n <= 9 and 0.0 <= coverage <= 1.0
-    assert (made[-1].coverage_renewed, made[-1].coverage_renewed_n) == pytest.approx((coverage, n))
+    assert (made[-1].coverage_propagated, made[-1].coverage_propagated_n) == pytest.approx((coverage, n))
     ages = [m.rollout_age_s for m in made]
     assert 6 <= ages.count(0.0) <= 10 and max(ages) > 4.0
 
 
 def test_a_renewal_after_the_origin_has_moved_is_in_the_frame_of_its_path(twin: Twin) -> None:
-    twin.base = twin.prediction
+    twin.prediction.last_rollout = twin.prediction.latest
     on(twin, 2.0, np.array([3.0, -4.0, 1.0]))
-    (before,) = renew(copy.deepcopy(twin))
-    far = to_geodetic(twin.origin, np.array([51e3, 0.0, 0.0]))
-    twin.origin = Origin(*map(int, far))
-    (made,) = renew(twin)
-    assert made.origin == before.origin == twin.base.origin
+    (before,) = extrapolate(copy.deepcopy(twin))
+    far = to_geodetic(twin.telemetry.origin, np.array([51e3, 0.0, 0.0]))
+    twin.telemetry.origin = Origin(*map(int, far))
+    (made,) = extrapolate(twin)
+    assert made.origin == before.origin == twin.prediction.last_rollout.origin
     assert made.path.numpy() == pytest.approx(before.path.numpy(), abs=0.1)
-    assert twin.record.coverage_renewed[1] == 0 and not twin.record._renewed  # scored in the twin's own frame alone
+    assert (
+        twin.confidence.tracker.extrapolated_coverage[1] == 0 and not twin.confidence.tracker._extrapolated
+    )  # scored in the twin's own frame alone
 
 
 def test_nothing_is_renewed_that_is_old_void_or_lost(twin: Twin) -> None:
-    twin.base = twin.prediction
+    twin.prediction.last_rollout = twin.prediction.latest
     fresh = copy.deepcopy(twin)
     on(fresh, 1.0, np.zeros(3))
-    assert renew(fresh)
-    for change in ({"base": None}, {"lost": True}, {"broken": True}, {"origin": None}):
+    assert extrapolate(fresh)
+    for part, name, value in (
+        ("prediction", "last_rollout", None),
+        ("telemetry", "link_lost", True),
+        ("prediction", "position_lost", True),
+        ("telemetry", "origin", None),
+    ):
         odd = copy.deepcopy(fresh)
-        for name, value in change.items():
-            setattr(odd, name, value)
-        assert renew(odd) == []
-    on(twin, LATEST_S + 0.5, np.zeros(3))
-    assert renew(twin), "the next is due and waits"
-    twin.predict_t = twin.base.t + LATEST_S
-    assert renew(twin) == []
-    twin.predict_t = twin.base.t
-    on(twin, OVERDUE_S + 0.5, np.zeros(3))
-    assert renew(twin) == []
+        setattr(getattr(odd, part), name, value)
+        assert extrapolate(odd) == []
+    on(twin, MAX_ROLLOUT_AGE_S + 0.5, np.zeros(3))
+    assert extrapolate(twin), "the next is due and waits"
+    twin.prediction.predict_timer.restart(twin.prediction.last_rollout.t + MAX_ROLLOUT_AGE_S)
+    assert extrapolate(twin) == []
+    twin.prediction.predict_timer.restart(twin.prediction.last_rollout.t)
+    on(twin, MAX_OVERDUE_AGE_S + 0.5, np.zeros(3))
+    assert extrapolate(twin) == []
     short = copy.deepcopy(fresh)
-    few = {name: Array.of(getattr(short.base, name).numpy()[:2]) for name in ("ahead", "path", "tube")}
-    short.base = msgspec.structs.replace(short.base, **few)
-    assert renew(short) == []
+    few = {
+        name: Array.of(getattr(short.prediction.last_rollout, name).numpy()[:2])
+        for name in ("ahead", "path", "prediction_region_half_axes")
+    }
+    short.prediction.last_rollout = msgspec.structs.replace(short.prediction.last_rollout, **few)
+    assert extrapolate(short) == []
 
 
 def test_the_shortest_flight_ahead_is_renewed_as_long_as_any(twin: Twin) -> None:
-    n = int(np.searchsorted(twin.prediction.ahead.numpy(), LEAST_AHEAD_S)) + 1
-    few = {name: Array.of(getattr(twin.prediction, name).numpy()[:n]) for name in ("ahead", "path", "tube")}
-    twin.base = msgspec.structs.replace(twin.prediction, **few)
-    for seconds in (0.5, 5.0, LATEST_S - 0.5):
+    n = int(np.searchsorted(twin.prediction.latest.ahead.numpy(), MIN_ROLLOUT_S)) + 1
+    few = {
+        name: Array.of(getattr(twin.prediction.latest, name).numpy()[:n])
+        for name in ("ahead", "path", "prediction_region_half_axes")
+    }
+    twin.prediction.last_rollout = msgspec.structs.replace(twin.prediction.latest, **few)
+    for seconds in (0.5, 5.0, MAX_ROLLOUT_AGE_S - 0.5):
         on(twin, seconds, np.zeros(3))
-        (made,) = renew(twin)
-        assert made.ahead.numpy()[-1] > LEAST_AHEAD_S - seconds - 5.0
+        (made,) = extrapolate(twin)
+        assert made.ahead.numpy()[-1] > MIN_ROLLOUT_S - seconds - 5.0

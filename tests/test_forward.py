@@ -12,11 +12,11 @@ from talker import ITEMS, Aircraft, Ears, Talker
 from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Alert, Mission, Params
 from fleet.telemetry.mavlink.parsing.decode import IDS
-from fleet.telemetry.mavlink.parsing.received import Heard
-from gateway.forwarding.forward import ASTRAY, DATAGRAM, DOUBLE
+from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
+from gateway.forwarding.forward import DUPLICATE_SENDER, MAX_DATAGRAM, NO_TARGET
 from gateway.forwarding.targets import targets
 from gateway.links.link import Batch
-from gateway.pipeline import Pump
+from gateway.pipeline import Pipeline
 
 STATION = Talker(253, 190)
 ASK = mav.MAVLink_param_request_list_message
@@ -28,20 +28,20 @@ class Field:
 
     def __init__(self, air, ground, **settings):
         self.air, self.ground, self.bus = air, ground, MemoryBus()
-        self.pump = Pump([*air, *ground], self.bus, stations=len(ground), **settings)
+        self.pump = Pipeline([*air, *ground], self.bus, stations=len(ground), **settings)
         self.now = time.time()
 
     def say(self, link, where, *frames):
         """One far end of one link says something; forwarded at once."""
         number = self.pump.links.index(link)
-        self.pump.take(Batch(number, Heard.of([(self.now, where, b"".join(frames))])))
-        self.pump._pass_on()
+        self.pump.take(Batch(number, ReceivedBytes.from_pieces([(self.now, where, b"".join(frames))])))
+        self.pump._forward_pending()
 
 
 @pytest.fixture
 def field():
     one, two = FakeLink(), FakeLink("tcpin:127.0.0.1:1")
-    found = Field([one, two], [FakeLink("udpin:127.0.0.1:2"), FakeLink("udpout:h:1", greets=("far",))])
+    found = Field([one, two], [FakeLink("udpin:127.0.0.1:2"), FakeLink("udpout:h:1", known_peers=("far",))])
     found.say(found.ground[0], "qgc", BEAT)
     for k, (link, system) in enumerate(((one, 7), (one, 8), (two, 9))):
         found.say(link, f"air{system}", Talker(system).heartbeat(), Talker(system).attitude(1.0 + k))
@@ -65,7 +65,7 @@ def test_what_is_for_one_goes_to_where_that_one_is(field):
     assert [link.told() for link in field.air] == [{"air8": ["PARAM_REQUEST_LIST"]}, {"air9": ["PARAM_REQUEST_LIST"]}]
     field.say(field.ground[0], "qgc", STATION.pack(ASK(44, 1)), STATION.pack(ASK(8, 77)))
     assert [link.told() for link in field.air] == [{}, {}]
-    assert field.pump.forward.refused == {ASTRAY: 2}
+    assert field.pump.forwarder.refused == {NO_TARGET: 2}
     field.say(field.ground[1], "far", Talker(252, 1).heartbeat(6, 8))
     [link.told() for link in (*field.air, *field.ground)]
     field.say(field.air[0], "air7", Talker(7).pack(mav.MAVLink_mission_ack_message(253, 190, 0)))
@@ -86,7 +86,7 @@ def test_a_second_sender_is_neither_forwarded_nor_given_what_is_for_the_first(fi
     [link.told() for link in field.ground]
     field.say(field.air[1], "spoofer", Talker(7).attitude(2.0), Talker(7).heartbeat())
     assert [link.told() for link in field.ground] == [{}, {}]
-    assert field.pump.forward.refused == {DOUBLE: 2}
+    assert field.pump.forwarder.refused == {DUPLICATE_SENDER: 2}
     field.say(field.ground[0], "qgc", STATION.pack(ASK(7, 1)))
     assert [link.told() for link in field.air] == [{"air7": ["PARAM_REQUEST_LIST"]}, {}]
     field.pump._tick(0.0)
@@ -97,15 +97,15 @@ def test_a_second_sender_is_neither_forwarded_nor_given_what_is_for_the_first(fi
 def test_a_station_that_speaks_in_an_aircraft_s_name_raises_the_alarm(field):
     field.say(field.ground[0], "qgc", Talker(7).heartbeat())
     field.pump._tick(0.0)
-    assert [alert.uav for alert, _ in field.bus.ask(Alert)] == [7]
+    assert [alert.uav for alert, _ in field.bus.get(Alert)] == [7]
 
 
 def test_a_station_makes_no_uav_and_is_not_kept(field):
     for _ in range(3):
         field.say(field.ground[0], "qgc", BEAT, Talker(99).heartbeat(), Talker(99).attitude(1.0))
     field.pump._tick(0.0)
-    assert [sorted(intake.crafts) for intake in field.pump.intakes] == [[7, 8], [9], [], []]
-    assert [intake._sorted for intake in field.pump.intakes] == [[], [], [], []]
+    assert [sorted(intake.aircraft) for intake in field.pump.intakes] == [[7, 8], [9], [], []]
+    assert [intake._pending_frames for intake in field.pump.intakes] == [[], [], [], []]
 
 
 def test_listening_only_stations_hear_and_are_not_heard():
@@ -119,14 +119,14 @@ def test_listening_only_stations_hear_and_are_not_heard():
 
 def test_a_station_gets_what_it_wants_and_a_link_brings_what_it_may():
     air = FakeLink("udpin:127.0.0.1:1#no-messages=STATUSTEXT")
-    wants = FakeLink("udpout:h:1#messages=ATTITUDE,STATUSTEXT&systems=7", greets=("far",))
+    wants = FakeLink("udpout:h:1#messages=ATTITUDE,STATUSTEXT&systems=7", known_peers=("far",))
     field = Field([air], [wants])
     text = mav.MAVLink_statustext_message(6, b"hello")
     for system in (7, 8):
         talker = Talker(system)
         field.say(air, f"air{system}", talker.heartbeat(), talker.attitude(1.0), talker.pack(text))
     assert wants.told() == {"far": ["ATTITUDE"]}
-    assert field.pump.intakes[0].refused == {"excluded by the filter of the link": 2}
+    assert field.pump.intakes[0].rejected == {"excluded by the filter of the link": 2}
     field.say(wants, "far", STATION.pack(ASK(7, 1)))  # what the station says is not sieved
     assert air.told() == {"air7": ["PARAM_REQUEST_LIST"]}
 
@@ -138,7 +138,7 @@ def test_bytes_go_on_as_they_came_several_to_a_datagram(field):
     field.say(field.air[0], "air7", *frames)
     sent = [data for _, data in field.ground[1].sent]
     assert b"".join(sent) == b"".join(frames)
-    assert 1 < len(sent) < 10 and max(map(len, sent)) <= DATAGRAM
+    assert 1 < len(sent) < 10 and max(map(len, sent)) <= MAX_DATAGRAM
 
 
 def test_an_upload_by_a_station_is_seen_by_us(field):
@@ -153,7 +153,7 @@ def test_an_upload_by_a_station_is_seen_by_us(field):
         field.say(field.ground[0], "qgc", STATION.pack(message))
     field.say(field.air[0], "air7", plane.talker.pack(mav.MAVLink_mission_ack_message(253, 190, 0)))
     field.pump._tick(1.0)
-    ((mission, _),) = field.bus.ask(Mission, 7)
+    ((mission, _),) = field.bus.get(Mission, 7)
     assert [item.lon_e7 for item in mission.items] == [80_000_000, 80_000_001]
 
 
@@ -181,8 +181,8 @@ def test_a_station_loads_parameters_and_mission_through_us_while_we_do(field, mo
     params = {message.param_id for message in heard if message.get_type() == "PARAM_VALUE"}
     items = {message.seq for message in heard if message.get_type() == "MISSION_ITEM_INT"}
     assert len(params) == 300 and items == set(range(12))
-    assert field.bus.ask(Mission, 7)[0][0].items == ITEMS
-    assert field.bus.ask(Params, 7)[0][0].complete
+    assert field.bus.get(Mission, 7)[0][0].items == ITEMS
+    assert field.bus.get(Params, 7)[0][0].complete
 
 
 def test_targets_are_read_off_every_message():

@@ -15,14 +15,14 @@ from talker import ITEMS, T0, Aircraft, Talker
 
 from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import connect
-from fleet.contract import Account, Mission, Params, Sample, Status
-from fleet.telemetry.mavlink.parsing.received import Heard
+from fleet.contract import GatewayCounters, Mission, Params, Sample, Status
+from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
 from fleet.telemetry.recording.recordings import replay_messages
-from gateway.__main__ import compiled
+from gateway.__main__ import compile_decoder
 from gateway.links.link import Batch
-from gateway.links.recorded import Replay
+from gateway.links.recorded import ReplayLink
 from gateway.links.udp import Udp
-from gateway.pipeline import Pump
+from gateway.pipeline import Pipeline
 from gateway.settings.link_spec import read_spec
 
 PATIENCE_S = 30.0  # an upper bound; every wait ends with its condition
@@ -34,7 +34,7 @@ class Ear:
     def __init__(self, bus):
         self.news = []
         self._changed = threading.Condition()
-        for kind in (Sample, Status, Mission, Params, Account):
+        for kind in (Sample, Status, Mission, Params, GatewayCounters):
             bus.subscribe(kind, self._hear)
 
     def _hear(self, message, _stamp):
@@ -55,7 +55,7 @@ class Ear:
 
 def test_a_link_is_read():
     spec = read_spec("udpin:0.0.0.0:14550#offset=-1")
-    assert (spec.kind, spec.where, spec.port, spec.offset) == ("udpin", "0.0.0.0", 14550, -1)
+    assert (spec.kind, spec.address, spec.port, spec.offset) == ("udpin", "0.0.0.0", 14550, -1)
     assert read_spec("udpin::14550", 3)[2:6] == ("127.0.0.1", 14550, 1.0, 3)
     assert read_spec("replay:/a b/c.tlog.xz?speed=max")[1:5] == ("replay", "/a b/c.tlog.xz", 0, float("inf"))
     assert read_spec("replay:c.tlog?speed=4").speed == 4
@@ -113,17 +113,17 @@ def test_a_busy_port_is_one_sentence():
 @pytest.mark.parametrize("listen_only", [False, True])
 def test_latest_news_answer_and_only_listening_sends_nothing(listen_only):
     bus, link, talker = MemoryBus(), FakeLink("udpin:127.0.0.1:1#offset=-1"), Talker()
-    pump, ear = Pump([link], bus, listen_only), Ear(bus)
+    pump, ear = Pipeline([link], bus, listen_only), Ear(bus)
     data = talker.heartbeat() + talker.attitude(1.0) + talker.mission(talker.item(0)) + talker.param("A", 2.0, 0, 1)
-    pump.take(Batch(0, Heard.of([(time.time(), "air", data)])))
+    pump.take(Batch(0, ReceivedBytes.from_pieces([(time.time(), "air", data)])))
     pump._tick(0.0)
     pump.run(threading.Event())
-    assert {type(m) for m in ear.news} == {Sample, Status, Mission, Params, Account}
-    ((mission, _),) = bus.ask(Mission)
+    assert {type(m) for m in ear.news} == {Sample, Status, Mission, Params, GatewayCounters}
+    ((mission, _),) = bus.get(Mission)
     assert (mission.uav, len(mission.items)) == (6, 1)
-    assert bus.ask(Params, 6)[0][0].values == {"A": 2.0}
-    assert bus.ask(Status, 5) == []
-    ((account, _),) = bus.ask(Account)
+    assert bus.get(Params, 6)[0][0].values == {"A": 2.0}
+    assert bus.get(Status, 5) == []
+    ((account, _),) = bus.get(GatewayCounters)
     assert (account.uavs, account.datagrams, account.messages, account.bad_bytes) == ((6,), 1, 5, 0)
     assert account.bytes_in == len(data)
     assert bool(link.sent) is not listen_only
@@ -131,9 +131,9 @@ def test_latest_news_answer_and_only_listening_sends_nothing(listen_only):
 
 def test_mission_and_parameters_are_said_again():
     bus, talker = MemoryBus(), Talker()
-    pump, ear = Pump([FakeLink()], bus), Ear(bus)
+    pump, ear = Pipeline([FakeLink()], bus), Ear(bus)
     data = talker.heartbeat() + talker.mission(talker.item(0))
-    pump.take(Batch(0, Heard.of([(time.time(), "air", data)])))
+    pump.take(Batch(0, ReceivedBytes.from_pieces([(time.time(), "air", data)])))
     for mono in (0.0, 5.0, 11.0, 12.0, 22.0):
         pump._tick(mono)
     assert len(ear.of(Mission)) == 3
@@ -154,18 +154,18 @@ def test_a_recording_played_live_says_what_it_says_offline(tmp_path):
     path.write_bytes(flight())
     bus = MemoryBus()
     ear = Ear(bus)
-    Pump([Replay(read_spec(f"replay:{path}?speed=max"))], bus).run(threading.Event())
-    live = [m for m in ear.news if not isinstance(m, Account)]
+    Pipeline([ReplayLink(read_spec(f"replay:{path}?speed=max"))], bus).run(threading.Event())
+    live = [m for m in ear.news if not isinstance(m, GatewayCounters)]
     assert live == list(replay_messages(path))
     assert len(live) > 200
-    assert ear.of(Account)[-1].t == pytest.approx(T0 + 20, abs=0.2)
+    assert ear.of(GatewayCounters)[-1].t == pytest.approx(T0 + 20, abs=0.2)
 
 
 def test_a_recording_keeps_its_pace(tmp_path):
     path = tmp_path / "flight.tlog"
     path.write_bytes(flight(10.0))
     began = time.monotonic()
-    Pump([Replay(read_spec(f"replay:{path}?speed=20"))], MemoryBus()).run(threading.Event())
+    Pipeline([ReplayLink(read_spec(f"replay:{path}?speed=20"))], MemoryBus()).run(threading.Event())
     assert 0.45 <= time.monotonic() - began < 5.0
 
 
@@ -180,7 +180,7 @@ def test_udp_to_zenoh_through_a_megabyte_of_noise(router):
     stop = threading.Event()
     with connect(router) as bus, connect(router) as mine:
         link, ear = Udp(read_spec(f"udpin:127.0.0.1:{udp_port()}")), Ear(mine)
-        thread = threading.Thread(target=Pump([link], bus).run, args=(stop,))
+        thread = threading.Thread(target=Pipeline([link], bus).run, args=(stop,))
         thread.start()
         try:
             with Radio(link.port) as radio:
@@ -190,11 +190,11 @@ def test_udp_to_zenoh_through_a_megabyte_of_noise(router):
                 before = len(ear.of(Sample, 7))
                 for start in range(0, len(noise), 1000):
                     radio.noise(noise[start : start + 1000])
-                ear.wait(lambda e: e.of(Account) and e.of(Account)[-1].bad_bytes > 100_000)
+                ear.wait(lambda e: e.of(GatewayCounters) and e.of(GatewayCounters)[-1].bad_bytes > 100_000)
                 ear.wait(lambda e: len(e.of(Sample, 7)) > before + 5)
-                assert [m.uav for m, _ in mine.ask(Status)] == [7]
-                assert mine.ask(Mission, 7)[0][0].items == ITEMS
-                assert ear.of(Account)[-1].uavs == (7,)
+                assert [m.uav for m, _ in mine.get(Status)] == [7]
+                assert mine.get(Mission, 7)[0][0].items == ITEMS
+                assert ear.of(GatewayCounters)[-1].uavs == (7,)
                 assert abs(ear.of(Sample, 7)[-1].t - time.time()) < 5
         finally:
             stop.set()
@@ -293,5 +293,5 @@ def test_compiling_that_takes_long_is_said(monkeypatch):
     said = threading.Event()
     monkeypatch.setattr("gateway.__main__._log.warning", lambda *_: said.set())
     monkeypatch.setattr("gateway.__main__.warm_up", lambda: said.wait(PATIENCE_S))
-    compiled()
+    compile_decoder()
     assert said.is_set()

@@ -11,8 +11,8 @@ from fleet.airframes.airframe import servo_map
 from fleet.contract import Sample
 from fleet.frames import Origin
 from fleet.window import Window
-from twin_worker.telemetry.history import History
-from twin_worker.telemetry.resample import DT, Grid, preprocess
+from twin_worker.telemetry.history import TelemetryHistory
+from twin_worker.telemetry.resample import DT, Resampler, preprocess
 
 PLAIN, CALM = servo_map({}), np.zeros(3)
 LATE_S = 1.5  # rows this late are still laid
@@ -43,11 +43,11 @@ def stream(seed: int, seconds: float = 60.0, *, late: float = 0.0, gaps: int = 0
     return out
 
 
-def look(grid: Grid, history: History, seconds: float = 30.0, wind: np.ndarray = CALM) -> Window | None:
+def look(grid: Resampler, history: TelemetryHistory, seconds: float = 30.0, wind: np.ndarray = CALM) -> Window | None:
     return grid.window(history, HERE, PLAIN, wind, until=history.newest, seconds=seconds)
 
 
-def once(history: History, seconds: float = 30.0, wind: np.ndarray = CALM) -> Window | None:
+def once(history: TelemetryHistory, seconds: float = 30.0, wind: np.ndarray = CALM) -> Window | None:
     return preprocess(history, HERE, PLAIN, wind, until=history.newest, seconds=seconds)
 
 
@@ -69,7 +69,7 @@ def same(piecewise: Window, whole: Window, skip: float = 8.0) -> None:
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("late", "gaps"), [(0.0, 0), (0.0, 2), (1.0, 0), (0.9, 2)])
 def test_piece_by_piece_is_all_at_once(seed, late, gaps):
-    history, grid, compared = History(), Grid(), 0
+    history, grid, compared = TelemetryHistory(), Resampler(), 0
     for k, message in enumerate(stream(seed, late=late, gaps=gaps)):
         history.add(message)
         got = look(grid, history) if k % 3 == seed % 3 else None
@@ -83,7 +83,7 @@ def test_piece_by_piece_is_all_at_once(seed, late, gaps):
 
 def test_rows_within_a_second_and_a_half_are_laid_later_ones_never():
     for late, laid in ((LATE_S - 0.3, True), (2 * LATE_S, False)):
-        history, grid = History(), Grid()
+        history, grid = TelemetryHistory(), Resampler()
         quick = f.turn(30.0)
         servo_t, servo = quick["servo"]
         slow = (servo_t > T0 + 15.0) & (servo_t < T0 + 15.4)
@@ -99,7 +99,7 @@ def test_rows_within_a_second_and_a_half_are_laid_later_ones_never():
 
 
 def test_angles_go_on_over_many_turns():
-    history, grid = History(), Grid()
+    history, grid = TelemetryHistory(), Resampler()
     for message in f.messages(f.turn(120.0, rate=0.5)):
         history.add(message)
         got = look(grid, history, 100.0)
@@ -108,7 +108,7 @@ def test_angles_go_on_over_many_turns():
 
 
 def test_what_is_laid_does_not_hang_on_the_wind_or_the_servos_of_its_time():
-    history, grid = History(), Grid()
+    history, grid = TelemetryHistory(), Resampler()
     for message in f.messages(f.turn(40.0, wind=(4.0, -3.0))):
         history.add(message)
         look(grid, history, wind=np.array([9.0, 9.0, 0.0]))
@@ -119,7 +119,7 @@ def test_what_is_laid_does_not_hang_on_the_wind_or_the_servos_of_its_time():
 
 
 def test_another_origin_begins_anew():
-    history, grid = History(), Grid()
+    history, grid = TelemetryHistory(), Resampler()
     for message in f.messages(f.turn(40.0)):
         history.add(message)
         look(grid, history)
@@ -129,7 +129,7 @@ def test_another_origin_begins_anew():
 
 
 def test_it_keeps_so_much_and_no_more():
-    history, grid = History(), Grid(keep_s=20.0)
+    history, grid = TelemetryHistory(), Resampler(keep_s=20.0)
     for message in f.messages(f.turn(60.0)):
         history.add(message)
         got = look(grid, history, 1e6)
@@ -138,7 +138,7 @@ def test_it_keeps_so_much_and_no_more():
 
 
 def test_a_short_look_is_the_end_of_a_long_one():
-    history, grid = History(), Grid()
+    history, grid = TelemetryHistory(), Resampler()
     for message in stream(5):
         history.add(message)
         look(grid, history)
@@ -148,7 +148,7 @@ def test_a_short_look_is_the_end_of_a_long_one():
 
 
 def test_a_kind_that_falls_silent_ends_the_window_there_and_it_goes_on_when_it_speaks():
-    history, grid = History(), Grid()
+    history, grid = TelemetryHistory(), Resampler()
     laid = f.without(f.turn(60.0), "velocity", 30.0, 45.0)
     ends = []
     for message in f.messages(laid):
@@ -162,7 +162,7 @@ def test_a_kind_that_falls_silent_ends_the_window_there_and_it_goes_on_when_it_s
 
 
 def test_forgetting_begins_anew_even_in_the_past():
-    history, grid = History(), Grid()
+    history, grid = TelemetryHistory(), Resampler()
     for message in f.messages(f.turn(30.0)):
         history.add(message)
         look(grid, history)

@@ -9,7 +9,7 @@ from conftest import ROOT
 
 ASK = """
 import ctypes, sys, threading
-from fleet.process.malloc_trim import give_back
+from fleet.process.malloc_trim import enable_malloc_trim
 names = "arena ordblks smblks hblks hblkhd usmblks fsmblks uordblks fordblks keepcost".split()
 class Info(ctypes.Structure):
     _fields_ = [(name, ctypes.c_size_t) for name in names]
@@ -23,7 +23,7 @@ def apart(size):  # bytes that blocks of their own add, of more than there is pl
         libc.free(block)
     return found
 if len(sys.argv) > 1:
-    give_back(int(sys.argv[1]))
+    enable_malloc_trim(int(sys.argv[1]))
 apart(8 << 20)
 print(apart(1 << 16) > 0, apart(1 << 14) > 0, any(one.name == "heap" for one in threading.enumerate()))
 """

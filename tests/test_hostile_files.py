@@ -10,10 +10,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from test_end_to_end import process, wait
 
 from fleet.bus.session import connect
-from fleet.contract import Account, Status
+from fleet.contract import GatewayCounters, Status
 from fleet.telemetry.onboard_logs.ulog.formats import Formats
-from fleet.telemetry.recording.opening import RATIO, UNFOLDED, Source
-from gateway.links.isolated_replay import divided
+from fleet.telemetry.recording.opening import MAX_RATIO, MIN_UNPACKED_LIMIT, RecordingFile
+from gateway.links.isolated_replay import split_replays
 from gateway.settings.link_spec import read_spec
 from tests.bench.security.hostile_files import CPU_S, FILES, MEMORY_MB, a_flight, read_apart, rightful_files, written
 
@@ -46,13 +46,13 @@ def test_a_format_is_judged_in_one_pass(n: int) -> None:
 def test_formats_are_looked_into_once_and_only_so_many_are_kept() -> None:
     formats = Formats(frozenset({"t"}))
     for k in range(1, 8):
-        assert formats.learn(f"f{k}:".encode() + b";".join(b"f%d x%d" % (k - 1, i) for i in range(4)) + b";")
-    assert formats.learn(b"f0:uint8_t x;")
-    assert formats.learn(b"t:uint64_t timestamp;f5 x;") and formats.learn(b"deep:uint64_t timestamp;f7 x;f7 y;")
-    assert formats.subscribe(b"\0\0\0t") and formats.topics[0].most == 8 + 4**5
+        assert formats.declare(f"f{k}:".encode() + b";".join(b"f%d x%d" % (k - 1, i) for i in range(4)) + b";")
+    assert formats.declare(b"f0:uint8_t x;")
+    assert formats.declare(b"t:uint64_t timestamp;f5 x;") and formats.declare(b"deep:uint64_t timestamp;f7 x;f7 y;")
+    assert formats.subscribe(b"\0\0\0t") and formats.topics[0].max_size == 8 + 4**5
     assert not formats.subscribe(b"\0\1\0deep")
     assert len(formats._extents) < 50
-    kept = sum(formats.learn(f"g{k}:uint64_t timestamp;".encode()) for k in range(60_000))
+    kept = sum(formats.declare(f"g{k}:uint64_t timestamp;".encode()) for k in range(60_000))
     assert 10_000 < kept < 60_000
 
 
@@ -64,22 +64,24 @@ def test_an_archive_ends_where_no_recording_would_unfold_to(suffix: str, tmp_pat
 
     pack = {".gz": gzip.compress, ".xz": lzma.compress, ".bz2": bz2.compress}[suffix]
     bomb, small = tmp_path / f"bomb.tlog{suffix}", tmp_path / f"small.tlog{suffix}"
-    bomb.write_bytes(pack(bytes(2 * UNFOLDED)))
-    small.write_bytes(pack(bytes(UNFOLDED)))
-    source = Source(bomb)
+    bomb.write_bytes(pack(bytes(2 * MIN_UNPACKED_LIMIT)))
+    small.write_bytes(pack(bytes(MIN_UNPACKED_LIMIT)))
+    source = RecordingFile(bomb)
     with source.open() as stream:
-        assert sum(map(len, iter(lambda: stream.read(1 << 20), b""))) == max(UNFOLDED, RATIO * source.size)
-    assert "decompress to more than" in source.trouble and "decompress a trusted file" in source.trouble
-    source = Source(small)
+        assert sum(map(len, iter(lambda: stream.read(1 << 20), b""))) == max(
+            MIN_UNPACKED_LIMIT, MAX_RATIO * source.size
+        )
+    assert "decompress to more than" in source.problem and "decompress a trusted file" in source.problem
+    source = RecordingFile(small)
     with source.open() as stream:
-        assert len(stream.read(UNFOLDED + 1)) == UNFOLDED
-    assert "damaged" not in source.trouble
+        assert len(stream.read(MIN_UNPACKED_LIMIT + 1)) == MIN_UNPACKED_LIMIT
+    assert "damaged" not in source.problem
 
 
 def test_recordings_are_played_apart_only_beside_live_links() -> None:
     live, file = read_spec("udpin:14550"), read_spec("replay:a.tlog")
-    assert divided([live, file]) == ([live], [file])
-    assert divided([file]) == ([file], []) and divided([live]) == ([live], [])
+    assert split_replays([live, file]) == ([live], [file])
+    assert split_replays([file]) == ([file], []) and split_replays([live]) == ([live], [])
 
 
 @pytest.mark.parametrize("what", ["hostile", "good"])
@@ -95,7 +97,7 @@ def test_a_live_link_is_served_beside_a_file_and_sigterm_ends_both(what: str, ro
     links = ("--link", f"udpin:127.0.0.1:{port}", "--link", f"replay:{file}")
     with connect(router) as bus, socket.socket(type=socket.SOCK_DGRAM) as aircraft:
         bus.subscribe(Status, lambda status, _: heard.add(status.uav))
-        bus.subscribe(Account, lambda account, _: accounts.add(account.links))
+        bus.subscribe(GatewayCounters, lambda account, _: accounts.add(account.links))
         with process("gateway", *links, "--router", router) as gateway:
 
             def served() -> bool:

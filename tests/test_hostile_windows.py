@@ -10,12 +10,12 @@ from flights import DT, HERE, T0, published
 
 from fleet.contract import Outcome, Verdict
 from fleet.window import Window
-from twin_worker.identification.fixed_wing.derivatives_model import Coupled, identify
-from twin_worker.identification.fixed_wing.plant import finite
+from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel, identify
+from twin_worker.identification.fixed_wing.plant import is_finite
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps import identify_step
 from twin_worker.twin.steps.model_message import model_message
-from twin_worker.twin.steps.model_selection import choose
+from twin_worker.twin.steps.model_selection import select_model
 from twin_worker.validation.verify import verify
 
 ROWS, SPLIT = 236, 130  # a short flight: 5.2 s to learn from, 4.2 s held out
@@ -137,14 +137,17 @@ def spoilt(spoil, rng: Rng) -> Window:
     return w
 
 
-def before(rng: Rng) -> tuple[Coupled | None, Coupled | None]:
+def before(rng: Rng) -> tuple[DerivativesModel | None, DerivativesModel | None]:
     """What an earlier flight said: nothing, the newest search, or a verified model."""
     model = known(aircraft(int(rng.integers(6))), T0 - 60.0, T0 - 30.0)
     return ((None, None), (model, None), (None, model), (model, model))[rng.integers(4)]
 
 
-def twin_with(plant: Coupled | None, verdict: Verdict) -> Twin:
-    return Twin(1, plant=plant, verdict=verdict, in_force=verdict if plant else None, origin=HERE)
+def twin_with(plant: DerivativesModel | None, verdict: Verdict) -> Twin:
+    twin = Twin.of(1)
+    twin.telemetry.origin, twin.identification.verdict = HERE, verdict
+    twin.models.active_model, twin.models.active_verdict = plant, verdict if plant else None
+    return twin
 
 
 def met(window: Window, rng: Rng) -> str:
@@ -153,13 +156,13 @@ def met(window: Window, rng: Rng) -> str:
     wind = rng.choice([1.0, 100.0]) * rng.standard_normal(3)
     try:
         plant = identify(window.part(0, SPLIT), wind, SMALL, last, near)
-        assert finite(plant) and np.isfinite(plant.covariance).all()
-        verdict = verify(plant, window, SPLIT, last=known(aircraft(0)) if rng.random() < 0.5 else None)
+        assert is_finite(plant) and np.isfinite(plant.covariance).all()
+        verdict = verify(plant, window, SPLIT, active=known(aircraft(0)) if rng.random() < 0.5 else None)
     except ValueError as error:
         assert str(error).startswith(("identify: found", "verify: found")) and "; wait" in str(error), error
         return "sentence"
     twin = twin_with(plant, verdict)
-    choose(twin, window, SPLIT, plant, verdict)
+    select_model(twin, window, SPLIT, plant, verdict)
     published([model_message(twin, window)])
     return verdict.outcome.value
 
@@ -180,9 +183,9 @@ def test_there_are_two_thousand():
 @pytest.mark.parametrize("spoil", [kind for kind in KINDS if kind is not same_stamps], ids=lambda kind: kind.__name__)
 def test_a_whole_hop_of_learning_meets_them(spoil, monkeypatch):
     """The same through `learn`, with a verified model in force: it is never replaced by a number that is none."""
-    monkeypatch.setattr(identify_step, "LEAST_S", 6.0)
-    monkeypatch.setattr(identify_step, "_HELD_S", (4.2, 4.2, 4.2))
-    monkeypatch.setattr(identify_step, "compare_with_flight", lambda twin: None)
+    monkeypatch.setattr(identify_step, "MIN_WINDOW_S", 6.0)
+    monkeypatch.setattr(identify_step, "_HOLD_OUT_S", (4.2, 4.2, 4.2))
+    monkeypatch.setattr(identify_step, "fit_kinematic_models", lambda twin: None)
     rng = np.random.default_rng(100 + KINDS.index(spoil))
     model = known(aircraft(0))
     for _ in range(3):
@@ -190,7 +193,7 @@ def test_a_whole_hop_of_learning_meets_them(spoil, monkeypatch):
         twin = twin_with(model, Verdict(outcome=Outcome.VERIFIED, sentence="verified before"))
         monkeypatch.setattr(Twin, "window", lambda self, seconds, window=window: window)
         for _ in range(3):
-            published(identify_step.learn(twin))
-            assert isinstance(twin.plant, Coupled) and finite(twin.plant)
-            assert twin.verdict.sentence
-            assert twin.near is None or finite(twin.near)
+            published(identify_step.identify_and_verify(twin))
+            assert isinstance(twin.models.active_model, DerivativesModel) and is_finite(twin.models.active_model)
+            assert twin.identification.verdict.sentence
+            assert twin.identification.warm_start is None or is_finite(twin.identification.warm_start)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twin_worker.prediction.turn_rate import STEP, imm, turn_on
+from twin_worker.prediction.turn_rate import STEP, constant_turn_prediction, imm
 from twin_worker.telemetry.track import STEP as TRACK_STEP
 from twin_worker.telemetry.track import Track
 
@@ -83,8 +83,8 @@ def test_a_leap_that_no_aircraft_flies_begins_the_track_anew(seed):
     p[: at + 1] += leap
     if seed % 2:
         v[at] += leap
-    path = turn_on(Track(t, p, v, np.full((n, 3), np.nan), np.ones(n, bool), ""), AHEAD)
+    path = constant_turn_prediction(Track(t, p, v, np.full((n, 3), np.nan), np.ones(n, bool), ""), AHEAD)
     assert path is not None
     assert np.linalg.norm(path[5] - (clean[-1] + 5.0 * np.array([18.0, 9.0, 0.0]))) < 5.0
     v[-1] = np.nan
-    assert turn_on(Track(t, p, v, np.full((n, 3), np.nan), np.ones(n, bool), ""), AHEAD) is None
+    assert constant_turn_prediction(Track(t, p, v, np.full((n, 3), np.nan), np.ones(n, bool), ""), AHEAD) is None

@@ -12,13 +12,19 @@ import pytest
 from fleet.cli import main
 from fleet.commands.offline import inspect
 from fleet.contract import Link, Mission, Params, Status
-from fleet.process.sanitise import plain
-from fleet.report.ink import drawn, mode_colours
+from fleet.process.sanitise import printable
+from fleet.report.ink import downsample, mode_colours
 from fleet.report.report_text import table
 from fleet.telemetry.inspection.abilities import abilities
-from fleet.telemetry.inspection.findings import Facts, File, Findings, findings, happened
-from fleet.telemetry.inspection.survey import Survey, airborne, survey
-from fleet.telemetry.inspection.thinned import Span, Thinned, overlap
+from fleet.telemetry.inspection.findings import (
+    AircraftFindings,
+    FileFindings,
+    LinkTexts,
+    compute_findings,
+    merged_events,
+)
+from fleet.telemetry.inspection.survey import Survey, airborne, survey_recording
+from fleet.telemetry.inspection.thinned import DecimatedRows, TimeInterval, overlap
 from fleet.telemetry.recording.recordings import replay_messages
 
 T0 = flights.T0
@@ -34,7 +40,7 @@ def tlog(heard, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def pretended(heard) -> Survey:
-    return survey(heard)[1]
+    return survey_recording(heard)[1]
 
 
 def lively(seconds: float = 60.0) -> flights.Laid:
@@ -57,7 +63,7 @@ def known(laid: flights.Laid, *, vehicle: str = "fixed_wing", mode: str = "AUTO"
     """A survey of rows, and of an aircraft that says what it is."""
     status = Status(uav=1, t=T0, mode=mode, armed=True, vehicle=vehicle, autopilot="ardupilot", **more)
     mission = Mission(uav=1, t=T0, items=tuple(flights.item(n, north=200.0 * n) for n in range(items)), complete=True)
-    return survey([status, *([mission] if items else []), *flights.messages(laid)])[1]
+    return survey_recording([status, *([mission] if items else []), *flights.messages(laid)])[1]
 
 
 def judged(of: Survey) -> dict[str, tuple[bool, str]]:
@@ -68,7 +74,9 @@ def judged(of: Survey) -> dict[str, tuple[bool, str]]:
 
 
 def test_a_pretend_flight_is_described(pretended):
-    told = findings(pretended, Facts("ArduPlane 4.7", ((T0 + 20, 2, "Engine out"), (T0 + 21, 6, "chatter"))))
+    told = compute_findings(
+        pretended, LinkTexts("ArduPlane 4.7", ((T0 + 20, 2, "Engine out"), (T0 + 21, 6, "chatter")))
+    )
     assert (told.uav, told.vehicle, told.autopilot, told.firmware) == (1, "fixed_wing", "ardupilot", "ArduPlane 4.7")
     assert told.seconds == pytest.approx(100, abs=2)
     assert told.airborne_s == pytest.approx(100, abs=3)
@@ -98,8 +106,8 @@ def test_events_are_told_once_and_in_time():
         flights.sample(1, T0 + 11, leg=(np.array([T0 + 11]), np.array([[2.0]]))),
         Status(uav=1, t=T0 + 12, mode="AUTO", armed=False),
     ]
-    one = survey(said)[1]
-    told = [(event.kind, event.text) for event in happened(one, Facts())]
+    one = survey_recording(said)[1]
+    told = [(event.kind, event.text) for event in merged_events(one, LinkTexts())]
     assert told.count(("text", "PreArm: no GPS")) == 1
     assert [(kind, text) for kind, text in told if kind == "parameter"] == [("parameter", "A 1 to 2")]
     assert [kind for kind, _ in told if kind in ("mode", "armed", "link", "clock", "disarmed")] == [
@@ -109,7 +117,7 @@ def test_events_are_told_once_and_in_time():
     assert [text for kind, text in told if kind == "item"] == ["item 1", "item 2"]
     assert ("gap", "no row for 10.0 s") in told
     texts = ((T0 + 10, 2, "PreArm: no GPS"),)
-    assert [e.kind for e in happened(one, Facts("", texts))].count("text") == 1
+    assert [e.kind for e in merged_events(one, LinkTexts("", texts))].count("text") == 1
 
 
 def test_a_glider_on_the_ground_never_flew():
@@ -118,13 +126,13 @@ def test_a_glider_on_the_ground_never_flew():
 
 def test_rows_that_do_not_fit_the_contract_are_counted():
     bad = flights.sample(1, T0, attitude=(np.array([T0]), np.zeros((1, 3))))
-    assert survey([bad])[1].refused == 1
+    assert survey_recording([bad])[1].rejected_fields == 1
 
 
 def test_thinned_rows_keep_rates_gaps_and_stretches():
     t = np.arange(0.0, 1000.0, 0.05)
     t = t[(t < 200) | (t > 210)]
-    whole, thin = Thinned(0.5), Thinned(0.5, most=500)
+    whole, thin = DecimatedRows(0.5), DecimatedRows(0.5, max_rows=500)
     for part in np.array_split(t, 77):
         for each in (whole, thin):
             each.add(T0 + part, part[:, None])
@@ -141,8 +149,8 @@ def test_thinned_rows_keep_rates_gaps_and_stretches():
 
 
 def test_overlaps_of_spans():
-    a, b = [Span(0, 10), Span(20, 30)], [Span(5, 22), Span(25, 26)]
-    assert overlap(a, b) == [Span(5, 10), Span(20, 22), Span(25, 26)]
+    a, b = [TimeInterval(0, 10), TimeInterval(20, 30)], [TimeInterval(5, 22), TimeInterval(25, 26)]
+    assert overlap(a, b) == [TimeInterval(5, 10), TimeInterval(20, 22), TimeInterval(25, 26)]
 
 
 # --- the command -----------------------------------------------------------------------------------------------------
@@ -168,22 +176,22 @@ def test_table_json_and_page_of_one_file(tlog, tmp_path, capsys):
 
 @pytest.mark.parametrize("suffix", [".svg", ".pdf"])
 def test_pages_for_printing(pretended, tmp_path, suffix):
-    from fleet.report.inspection_page import Sheet, write
+    from fleet.report.inspection_page import ReportPage, write
 
-    told = findings(pretended, Facts())
-    sheets = [Sheet(pretended, told, Facts(), "a$b_{x.tlog")] * 2
+    told = compute_findings(pretended, LinkTexts())
+    sheets = [ReportPage(pretended, told, LinkTexts(), "a$b_{x.tlog")] * 2
     made = write(tmp_path / f"page{suffix}", sheets)
     assert len(set(made)) == (1 if suffix == ".pdf" else 2)
     assert all(path.stat().st_size > 20_000 for path in made)
 
 
 def test_a_page_is_drawn_of_an_aircraft_that_said_next_to_nothing(tmp_path):
-    from fleet.report.inspection_page import Sheet, write
+    from fleet.report.inspection_page import ReportPage, write
 
-    silent = survey([Status(uav=1, t=T0, mode="")])[1]
-    told = findings(silent, Facts())
+    silent = survey_recording([Status(uav=1, t=T0, mode="")])[1]
+    told = compute_findings(silent, LinkTexts())
     assert told.wind is None
-    (made,) = write(tmp_path / "page.png", [Sheet(silent, told, Facts(), "silent.tlog")])
+    (made,) = write(tmp_path / "page.png", [ReportPage(silent, told, LinkTexts(), "silent.tlog")])
     assert made.stat().st_size > 10_000
 
 
@@ -199,9 +207,9 @@ def test_the_keys_of_the_json_are_stable(tlog, capsys):
     }
     assert set(file["aircraft"][0]["rows"]["attitude"]) == {"rows", "rate_hz", "gaps", "gap_s", "longest"}
     assert set(file["aircraft"][0]["abilities"][0]) == {"name", "can", "why"}
-    assert msgspec.convert(file, File).aircraft[0].uav == 1
-    explained = inspect.keys()
-    assert all(f"    {name}" in explained for name in Findings.__struct_fields__)
+    assert msgspec.convert(file, FileFindings).aircraft[0].uav == 1
+    explained = inspect.describe_keys()
+    assert all(f"    {name}" in explained for name in AircraftFindings.__struct_fields__)
 
 
 def test_damage_is_said_and_the_other_files_are_still_shown(tlog, tmp_path, capsys):
@@ -245,9 +253,11 @@ def test_a_recording_is_never_overwritten(tlog, tmp_path):
 def test_what_an_aircraft_says_cannot_steer_the_terminal(capsys):
     from rich.console import Console
 
-    assert plain("a\x1b[2Jb") == "a?[2Jb"
+    assert printable("a\x1b[2Jb") == "a?[2Jb"
     evil = Status(uav=1, t=T0, mode="\x1b[2J[red]", sentence="uav-1: \x1b]0;owned\x07")
-    Console().print(table(File(file="x\x1b.tlog", aircraft=(findings(survey([evil])[1], Facts()),))))
+    Console().print(
+        table(FileFindings(file="x\x1b.tlog", aircraft=(compute_findings(survey_recording([evil])[1], LinkTexts()),)))
+    )
     assert "\x1b" not in capsys.readouterr().out
 
 
@@ -277,7 +287,7 @@ def test_the_help_does_not_load_the_plots():
 def test_lines_keep_their_peaks_and_break_at_gaps():
     t = np.concatenate([np.arange(0, 100, 0.01), np.arange(200, 300, 0.01)])
     y = np.where(np.abs(t - 50.0) < 0.004, 9.0, 0.0)
-    at, line = drawn(t, y, 1.0)
+    at, line = downsample(t, y, 1.0)
     assert len(at) < 3_100
     assert np.nanmax(line) == 9.0
     assert np.isnan(line).sum() == 1
@@ -288,8 +298,8 @@ def test_lines_keep_their_peaks_and_break_at_gaps():
 
 
 def test_a_recorded_flight_of_another_autopilot(recordings):
-    one = survey(replay_messages(recordings / S02))[3]
-    told = findings(one, Facts())
+    one = survey_recording(replay_messages(recordings / S02))[3]
+    told = compute_findings(one, LinkTexts())
     assert (told.vehicle, told.mission.items, told.mission.complete) == ("fixed_wing", 17, True)
     assert [(mode.mode, round(mode.start_s)) for mode in told.modes] == [("MANUAL", 0), ("AUTO", 35)]
     rates = {"attitude": 25, "servo": 20, "position": 10, "air": 10, "command": 5, "wind": 2}
@@ -301,14 +311,14 @@ def test_a_recorded_flight_of_another_autopilot(recordings):
 
 
 def test_three_aircraft_in_one_recording(recordings):
-    found = survey(replay_messages(recordings / S10))
+    found = survey_recording(replay_messages(recordings / S10))
     assert list(found) == [21, 22, 23]
-    assert all(each.begun == found[21].begun for each in found.values())
+    assert all(each.start_t == found[21].start_t for each in found.values())
 
 
 def test_a_slow_link_without_a_mission_list(recordings):
-    one = survey(replay_messages(recordings / CUAV))[2]
-    told = findings(one, Facts())
+    one = survey_recording(replay_messages(recordings / CUAV))[2]
+    told = compute_findings(one, LinkTexts())
     assert told.vehicle == "quadplane"
     assert told.rows["attitude"].rate_hz == pytest.approx(1.9, abs=0.05)
     assert told.mission.sentence == "no mission list in the recording"

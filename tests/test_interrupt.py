@@ -12,7 +12,7 @@ import pytest
 from conftest import ROOT
 
 from fleet.process import interrupt
-from fleet.process.interrupt import INTERRUPTED, interruptible
+from fleet.process.interrupt import INTERRUPTED, run_interruptible
 
 PATIENCE_S = 120.0
 PHASES = {
@@ -52,7 +52,7 @@ sys.settrace(calls)
 """
 CALLBACK = """
 import ctypes, signal, sys
-from fleet.cli import guarded
+from fleet.cli import run_command
 
 def work(args):
     noted = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))
@@ -61,11 +61,11 @@ def work(args):
         pass
     return 0
 
-sys.exit(guarded("fleet", work, None))
+sys.exit(run_command("fleet", work, None))
 """
 TEARDOWN = """
 import atexit, os, sys
-from fleet.cli import guarded
+from fleet.cli import run_command
 
 class Global:
     def __del__(self):
@@ -79,7 +79,7 @@ def work(args):
 
 kept = Global()
 atexit.register(os.write, 1, b"cleaned up ")
-sys.exit(guarded("fleet", work, None))
+sys.exit(run_command("fleet", work, None))
 """
 
 
@@ -153,20 +153,20 @@ def test_an_error_that_a_library_makes_of_ctrl_c_is_not_told_as_one(handled):
             raise RuntimeError("no object was compiled") from None
         return 0
 
-    assert interruptible(work) == INTERRUPTED
+    assert run_interruptible(work) == INTERRUPTED
 
 
 def test_ctrl_c_that_comes_in_a_deferred_block_is_raised_at_its_end(handled):
     done = []
 
     def work() -> int:
-        with interrupt.deferred():
+        with interrupt.interrupt_deferred():
             signal.raise_signal(signal.SIGINT)
             done.append("within")
         done.append("after")
         return 0
 
-    assert interruptible(work) == INTERRUPTED and done == ["within"]
+    assert run_interruptible(work) == INTERRUPTED and done == ["within"]
 
 
 def test_an_error_without_ctrl_c_is_still_one(handled):
@@ -174,8 +174,8 @@ def test_an_error_without_ctrl_c_is_still_one(handled):
         raise RuntimeError("a defect")
 
     with pytest.raises(RuntimeError, match="a defect"):
-        interruptible(work)
-    assert interruptible(lambda: 3) == 3
+        run_interruptible(work)
+    assert run_interruptible(lambda: 3) == 3
 
 
 def test_a_program_that_uses_us_as_a_library_keeps_its_own_handler():

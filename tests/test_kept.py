@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from flights import T0
 
-from fleet.contract import COLUMNS, UNTOLD, Array, Rows, Sample
-from twin_worker.ownership.handover import CARRIED
-from twin_worker.ownership.typed_serialization import pack, unpack
-from twin_worker.telemetry.history import History
+from fleet.contract import COLUMNS, FIRST_OPTIONAL_COLUMN, Array, Rows, Sample
+from twin_worker.ownership.handover import REGISTRY
+from twin_worker.ownership.typed_serialization import deserialise, serialise
+from twin_worker.telemetry.history import TelemetryHistory
 
 MOST = {"position": 2e9, "leg": 1e5, "command": 1e5}
 KINDS = tuple(MOST)
@@ -75,7 +75,7 @@ class Plain:
         timed = [(float(at), row.tolist()) for at, row in zip(t, x, strict=True) if 0 < at <= latest]
         self.newest = max([self.newest, *(at for at, _ in timed)])
         for at, row in timed:
-            if all(abs(value) < MOST[name] for value in row[: UNTOLD.get(name)]):
+            if all(abs(value) < MOST[name] for value in row[: FIRST_OPTIONAL_COLUMN.get(name)]):
                 self.heard[name].setdefault(at, row)
         return len(timed) < len(t)
 
@@ -83,7 +83,7 @@ class Plain:
         return [(at, row) for at, row in sorted(self.heard[name].items()) if at >= since]
 
 
-def same(history: History, plain: Plain, name: str, since: float) -> None:
+def same(history: TelemetryHistory, plain: Plain, name: str, since: float) -> None:
     t, x = history.rows(name, since)
     want = plain.rows(name, since)
     assert t.tolist() == [at for at, _ in want]
@@ -93,7 +93,7 @@ def same(history: History, plain: Plain, name: str, since: float) -> None:
 @pytest.mark.parametrize("every", [1, 7, 1000])  # messages between two readings
 @pytest.mark.parametrize("seed", range(4))
 def test_rows_read_the_same_however_long_they_have_waited(seed: int, every: int) -> None:
-    history, plain = History(keep_s=12.0), Plain()
+    history, plain = TelemetryHistory(keep_s=12.0), Plain()
     told = talk(seed)
     for k, sample in enumerate(told):
         assert history.add(sample) == plain.add(sample), f"message {k}"
@@ -107,28 +107,28 @@ def test_rows_read_the_same_however_long_they_have_waited(seed: int, every: int)
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_history_goes_to_another_worker_with_what_waits(seed: int) -> None:
-    told, plain, history = talk(seed, 100), Plain(), History()
+    told, plain, history = talk(seed, 100), Plain(), TelemetryHistory()
     for k, sample in enumerate(told):
         history.add(sample)
         plain.add(sample)
         if k == 50:
             before = copy.deepcopy(history)
-            history = unpack(pack(history, CARRIED), CARRIED)
-            assert pack(history, CARRIED) == pack(before, CARRIED)
+            history = deserialise(serialise(history, REGISTRY), REGISTRY)
+            assert serialise(history, REGISTRY) == serialise(before, REGISTRY)
     for name in KINDS:
         same(history, plain, name, -np.inf)
 
 
 def test_what_nobody_reads_takes_no_more_place_than_what_is_kept() -> None:
-    history = History(keep_s=10.0)
+    history = TelemetryHistory(keep_s=10.0)
     for k in range(20_000):
         history.add(f.sample(t=T0 + 0.1 * k, imu=([T0 + 0.1 * k], [[0.0] * 6])))
-    assert len(history.look("imu")[0]) < 1_000
+    assert len(history.rows_since("imu")[0]) < 1_000
 
 
 def test_rows_are_the_caller_s_own_and_a_look_is_not() -> None:
-    history = History()
+    history = TelemetryHistory()
     history.add(f.sample(leg=([T0], [[1.0]])))
     history.rows("leg")[1][:] = 5.0
-    assert history.look("leg")[1].tolist() == [[1.0]]
-    assert np.shares_memory(history.look("leg")[1], history.look("leg")[1])
+    assert history.rows_since("leg")[1].tolist() == [[1.0]]
+    assert np.shares_memory(history.rows_since("leg")[1], history.rows_since("leg")[1])

@@ -14,7 +14,7 @@ from fleet.autopilots.common import controller_state as S
 from fleet.autopilots.common import parameter_vector
 from fleet.autopilots.px4_fixedwing import npfg
 from fleet.autopilots.px4_fixedwing import params as P
-from fleet.autopilots.shadow import shadow
+from fleet.autopilots.shadow import replay_controller
 from fleet.autopilots.textbook import params as T
 from fleet.frames import G
 
@@ -27,7 +27,7 @@ NEW = ("px4", "textbook")
 
 
 def par_of(law, wind=(0.0, 0.0), **more):
-    return laws.blown(laws.parameters(law, {**OURS[law], **more})[0], *wind)
+    return laws.with_wind(laws.parameters(law, {**OURS[law], **more})[0], *wind)
 
 
 @pytest.mark.parametrize("wind", [(0.0, 0.0), (0.0, 6.0), (-7.0, 3.0)])
@@ -153,7 +153,7 @@ def test_px4_switches_within_its_distance_at_the_height_accepted():
     assert over("px4", corner, (-reach + 1, 0.0, -100.0), start)
     assert not over("px4", corner, (-reach + 1, 0.0, -85.0), start)  # NAV_FW_ALT_RAD 10 m
     assert not over("px4", corner, (1.0, reach + 5, -100.0), start)  # missed: it is flown to again
-    assert over("px4", route(leg(accept=120.0), leg(e=500.0)), (-119.0, 0.0, -100.0), start)
+    assert over("px4", route(leg(accept_radius=120.0), leg(e=500.0)), (-119.0, 0.0, -100.0), start)
 
 
 def test_px4_circles_at_a_waypoint_until_it_is_high_enough():
@@ -180,7 +180,7 @@ def test_the_textbook_cuts_corners_by_a_fillet():
 
 def test_px4_leaves_a_timed_circle_towards_the_next_leg_only_where_asked():
     def left(accept):
-        circle = leg(m.LOITER_TIME, n=300.0, radius=70.0, turns=30.0, accept=accept)
+        circle = leg(m.LOITER_TIME, n=300.0, radius=70.0, turns=30.0, accept_radius=accept)
         rows, _ = fly(route(circle, leg(n=1500.0)), Plane(), 120, par_of("px4"))
         near = rows[abs(np.hypot(rows[:, 1] - 300, rows[:, 2]) - 70) < 1.2 * 0.32 * 20 * 7.071][0, 0]
         out = rows[rows[:, 14] == 2][0]
@@ -213,7 +213,7 @@ def test_the_shadow_run_meets_the_memory_of_the_controller_that_flew(law, second
     now = int(np.argmax(legs[:, m.SEQ] == r[0, 14]))
     ahead, start = legs[now:], legs[now - 1, m.P_N : m.P_D + 1].copy() if now else np.array([0.0, 0.0, -100.0])
     told = (np.ascontiguousarray(c) for c in (r[:, 0], r[:, 1:4], r[:, 4:7], r[:, 7:10], np.zeros((600, 3)), r[:, 10]))
-    ctl, rms = shadow(par, ahead, start, *told, r[:, 11].copy(), r[:, 12].copy(), d.copy(), r[:, 14].copy())
+    ctl, rms = replay_controller(par, ahead, start, *told, r[:, 11].copy(), r[:, 12].copy(), d.copy(), r[:, 14].copy())
     assert rms < radians(4)  # a fillet begun before is not seen
     assert ahead[int(ctl[S.LEG]), m.SEQ] == r[-1, 14]
     for _ in range(60):
@@ -256,12 +256,12 @@ def test_the_door_leads_arduplane_to_its_own_law_bit_for_bit():
 @pytest.mark.parametrize("law", tuple(laws.LAWS))
 def test_every_law_knows_its_mark_and_fits_the_vector(law):
     par, absent = laws.parameters(law, {})
-    assert par.shape == (parameter_vector.N_PAR,) and par[parameter_vector.LAW] == laws.LAWS[law].mark
+    assert par.shape == (parameter_vector.N_PAR,) and par[parameter_vector.LAW] == laws.LAWS[law].code
     assert absent == laws.LAWS[law].names
     assert len(laws.LAWS[law].names) + 1 <= parameter_vector.N_PAR + parameter_vector.W_N
-    assert tuple(laws.blown(par, 1.0, 2.0)[[parameter_vector.W_N, parameter_vector.W_E]]) == (1.0, 2.0)
+    assert tuple(laws.with_wind(par, 1.0, 2.0)[[parameter_vector.W_N, parameter_vector.W_E]]) == (1.0, 2.0)
     assert par[parameter_vector.W_N] == 0.0  # the original is as it was
-    assert len({known.sentence for known in laws.LAWS.values()}) == len(laws.LAWS)
+    assert len({known.description for known in laws.LAWS.values()}) == len(laws.LAWS)
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -1e9, 1e12])

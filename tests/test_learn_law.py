@@ -11,8 +11,8 @@ from fleet.autopilots import laws
 from fleet.window import Window
 from twin_worker.estimation.wind_filter import WindFilter
 from twin_worker.prediction import autopilot_identification as learning
-from twin_worker.prediction.autopilot_identification import Learnt, learn_law
-from twin_worker.prediction.closed_loop import Heard, Onboard, Situation
+from twin_worker.prediction.autopilot_identification import AutopilotEstimate, identify_autopilot
+from twin_worker.prediction.closed_loop import AutopilotConfig, PredictionContext, ReplayWindow
 
 OURS = {
     "arduplane": PLANE | {"NAVL1_PERIOD": 15},
@@ -22,7 +22,7 @@ OURS = {
 LAP = [(700.0, 0.0), (700.0, 500.0), (0.0, 500.0), (0.0, 0.0), (700.0, 0.0), (700.0, 900.0)]
 
 
-def flown(law: str, banks=None, **more: float) -> Heard:
+def flown(law: str, banks=None, **more: float) -> ReplayWindow:
     """Give a minute of a lap flown by `law` in calm air, as a replay takes it."""
     par, _ = laws.parameters(law, {**OURS[law], **more})
     legs, plane = route(*(leg(n=n, e=e) for n, e in LAP)), Plane()
@@ -33,18 +33,20 @@ def flown(law: str, banks=None, **more: float) -> Heard:
     told = (*parts, phi_c, rows[:, 12], np.column_stack([np.full((n, 3), np.nan), rows[:, 13]]))
     good = Window(rows[:, 0], np.zeros((n, 9)), np.zeros((n, 4)), *parts[1:3], np.ones(n, bool), np.zeros(n, bool))
     start = np.array([0.0, 0.0, -100.0])
-    return Heard(good, legs, start, tuple(map(np.ascontiguousarray, told)), rows[:, 14].astype(np.int64), 0.0, "")
+    return ReplayWindow(
+        good, legs, start, tuple(map(np.ascontiguousarray, told)), rows[:, 14].astype(np.int64), 0.0, ""
+    )
 
 
 @pytest.fixture
 def learn(monkeypatch: pytest.MonkeyPatch):
     """Learn from what was heard, as an autopilot that calls itself so and sent these parameters."""
 
-    def learnt(heard: Heard, autopilot: str, params: dict[str, float]) -> Learnt:
-        monkeypatch.setattr(learning, "heard", lambda now: heard)
-        now = Situation(heard.good, remembered([]), Onboard((), params, 0.0), WindFilter(), HERE)
-        found = Learnt()
-        learn_law(found, autopilot, now)
+    def learnt(heard: ReplayWindow, autopilot: str, params: dict[str, float]) -> AutopilotEstimate:
+        monkeypatch.setattr(learning, "replay_inputs", lambda now: heard)
+        now = PredictionContext(heard.window, remembered([]), AutopilotConfig((), params, 0.0), WindFilter(), HERE)
+        found = AutopilotEstimate()
+        identify_autopilot(found, autopilot, now)
         return found
 
     return learnt
@@ -55,8 +57,8 @@ def learn(monkeypatch: pytest.MonkeyPatch):
 def test_a_stranger_is_given_the_law_that_asks_for_its_banks(learn, law, with_params):
     found = learn(flown(law), "generic", OURS[law] if with_params else {})
     assert found.law == law
-    assert "autopilot generic: control law " + laws.LAWS[law].sentence in found.said
-    assert min(found.miss, key=found.miss.get) == law
+    assert "autopilot generic: control law " + laws.LAWS[law].description in found.reason
+    assert min(found.bank_error, key=found.bank_error.get) == law
 
 
 def test_parameters_not_received_are_read_off_the_flight(learn):
@@ -70,15 +72,15 @@ def test_parameters_not_received_are_read_off_the_flight(learn):
 @pytest.mark.parametrize(("autopilot", "law"), [("ardupilot", "arduplane"), ("px4", "px4")])
 def test_an_autopilot_that_says_what_it_is_flies_its_own_law(learn, autopilot, law):
     found = learn(flown("textbook"), autopilot, OURS[law])  # whatever it did
-    assert (found.law, found.said) == (law, "")
+    assert (found.law, found.reason) == (law, "")
 
 
 def test_banks_that_no_law_asks_for_leave_none(learn):
     found = learn(flown("px4", banks=lambda t: 0.6 * np.sin(0.8 * t)), "generic", {})
-    assert found.law == "" and "no known control law matches the commanded banks" in found.said
+    assert found.law == "" and "no known control law matches the commanded banks" in found.reason
 
 
 @pytest.mark.parametrize("bank", [np.nan, radians(3)])
 def test_without_a_turn_no_law_can_be_told(learn, bank):
     found = learn(flown("px4", banks=lambda t: np.full(len(t), bank)), "unknown", {})
-    assert found.law == "" and "control law unknown" in found.said
+    assert found.law == "" and "control law unknown" in found.reason

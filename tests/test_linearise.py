@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from coupled_flights import AT, aircraft, fly, known
 
-from fleet.contract import Linear
+from fleet.contract import LinearModel
 from fleet.physics.actuators import TAU, lagged
 from fleet.physics.dynamics import step
 from fleet.physics.wrench import WIND
@@ -14,7 +14,7 @@ from twin_worker.identification.fixed_wing.linearise import linearise
 FINE = 20  # steps of integration in one sample
 
 
-def columns(axis: Linear) -> tuple[list[int], list[int]]:
+def columns(axis: LinearModel) -> tuple[list[int], list[int]]:
     return [STATES.index(name) for name in axis.states], [INPUTS.index(name) for name in axis.inputs]
 
 
@@ -55,7 +55,7 @@ def test_the_matrices_are_slopes_of_one_sample(wind, seed):
         assert np.array_equal(axis.C.numpy(), np.eye(len(rows))) and not axis.D.numpy().any()
 
 
-def flown(axis: Linear, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+def flown(axis: LinearModel, x: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Run x' = A (x - x_trim) + B (u - u_trim) + x_trim."""
     rows, inputs = columns(axis)
     A, B, x_trim, u_trim = (part.numpy() for part in (axis.A, axis.B, axis.x_trim, axis.u_trim))

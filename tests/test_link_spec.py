@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gateway.settings.link_spec import read_forward, read_spec
-from gateway.settings.message_filter import read_sieve
+from gateway.settings.message_filter import read_filter
 
 
 def test_links_are_read():
@@ -15,7 +15,7 @@ def test_links_are_read():
         57_600,
     )
     assert read_spec("udpin:[::1]:14550#sign=require&key=k")[2:4] == ("::1", 14550)
-    assert read_forward("udpin::14551#no-messages=RAW_IMU").sieve.rules
+    assert read_forward("udpin::14551#no-messages=RAW_IMU").message_filter.rules
 
 
 @pytest.mark.parametrize("text", ["replay:a.tlog", "udpin:h:1#offset=2"])
@@ -27,17 +27,17 @@ def test_a_forward_is_no_recording_and_has_no_offset(text):
 def test_a_sieve_keeps_by_message_system_and_component():
     at = np.zeros((6, 8), np.int64)
     at[:, 4], at[:, 5], at[:, 6] = (0, 30, 30, 253, 30, 27), (1, 1, 2, 1, 3, 1), (1, 1, 1, 1, 1, 154)
-    assert read_sieve({}).keep(at).all()
+    assert read_filter({}).passes(at).all()
     for settings, kept in (
         ({"messages": "ATTITUDE,0"}, [1, 1, 1, 0, 1, 0]),
         ({"no-messages": "statustext"}, [1, 1, 1, 0, 1, 1]),
         ({"systems": "2-3"}, [0, 0, 1, 0, 1, 0]),
         ({"no-components": "154", "systems": "1"}, [1, 1, 0, 1, 0, 0]),
     ):
-        assert read_sieve(dict(settings)).keep(at).tolist() == list(map(bool, kept))
+        assert read_filter(dict(settings)).passes(at).tolist() == list(map(bool, kept))
 
 
 @pytest.mark.parametrize("settings", [{"messages": "ATITUDE"}, {"systems": "256"}, {"components": "5-2"}])
 def test_what_is_no_sieve_says_so(settings):
     with pytest.raises(ValueError, match=r"found '.*', expected .*numbers up to"):
-        read_sieve(settings)
+        read_filter(settings)

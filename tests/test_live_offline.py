@@ -10,7 +10,7 @@ import pytest
 from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Alert, Event, Message, Model, Prediction, Sample
 from fleet.telemetry.recording.recordings import replay_messages
-from twin_worker.evaluation.offline import run
+from twin_worker.evaluation.offline import run_offline
 from twin_worker.service import worker as live
 from twin_worker.service.worker import Worker
 
@@ -31,15 +31,15 @@ def lived(heard: Iterable[Message], seed: int, most: int = 40) -> list[Message]:
     for kind in KINDS:
         bus.subscribe(kind, lambda message, _: told.append(message))
     worker = Worker(bus, range(1, 256), omega=0.0)
-    worker.listen()
+    worker.connect()
     left = 0
     for message in heard:
         if not left:
-            worker.turn()
+            worker.sweep()
             left = int(rng.integers(1, most))
         bus.publish(message)
         left -= 1
-    worker.turn()
+    worker.sweep()
     assert worker.state().sentence == ""
     return told
 
@@ -63,7 +63,7 @@ def same(one: list[Message], other: list[Message], uav: int) -> tuple[int, int]:
     for a, b in made:
         assert (a.t, a.method, a.state, a.sentence, a.seq) == (b.t, b.method, b.state, b.sentence, b.seq)
         assert np.abs(a.path.numpy() - b.path.numpy()).max() < 1e-3
-        assert np.abs(a.tube.numpy() - b.tube.numpy()).max() < 1e-3
+        assert np.abs(a.prediction_region_half_axes.numpy() - b.prediction_region_half_axes.numpy()).max() < 1e-3
     return len(models), len(made)
 
 
@@ -75,7 +75,7 @@ def test_a_pretend_flight_in_bursts_is_answered_as_one_by_one(heard, flown, seed
 
 def test_a_multirotor_in_bursts_is_answered_as_one_by_one():
     flown = hover.fly(3).messages[:500]
-    _, n_made = same(lived(flown, 4), list(run(flown, {})), 7)
+    _, n_made = same(lived(flown, 4), list(run_offline(flown, {})), 7)
     assert n_made > 60
 
 
@@ -87,14 +87,14 @@ def test_a_recorded_flight_in_bursts_is_answered_as_one_by_one(recordings: Path)
             break
         if message.t > start + 30.0 or not isinstance(message, Sample):
             stretch.append(message)
-    n_models, n_made = same(lived(stretch, 5), list(run(stretch, {})), stretch[0].uav)
+    n_models, n_made = same(lived(stretch, 5), list(run_offline(stretch, {})), stretch[0].uav)
     assert n_models > 3 and n_made > 40
 
 
 def test_a_silence_in_the_data_is_met_on_the_same_beat(heard, sighted):
     start = heard[0].t
     gap = [m for m in heard if m.t < start + 40.0 or m.t > start + 52.0][:700]
-    offline = list(run(gap, {}))
+    offline = list(run_offline(gap, {}))
     _, made = same(lived(gap, 7), offline, 1)
     coasting = [m for m in offline if isinstance(m, Prediction) and m.coast_s]
     assert made and int(sighted) - 5 <= len(coasting) <= int(sighted) + 1
@@ -107,18 +107,18 @@ def test_a_worker_whose_data_fall_silent_coasts_and_finds_its_beat_again(heard, 
     bus, told = MemoryBus(), []
     bus.subscribe(Prediction, lambda message, _: told.append(message))
     worker = Worker(bus, range(1, 2), omega=0.0)
-    worker.listen()
+    worker.connect()
     for message in heard:
         if message.t > start + 15.0:
             break
         if clock[0] == 1000.0 and message.t > start + 8.0:
-            worker.turn()
+            worker.sweep()
             for _ in range(20):
                 clock[0] += 1.0
-                worker.turn()
+                worker.sweep()
         bus.publish(message)
-    worker.turn()
-    (over,) = [p for p in told if p.event is Event.HORIZON_OVER]
+    worker.sweep()
+    (over,) = [p for p in told if p.event is Event.COASTING_EXPIRED]
     assert over.coast_s > 3.0 and over.horizon_s == 0.0
     late = [p for p in told if not p.coast_s and p.t > start + 9.0]
     assert len(late) >= 5 and all("link lost" not in p.sentence for p in late)

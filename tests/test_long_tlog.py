@@ -15,7 +15,7 @@ from talker import T0, of
 
 from fleet.commands.offline import inspect
 from fleet.contract import Sample
-from fleet.telemetry.inspection.thinned import Thinned
+from fleet.telemetry.inspection.thinned import DecimatedRows
 from fleet.telemetry.recording.recordings import Recording
 
 PATIENCE_S = 60.0
@@ -23,9 +23,9 @@ FILES = 12  # so many that a terminal that is read late on a busy machine is sti
 PEAK = """
 import sys
 from pathlib import Path
-from fleet.commands.offline.inspect import read
+from fleet.commands.offline.inspect import inspect_file
 from tests.bench.peak_memory import peak_mb
-heard = read(Path(sys.argv[1]))
+heard = inspect_file(Path(sys.argv[1]))
 (told,) = heard.file.aircraft
 print(round(told.seconds), round(peak_mb()))
 """
@@ -74,7 +74,7 @@ def test_progress_rises_to_the_end(tmp_path, monkeypatch):
                 yield step
 
     monkeypatch.setattr(inspect, "Recording", Watched)
-    assert inspect.read(path).file.sentences == ()
+    assert inspect.inspect_file(path).file.sentences == ()
     assert shares == sorted(shares) and len(set(shares)) >= 4 and shares[-1] == 1.0
 
 
@@ -109,7 +109,7 @@ def _read_terminal(primary: int) -> bytes:
 def test_rows_that_are_let_go_free_their_memory():
     tracemalloc.start()
     try:
-        kept = Thinned(1.0, 1_000)
+        kept = DecimatedRows(1.0, 1_000)
         for k in range(400):
             t = T0 + 0.01 * np.arange(5_000 * k, 5_000 * (k + 1))
             kept.add(t, np.ones((len(t), 6)))

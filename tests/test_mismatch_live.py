@@ -15,15 +15,15 @@ import pytest
 from diagnosed import made
 
 from fleet.bus.codec import Stamp
-from fleet.contract import Found, Mismatch, Prediction
+from fleet.contract import DiagnosisOutcome, Mismatch, Prediction
 from twin_worker.diagnosis.data.card import UNKNOWN
-from twin_worker.diagnosis.inference.report import Outcome, Report
+from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.model.baseline import Baseline
-from twin_worker.mismatch.coordinator import ALL, Live
-from twin_worker.mismatch.job import Answer, Job, rows_of, work
-from twin_worker.mismatch.messages import message, since, word
-from twin_worker.mismatch.process import Background
-from twin_worker.mismatch.scheduler import LOOK_S, Watch
+from twin_worker.mismatch.coordinator import ALL_UAVS, Coordinator
+from twin_worker.mismatch.job import DiagnosisJob, DiagnosisResult, run_job, telemetry_rows
+from twin_worker.mismatch.messages import mismatch_message, shift_times, summary
+from twin_worker.mismatch.process import DiagnosisProcess
+from twin_worker.mismatch.scheduler import CHECK_PERIOD_S, DiagnosisState
 
 BASE = Baseline(UNKNOWN, {}, 20.0)
 
@@ -34,43 +34,43 @@ class Hand:
     def __init__(self) -> None:
         self.free, self.jobs, self.answers = True, [], []
 
-    def give(self, job: Job) -> None:
+    def submit(self, job: DiagnosisJob) -> None:
         self.jobs.append(job)
         self.free = False
 
-    def answer(self) -> Answer | None:
+    def poll(self) -> DiagnosisResult | None:
         return self.answers.pop(0) if self.answers else None
 
     def say(self, report: Report | None, **more) -> None:
         """Answer the newest job."""
         t = self.jobs[-1].rows["attitude"][0]
-        self.answers.append(Answer(self.jobs[-1].uav, float(t[0]), float(t[-1]), report=report, **more))
+        self.answers.append(DiagnosisResult(self.jobs[-1].uav, float(t[0]), float(t[-1]), report=report, **more))
         self.free = True
 
 
-def answered(watch: Watch, end: float, report: Report) -> Mismatch | None:
-    return watch.take(Answer(1, end - 120.0, end, report=report))
+def answered(watch: DiagnosisState, end: float, report: Report) -> Mismatch | None:
+    return watch.handle_result(DiagnosisResult(1, end - 120.0, end, report=report))
 
 
 @pytest.fixture
-def looking(twin) -> tuple[Live, Hand, object]:
+def looking(twin) -> tuple[Coordinator, Hand, object]:
     """Diagnoses of one aircraft that has flown for a while, against a model."""
     hand = Hand()
-    live = Live(hand, {ALL: BASE})
+    live = Coordinator(hand, {ALL_UAVS: BASE})
     return live, hand, twin
 
 
-def turned(live: Live, twin: object) -> list[Mismatch]:
-    return list(live.turn([(twin, nullcontext())]))
+def turned(live: Coordinator, twin: object) -> list[Mismatch]:
+    return list(live.run_once([(twin, nullcontext())]))
 
 
 def test_a_look_is_due_after_some_flight_and_then_every_few_seconds(looking):
     live, hand, twin = looking
     assert turned(live, twin) == [] and len(hand.jobs) == 1
-    assert hand.jobs[0].base is BASE and len(hand.jobs[0].rows["attitude"][0]) > 500
+    assert hand.jobs[0].baseline is BASE and len(hand.jobs[0].rows["attitude"][0]) > 500
     hand.say(None)
     assert turned(live, twin) == [] and len(hand.jobs) == 1  # too soon
-    live.watch(1).next_t -= LOOK_S
+    live.state(1).next_t -= CHECK_PERIOD_S
     turned(live, twin)
     assert len(hand.jobs) == 2
 
@@ -78,178 +78,186 @@ def test_a_look_is_due_after_some_flight_and_then_every_few_seconds(looking):
 def test_one_job_at_a_time(looking):
     live, hand, twin = looking
     turned(live, twin)
-    live.watch(1).next_t = -np.inf
+    live.state(1).next_t = -np.inf
     turned(live, twin)
     assert len(hand.jobs) == 1
 
 
 def test_who_is_lost_landed_or_has_no_wings_is_left_alone(looking):
     live, hand, twin = looking
-    for name, value in (("lost", True), ("status", msgspec.structs.replace(twin.status, vehicle="multirotor"))):
-        kept = getattr(twin, name)
-        setattr(twin, name, value)
+    other = msgspec.structs.replace(twin.onboard.status, vehicle="multirotor")
+    for part, name, value in ((twin.telemetry, "link_lost", True), (twin.onboard, "status", other)):
+        kept = getattr(part, name)
+        setattr(part, name, value)
         turned(live, twin)
-        setattr(twin, name, kept)
+        setattr(part, name, kept)
     assert not hand.jobs
 
 
 def test_without_a_model_the_own_past_must_be_long_enough(twin):
     hand = Hand()
-    live = Live(hand)
+    live = Coordinator(hand)
     turned(live, twin)
-    assert not hand.jobs and live.watch(1).past is None
+    assert not hand.jobs and live.state(1).past is None
 
 
 def test_a_name_is_told_when_a_second_look_says_the_same():
-    watch = Watch(base=BASE)
-    watch.begun = 1000.0
+    watch = DiagnosisState(baseline=BASE)
+    watch.first_t = 1000.0
     first = answered(watch, 1200.0, made())
-    assert first.outcome is Found.SUSPECTED
+    assert first.outcome is DiagnosisOutcome.SUSPECTED
     assert watch.next_t == pytest.approx(1205.0)  # look again soon
     second = answered(watch, 1210.0, _later(made(), -10.0))
-    assert second.outcome is Found.NAMED and second.causes[0].name == "actuator_lag"
+    assert second.outcome is DiagnosisOutcome.NAMED and second.causes[0].name == "actuator_lag"
     assert second.causes[0].segments[0][0] == pytest.approx(1210.0 - 120.0 + 73.0)
 
 
 def test_what_is_seen_once_says_so_and_where():
-    watch = Watch(base=BASE)
-    watch.begun = 1000.0
-    unknown = made(outcome=Outcome.UNKNOWN)
+    watch = DiagnosisState(baseline=BASE)
+    watch.first_t = 1000.0
+    unknown = made(outcome=ReportOutcome.UNKNOWN)
     first = answered(watch, 1200.0, unknown)
-    assert first.outcome is Found.SUSPECTED and first.causes[0].channel == "pitch"
-    assert first.sentence.startswith("detected once, not confirmed: mismatch in") and word(first) == "suspected"
-    assert answered(watch, 1210.0, unknown).outcome is Found.UNKNOWN
+    assert first.outcome is DiagnosisOutcome.SUSPECTED and first.causes[0].channel == "pitch"
+    assert first.sentence.startswith("detected once, not confirmed: mismatch in") and summary(first) == "suspected"
+    assert answered(watch, 1210.0, unknown).outcome is DiagnosisOutcome.UNKNOWN
 
 
 def test_by_its_own_past_nothing_is_named_that_began_in_it(twin, monkeypatch):
-    for name, gives in {"calibrate_past": BASE, "growth": 1.0, "diagnose": made(), "pushes": None}.items():
+    for name, gives in {
+        "calibrate_past": BASE,
+        "residual_growth": 1.0,
+        "diagnose": made(),
+        "effect_outputs": None,
+    }.items():
         monkeypatch.setattr(f"twin_worker.mismatch.job.{name}", lambda *_, gives=gives: gives)
-    rows = rows_of(twin.history, -np.inf)
+    rows = telemetry_rows(twin.telemetry.history, -np.inf)
     begin = rows["attitude"][0][0]
-    named, suspected = (work(Job(1, rows, {}, UNKNOWN, None, begin + until, whole=True)) for until in (60.0, 100.0))
-    assert named.report.outcome is Outcome.NAMED
-    assert suspected.report.outcome is Outcome.SUSPECTED  # its onset is at 83 s
+    named, suspected = (
+        run_job(DiagnosisJob(1, rows, {}, UNKNOWN, None, begin + until, full=True)) for until in (60.0, 100.0)
+    )
+    assert named.report.outcome is ReportOutcome.NAMED
+    assert suspected.report.outcome is ReportOutcome.SUSPECTED  # its onset is at 83 s
 
 
 def test_who_waits_to_be_confirmed_goes_first(twin):
-    calm, waiting = Watch(base=BASE), Watch(base=BASE)
-    answered(waiting, twin.history.newest - 10.0, made())
-    calm.whole_t = waiting.whole_t - 30.0  # and has waited longer
-    assert waiting.wants(twin) > calm.wants(twin)
+    calm, waiting = DiagnosisState(baseline=BASE), DiagnosisState(baseline=BASE)
+    answered(waiting, twin.telemetry.history.newest - 10.0, made())
+    calm.diagnosed_t = waiting.diagnosed_t - 30.0  # and has waited longer
+    assert waiting.urgency(twin) > calm.urgency(twin)
 
 
 def test_another_name_or_onset_at_a_second_look_is_no_confirmation():
-    watch = Watch(base=BASE)
-    watch.begun = 1000.0
+    watch = DiagnosisState(baseline=BASE)
+    watch.first_t = 1000.0
     answered(watch, 1200.0, made())
-    assert answered(watch, 1260.0, made()).outcome is Found.SUSPECTED  # 60 s later: another onset
+    assert answered(watch, 1260.0, made()).outcome is DiagnosisOutcome.SUSPECTED  # 60 s later: another onset
 
 
 def test_one_look_that_sees_less_takes_nothing_back_two_do():
-    watch = Watch(base=BASE)
-    watch.begun = 1000.0
+    watch = DiagnosisState(baseline=BASE)
+    watch.first_t = 1000.0
     answered(watch, 1200.0, made())
-    assert answered(watch, 1200.0, made()).outcome is Found.NAMED
-    nothing = made(outcome=Outcome.NONE)
-    assert answered(watch, 1220.0, nothing) is None and watch.told.outcome is Found.NAMED
+    assert answered(watch, 1200.0, made()).outcome is DiagnosisOutcome.NAMED
+    nothing = made(outcome=ReportOutcome.NONE)
+    assert answered(watch, 1220.0, nothing) is None and watch.published.outcome is DiagnosisOutcome.NAMED
     over = answered(watch, 1240.0, nothing)
-    assert over.outcome is Found.NONE and over.causes == ()
+    assert over.outcome is DiagnosisOutcome.NONE and over.causes == ()
 
 
 def test_a_refusal_is_kept_and_tried_again_later():
-    watch = Watch(base=BASE)
-    assert watch.take(Answer(1, 0.0, 1200.0, refused="found 3 s, expected 25 s")) is None
-    assert watch.why.startswith("found 3 s") and watch.next_t == 1230.0
+    watch = DiagnosisState(baseline=BASE)
+    assert watch.handle_result(DiagnosisResult(1, 0.0, 1200.0, refusal="found 3 s, expected 25 s")) is None
+    assert watch.reason.startswith("found 3 s") and watch.next_t == 1230.0
 
 
 def test_the_message_tells_where_what_and_how_well():
-    told = message(7, made(), 5000.0, 5200.0)
+    told = mismatch_message(7, made(), 5000.0, 5200.0)
     (cause,) = told.causes
-    assert (cause.channel, cause.surface, cause.rivals[0]) == ("actuator", "elevator", "actuator_delay")
+    assert (cause.channel, cause.surface, cause.confusable_with[0]) == ("actuator", "elevator", "actuator_delay")
     assert cause.segments == ((5083.0, 5200.0),) and told.onset == 5083.0
     assert cause.parameters["tau_s"] == pytest.approx(0.253) and cause.sigma["tau_s"] == pytest.approx(0.0061)
-    assert (told.fit_before, told.fit_after) == (1.94, 1.07) and told.stray_after == 2.2
-    assert word(told) == "named actuator_lag of the elevator"
+    assert (told.fit_before, told.fit_after) == (1.94, 1.07) and told.attitude_error_after == 2.2
+    assert summary(told) == "named actuator_lag of the elevator"
 
 
 def test_unknown_says_where_and_nothing_says_nothing():
-    told = message(7, made(outcome=Outcome.UNKNOWN), 5000.0, 5200.0)
+    told = mismatch_message(7, made(outcome=ReportOutcome.UNKNOWN), 5000.0, 5200.0)
     assert told.causes[0].name == "unknown" and told.causes[0].channel == "pitch"
-    assert told.causes[0].segments[0] == (5083.0, 5118.0) and word(told) == "unknown, in pitch"
-    nothing = message(7, made(outcome=Outcome.NONE), 5000.0, 5200.0)
-    assert nothing.causes == () and word(nothing) == "" and nothing.onset is None
+    assert told.causes[0].segments[0] == (5083.0, 5118.0) and summary(told) == "unknown, in pitch"
+    nothing = mismatch_message(7, made(outcome=ReportOutcome.NONE), 5000.0, 5200.0)
+    assert nothing.causes == () and summary(nothing) == "" and nothing.onset is None
     assert nothing.fit_before is None  # nan is no number on the wire
 
 
 def test_the_sentence_counts_from_when_the_aircraft_was_first_heard():
-    assert "after 203 s" in since(made(), 120.0).sentence
+    assert "after 203 s" in shift_times(made(), 120.0).sentence
 
 
 def test_a_flight_that_cannot_be_is_refused_in_a_sentence(twin):
-    rows = rows_of(twin.history, twin.history.newest - 5.0)
-    answer = work(Job(1, rows, {}, UNKNOWN, BASE))
-    assert "expected 25 s" in answer.refused and answer.report is None
+    rows = telemetry_rows(twin.telemetry.history, twin.telemetry.history.newest - 5.0)
+    answer = run_job(DiagnosisJob(1, rows, {}, UNKNOWN, BASE))
+    assert "expected 25 s" in answer.refusal and answer.report is None
     nothing = {kind: (np.empty(0), np.empty((0, x.shape[1]))) for kind, (_, x) in rows.items()}
-    assert work(Job(1, nothing, {}, UNKNOWN, BASE)).refused
+    assert run_job(DiagnosisJob(1, nothing, {}, UNKNOWN, BASE)).refusal
 
 
 def test_kept_past_and_newest_flight_are_joined_without_doubles(twin):
-    newest = twin.history.newest
-    past = rows_of(twin.history, newest - 60.0)
-    joined = rows_of(twin.history, newest - 30.0, past)
+    newest = twin.telemetry.history.newest
+    past = telemetry_rows(twin.telemetry.history, newest - 60.0)
+    joined = telemetry_rows(twin.telemetry.history, newest - 30.0, past)
     assert (np.diff(joined["attitude"][0]) > 0).all()
     assert len(joined["attitude"][0]) == len(past["attitude"][0])
 
 
 def test_the_worker_publishes_answers_and_shows_what_was_found(holder, monkeypatch):
     hand = Hand()
-    holder.diagnosis = Live(hand, {ALL: BASE}, adapt=False)
+    holder.diagnosis = Coordinator(hand, {ALL_UAVS: BASE}, adapt=False)
     told: list = []
     holder.bus.subscribe(Mismatch, lambda m, stamp: told.append((m, stamp)))
-    holder.turn()
+    holder.sweep()
     for _ in range(2):
-        holder.turn()
+        holder.sweep()
         hand.say(made())
-        holder.turn()
-        holder.diagnosis.watch(1).next_t = -np.inf
-    assert [m.outcome for m, _ in told] == [Found.SUSPECTED, Found.NAMED]
+        holder.sweep()
+        holder.diagnosis.state(1).next_t = -np.inf
+    assert [m.outcome for m, _ in told] == [DiagnosisOutcome.SUSPECTED, DiagnosisOutcome.NAMED]
     assert {stamp for _, stamp in told} == {Stamp(9, holder.bus.writer)}
-    assert [m for m, _ in holder.bus.ask(Mismatch)] == [told[-1][0]]
+    assert [m for m, _ in holder.bus.get(Mismatch)] == [told[-1][0]]
     (row,) = holder.state().rows
     assert row.mismatch == "named actuator_lag of the elevator"
 
 
 def test_a_defect_of_the_diagnosis_leaves_the_predictions_and_is_said(holder, monkeypatch):
     class Broken(Hand):
-        def answer(self) -> Answer | None:
+        def poll(self) -> DiagnosisResult | None:
             raise RuntimeError("broken")
 
-    holder.diagnosis = Live(Broken(), {ALL: BASE})
+    holder.diagnosis = Coordinator(Broken(), {ALL_UAVS: BASE})
     made_: list = []
     holder.bus.subscribe(Prediction, lambda m, _: made_.append(m))
     for m in f.messages(f.turn(6.0), uav=2):
         holder.bus.publish(m)
-    holder.turn()
+    holder.sweep()
     assert made_ and "diagnosis failed with an internal error (broken); retried in 60 s" in holder.state().sentence
-    holder.diagnosis._hand = hand = Hand()
-    holder.turn()
+    holder.diagnosis._executor = hand = Hand()
+    holder.sweep()
     assert not hand.jobs  # not yet
-    holder._diagnose_from = -np.inf
-    holder.turn()
+    holder._diagnosis_resume_t = -np.inf
+    holder.sweep()
     assert hand.jobs and not holder.state().sentence
 
 
 def test_a_defect_met_by_one_aircraft_leaves_the_diagnosis_of_the_others(looking, twin):
     live, hand, twin = looking
     other = copy.copy(twin)
-    other.uav = 2
-    live.watch(1).base = None
-    live.watch(1).told = "no message"  # what is looked at raises
-    live.watch(1).past = {}
+    other.config = msgspec.structs.replace(other.config, uav=2)
+    live.state(1).baseline = None
+    live.state(1).published = "no message"  # what is looked at raises
+    live.state(1).past = {}
     held = [(twin, nullcontext()), (other, nullcontext())]
-    assert list(live.turn(held)) == []
+    assert list(live.run_once(held)) == []
     assert [job.uav for job in hand.jobs] == [2]
-    (said,) = live.failed([1, 2])
+    (said,) = live.defects([1, 2])
     assert (
         said.startswith("uav-1: diagnosis failed with an internal error (AttributeError") and "retried in 60 s" in said
     )
@@ -259,17 +267,17 @@ def test_a_defect_in_taking_an_answer_is_that_aircrafts_alone_and_passes(looking
     live, hand, twin = looking
     turned(live, twin)
     hand.say(made())
-    monkeypatch.setattr("twin_worker.mismatch.scheduler.message", None)
-    assert turned(live, twin) == [] and "TypeError" in live.failed([1])[0]
+    monkeypatch.setattr("twin_worker.mismatch.scheduler.mismatch_message", None)
+    assert turned(live, twin) == [] and "TypeError" in live.defects([1])[0]
     monkeypatch.undo()
-    watch = live.watch(1)
+    watch = live.state(1)
     watch.next_t = -np.inf
     turned(live, twin)
     assert len(hand.jobs) == 1  # left alone for a while
     watch.off_until = -np.inf
     turned(live, twin)
     hand.say(made())
-    assert turned(live, twin) and live.failed([1]) == []
+    assert turned(live, twin) and live.defects([1]) == []
 
 
 def test_an_answer_waits_for_an_aircraft_that_is_worked_on(looking):
@@ -279,83 +287,87 @@ def test_an_answer_waits_for_an_aircraft_that_is_worked_on(looking):
     hand.say(made())
     lock = threading.Lock()
     with lock:
-        assert list(live.turn([(twin, lock)])) == []
-    (found,) = live.turn([(twin, lock)])
-    assert found.outcome is Found.SUSPECTED
+        assert list(live.run_once([(twin, lock)])) == []
+    (found,) = live.run_once([(twin, lock)])
+    assert found.outcome is DiagnosisOutcome.SUSPECTED
 
 
 def test_a_defect_is_retried_less_and_less_often():
-    watch, waits = Watch(base=BASE), []
+    watch, waits = DiagnosisState(baseline=BASE), []
     for _ in range(9):
-        watch.take(Answer(1, 0.0, 1000.0, failed="its process was killed by signal 9"))
-        waits.append(watch.off_until - 1000.0)
-    assert waits[:3] == [60.0, 120.0, 240.0] and waits[-1] == 3600.0 and "signal 9" in watch.failed
-    watch.take(Answer(1, 0.0, 5000.0))
-    assert watch.failures == 0 and not watch.failed
+        watch.handle_result(DiagnosisResult(1, 0.0, 1000.0, defect="its process was killed by signal 9"))
+        waits.append(watch.suspended_until - 1000.0)
+    assert waits[:3] == [60.0, 120.0, 240.0] and waits[-1] == 3600.0 and "signal 9" in watch.defect
+    watch.handle_result(DiagnosisResult(1, 0.0, 5000.0))
+    assert watch.failures == 0 and not watch.defect
 
 
 def test_without_a_diagnosis_nothing_is_answered(holder):
-    assert holder.bus.ask(Mismatch) == [] and holder.state().rows[0].mismatch == ""
+    assert holder.bus.get(Mismatch) == [] and holder.state().rows[0].mismatch == ""
 
 
-def worked(hand: Background, uav: int, rows: dict | None = None) -> Answer:
+def worked(hand: DiagnosisProcess, uav: int, rows: dict | None = None) -> DiagnosisResult:
     """Give a job and wait for its answer."""
     empty = {"attitude": (np.array([1.0, 2.0]), np.zeros((2, 6)))}
-    hand.give(Job(uav, rows or empty, {}, UNKNOWN, BASE))
+    hand.submit(DiagnosisJob(uav, rows or empty, {}, UNKNOWN, BASE))
     hand._thread.join(300.0)
     assert not hand._thread.is_alive()
-    answer = hand.answer()
+    answer = hand.poll()
     assert answer is not None and answer.uav == uav
     hand._free_at = 0.0
     return answer
 
 
 def test_the_background_process_answers_keeps_its_budget_and_ends(twin):
-    hand = Background(share=1e-6)
+    hand = DiagnosisProcess(share=1e-6)
     try:
-        hand.give(Job(1, rows_of(twin.history, twin.history.newest - 5.0), {}, UNKNOWN, BASE))
+        hand.submit(
+            DiagnosisJob(
+                1, telemetry_rows(twin.telemetry.history, twin.telemetry.history.newest - 5.0), {}, UNKNOWN, BASE
+            )
+        )
         assert not hand.free
         hand._thread.join(300.0)
-        answer = hand.answer()
-        assert answer.uav == 1 and "expected 25 s" in answer.refused
+        answer = hand.poll()
+        assert answer.uav == 1 and "expected 25 s" in answer.refusal
         assert not hand.free  # the little time it took is a millionth of a core only after a while
-        assert hand.answer() is None
+        assert hand.poll() is None
     finally:
         hand.close()
     assert hand._process is None and not hand.free
 
 
 def test_a_job_that_dies_hangs_or_raises_is_told_and_the_next_is_worked_out():
-    hand = Background(1.0, odd_jobs.odd, limit_cpu_s=2.0, limit_s=300.0)
+    hand = DiagnosisProcess(1.0, odd_jobs.odd, limit_cpu_s=2.0, limit_s=300.0)
     try:
         said = {uav: worked(hand, uav) for uav in (odd_jobs.RAISES, odd_jobs.ENDS, odd_jobs.KILLED, odd_jobs.SPINS)}
-        assert said[odd_jobs.RAISES].failed == "KeyError: 'nothing of the kind'"
+        assert said[odd_jobs.RAISES].defect == "KeyError: 'nothing of the kind'"
         assert "odd_jobs.py" in said[odd_jobs.RAISES].details
-        assert said[odd_jobs.ENDS].failed == "its process ended with exit code 3"
-        assert said[odd_jobs.KILLED].failed == "its process was killed by signal 9"
-        assert said[odd_jobs.SPINS].failed == "found no result after 2 s of CPU time"
+        assert said[odd_jobs.ENDS].defect == "its process ended with exit code 3"
+        assert said[odd_jobs.KILLED].defect == "its process was killed by signal 9"
+        assert said[odd_jobs.SPINS].defect == "found no result after 2 s of CPU time"
         assert all((one.begin, one.end) == (1.0, 2.0) for one in said.values())
-        assert not worked(hand, odd_jobs.FINE).failed
+        assert not worked(hand, odd_jobs.FINE).defect
         hand._limit_s = 0.5  # of a process that lives already
-        assert worked(hand, odd_jobs.HANGS).failed == "found no result after 0 s"
+        assert worked(hand, odd_jobs.HANGS).defect == "found no result after 0 s"
         hand._limit_s = 300.0
-        assert not worked(hand, odd_jobs.FINE).failed
+        assert not worked(hand, odd_jobs.FINE).defect
     finally:
         hand.close()
 
 
 def test_who_gives_a_job_never_waits_for_the_process_to_take_it():
     """A job of 20 MB, and a process that does not run: the pipe holds a fraction of it."""
-    hand = Background(1.0, odd_jobs.deaf, limit_s=300.0)
+    hand = DiagnosisProcess(1.0, odd_jobs.deaf, limit_s=300.0)
     rows = {"attitude": (np.arange(500_000.0), np.zeros((500_000, 6)))}
     try:
         worked(hand, odd_jobs.FINE)
         os.kill(hand._process.pid, signal.SIGSTOP)
-        hand.give(Job(7, rows, {}, UNKNOWN, BASE))  # would wait for ever
-        assert not hand.free and hand.answer() is None and hand._thread.is_alive()
+        hand.submit(DiagnosisJob(7, rows, {}, UNKNOWN, BASE))  # would wait for ever
+        assert not hand.free and hand.poll() is None and hand._thread.is_alive()
         os.kill(hand._process.pid, signal.SIGCONT)
         hand._thread.join(300.0)
-        assert hand.answer().end == 500_000
+        assert hand.poll().end == 500_000
     finally:
         hand.close()
 

@@ -25,7 +25,7 @@ def jump(seq: int, target: float, count: float) -> Item:
 
 
 def fly(items, seq=1, params=None, limit=64) -> m.Route:
-    return m.route(items, seq=seq, origin=ORIGIN, params=params or {}, limit=limit)
+    return m.unroll_route(items, seq=seq, origin=ORIGIN, params=params or {}, limit=limit)
 
 
 def seqs(route: m.Route) -> list[int]:
@@ -38,8 +38,8 @@ def test_waypoints_become_legs_and_return_follows():
     assert r.sentences == ()
     assert r.legs.shape == (3, m.N_COLUMNS)
     assert r.start[0] == pytest.approx(r.legs[0, m.P_N], abs=1)
-    assert r.legs[0, m.ACCEPT] == 30.0
-    assert r.legs[1, m.ACCEPT] == -25.0  # flown past, not cut
+    assert r.legs[0, m.ACCEPT_RADIUS] == 30.0
+    assert r.legs[1, m.ACCEPT_RADIUS] == -25.0  # flown past, not cut
     back = r.legs[-1]
     assert back[m.KIND] == m.LOITER_UNLIMITED
     np.testing.assert_allclose(back[m.P_N : m.P_D + 1], [0, 0, -110], atol=1e-6)  # home is 10 m above the origin
@@ -192,7 +192,7 @@ def test_nothing_raises_and_every_leg_is_finite(items, seq, params):
 
 
 def without_home(items, seq=0) -> m.Route:
-    return m.route(items, seq=seq, origin=ORIGIN, params={}, limit=6, first=m.FIRST["px4"])
+    return m.unroll_route(items, seq=seq, origin=ORIGIN, params={}, limit=6, first=m.FIRST_ITEM["px4"])
 
 
 def test_without_home_item_0_is_flown_and_jumps_go_to_it():
@@ -211,7 +211,7 @@ def test_without_home_circles_have_a_radius_and_an_exit_of_their_own():
     timed = waypoint(1, 1, 1, command=19, param1=40.0, param2=1.0, param3=-120.0)
     climb = waypoint(2, 1, 2, command=31, param1=0.0, param2=90.0)
     legs = without_home([waypoint(0, 1), timed, climb]).legs
-    assert legs[1, [m.TURNS, m.RADIUS, m.ACCEPT]].tolist() == [40.0, -120.0, 1.0]
-    assert legs[2, [m.RADIUS, m.ACCEPT]].tolist() == [90.0, 0.0]
+    assert legs[1, [m.TURNS, m.RADIUS, m.ACCEPT_RADIUS]].tolist() == [40.0, -120.0, 1.0]
+    assert legs[2, [m.RADIUS, m.ACCEPT_RADIUS]].tolist() == [90.0, 0.0]
     home_first = fly([HOME, timed]).legs[0]
-    assert home_first[[m.RADIUS, m.ACCEPT]].tolist() == [-60.0, 0.0]  # ArduPlane reads the direction only
+    assert home_first[[m.RADIUS, m.ACCEPT_RADIUS]].tolist() == [-60.0, 0.0]  # ArduPlane reads the direction only

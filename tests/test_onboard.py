@@ -3,25 +3,25 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import ITEMS, T0, Aircraft, Ears, Talker, of
 
 from fleet.contract import Mission, Params
-from fleet.telemetry.mavlink.intake import Intake
-from gateway.onboard import Onboard
+from fleet.telemetry.mavlink.intake import MavlinkReceiver
+from gateway.onboard import RequestSender
 
 
 def fly(aircraft, seconds, tick=0.1, every_tick=lambda t: None):
     """Let intake and questions talk with an aircraft for a while of pretended time."""
-    intake, onboard, news = Intake(), Onboard(), []
+    intake, onboard, news = MavlinkReceiver(), RequestSender(), []
     for step in range(round(seconds / tick)):
         t = T0 + step * tick
         every_tick(t - T0)
         if step % 10 == 0:
-            intake.hear(t, aircraft.talker.heartbeat(), "air")
+            intake.receive(t, aircraft.talker.heartbeat(), "air")
         for frame in aircraft.stream():
-            intake.hear(t, frame, "air")
+            intake.receive(t, frame, "air")
         news += intake.flush(t)
-        for where, data in onboard.tick(t, intake.crafts.values()):
+        for where, data in onboard.tick(t, intake.aircraft.values()):
             assert where == "air"
             for frame in aircraft.hear(data, t):
-                intake.hear(t, frame, "air")
+                intake.receive(t, frame, "air")
     return news, intake
 
 
@@ -57,19 +57,19 @@ def test_a_mission_that_became_shorter_meanwhile_is_asked_for_again():
 
 
 def test_after_a_restart_the_mission_is_asked_for_again():
-    aircraft, intake, onboard = Aircraft(0.0), Intake(), Onboard()
+    aircraft, intake, onboard = Aircraft(0.0), MavlinkReceiver(), RequestSender()
     for step in range(600):
         t = T0 + 0.1 * step
         if step == 300:
             aircraft.voice._items = ITEMS[:5]
         boot = 500 + 0.1 * step if step < 300 else 0.1 * (step - 300)
-        intake.hear(t, aircraft.talker.heartbeat() + aircraft.talker.attitude(boot), "air")
-        for _, data in onboard.tick(t, intake.crafts.values()):
+        intake.receive(t, aircraft.talker.heartbeat() + aircraft.talker.attitude(boot), "air")
+        for _, data in onboard.tick(t, intake.aircraft.values()):
             for frame in aircraft.hear(data, t):
-                intake.hear(t, frame, "air")
+                intake.receive(t, frame, "air")
         intake.flush(t)
-    (craft,) = intake.crafts.values()
-    assert craft.route.items == ITEMS[:5]
+    (craft,) = intake.aircraft.values()
+    assert craft.mission.items == ITEMS[:5]
 
 
 def test_who_does_not_answer_is_asked_ever_less():
@@ -86,25 +86,25 @@ def test_who_does_not_answer_is_asked_ever_less():
 
 
 def test_rates_that_are_high_enough_are_left_alone():
-    intake, onboard, talker = Intake(), Onboard(), Talker()
+    intake, onboard, talker = MavlinkReceiver(), RequestSender(), Talker()
     asked = []
     for step in range(1500):
         t = T0 + step * 0.02
         if step % 50 == 0:
-            intake.hear(t, talker.heartbeat(), "air")
-        intake.hear(t, talker.attitude(step * 0.02), "air")
+            intake.receive(t, talker.heartbeat(), "air")
+        intake.receive(t, talker.attitude(step * 0.02), "air")
         if step % 5 == 0:
             intake.flush(t)
-            asked += [m for _, d in onboard.tick(t, intake.crafts.values()) for m in Ears().feed(d)]
+            asked += [m for _, d in onboard.tick(t, intake.aircraft.values()) for m in Ears().feed(d)]
     ids = {int(m.param1) for m in asked if m.get_type() == "COMMAND_LONG"}
     assert ids
     assert mav.MAVLINK_MSG_ID_ATTITUDE not in ids
 
 
 def test_a_lost_aircraft_is_not_spoken_to():
-    intake, onboard = Intake(), Onboard()
-    intake.hear(T0, Talker().heartbeat(), "air")
+    intake, onboard = MavlinkReceiver(), RequestSender()
+    intake.receive(T0, Talker().heartbeat(), "air")
     intake.flush(T0)
-    assert onboard.tick(T0, intake.crafts.values())
+    assert onboard.tick(T0, intake.aircraft.values())
     intake.flush(T0 + 10)
-    assert onboard.tick(T0 + 10, intake.crafts.values()) == []
+    assert onboard.tick(T0 + 10, intake.aircraft.values()) == []

@@ -7,12 +7,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import ITEMS, T0, Aircraft, of
 
 from fleet.contract import Item, Mission, Params
-from fleet.simulator.flight.mavlink import Voice
+from fleet.simulator.flight.mavlink import MavlinkEndpoint
 from fleet.simulator.flight.mavlink_messages import DIALECTS
-from fleet.telemetry.mavlink.intake import Intake
-from gateway.onboard import Onboard
+from fleet.telemetry.mavlink.intake import MavlinkReceiver
+from gateway.onboard import RequestSender
 from gateway.onboard.cache import Cache
-from gateway.onboard.rates import LEAST, WANTED_BYTES_S, WANTED_HZ, budget_of
+from gateway.onboard.rates import MIN_SHARE, WANTED_BYTES_S, WANTED_HZ, budget_of
 from gateway.settings.link_spec import read_spec
 
 VALUES = {"NAVL1_PERIOD": 17.0, "STAT_RUNTIME": 1.0, **{f"P{k:03d}": k / 7 for k in range(300)}}
@@ -24,7 +24,7 @@ class Px4(Aircraft):
 
     def __init__(self, values, number):
         super().__init__(0.0)
-        self.voice = Voice(7, ITEMS, values, DIALECTS["px4"])
+        self.voice = MavlinkEndpoint(7, ITEMS, values, DIALECTS["px4"])
         (self._hash,) = struct.unpack("<f", struct.pack("<I", number))
         self.beat = (mav.MAV_TYPE_FIXED_WING, mav.MAV_AUTOPILOT_PX4)
 
@@ -38,25 +38,25 @@ class Px4(Aircraft):
 
 def ardupilot(values=VALUES, items=LONG, loss=0.0):
     aircraft = Aircraft(loss)
-    aircraft.voice = Voice(7, items, values)
+    aircraft.voice = MavlinkEndpoint(7, items, values)
     aircraft.beat = ()
     return aircraft
 
 
 def fly(aircraft, cache, seconds=90.0, every_tick=lambda t: None):
     """Fly for a while of pretended time; give parameters and mission in the end, and the names of what was asked."""
-    intake, onboard, news = Intake(), Onboard(cache=cache), []
+    intake, onboard, news = MavlinkReceiver(), RequestSender(cache=cache), []
     for step in range(round(seconds * 10)):
         t = T0 + 0.1 * step
         every_tick(0.1 * step)
         if step % 10 == 0:
-            intake.hear(t, aircraft.talker.heartbeat(*aircraft.beat), "air")
+            intake.receive(t, aircraft.talker.heartbeat(*aircraft.beat), "air")
         for frame in aircraft.stream():
-            intake.hear(t, frame, "air")
+            intake.receive(t, frame, "air")
         news += intake.flush(t)
-        for _, data in onboard.tick(t, intake.crafts.values()):
+        for _, data in onboard.tick(t, intake.aircraft.values()):
             for frame in aircraft.hear(data, t):
-                intake.hear(t, frame, "air")
+                intake.receive(t, frame, "air")
     return of(Params, news)[-1], of(Mission, news)[-1], aircraft.names()
 
 
@@ -147,15 +147,15 @@ def test_a_mission_recalled_is_proven_item_by_item_soon_after(tmp_path):
 
 def rates_asked(count, budget):
     """Let aircraft that send nothing but heartbeats be asked for rates; give rates by message, and the share."""
-    intake, onboard, asked = Intake(), Onboard(budget), {}
+    intake, onboard, asked = MavlinkReceiver(), RequestSender(budget), {}
     crowd = [Aircraft(0.0, (), system) for system in range(1, count + 1)]
     for step in range(80):
         t = T0 + 0.1 * step
         for aircraft in crowd:
             if step % 10 == 0:
-                intake.hear(t, aircraft.talker.heartbeat(), aircraft)
+                intake.receive(t, aircraft.talker.heartbeat(), aircraft)
         intake.flush(t)
-        for aircraft, data in onboard.tick(t, intake.crafts.values()):
+        for aircraft, data in onboard.tick(t, intake.aircraft.values()):
             aircraft.hear(data, t)
     for aircraft in crowd:
         for _, question in aircraft.asked:
@@ -168,13 +168,13 @@ def test_what_does_not_fit_is_asked_for_in_proportion_and_that_is_said():
     asked, share = rates_asked(1, WANTED_BYTES_S * 2)
     assert asked[30] == {WANTED_HZ["ATTITUDE"]} and share.sentence == ""
     asked, share = rates_asked(4, WANTED_BYTES_S)
-    assert share.now == pytest.approx(0.25, abs=0.02)  # heartbeats count too
+    assert share.value == pytest.approx(0.25, abs=0.02)  # heartbeats count too
     assert {name: list(hz) for name, hz in asked.items() if name in (30, 42)} == {
-        30: [pytest.approx(25 * share.now, abs=0.01)],
-        42: [pytest.approx(share.now, abs=0.01)],
+        30: [pytest.approx(25 * share.value, abs=0.01)],
+        42: [pytest.approx(share.value, abs=0.01)],
     }
     assert share.sentence.startswith("4 aircraft would send ") and share.sentence.endswith("link has more capacity")
-    assert rates_asked(4, 10.0)[1].now == LEAST
+    assert rates_asked(4, 10.0)[1].value == MIN_SHARE
 
 
 def test_the_budget_suits_the_link_or_is_as_asked_for():

@@ -6,8 +6,8 @@ from flights import item
 from talker import of
 
 from fleet.contract import Mission, Params, Sample, Status
-from fleet.telemetry.mavlink.onboard_log import Chunk, Said
-from fleet.telemetry.onboard_logs.onboard_news import UNDATED_S, craft_of, log_steps
+from fleet.telemetry.mavlink.onboard_log import Chunk, OnboardEvent
+from fleet.telemetry.onboard_logs.onboard_news import DEFAULT_EPOCH_S, aircraft_of, log_steps
 
 ITEMS = (item(0), item(1, north=500.0), item(2, north=500.0, east=500.0))
 
@@ -23,12 +23,12 @@ class Log:
         legs = (([0.5, 12.3], [1, 2]), ([33.0], [3]))
         said = (
             [
-                Said(0.1, "param", ("AIRSPEED_CRUISE", 22.0)),
-                Said(0.2, "mission", ITEMS),
-                Said(0.3, "mode", "AUTO"),
-                Said(5.0, "armed", True),
+                OnboardEvent(0.1, "param", ("AIRSPEED_CRUISE", 22.0)),
+                OnboardEvent(0.2, "mission", ITEMS),
+                OnboardEvent(0.3, "mode", "AUTO"),
+                OnboardEvent(5.0, "armed", True),
             ],
-            [Said(21.0, "text", (2, "engine failure")), Said(30.0, "mode", "RTL")],
+            [OnboardEvent(21.0, "text", (2, "engine failure")), OnboardEvent(30.0, "mode", "RTL")],
         )
         for k, (when, seq) in enumerate(legs):
             t = 20.0 * k + np.arange(0, 20, 0.1)
@@ -39,7 +39,7 @@ class Log:
 @pytest.fixture(scope="module")
 def news():
     log = Log()
-    return [n for _, step in log_steps(log, craft_of(log, offset=-1)) for n in step]
+    return [n for _, step in log_steps(log, aircraft_of(log, offset=-1)) for n in step]
 
 
 def rows(news, field):
@@ -78,5 +78,5 @@ def test_what_is_said_reaches_status_mission_and_parameters(news):
 def test_a_log_without_a_date_begins_in_the_year_2000():
     log = Log()
     log.epoch_s = None
-    first = next(n for _, step in log_steps(log, craft_of(log, 0)) for n in step if isinstance(n, Sample))
-    assert first.t == pytest.approx(UNDATED_S, abs=1.0)
+    first = next(n for _, step in log_steps(log, aircraft_of(log, 0)) for n in step if isinstance(n, Sample))
+    assert first.t == pytest.approx(DEFAULT_EPOCH_S, abs=1.0)

@@ -13,19 +13,19 @@ from flights import linear_flight, truth
 from fleet.cli import main as fleet
 from fleet.contract import Outcome
 from fleet.simulator.flight.drive import to_tlog
-from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.flight.uav import SimulatedUav
 from twin_worker.identification.linear.linear_model import AXES
 from twin_worker.paper_experiments import __main__, experiment
-from twin_worker.paper_experiments.experiment import NAMES, Experiment, Plan, both_steps
-from twin_worker.paper_experiments.recorded_flights import Flown, flown
-from twin_worker.telemetry.flight_phase import MODES, mode_of
+from twin_worker.paper_experiments.experiment import STATE_NAMES, Experiment, ExperimentPlan, both_steps
+from twin_worker.paper_experiments.recorded_flights import RecordedFlight, read_flights
+from twin_worker.telemetry.flight_phase import PHASES, phase_of
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     """A recording of two aircraft."""
     path = tmp_path_factory.mktemp("paper") / "flight.tlog"
-    to_tlog(path, [PretendUav(i, 5, wind=2.0, turbulence=1) for i in (0, 1)], seconds=110, loss=0.01, seed=5)
+    to_tlog(path, [SimulatedUav(i, 5, wind=2.0, turbulence=1) for i in (0, 1)], seconds=110, loss=0.01, seed=5)
     return path
 
 
@@ -35,10 +35,10 @@ def recorded(tmp_path_factory):
 def test_modes_are_told_apart(phi, up, mode):
     stretch = linear_flight(4.0)
     stretch.x[:, 6], stretch.v[:, 2] = phi, -up
-    assert mode_of(stretch) == mode and mode in MODES
+    assert phase_of(stretch) == mode and mode in PHASES
 
 
-@pytest.mark.parametrize("first", experiment.FIRST)
+@pytest.mark.parametrize("first", experiment.FIRST_STEPS)
 @pytest.mark.parametrize("axis", AXES)
 def test_both_steps_find_a_known_aircraft(axis, first):
     window = linear_flight(60.0, noise=0.01)
@@ -51,13 +51,14 @@ def test_both_steps_find_a_known_aircraft(axis, first):
 
 
 def test_the_wind_is_taken_out(recorded):
-    one = next(flown(recorded))
-    assert isinstance(one, Flown) and one.uav == 1
+    one = next(read_flights(recorded))
+    assert isinstance(one, RecordedFlight) and one.uav == 1
     start = next(iter(one.starts(40.0, 8.0, 5.0)))
     window = one.window(start, 40.0, 8.0)
     assert len(window) == 1200
     speed = {
-        name: np.linalg.norm(w.columns(("u", "v", "w")), axis=1) for name, w in (("air", window), ("ground", one.whole))
+        name: np.linalg.norm(w.columns(("u", "v", "w")), axis=1)
+        for name, w in (("air", window), ("ground", one.recording))
     }
     assert speed["air"].std() < speed["ground"].std()
 
@@ -68,11 +69,11 @@ def test_the_command_flies_identifies_and_draws(tmp_path, capfd):
     assert fleet(["paper", "identify", *flight, "--out", str(out), "--json", str(numbers)]) == 0
     said = capfd.readouterr()
     rows = json.loads(numbers.read_text())["first_step"]["pbsid"]
-    assert rows and set(rows) <= set(MODES)
+    assert rows and set(rows) <= set(PHASES)
     for mode, row in rows.items():
         assert mode in said.out
         assert sum(row["verdicts"].values()) == row["n"] and row["sentence"]
-        assert set(row["states"]) == set(NAMES)
+        assert set(row["states"]) == set(STATE_NAMES)
         assert all(-100 <= q <= 100 for state in row["states"].values() for q in (*state["first"], *state["refined"]))
         assert (out / f"fig7_pbsid_{mode}.png").stat().st_size > 10_000
     assert (out / "fig8_pbsid.png").stat().st_size > 10_000 and (out / "fig8_pbsid_seen.png").exists()
@@ -93,9 +94,9 @@ def test_the_paired_gain_is_of_pairs():
 
 
 def test_what_cannot_be_identified_is_said_and_not_done(recorded):
-    one = next(flown(recorded))
-    one.whole.u[:] = 0.3
-    told = list(experiment.experiments([one], "projection", Plan(every_s=20.0)))
+    one = next(read_flights(recorded))
+    one.recording.u[:] = 0.3
+    told = list(experiment.run_experiments([one], "projection", ExperimentPlan(every_s=20.0)))
     assert told and all("input 0 is constant" in sentence for sentence in told)
 
 
@@ -115,9 +116,9 @@ def test_wrong_use_is_one_sentence(words, sentence, capfd):
 
 def test_too_short_a_recording_is_said(tmp_path, capfd):
     path = tmp_path / "short.tlog"
-    to_tlog(path, [PretendUav(0, 5)], seconds=30, loss=0.0, seed=5)
+    to_tlog(path, [SimulatedUav(0, 5)], seconds=30, loss=0.0, seed=5)
     assert __main__.main(["identify", str(path)]) == 2
-    assert "no 48 s of whole data; fly longer" in capfd.readouterr().err
+    assert "no 48 s of data without gaps; record longer" in capfd.readouterr().err
 
 
 def test_ctrl_c_ends_it_cleanly(recorded, tmp_path):

@@ -11,15 +11,15 @@ from test_predict import AHEAD, PARAMS, level, situation
 from fleet.physics.dynamics import rates_of_change
 from fleet.physics.wrench import NAMES, OFFSETS, WIND
 from fleet.window import INPUTS
-from twin_worker.identification.fixed_wing.derivatives_model import Coupled
-from twin_worker.identification.fixed_wing.plant import acting, finite, method, settled
+from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
+from twin_worker.identification.fixed_wing.plant import actuator_state, bias_corrected, is_finite, method
 from twin_worker.prediction.closed_loop import fly_ahead
 
 CALM = aircraft(0, wind=(0.0, 0.0))
 SLOWER = PARAMS | {"AIRSPEED_CRUISE": V, "TRIM_ARSPD_CM": 100 * V}
 
 
-def off(plant: Coupled, by: float) -> Coupled:
+def off(plant: DerivativesModel, by: float) -> DerivativesModel:
     """The model with wrong offsets, as a trim that has changed since."""
     par = plant.par.copy()
     par[list(OFFSETS)] += by * np.array([1.0, 2.0, 1.0, 0.5, 1.0, 0.5])
@@ -33,15 +33,15 @@ def test_kinds_are_named():
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_number_that_is_none_is_seen(value):
     lon, lat = truth()
-    assert finite(known(CALM)) and finite((lon, lat))
+    assert is_finite(known(CALM)) and is_finite((lon, lat))
     D = lat.D.copy()
     D[1, 1] = value
-    assert not finite((lon, replace(lat, D=D))) and not finite(replace(known(CALM), par=np.full(37, value)))
+    assert not is_finite((lon, replace(lat, D=D))) and not is_finite(replace(known(CALM), par=np.full(37, value)))
 
 
 def test_a_settled_plant_accelerates_on_average_as_was_flown():
     window = fly(CALM, 40.0, noise=0.3)
-    *_, par, at, _ = settled(off(known(CALM), 1.0), window)
+    *_, par, at, _ = bias_corrected(off(known(CALM), 1.0), window)
     assert np.array_equal(at, AT) and not par[WIND:].any()
     assert np.abs((par - CALM)[list(OFFSETS)]).max() < 0.25
     rest = [k for k in range(WIND) if k not in OFFSETS]
@@ -50,19 +50,19 @@ def test_a_settled_plant_accelerates_on_average_as_was_flown():
 
 def test_the_true_plant_is_settled_already_in_any_wind():
     windy = aircraft(0, wind=(5.0, 4.0))
-    *_, par, _, _ = settled(known(windy), fly(windy, 40.0, noise=0.0))
+    *_, par, _, _ = bias_corrected(known(windy), fly(windy, 40.0, noise=0.0))
     assert np.abs((par - CALM)[list(OFFSETS)]).max() < 0.1
 
 
 def test_what_acts_at_the_end_is_behind_its_command():
     window = fly(CALM, 10.0)
     window.u[:], window.u[-2:] = TRIM, [1.0, 1.0, 1.0, 1.0]
-    now = acting(window)
+    now = actuator_state(window)
     assert now.shape == (len(INPUTS),)
     assert (now > TRIM).all() and (now < 1.0).all() and now[3] - TRIM[3] < now[0]
 
 
-def straight(plant: Coupled, **more):
+def straight(plant: DerivativesModel, **more):
     """Fly ahead from half a minute of level flight at the coupled models' speed."""
     window = level()
     window.x[:, 0], window.v[:, 0], window.x[:, 7] = V, V, 0.05
@@ -95,7 +95,7 @@ def test_a_model_that_cannot_fly_gives_no_path_and_says_so(name, value):
 
 def test_rates_at_trim_are_small_once_settled():
     window = fly(CALM, 40.0, lively=0.0, noise=0.0)
-    *_, par, at, _ = settled(off(known(CALM), 0.5), window)
+    *_, par, at, _ = bias_corrected(off(known(CALM), 0.5), window)
     rate = np.empty(9)
     rates_of_change(window.x[-1], TRIM, par, at, rate)
     assert np.abs(rate[:6]).max() < 0.05

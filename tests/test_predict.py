@@ -10,8 +10,9 @@ from flights import DT, HERE, SPEED, T0, item, truth
 from fleet.autopilots import arduplane
 from fleet.window import Window
 from twin_worker.estimation.wind_filter import WindFilter
+from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.prediction import closed_loop
-from twin_worker.prediction.closed_loop import Onboard, Situation, fly_ahead, held
+from twin_worker.prediction.closed_loop import AutopilotConfig, PredictionContext, fly_ahead
 
 AHEAD = np.arange(0.0, 31.0)
 FLOWN_S = 30.0
@@ -30,19 +31,21 @@ def level() -> Window:
     return Window(t, x, u, p, v, np.ones(n, bool), np.zeros(n, bool))
 
 
-def situation(items=NORTH, *, window: Window | None = None, params=PARAMS, since=-np.inf, seq=1, lost=()) -> Situation:
+def situation(
+    items=NORTH, *, window: Window | None = None, params=PARAMS, since=-np.inf, seq=1, lost=()
+) -> PredictionContext:
     laid = f.turn(FLOWN_S, rate=0.0, psi=0.0, bank=0.0, Va=float(np.hypot(SPEED, 1.0)))
     laid["leg"] = (laid["leg"][0], np.full((len(laid["leg"][0]), 1), float(seq)))
     laid = {name: pair for name, pair in laid.items() if name not in lost}
     history = f.remembered(f.messages(laid))
-    return Situation(window or level(), history, Onboard(items, params, since), WindFilter(), HERE)
+    return PredictionContext(window or level(), history, AutopilotConfig(items, params, since), WindFilter(), HERE)
 
 
 def test_held_by_hand():
     t, x = np.array([1.0, 2.0, 5.0]), np.array([[1.0], [2.0], [5.0]])
-    got = held(t, x, np.array([0.5, 1.0, 1.9, 2.0, 3.0, 3.1, 5.0]), longest=1.0)[:, 0]
+    got = zero_order_hold(t, x, np.array([0.5, 1.0, 1.9, 2.0, 3.0, 3.1, 5.0]), max_age=1.0)[:, 0]
     assert np.array_equal(got, [np.nan, 1.0, 1.0, 2.0, 2.0, np.nan, 5.0], equal_nan=True)
-    assert np.isnan(held(np.empty(0), np.empty((0, 2)), t, 1.0)).all()
+    assert np.isnan(zero_order_hold(np.empty(0), np.empty((0, 2)), t, 1.0)).all()
 
 
 def test_a_straight_leg_is_flown_straight():

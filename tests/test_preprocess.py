@@ -7,9 +7,9 @@ from flights import T0
 
 from fleet.airframes.airframe import servo_map
 from fleet.contract import Array, Rows, Sample
-from fleet.telemetry.tables.row import HIGHEST
-from twin_worker.telemetry.history import History
-from twin_worker.telemetry.resample import fill, lagrange, preprocess
+from fleet.telemetry.tables.row import MAX_MAGNITUDE
+from twin_worker.telemetry.history import TelemetryHistory
+from twin_worker.telemetry.resample import interpolate_samples, lagrange, preprocess
 
 PLAIN = servo_map({})
 CALM = np.zeros(3)
@@ -24,7 +24,7 @@ def window(laid, wind=CALM, until: float | None = None, seconds: float = 20.0):
 
 
 def test_rows_come_out_sorted_once_and_finite():
-    history = History()
+    history = TelemetryHistory()
     history.add(f.sample(leg=([T0 + 2.0, T0 + 3.0], [[2.0], [3.0]])))
     history.add(f.sample(leg=([T0, T0 + 1.0, T0 + 2.0], [[0.0], [np.nan], [9.0]])))
     history.add(f.sample(leg=([T0 + 4.0, np.nan], [[4.0], [5.0]])))
@@ -34,14 +34,14 @@ def test_rows_come_out_sorted_once_and_finite():
 
 
 def test_every_kind_has_room_for_what_the_dialects_believe():
-    history = History()
-    for name, highest in HIGHEST.items():
+    history = TelemetryHistory()
+    for name, highest in MAX_MAGNITUDE.items():
         history.add(f.sample(**{name: ([T0], [highest])}))
         assert history.rows(name)[1].tolist() == [list(highest)], name
 
 
 def test_rows_since():
-    history = History()
+    history = TelemetryHistory()
     history.add(f.sample(leg=(T0 + np.arange(10.0), np.arange(10.0)[:, None])))
     assert history.rows("leg", T0 + 6.5)[1][:, 0].tolist() == [7.0, 8.0, 9.0]
     assert history.rows("leg", T0 + 99.0)[0].shape == (0,)
@@ -49,7 +49,7 @@ def test_rows_since():
 
 
 def test_a_late_row_at_the_end_of_a_message_hides_nothing():
-    history = History()
+    history = TelemetryHistory()
     history.add(f.sample(leg=([T0 + 50.0, T0 + 1.0], [[50.0], [1.0]])))
     assert history.rows("leg", T0 + 40.0)[1][:, 0].tolist() == [50.0]
     assert history.newest == T0 + 50.0
@@ -57,7 +57,7 @@ def test_a_late_row_at_the_end_of_a_message_hides_nothing():
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_time_that_is_no_time_does_not_become_the_newest(bad):
-    history = History()
+    history = TelemetryHistory()
     history.add(f.sample(leg=([T0], [[1.0]])))
     history.add(f.sample(leg=([T0 + 1.0, bad], [[2.0], [3.0]])))
     assert history.newest == T0 + 1.0
@@ -74,7 +74,7 @@ def test_lying_shapes_are_counted_and_dropped():
         f.rows(np.empty(0), np.empty((0, 3))),  # nothing
         Rows(t=good.t, x=Array("<c8", (1, 3), b"\0" * 24)),  # no dtype of ours
     )
-    history = History()
+    history = TelemetryHistory()
     assert [history.add(Sample(uav=1, t=T0, air=lie)) for lie in lies] == [1] * len(lies)
     assert not len(history.rows("air")[0]) and history.newest == -np.inf
     assert history.add(Sample(uav=1, t=T0, air=lies[2], attitude=lies[2], leg=f.rows([T0], [[1.0]]))) == 2
@@ -82,7 +82,7 @@ def test_lying_shapes_are_counted_and_dropped():
 
 
 def test_memory_is_bounded_and_joins_lose_nothing_young():
-    history = History(keep_s=20.0)
+    history = TelemetryHistory(keep_s=20.0)
     held = []
     for k in range(3000):
         history.add(f.sample(leg=([T0 + 0.1 * k], [[k]])))
@@ -119,7 +119,7 @@ def test_lagrange_of_few_samples_is_straight():
 def test_fill_marks_lost_and_never_fills_the_long_gap():
     t = np.concatenate([np.arange(0, 1.95, 0.1), np.arange(2.3, 3.95, 0.1), np.arange(6.0, 8, 0.1)])
     grid = np.arange(0.01, 7.85, 0.04)
-    y, ok, lost = fill(t, np.sin(t)[:, None], grid, 0.5)
+    y, ok, lost = interpolate_samples(t, np.sin(t)[:, None], grid, 0.5)
     short, long = (grid > 1.9) & (grid < 2.3), (grid > 3.9) & (grid < 6.0)
     assert ok[short].all() and lost[short].all()
     assert not ok[long].any() and ok[~long].all()
@@ -130,9 +130,9 @@ def test_fill_marks_lost_and_never_fills_the_long_gap():
 def test_fill_does_not_reach_beyond_the_ends():
     t = np.arange(2, 4, 0.1)
     grid = np.arange(0, 6, 0.04)
-    _, ok, _ = fill(t, np.ones((len(t), 1)), grid, 0.5)
+    _, ok, _ = interpolate_samples(t, np.ones((len(t), 1)), grid, 0.5)
     assert not ok[(grid < 1.8) | (grid > 4.1)].any() and ok[(grid > 2.0) & (grid < 3.8)].all()
-    assert not fill(t[:3], np.ones((3, 1)), grid, 0.5)[1].any()
+    assert not interpolate_samples(t[:3], np.ones((3, 1)), grid, 0.5)[1].any()
 
 
 # --- the window ------------------------------------------------------------------------------------------------------
@@ -181,6 +181,6 @@ def test_the_window_never_passes_the_data():
 
 
 def test_rows_newer_than_their_message_are_refused():
-    history = History()
+    history = TelemetryHistory()
     assert history.add(f.sample(t=T0, leg=([T0, T0 + 1e6], [[1], [2]]))) == 1
     assert history.newest == T0

@@ -9,11 +9,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from fleet.cli import main
 from fleet.contract import Item
 from fleet.frames import to_geodetic, to_ned
-from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.jsbsim import CRUISE, DT, Aircraft
-from fleet.simulator.vehicle.missions import DO_CHANGE_SPEED, DO_JUMP, HOME, LOITER_TURNS, WAYPOINT, mission
+from fleet.simulator.vehicle.missions import DO_CHANGE_SPEED, DO_JUMP, HOME, LOITER_TURNS, WAYPOINT, draw_mission
 from fleet.simulator.vehicle.sensors import Sensors
-from fleet.simulator.vehicle.weather import GaussMarkov, Wind, turbulence_level
+from fleet.simulator.vehicle.weather import GaussMarkov, MeanWind, turbulence_level
 
 ALOFT = np.array([100.0, -200.0, -120.0])
 
@@ -21,7 +21,7 @@ ALOFT = np.array([100.0, -200.0, -120.0])
 def trimmed(seed: int = 3, wind: tuple[float, float] = (0.0, 0.0), turbulence: int = 0) -> tuple[Aircraft, float]:
     aircraft = Aircraft(HOME, seed, turbulence)
     _, delta_e, delta_t = aircraft.start(ALOFT, 1.0, CRUISE, wind)
-    aircraft.drive(0.0, delta_e, 0.0, delta_t)
+    aircraft.set_controls(0.0, delta_e, 0.0, delta_t)
     return aircraft, delta_t
 
 
@@ -36,9 +36,9 @@ def heard(frames: list[bytes]) -> list:
 
 
 @pytest.fixture(scope="module")
-def flown() -> tuple[PretendUav, list]:
+def flown() -> tuple[SimulatedUav, list]:
     """Forty seconds of one aircraft, and everything it said."""
-    uav = PretendUav(4, seed=11, wind=3.0, turbulence=2)
+    uav = SimulatedUav(4, seed=11, wind=3.0, turbulence=2)
     frames = [frame for k in range(4_000) for frame in uav.step((k + 1) * DT)]
     return uav, heard(frames)
 
@@ -91,14 +91,14 @@ def test_positive_commands_roll_right_pitch_up_yaw_right(surface: int, rate: int
     _, delta_e, delta_t = aircraft.start(ALOFT, 1.0, CRUISE, (0.0, 0.0))
     deltas = [0.0, delta_e, 0.0, delta_t]
     deltas[surface] += 0.2
-    aircraft.drive(*deltas)
+    aircraft.set_controls(*deltas)
     glide(aircraft, 0.4)
     assert sign * degrees(aircraft.truth().rates[rate]) > 3
 
 
 def test_servos_lag() -> None:
     aircraft, delta_t = trimmed()
-    aircraft.drive(1.0, 0.0, 0.0, delta_t)
+    aircraft.set_controls(1.0, 0.0, 0.0, delta_t)
     aircraft.step()
     early = aircraft["fcs/aileron-rad"]
     glide(aircraft, 0.5)
@@ -114,7 +114,7 @@ def test_aircraft_of_two_seeds_differ() -> None:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_missions_have_everything_and_stay_near(seed: int) -> None:
-    items, start = mission(seed, CRUISE)
+    items, start = draw_mission(seed, CRUISE)
     commands = [item.command for item in items]
     assert [item.seq for item in items] == list(range(len(items)))
     assert {WAYPOINT, LOITER_TURNS, DO_CHANGE_SPEED} <= set(commands[1:])
@@ -127,25 +127,25 @@ def test_missions_have_everything_and_stay_near(seed: int) -> None:
     assert items[start.seq].command == WAYPOINT
 
 
-def test_it_flies_its_mission_and_turns_at_once(flown: tuple[PretendUav, list]) -> None:
+def test_it_flies_its_mission_and_turns_at_once(flown: tuple[SimulatedUav, list]) -> None:
     uav, said = flown
     rolls = [abs(degrees(m.roll)) for m in said if m.get_type() == "ATTITUDE"]
     assert max(rolls[: 15 * 25]) > 20
     assert max(rolls) < 65
-    assert not uav.down
+    assert not uav.crashed
     assert len({m.seq for m in said if m.get_type() == "MISSION_CURRENT"}) > 1
 
 
 @pytest.mark.parametrize("uav_id", range(3))
 def test_the_autopilot_holds_height_speed_and_bank(uav_id: int) -> None:
-    uav = PretendUav(uav_id, seed=21, wind=4.0, turbulence=2)
+    uav = SimulatedUav(uav_id, seed=21, wind=4.0, turbulence=2)
     rows = []
     for k in range(1, 900):
         uav.step(k * 0.1)
-        f, x = uav._flight(), uav.aircraft.truth()
+        f, x = uav._telemetry_state(), uav.aircraft.truth()
         rows.append((f.alt_error, f.Va_error, degrees(f.phi_c - x.euler[0]), degrees(f.theta_c - x.euler[1])))
     alt, Va, phi, theta = np.sqrt(np.mean(np.square(rows), axis=0))
-    assert not uav.down
+    assert not uav.crashed
     assert alt < 12
     assert Va < 2.5
     assert phi < 8  # most of it in the second after a turn begins
@@ -155,7 +155,7 @@ def test_the_autopilot_holds_height_speed_and_bank(uav_id: int) -> None:
 
 def test_one_seed_one_flight_two_seeds_two() -> None:
     def bytes_of(uav_id: int, seed: int) -> bytes:
-        return b"".join(PretendUav(uav_id, seed).step(3.0))
+        return b"".join(SimulatedUav(uav_id, seed).step(3.0))
 
     assert bytes_of(0, 5) == bytes_of(0, 5)
     assert bytes_of(0, 5) != bytes_of(0, 6)
@@ -163,7 +163,7 @@ def test_one_seed_one_flight_two_seeds_two() -> None:
 
 
 def test_aircraft_of_one_fleet_share_the_mean_wind() -> None:
-    drawn = [PretendUav(i, 5, wind=6.0, turbulence=0)._wind.step(100.0) for i in range(3)]
+    drawn = [SimulatedUav(i, 5, wind=6.0, turbulence=0)._wind.step(100.0) for i in range(3)]
     assert np.std(drawn, axis=0).max() < 2.0
     assert np.mean(np.hypot(*np.transpose(drawn))) == pytest.approx(6.0, abs=2.0)
 
@@ -178,9 +178,9 @@ def test_gauss_markov_has_its_deviation_and_memory() -> None:
 
 
 def test_wind_grows_with_height_and_can_be_calm() -> None:
-    wind = Wind(8.0, np.random.default_rng(3), 0.1, towards=0.0)
+    wind = MeanWind(8.0, np.random.default_rng(3), 0.1, towards=0.0)
     assert wind.step(300.0)[0] > wind.step(20.0)[0] > 2
-    assert Wind(0.0, np.random.default_rng(3), 0.1).step(100.0) == (0.0, 0.0)
+    assert MeanWind(0.0, np.random.default_rng(3), 0.1).step(100.0) == (0.0, 0.0)
 
 
 def test_sensor_errors_are_small_but_there() -> None:
@@ -193,14 +193,14 @@ def test_sensor_errors_are_small_but_there() -> None:
 
 def test_an_endless_mission_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fleet.simulator.flight.uav._LEGS_AHEAD", 4)
-    uav = PretendUav(2, seed=9, wind=2.0, turbulence=0)
+    uav = SimulatedUav(2, seed=9, wind=2.0, turbulence=0)
     seen = []
     for k in range(1, 90):
         uav.step(float(k) * 2)
-        seen.append(uav._flight().seq)
+        seen.append(uav._telemetry_state().seq)
     order = [a for a, b in zip(seen, [None, *seen], strict=False) if a != b]
     assert len(order) > 5
-    assert not uav.down
+    assert not uav.crashed
 
 
 @pytest.mark.parametrize(
@@ -224,7 +224,7 @@ def test_turbulence_words() -> None:
 
 
 def test_items_carry_their_places() -> None:
-    items, start = mission(3, CRUISE)
+    items, start = draw_mission(3, CRUISE)
     assert isinstance(items[1], Item)
     lat, lon, _ = to_geodetic(HOME, start.p)
     assert abs(lat - HOME.lat_e7) < 200_000

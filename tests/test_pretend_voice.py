@@ -13,11 +13,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from fleet.frames import to_ned
 from fleet.simulator.flight import drive
-from fleet.simulator.flight.link import Link
-from fleet.simulator.flight.mavlink import Voice
+from fleet.simulator.flight.link import RadioLink
+from fleet.simulator.flight.mavlink import MavlinkEndpoint
 from fleet.simulator.flight.mavlink_messages import AUTO, TELEMETRY
-from fleet.simulator.flight.tuning import tuned
-from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.flight.tuning import tuned_parameters
+from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.jsbsim import DT
 from fleet.simulator.vehicle.sensors import Servos
 
@@ -32,14 +32,14 @@ def ask(message: mav.MAVLink_message) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def flown() -> tuple[PretendUav, list]:
+def flown() -> tuple[SimulatedUav, list]:
     """Forty seconds of one aircraft, and everything it said."""
-    uav = PretendUav(4, seed=11, wind=3.0, turbulence=2)
+    uav = SimulatedUav(4, seed=11, wind=3.0, turbulence=2)
     frames = [frame for k in range(4_000) for frame in uav.step((k + 1) * DT)]
     return uav, heard(frames)
 
 
-def test_frames_come_at_their_rates(flown: tuple[PretendUav, list]) -> None:
+def test_frames_come_at_their_rates(flown: tuple[SimulatedUav, list]) -> None:
     uav, said = flown
     assert {(m.get_srcSystem(), m.get_srcComponent()) for m in said} == {(uav.uav_id + 1, 1)}
     counts = Counter(m.get_type() for m in said)
@@ -58,7 +58,7 @@ def test_frames_come_at_their_rates(flown: tuple[PretendUav, list]) -> None:
     assert len(TELEMETRY) == len(wanted)
 
 
-def test_sequence_numbers_count_and_clocks_run(flown: tuple[PretendUav, list]) -> None:
+def test_sequence_numbers_count_and_clocks_run(flown: tuple[SimulatedUav, list]) -> None:
     _, said = flown
     assert {(b.get_seq() - a.get_seq()) % 256 for a, b in pairwise(said)} == {1}
     boots = np.array([m.time_boot_ms for m in said if m.get_type() == "ATTITUDE"])
@@ -66,7 +66,7 @@ def test_sequence_numbers_count_and_clocks_run(flown: tuple[PretendUav, list]) -
     assert 60_000 <= boots[0] <= 601_000
 
 
-def test_what_it_says_agrees_with_where_it_is(flown: tuple[PretendUav, list]) -> None:
+def test_what_it_says_agrees_with_where_it_is(flown: tuple[SimulatedUav, list]) -> None:
     uav, said = flown
     x = uav.aircraft.truth()
     last = {m.get_type(): m for m in said}
@@ -83,12 +83,12 @@ def test_what_it_says_agrees_with_where_it_is(flown: tuple[PretendUav, list]) ->
     assert beat.base_mode & mav.MAV_MODE_FLAG_SAFETY_ARMED
 
 
-def test_mission_protocol(flown: tuple[PretendUav, list]) -> None:
+def test_mission_protocol(flown: tuple[SimulatedUav, list]) -> None:
     uav, _ = flown
-    (count,) = heard(uav.hear(ask(mav.MAVLink_mission_request_list_message(5, 1))))
+    (count,) = heard(uav.receive(ask(mav.MAVLink_mission_request_list_message(5, 1))))
     assert (count.get_type(), count.count, count.target_system) == ("MISSION_COUNT", len(uav.items), 255)
     for item in uav.items:
-        (sent,) = heard(uav.hear(ask(mav.MAVLink_mission_request_int_message(5, 1, item.seq))))
+        (sent,) = heard(uav.receive(ask(mav.MAVLink_mission_request_int_message(5, 1, item.seq))))
         assert (sent.seq, sent.command, sent.frame, sent.x, sent.y) == (
             *(item.seq, item.command, item.frame),
             *(item.lat_e7, item.lon_e7),
@@ -96,67 +96,67 @@ def test_mission_protocol(flown: tuple[PretendUav, list]) -> None:
         assert [sent.param1, sent.param2, sent.param3, sent.z] == pytest.approx(
             [item.param1, item.param2, item.param3, item.alt_m], rel=1e-5
         )
-    (old,) = heard(uav.hear(ask(mav.MAVLink_mission_request_message(5, 1, 1))))
+    (old,) = heard(uav.receive(ask(mav.MAVLink_mission_request_message(5, 1, 1))))
     assert (old.get_type(), old.x) == ("MISSION_ITEM", pytest.approx(uav.items[1].lat_e7 * 1e-7, abs=1e-5))
-    (refused,) = heard(uav.hear(ask(mav.MAVLink_mission_request_int_message(5, 1, 999))))
+    (refused,) = heard(uav.receive(ask(mav.MAVLink_mission_request_int_message(5, 1, 999))))
     assert (refused.get_type(), refused.type) == ("MISSION_ACK", mav.MAV_MISSION_INVALID_SEQUENCE)
 
 
 def test_parameter_protocol() -> None:
-    params = tuned(3)
-    voice = Voice(7, (), params)
-    assert voice.hear(ask(mav.MAVLink_param_request_list_message(7, 1)), 1.0) == []
-    sent = heard(voice.stream(10_000))
+    params = tuned_parameters(3)
+    voice = MavlinkEndpoint(7, (), params)
+    assert voice.receive(ask(mav.MAVLink_param_request_list_message(7, 1)), 1.0) == []
+    sent = heard(voice.stream_parameters(10_000))
     assert {m.param_id: m.param_value for m in sent} == {k: np.float32(v) for k, v in params.items()}
     assert [m.param_index for m in sent] == list(range(len(params)))
     assert {m.param_count for m in sent} == {len(params)}
-    (named,) = heard(voice.hear(ask(mav.MAVLink_param_request_read_message(7, 1, b"WP_RADIUS", -1)), 1.0))
+    (named,) = heard(voice.receive(ask(mav.MAVLink_param_request_read_message(7, 1, b"WP_RADIUS", -1)), 1.0))
     assert (named.param_id, named.param_value) == ("WP_RADIUS", params["WP_RADIUS"])
-    (third,) = heard(voice.hear(ask(mav.MAVLink_param_request_read_message(7, 1, b"", 3)), 1.0))
+    (third,) = heard(voice.receive(ask(mav.MAVLink_param_request_read_message(7, 1, b"", 3)), 1.0))
     assert (third.param_index, third.param_id) == (3, sorted(params)[3])
     for index, name in ((9_999, b""), (-1, b"NO_SUCH")):
-        assert voice.hear(ask(mav.MAVLink_param_request_read_message(7, 1, name, index)), 1.0) == []
+        assert voice.receive(ask(mav.MAVLink_param_request_read_message(7, 1, name, index)), 1.0) == []
 
 
 def test_parameters_are_streamed_while_it_flies() -> None:
-    uav = PretendUav(0, 5)
-    uav.hear(ask(mav.MAVLink_param_request_list_message(1, 1)))
+    uav = SimulatedUav(0, 5)
+    uav.receive(ask(mav.MAVLink_param_request_list_message(1, 1)))
     counts = Counter(m.get_type() for m in heard(uav.step(1.0)))
     assert counts["PARAM_VALUE"] == len(uav.params)
     assert counts["ATTITUDE"] == 25
 
 
 def test_servo_parameters_say_what_is_wired_where() -> None:
-    params = tuned(0)
+    params = tuned_parameters(0)
     assert [params[f"SERVO{i}_FUNCTION"] for i in (1, 2, 3, 4)] == [4, 19, 70, 21]
     assert Servos.pulses(-1.0, 0.5, 2.0, 0.25) == (1100, 1700, 1250, 1900)
     assert Servos.commands((1100, 1700, 1250, 1900)) == (-1.0, 0.5, 1.0, 0.25)
-    assert tuned(0) == params
-    assert tuned(1) != params
+    assert tuned_parameters(0) == params
+    assert tuned_parameters(1) != params
 
 
 def test_version_and_unknown_commands_are_answered_politely() -> None:
-    voice = Voice(7, (), {})
+    voice = MavlinkEndpoint(7, (), {})
     asked = mav.MAVLink_command_long_message(7, 1, mav.MAV_CMD_REQUEST_MESSAGE, 0, 148, 0, 0, 0, 0, 0, 0)
-    ack, version = heard(voice.hear(ask(asked), 1.0))
+    ack, version = heard(voice.receive(ask(asked), 1.0))
     assert (ack.result, version.get_type()) == (mav.MAV_RESULT_ACCEPTED, "AUTOPILOT_VERSION")
     assert version.capabilities & mav.MAV_PROTOCOL_CAPABILITY_MISSION_INT
     unknown = mav.MAVLink_command_long_message(7, 1, mav.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 0, 0)
-    assert [m.result for m in heard(voice.hear(ask(unknown), 1.0))] == [mav.MAV_RESULT_UNSUPPORTED]
+    assert [m.result for m in heard(voice.receive(ask(unknown), 1.0))] == [mav.MAV_RESULT_UNSUPPORTED]
     for_another = mav.MAVLink_mission_request_list_message(8, 1)
-    assert voice.hear(ask(for_another), 1.0) == []
+    assert voice.receive(ask(for_another), 1.0) == []
 
 
 def test_noise_is_passed_over() -> None:
-    voice = Voice(7, (), {"A": 1.0})
+    voice = MavlinkEndpoint(7, (), {"A": 1.0})
     rng = np.random.default_rng(1)
-    assert voice.hear(rng.bytes(5_000), 1.0) == []
-    voice.hear(b"\x00" * 300, 1.0)
-    assert heard(voice.hear(ask(mav.MAVLink_param_request_read_message(7, 1, b"A", -1)), 1.0))[0].param_value == 1.0
+    assert voice.receive(rng.bytes(5_000), 1.0) == []
+    voice.receive(b"\x00" * 300, 1.0)
+    assert heard(voice.receive(ask(mav.MAVLink_param_request_read_message(7, 1, b"A", -1)), 1.0))[0].param_value == 1.0
 
 
 def test_the_link_loses_delays_and_keeps_order() -> None:
-    link = Link(np.random.default_rng(4), 0.2)
+    link = RadioLink(np.random.default_rng(4), 0.2)
     for k in range(1_000):
         link.send(k * 0.01, [struct.pack("<I", k)])
     arrived = link.receive(100.0)
@@ -169,7 +169,7 @@ def test_the_link_loses_delays_and_keeps_order() -> None:
 
 def test_a_recording_stands_by_itself(tmp_path) -> None:
     path = tmp_path / "two.tlog"
-    uavs = [PretendUav(i, 5) for i in (0, 1)]
+    uavs = [SimulatedUav(i, 5) for i in (0, 1)]
     written = drive.to_tlog(path, uavs, seconds=2, loss=0.0, seed=5)
     data, at, stamps, frames = path.read_bytes(), 0, [], []
     while at < len(data):
@@ -192,7 +192,7 @@ def test_it_flies_over_udp_and_answers() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ground:
         ground.bind(("127.0.0.1", 0))
         ground.settimeout(10)
-        uavs = [PretendUav(i, 5) for i in (0, 1)]
+        uavs = [SimulatedUav(i, 5) for i in (0, 1)]
         asked, said = set(), []
 
         class Answering(Event):

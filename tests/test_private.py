@@ -9,11 +9,11 @@ import pytest
 from conftest import ROOT
 
 import fleet
-from fleet.access.papers import private as secret
-from fleet.blind_test.seal import seal, taken
+from fleet.access.papers import check_private as secret
+from fleet.blind_test.seal import consume_key, encrypt
 from fleet.health import machine
 from fleet.process import private_files
-from gateway.onboard.cache import Cache, Card
+from gateway.onboard.cache import Cache, CachedAircraft
 from tests.bench.security import planted
 
 CACHES = ("NUMBA_CACHE_DIR", "PARAUAV_CACHE", "XDG_CACHE_HOME", "HOME", "TMPDIR")
@@ -67,13 +67,13 @@ def test_a_folder_the_user_names_is_honoured_and_checked(name: str, tmp_path: Pa
 
 def test_a_folder_below_one_that_others_may_change_is_refused_where_it_is_not_sticky(tmp_path: Path) -> None:
     above = tmp_path / "above"
-    below = private_files.folder(above / "below", "cache")
+    below = private_files.ensure_private_folder(above / "below", "cache")
     assert below.stat().st_mode & 0o777 == 0o700
     above.chmod(0o777)
     with pytest.raises(ValueError, match="above with mode 0777"):
-        private_files.folder(below, "cache")
+        private_files.ensure_private_folder(below, "cache")
     above.chmod(0o1777)
-    assert private_files.folder(below, "cache") == below
+    assert private_files.ensure_private_folder(below, "cache") == below
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file away")
@@ -81,12 +81,12 @@ def test_what_belongs_to_another_is_refused(tmp_path: Path, monkeypatch: pytest.
     other = tmp_path / "other"
     other.mkdir(mode=0o700)
     os.chown(other, 12345, 12345)
-    assert "owner 12345, expected 0" in private_files.trouble(other)
+    assert "owner 12345, expected 0" in private_files.tampering_risk(other)
     key = tmp_path / "key"
-    seal(b"words", tmp_path / "sealed", key)
+    encrypt(b"words", tmp_path / "sealed", key)
     os.chown(key, 12345, 12345)
     with pytest.raises(ValueError, match="owner 12345"):
-        taken(key)
+        consume_key(key)
     monkeypatch.setattr(os, "geteuid", lambda: 54321)
     with pytest.raises(ValueError, match="owner 12345, expected 54321"):
         secret(key)
@@ -96,18 +96,18 @@ def test_a_key_is_written_anew_for_its_owner_alone_and_leaves_the_disk_when_take
     victim, key = tmp_path / "victim", tmp_path / "key"
     victim.write_text("mine")
     key.symlink_to(victim)
-    seal(b"words", tmp_path / "sealed", key)
+    encrypt(b"words", tmp_path / "sealed", key)
     assert victim.read_text() == "mine" and key.lstat().st_mode & 0o777 == 0o600
-    assert len(taken(key)) == 44 and not key.exists()
+    assert len(consume_key(key)) == 44 and not key.exists()
     key.write_bytes(b"k" * 44)
     key.chmod(0o644)
     with pytest.raises(ValueError, match="found mode 0644"):
-        taken(key)
+        consume_key(key)
 
 
 def test_doctor_says_of_caches_what_is_wrong_with_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cache, told = tmp_path / "cache", tmp_path / "told"
-    Cache(told).keep("a", Card({"P": 1.0}))
+    Cache(told).store("a", CachedAircraft({"P": 1.0}))
     cache.mkdir(mode=0o700)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache))
     monkeypatch.setenv("PARAUAV_ONBOARD", str(told))

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from fleet.blind_test.mark import Mark, Size, mark
-from fleet.blind_test.score import ASKED, met, score
-from fleet.blind_test.seal import digest, seal, taken, unseal
-from fleet.blind_test.shown import confusion, ordered
+from fleet.blind_test.mark import GradedFlight, ScoredParameter, grade
+from fleet.blind_test.score import REQUIREMENTS, meets_requirement, score
+from fleet.blind_test.seal import consume_key, decrypt, digest, encrypt
+from fleet.blind_test.shown import confusion, misses_first
 from fleet.cli import main as fleet
 
 
@@ -35,29 +35,29 @@ def report(*named: str, verdict: str = "named", **more: Any) -> dict[str, Any]:
 
 def sealed(folder: Path) -> tuple[Path, Path]:
     letter, key = folder / "labels.sealed", folder / "key"
-    seal(b"nothing but the truth", letter, key)
+    encrypt(b"nothing but the truth", letter, key)
     return letter, key
 
 
 def test_a_seal_hides_and_opens(tmp_path: Path) -> None:
     letter, key = sealed(tmp_path)
     assert b"truth" not in letter.read_bytes() and key.stat().st_mode & 0o077 == 0
-    assert unseal(letter, taken(key), digest(letter)) == b"nothing but the truth"
+    assert decrypt(letter, consume_key(key), digest(letter)) == b"nothing but the truth"
 
 
 def test_a_changed_letter_is_refused(tmp_path: Path) -> None:
     letter, key = sealed(tmp_path)
     promised = digest(letter)
-    seal(b"another truth", letter, key)
+    encrypt(b"another truth", letter, key)
     with pytest.raises(ValueError, match=r"labels\.sealed: found another hash"):
-        unseal(letter, taken(key), promised)
+        decrypt(letter, consume_key(key), promised)
 
 
 @pytest.mark.parametrize("wrong", [b"", b"no key", b"A" * 43 + b"="])
 def test_another_key_does_not_fit(wrong: bytes, tmp_path: Path) -> None:
     letter, _ = sealed(tmp_path)
-    with pytest.raises(ValueError, match="found a key of another seal"):
-        unseal(letter, wrong, digest(letter))
+    with pytest.raises(ValueError, match="found a wrong key"):
+        decrypt(letter, wrong, digest(letter))
 
 
 # --- marks -----------------------------------------------------------------------------------------------------------
@@ -81,18 +81,18 @@ def test_another_key_does_not_fit(wrong: bytes, tmp_path: Path) -> None:
     ],
 )
 def test_what_is_a_hit(role: str, concealed: list[str], said: dict[str, Any] | None, hit: bool) -> None:
-    assert mark("one", label(role, *map(effect, concealed)), said).hit is hit
+    assert grade("one", label(role, *map(effect, concealed)), said).hit is hit
 
 
 def test_a_rival_is_in_the_class() -> None:
-    one = mark("one", label("single", effect("icing")), report("drag_increase", equivalents=[["icing"]]))
+    one = grade("one", label("single", effect("icing")), report("drag_increase", equivalents=[["icing"]]))
     assert one.in_class and not one.hit
 
 
 def test_where_when_and_how_much() -> None:
     concealed = effect("drag_increase", dCD=0.02) | {"t0": 57.0}
     told = report("drag_increase", parameters=[{"dCD": 0.022}], sigma=[{"dCD": 0.002}])
-    one = mark("one", label("single", concealed), told)
+    one = grade("one", label("single", concealed), told)
     assert one.located == (True,) and one.late == ((3.0, 5.0),)
     (_, size) = one.sizes[0]
     assert size.error == pytest.approx(0.1) and size.covered
@@ -101,22 +101,22 @@ def test_where_when_and_how_much() -> None:
 @pytest.mark.parametrize(
     ("size", "error"),
     [
-        (Size("from_deg", 350.0, 5.0, None), 15 / 45),
-        (Size("scale", 0.9, 0.92, None), 0.2),
-        (Size("density_ratio", 0.9, 0.88, None), 0.2),
-        (Size("roll_deg", 0.0, 0.5, None), 0.5),
-        (Size("bias_deg", 10.0, 9.0, None), 0.1),
-        (Size("loss", 0.5, None, None), 1.0),
+        (ScoredParameter("from_deg", 350.0, 5.0, None), 15 / 45),
+        (ScoredParameter("scale", 0.9, 0.92, None), 0.2),
+        (ScoredParameter("density_ratio", 0.9, 0.88, None), 0.2),
+        (ScoredParameter("roll_deg", 0.0, 0.5, None), 0.5),
+        (ScoredParameter("bias_deg", 10.0, 9.0, None), 0.1),
+        (ScoredParameter("loss", 0.5, None, None), 1.0),
     ],
 )
-def test_errors_of_numbers(size: Size, error: float) -> None:
+def test_errors_of_numbers(size: ScoredParameter, error: float) -> None:
     assert size.error == pytest.approx(error) and size.covered is None
 
 
 # --- scores ----------------------------------------------------------------------------------------------------------
 
 
-def examined() -> list[Mark]:
+def examined() -> list[GradedFlight]:
     asked = [
         ("control", [], report(verdict="none")),
         ("control", [], report("icing")),
@@ -126,11 +126,14 @@ def examined() -> list[Mark]:
         ("unknown", ["_slosh"], report(verdict="unknown")),
     ]
     flights = [(label(role, *map(effect, names)), said) for role, names, said in asked]
-    return [mark(f"rec_{k}", one, said) for k, (one, said) in enumerate(flights)]
+    return [grade(f"rec_{k}", one, said) for k, (one, said) in enumerate(flights)]
 
 
 def test_a_direction_is_covered_across_north() -> None:
-    assert Size("from_deg", 355.0, 3.0, 5.0).covered and not Size("from_deg", 355.0, 3.0, 3.0).covered
+    assert (
+        ScoredParameter("from_deg", 355.0, 3.0, 5.0).covered
+        and not ScoredParameter("from_deg", 355.0, 3.0, 3.0).covered
+    )
 
 
 def test_scores_count_what_they_say() -> None:
@@ -153,17 +156,17 @@ def test_scores_count_what_they_say() -> None:
 
 def test_nothing_to_score_is_no_failure() -> None:
     told = score([])
-    assert all(met(name, told[name]) for name in ASKED)
+    assert all(meets_requirement(name, told[name]) for name in REQUIREMENTS)
 
 
 def test_what_is_asked_is_at_least_or_at_most() -> None:
-    assert met("false_alarm", 1 / 60) and not met("false_alarm", 2 / 60)
-    assert met("top1_naming", 44 / 50) and not met("top1_naming", 43 / 50)
+    assert meets_requirement("false_alarm", 1 / 60) and not meets_requirement("false_alarm", 2 / 60)
+    assert meets_requirement("top1_naming", 44 / 50) and not meets_requirement("top1_naming", 43 / 50)
 
 
 def test_misses_come_first_and_confusion_counts_every_name() -> None:
     marks = examined()
-    assert [one.hit for one in ordered(marks)] == [False] * 3 + [True] * 3
+    assert [one.hit for one in misses_first(marks)] == [False] * 3 + [True] * 3
     pairs = confusion(marks)
     assert pairs["stall", "drag_increase"] == pairs["gyro_bias", "stall"] == pairs["_slosh", "unknown"] == 1
     assert pairs["icing", "icing"] == 2 and pairs["nothing", "icing"] == pairs["nothing", "nothing"] == 1
@@ -179,7 +182,7 @@ def test_misses_come_first_and_confusion_counts_every_name() -> None:
         (["--seed", "-1"], "--seed: found -1"),
         (["--jobs", "0"], "--jobs: found 0"),
         (["--json", "nowhere/here.json"], "--json: found no folder"),
-        (["--report", "."], "not empty"),
+        (["--report", "."], "expected an empty folder"),
     ],
 )
 def test_wrong_use_is_refused_before_anything_flies(
@@ -204,7 +207,7 @@ def test_an_examination_runs_and_keeps_its_promises(tmp_path: Path) -> None:
     assert promised[0] < promised[1] < opened
     assert digest(folder / "labels.sealed") == told["labels_sha256"]
     assert digest(*sorted(folder.glob("*/reports.json"))) == told["reports_sha256"]
-    assert len(told["marks"]) == 6 and set(ASKED) <= set(told)
+    assert len(told["marks"]) == 6 and set(REQUIREMENTS) <= set(told)
     page = (folder / "index.html").read_text()
     for one in told["marks"]:
         assert (folder / one["airframe"] / "pages" / f"{one['flight']}.html").exists() and one["flight"] in page

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import yaml
@@ -17,14 +18,14 @@ from conftest import ROOT, unused_port
 from docs import check_offline, generate
 from fleet import cli
 from fleet.access.entry import ROUTER
-from fleet.bus.bus_protocol import Answer
+from fleet.bus.bus_protocol import QueryHandler
 from fleet.bus.codec import Stamp
 from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import connect, open_router
-from fleet.contract import Array, Prediction, State
+from fleet.contract import Array, Prediction, TwinState
 from gateway import __main__ as gateway
 from twin_worker import __main__ as twin_worker
-from twin_worker.service.queries import Answers
+from twin_worker.service.queries import QueryHandlers
 from twin_worker.service.worker import Worker
 from viewer import __main__ as viewer
 
@@ -65,18 +66,18 @@ def answers(*_: object) -> Iterator[tuple[Prediction, Stamp]]:
         prediction = Prediction(
             uav=uav,
             t=1.0,
-            state=State.PREDICTING,
+            state=TwinState.PREDICTING,
             method="paper",
             origin=(470_000_000, 80_000_000, 500_000),
             ahead=Array.of(ahead),
             path=Array.of(ahead[:, None] * np.array(velocity) + np.array([0.0, 0.0, -100.0])),
-            tube=Array.of(np.ones((2, 3))),
+            prediction_region_half_axes=Array.of(np.ones((2, 3))),
             horizon_s=10.0 + uav,
         )
         yield prediction, Stamp(epoch, 1)
 
 
-def run_tool(code: str, folder: Path, reply: Answer) -> list[str]:
+def run_tool(code: str, folder: Path, reply: QueryHandler) -> list[str]:
     """Run a foreign tool against a bus where predictions are answered by `reply`; give what it prints."""
     where = f"tcp/127.0.0.1:{unused_port()}"
     script = folder / "tool.py"
@@ -85,7 +86,7 @@ def run_tool(code: str, folder: Path, reply: Answer) -> list[str]:
     router = open_router(where)
     try:
         with connect(where) as bus:
-            bus.answer(Prediction, reply)
+            bus.declare_queryable(Prediction, reply)
             env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
             command = [sys.executable, "-I", "-W", "error", str(script)]
             done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=60, check=False)
@@ -104,9 +105,9 @@ def test_the_foreign_tool_prints_where_everyone_will_be(tmp_path: Path) -> None:
 
 
 def test_a_foreign_tool_asks_what_if(tmp_path: Path, holder: Worker) -> None:
-    (held,) = holder.holding()
-    held.twin.uav = 7
-    seven = Answers(MemoryBus().writer, lambda: [held])
+    (held,) = holder.owned_twins()
+    held.twin.config = msgspec.structs.replace(held.twin.config, uav=7)
+    seven = QueryHandlers(MemoryBus().writer, lambda: [held])
     (line,) = run_tool(tools()[1], tmp_path, seven.predictions)
     assert line.startswith("what if it flew at 18 m/s, the wind blew 3 m/s north and -1 east, NAVL1_PERIOD were 25")
     assert line.endswith("{'NAVL1_PERIOD': 25.0, 'AIRSPEED_CRUISE': 18.0}")
@@ -180,7 +181,7 @@ def understood(line: str, monkeypatch: pytest.MonkeyPatch) -> bool:
         return 0
 
     for module in (cli, gateway, twin_worker, viewer):
-        monkeypatch.setattr(module, "guarded", note)
+        monkeypatch.setattr(module, "run_command", note)
     return MAINS[words[0]](words[1:]) == 0 and bool(taken)
 
 

@@ -19,16 +19,16 @@ from fleet.bus.codec import Stamp, encode, encoding
 from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import connect
 from fleet.commands.live import record
-from fleet.commands.live.record import Recorder
+from fleet.commands.live.record import BusRecorder
 from fleet.contract import TOPICS, Alert, FleetState, Message, Mission, Model, Prediction, Sample, Status
-from fleet.telemetry.recording.fleet_log import HOPELESS, Record
-from fleet.telemetry.recording.fleet_news import NEWS, RESULTS
+from fleet.telemetry.recording.fleet_log import MAX_UNRECOGNISED, BusRecord
+from fleet.telemetry.recording.fleet_news import RESULT_TYPES, TELEMETRY_TYPES
 from fleet.telemetry.recording.recordings import Recording, replay_messages
-from gateway.links.recorded import Replay
-from gateway.pipeline import Pump
+from gateway.links.recorded import ReplayLink
+from gateway.pipeline import Pipeline
 from gateway.publication.publish import Publisher
 from gateway.settings.link_spec import read_spec
-from viewer.store.store import Feed
+from viewer.store.store import FleetStore
 
 PATIENCE_S = 60.0
 
@@ -39,7 +39,7 @@ class Everything:
     def __init__(self, bus):
         self.said = []
         for kind in TOPICS.values():
-            bus.overhear(kind, lambda payload, named, stamp: self.said.append((payload, named, stamp)))
+            bus.subscribe_raw(kind, lambda payload, named, stamp: self.said.append((payload, named, stamp)))
 
 
 def recorded(path, seconds=10.0, uavs=2):
@@ -48,8 +48,8 @@ def recorded(path, seconds=10.0, uavs=2):
     fleet = PretendFleet(bus, uavs)
     fleet.advance(T)
     with path.open("wb", buffering=0) as file:
-        recorder = Recorder(bus, file)
-        recorder.listen()
+        recorder = BusRecorder(bus, file)
+        recorder.subscribe()
         heard = Everything(bus)
         for step in range(1, round(seconds * 10)):
             fleet.advance(T + step * 0.1)
@@ -67,15 +67,15 @@ def test_a_recording_holds_every_byte_that_was_said(tmp_path):
     asked = recorder.counts.total() - len(said)
     assert asked == 2 + 2 + 2 + 1  # status, mission, model of each, the prediction of the one not identifying
     assert [encode(message) for message in everything(path)[asked:]] == [payload for payload, *_ in said]
-    assert f"{len(said) + asked} messages" in recorder.words() and recorder.size == path.stat().st_size
+    assert f"{len(said) + asked} messages" in recorder.summary() and recorder.size == path.stat().st_size
 
 
 def test_every_message_of_the_contract_comes_back(tmp_path):
     path = tmp_path / "all.parauav"
-    path.write_bytes(b"".join(Record(T, encoding(type(m)), encode(m), STAMP).pack() for m in MESSAGES))
+    path.write_bytes(b"".join(BusRecord(T, encoding(type(m)), encode(m), STAMP).pack() for m in MESSAGES))
     found = everything(path)
-    assert [encode(m) for m in found] == [encode(m) for m in MESSAGES if type(m) in NEWS + RESULTS]
-    assert {type(m) for m in replay_messages(path)} == set(NEWS)
+    assert [encode(m) for m in found] == [encode(m) for m in MESSAGES if type(m) in TELEMETRY_TYPES + RESULT_TYPES]
+    assert {type(m) for m in replay_messages(path)} == set(TELEMETRY_TYPES)
     moved = [m for _, step in Recording(path, offset=3).steps(results=True) for m in step]
     assert {m.uav for m in moved if isinstance(m, Message)} == {10}
     assert [row.uav for m in moved if isinstance(m, FleetState) for row in m.rows] == [10]
@@ -115,7 +115,7 @@ def test_a_file_cut_anywhere_is_read_to_its_last_whole_record(tmp_path):
 def test_two_joined_recordings_play_without_the_days_between(tmp_path):
     status = EXAMPLES[Status]
     heard = [T, T + 1, T + 30 * 86_400, T + 30 * 86_400 + 1]
-    packed = [Record(t, encoding(Status), encode(status)).pack() for t in heard]
+    packed = [BusRecord(t, encoding(Status), encode(status)).pack() for t in heard]
     path = tmp_path / "joined.parauav"
     path.write_bytes(b"".join(packed))
     times = [now for now, _ in Recording(path).steps()]
@@ -137,8 +137,8 @@ def test_two_joined_recordings_play_without_the_days_between(tmp_path):
     ],
 )
 def test_a_sound_record_of_nonsense_is_refused_with_its_place(tmp_path, message, words):
-    good = Record(T, encoding(Status), encode(EXAMPLES[Status])).pack()
-    bad = Record(T, encoding(type(message)), encode(message)).pack()
+    good = BusRecord(T, encoding(Status), encode(EXAMPLES[Status])).pack()
+    bad = BusRecord(T, encoding(type(message)), encode(message)).pack()
     path = tmp_path / "odd.parauav"
     path.write_bytes(good + bad + good)
     recording = Recording(path)
@@ -148,9 +148,9 @@ def test_a_sound_record_of_nonsense_is_refused_with_its_place(tmp_path, message,
 
 
 def test_other_versions_and_broken_payloads_are_refused(tmp_path):
-    good = Record(T, encoding(Status), encode(EXAMPLES[Status])).pack()
-    newer = Record(T, encoding(Status).replace(".1", ".9"), encode(EXAMPLES[Status])).pack()
-    broken = Record(T, encoding(Status), b"\xc1\xc1").pack()
+    good = BusRecord(T, encoding(Status), encode(EXAMPLES[Status])).pack()
+    newer = BusRecord(T, encoding(Status).replace(".1", ".9"), encode(EXAMPLES[Status])).pack()
+    broken = BusRecord(T, encoding(Status), b"\xc1\xc1").pack()
     path = tmp_path / "odd.parauav"
     path.write_bytes(good + newer + broken)
     recording = Recording(path)
@@ -165,7 +165,7 @@ def test_of_two_workers_only_the_one_that_held_the_aircraft_is_played(tmp_path):
     path = tmp_path / "two.parauav"
     path.write_bytes(
         b"".join(
-            Record(
+            BusRecord(
                 T, encoding(Prediction), encode(msgspec.structs.replace(made, sentence=words)), Stamp(epoch, 1)
             ).pack()
             for epoch, words in said
@@ -179,30 +179,30 @@ def test_what_the_twins_said_then_is_played_and_answered_for(tmp_path):
     recorded(path)
     bus = MemoryBus()
     heard = Everything(bus)
-    Pump([Replay(read_spec(f"replay:{path}?speed=max&results=1"))], bus).run(threading.Event())
+    Pipeline([ReplayLink(read_spec(f"replay:{path}?speed=max&results=1"))], bus).run(threading.Event())
     played = [payload for payload, named, _ in heard.said if "gateway" not in named and "fleet.state" not in named]
     assert played == [encode(m) for m in everything(path) if not isinstance(m, FleetState)]
     stamps = {named.split(".")[1]: stamp for _, named, stamp in heard.said}
     assert stamps["sample"] is None and stamps["prediction"].epoch > STAMP.epoch
     assert stamps["prediction"].writer == bus.writer
     for kind in (Prediction, Model, Status, Mission):
-        assert {message.uav for message, _ in bus.ask(kind)} <= {0, 1} and bus.ask(kind)
-    ((state, stamp),) = bus.ask(FleetState)
+        assert {message.uav for message, _ in bus.get(kind)} <= {0, 1} and bus.get(kind)
+    ((state, stamp),) = bus.get(FleetState)
     assert {row.epoch for row in state.rows} == {stamp.epoch}
-    assert bus.ask(Alert) == []
+    assert bus.get(Alert) == []
 
 
 def test_the_viewer_believes_the_results_of_then_while_a_worker_computes_its_own():
     bus = MemoryBus()
-    feed, player = Feed(bus), Publisher(bus, results=True)
+    feed, player = FleetStore(bus), Publisher(bus, results=True)
     worker = Stamp(time.time_ns() // 1_000_000 - 5, 1)  # it heard of the aircraft when the recording began to play
     then, now = (msgspec.structs.replace(EXAMPLES[Prediction], sentence=words) for words in ("then", "now"))
     bus.publish(now, worker)
-    assert feed.one(then.uav).prediction.sentence == "now"
+    assert feed.get(then.uav).prediction.sentence == "now"
     for _ in range(3):
         player.publish([then])
         bus.publish(now, worker)
-        assert feed.one(then.uav).prediction.sentence == "then"
+        assert feed.get(then.uav).prediction.sentence == "then"
 
 
 def test_without_asking_for_results_only_telemetry_is_played(tmp_path):
@@ -210,16 +210,16 @@ def test_without_asking_for_results_only_telemetry_is_played(tmp_path):
     recorded(path)
     bus = MemoryBus()
     heard = Everything(bus)
-    Pump([Replay(read_spec(f"replay:{path}?speed=max"))], bus).run(threading.Event())
+    Pipeline([ReplayLink(read_spec(f"replay:{path}?speed=max"))], bus).run(threading.Event())
     assert {named.split(".")[1] for _, named, _ in heard.said} == {"sample", "status", "mission", "gateway"}
 
 
 def test_what_the_disk_cannot_take_is_counted(tmp_path, monkeypatch):
-    monkeypatch.setattr(record, "MOST", 5_000)
+    monkeypatch.setattr(record, "MAX_BUFFER_BYTES", 5_000)
     bus = MemoryBus()
     with (tmp_path / "a.parauav").open("wb", buffering=0) as file:
-        recorder = Recorder(bus, file)
-        recorder.listen()
+        recorder = BusRecorder(bus, file)
+        recorder.subscribe()
         for _ in range(100):
             bus.publish(EXAMPLES[Status])
         recorder.write()
@@ -232,7 +232,7 @@ def test_what_the_disk_cannot_take_is_counted(tmp_path, monkeypatch):
 def test_an_endless_file_of_nothing_is_given_up(tmp_path):
     path = tmp_path / "zeros.parauav"
     with path.open("wb") as file:
-        file.truncate(4 * HOPELESS)
+        file.truncate(4 * MAX_UNRECOGNISED)
     recording = Recording(path)
     with pytest.raises(ValueError, match=r"zeros\.parauav: \d+ damaged bytes .* expected"):
         list(recording.steps())

@@ -7,10 +7,10 @@ from talker import T0, Talker, assert_finite, of
 
 from fleet.contract import COLUMNS, Mission, Params, Sample, Status
 from fleet.telemetry.mavlink.parsing.decode import Decoder
-from fleet.telemetry.mavlink.parsing.received import Heard
-from fleet.telemetry.recording.opening import Source
+from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
+from fleet.telemetry.recording.opening import RecordingFile
 from fleet.telemetry.recording.recordings import Recording, replay_messages
-from fleet.telemetry.recording.tlog import Line, Tlog, backlog_offset, boot_s, restamped
+from fleet.telemetry.recording.tlog import StampCorrector, Tlog, backlog_offset, boot_times, restamped
 
 S02 = "sitl/s02_nominal_light_wind.tlog.xz"
 
@@ -73,9 +73,9 @@ def log_of(frames, t0=T0, step=0.05):
 
 def read(path) -> tuple[list[bytes], list[float], list[str]]:
     """Frames and times of a .tlog, and what was skipped."""
-    tlog, frames, times = Tlog(Source(path)), [], []
+    tlog, frames, times = Tlog(RecordingFile(path)), [], []
     for batch in tlog.batches():
-        frames += [batch.buf[start:stop].tobytes() for start, stop in batch.at[:, :2]]
+        frames += [batch.buf[start:stop].tobytes() for start, stop in batch.headers[:, :2]]
         times += batch.arrival.tolist()
     return frames, times, tlog.skipped
 
@@ -135,7 +135,9 @@ def test_a_wrong_suffix_is_seen_through(tmp_path):
 
 def heard(frames, times):
     """Frames of one sender, each with its time of arrival."""
-    return Decoder().feed(Heard.of([(t, None, frame) for t, frame in zip(times, frames, strict=True)]))
+    return Decoder().decode(
+        ReceivedBytes.from_pieces([(t, None, frame) for t, frame in zip(times, frames, strict=True)])
+    )
 
 
 def test_a_backlog_is_played_in_the_time_of_the_flight():
@@ -148,16 +150,18 @@ def test_a_backlog_is_played_in_the_time_of_the_flight():
     assert np.diff(played.arrival) == pytest.approx(0.1, abs=1e-6)
     assert played.arrival[-1] == pytest.approx(rushed.arrival[-1], abs=1e-3)
     assert backlog_offset(iter([heard(frames, [T0 + i * 0.1 for i in range(1000)])])) is None
-    assert boot_s(rushed)[5] == 100.5
+    assert boot_times(rushed)[5] == 100.5
 
 
 def test_the_recorders_clock_is_straightened():
     t = T0 + np.arange(100.0)
     for wrong in (t + 0.0, np.where(t == T0 + 50, t + 3600, t), np.where(t == T0 + 50, t - 3600, t)):
-        straight = np.concatenate([line.straight(part) for line in [Line()] for part in np.split(wrong, [30, 70])])
+        straight = np.concatenate(
+            [line.correct(part) for line in [StampCorrector()] for part in np.split(wrong, [30, 70])]
+        )
         assert np.abs(straight - t).max() <= 1.0  # a wrong stamp takes its neighbour's time
         assert (np.diff(straight) >= 0).all()
     set_back = np.where(t >= T0 + 50, t - 7200, t)
-    straight = Line().straight(set_back)
+    straight = StampCorrector().correct(set_back)
     assert np.diff(straight).min() >= 0
     assert straight[-1] == pytest.approx(t[-1], abs=1.5)

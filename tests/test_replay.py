@@ -4,10 +4,10 @@ import json
 
 import pytest
 
-from fleet.process.logs import untimed
+from fleet.process.logs import strip_time
 from fleet.simulator.flight.drive import to_tlog
-from fleet.simulator.flight.uav import PretendUav
-from twin_worker.evaluation.replay import WITHIN_S, main, replay, text
+from fleet.simulator.flight.uav import SimulatedUav
+from twin_worker.evaluation.replay import WITHIN_S, format_row, main, replay
 
 ROW = {"vehicle", "seconds", "methods", "first_verified_s", "scored", "within_10_percent", "verdict", "prediction"}
 
@@ -22,13 +22,13 @@ def test_a_flight_becomes_a_row_and_lines(heard):
     for method, shares in row["within_10_percent"].items():
         assert set(shares) == {str(s) for s in WITHIN_S} and scored[method]
         assert 1 >= shares["10"] >= shares["30"] >= shares["60"] >= 0
-    said = text("1", row)
+    said = format_row("1", row)
     assert said.startswith("uav-1: fixed_wing") and "verified after" in said and "within 10 %" in said
 
 
 def test_the_command_writes_what_it_prints(tmp_path, capsys):
     path = tmp_path / "short.tlog"
-    to_tlog(path, [PretendUav(0, 3, wind=3.0)], seconds=20, loss=0.0, seed=3)
+    to_tlog(path, [SimulatedUav(0, 3, wind=3.0)], seconds=20, loss=0.0, seed=3)
     assert main(["--json", str(tmp_path / "out.json"), "--offset", "4", str(path), str(path)]) == 0
     out = capsys.readouterr().out
     assert out.count("short.tlog: 1 UAVs") == 2 and "uav-5: fixed_wing" in out and "verified never" in out
@@ -40,7 +40,7 @@ def test_the_command_writes_what_it_prints(tmp_path, capsys):
 def test_progress_goes_to_stderr(heard, capsys):
     replay(heard, "flight")
     err = capsys.readouterr().err
-    assert untimed(err).startswith("flight: 60 s of flight, 1 UAVs")
+    assert strip_time(err).startswith("flight: 60 s of flight, 1 UAVs")
 
 
 @pytest.mark.parametrize("name", ["nothing.tlog", "notes.txt"])

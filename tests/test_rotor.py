@@ -7,10 +7,10 @@ import pytest
 from flights import predictions, published
 
 from fleet.autopilots import copter
-from fleet.contract import Mission, Params, Prediction, Sample, State, Status
+from fleet.contract import Mission, Params, Prediction, Sample, Status, TwinState
 from fleet.frames import to_ned
 from twin_worker.confidence.tube_and_horizon import AHEAD
-from twin_worker.evaluation.offline import run
+from twin_worker.evaluation.offline import run_offline
 from twin_worker.prediction.turn_rate import imm
 from twin_worker.twin.step import Twin
 
@@ -25,7 +25,7 @@ def mission() -> hover.Flight:
 @pytest.fixture(scope="module")
 def answered(mission) -> tuple[Twin, list[Prediction]]:
     twins: dict[int, Twin] = {}
-    results = list(run(mission.messages, twins))
+    results = list(run_offline(mission.messages, twins))
     published(results)
     return twins[7], predictions(results)
 
@@ -48,9 +48,9 @@ def test_it_follows_its_route_by_its_own_law(mission, answered):
     twin, made = answered
     late = [p for p in made if p.t > mission.t[0] + 5.0]
     assert {p.method for p in late} == {"copter"} and {p.law for p in late} == {copter.LAW}
-    assert all(p.state is State.PREDICTING and p.seq >= 1 for p in late)
+    assert all(p.state is TwinState.PREDICTING and p.seq >= 1 for p in late)
     assert "kinematic twin: lag" in late[-1].sentence
-    assert "no wings to identify" in twin.verdict.sentence and twin.plant is None
+    assert "no wings to identify" in twin.identification.verdict.sentence and twin.models.active_model is None
 
 
 def test_it_stays_near_the_flight_for_a_minute(mission, answered):
@@ -73,15 +73,15 @@ def test_it_beats_the_guess_by_turn_rate(mission, answered):
 
 def test_its_tube_is_its_own_and_honest(answered):
     twin, _ = answered
-    held, n = twin.record.held
+    held, n = twin.confidence.tracker.coverage
     assert n > 20 and held > 0.8
-    assert twin.record.t10("copter")[2] > 20 and not twin.record.t10("paper")[2]
+    assert twin.confidence.tracker.t10("copter")[2] > 20 and not twin.confidence.tracker.t10("paper")[2]
 
 
 def test_it_learns_lag_and_speed_from_flight(answered):
     twin, _ = answered
-    assert twin.rotor.starts > 5 and twin.rotor.miss < 3.0
-    assert 0.9 <= twin.rotor.share <= 1.1 and 0.5 < twin.rotor.wn < 3.0
+    assert twin.models.multirotor.n_starts > 5 and twin.models.multirotor.mean_error < 3.0
+    assert 0.9 <= twin.models.multirotor.speed_fraction <= 1.1 and 0.5 < twin.models.multirotor.wn < 3.0
 
 
 def changed(flight: hover.Flight, until: float, **status) -> list:
@@ -92,7 +92,7 @@ def changed(flight: hover.Flight, until: float, **status) -> list:
 
 def test_without_parameters_it_finds_its_speed_in_the_flight(mission):
     bare = [msgspec.structs.replace(m, values={}) if isinstance(m, Params) else m for m in mission.messages[:900]]
-    made = predictions(run(bare, {}))
+    made = predictions(run_offline(bare, {}))
     late = [p for p in made if p.t > mission.t[0] + 60.0]
     assert {p.method for p in late} == {"copter"} and "limits not received" in late[-1].sentence
     short = hover.Flight(mission.t, mission.p, bare, mission.items)
@@ -104,8 +104,8 @@ def test_told_to_hold_it_stops(mission, mode):
     heard = changed(mission, 25.0)
     last = heard[-1]
     twins: dict[int, Twin] = {}
-    list(run(heard, twins))
-    (made,) = predictions(run([Status(uav=7, t=last.t, mode=mode, armed=True, vehicle="multirotor")], twins))
+    list(run_offline(heard, twins))
+    (made,) = predictions(run_offline([Status(uav=7, t=last.t, mode=mode, armed=True, vehicle="multirotor")], twins))
     path = made.path.numpy()
     assert made.method == "copter" and f"{mode} holds" in made.sentence and made.seq == -1
     assert np.linalg.norm(path[-1] - path[0]) < 40.0 and np.linalg.norm(path[-1] - path[20]) < 0.1
@@ -117,16 +117,18 @@ def test_on_the_ground_by_hand_and_without_a_mission_it_is_a_guess(mission):
         ("STABILIZE follows no mission", changed(mission, 12.0, mode="STABILIZE")),
         ("no mission on board", [m for m in changed(mission, 12.0) if not isinstance(m, Mission)]),
     ):
-        made = predictions(run(heard, {}))
+        made = predictions(run_offline(heard, {}))
         assert {p.method for p in made} == {"imm"} and why in made[-1].sentence, why
-        assert "turn rate only" in made[-1].sentence and made[-1].state is State.WAITING
+        assert "turn rate only" in made[-1].sentence and made[-1].state is TwinState.WAITING
 
 
 def test_a_return_to_launch_ends_at_home(mission):
     heard = changed(mission, 25.0)
     twins: dict[int, Twin] = {}
-    list(run(heard, twins))
-    (made,) = predictions(run([Status(uav=7, t=heard[-1].t, mode="RTL", armed=True, vehicle="multirotor")], twins))
+    list(run_offline(heard, twins))
+    (made,) = predictions(
+        run_offline([Status(uav=7, t=heard[-1].t, mode="RTL", armed=True, vehicle="multirotor")], twins)
+    )
     assert made.method == "copter" and "returns to launch" in made.sentence
     path = made.path.numpy()
     assert np.linalg.norm(path[-1, :2]) < np.linalg.norm(path[0, :2])

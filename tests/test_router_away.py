@@ -14,14 +14,14 @@ from pymavlink import mavutil
 from talker import T0, Talker
 from test_gateway import PATIENCE_S, Ear, udp_port
 
-from fleet.bus.codec import Wire, encode
+from fleet.bus.codec import EncodedMessage, encode
 from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import connect, open_router
-from fleet.contract import Account, Mission, Status
+from fleet.contract import GatewayCounters, Mission, Status
 from gateway.publication.publish import Publisher
-from gateway.publication.router_session import LEASE_S, Way
+from gateway.publication.router_session import LEASE_S, RouterSession
 
-STATUS = Wire(Status, 7, encode(Status(uav=7, t=T0)))
+STATUS = EncodedMessage(Status, 7, encode(Status(uav=7, t=T0)))
 
 
 class Flaky(MemoryBus):
@@ -30,14 +30,14 @@ class Flaky(MemoryBus):
 
 def test_every_message_is_published_unsent_or_unsure_and_the_way_back_is_noticed(caplog):
     bus, now = Flaky(), [0.0]
-    way, heard = Way(bus, lambda: now[0]), []
+    way, heard = RouterSession(bus, lambda: now[0]), []
     bus.subscribe(Status, lambda message, _: heard.append(message))
 
     def fly(seconds):
         came = []
         for _ in range(round(seconds * 10)):
             now[0] += 0.1
-            came.append(way.look())
+            came.append(way.poll())
             for _ in range(3):
                 way.send([STATUS])
         return came
@@ -46,13 +46,13 @@ def test_every_message_is_published_unsent_or_unsure_and_the_way_back_is_noticed
     bus.router = ""
     assert not any(fly(4.0))
     assert (way.published, way.unsent) == (300, 120)
-    assert 30 * LEASE_S <= way.unsure <= 30 * (LEASE_S + 0.2)
+    assert 30 * LEASE_S <= way.unconfirmed <= 30 * (LEASE_S + 0.2)
     bus.router = "two"
     assert fly(1.0).count(True) == 1
     assert (way.published, way.unsent, len(heard)) == (330, 120, 330)
     bus.router = "three"  # restarted so fast that nobody noticed it gone
-    assert fly(0.1) == [True] and way.unsure > 60
-    assert ["away" in record.message for record in caplog.records] == [True, False, True, False]
+    assert fly(0.1) == [True] and way.unconfirmed > 60
+    assert ["disconnected" in record.message for record in caplog.records] == [True, False, True, False]
 
 
 def test_missions_are_said_again_as_soon_as_the_router_is_back():
@@ -96,11 +96,13 @@ def test_a_gateway_that_records_begins_without_a_router_and_joins_it_later(tmp_p
                 session = open_router(router)
                 with connect(router) as bus:
                     ear = Ear(bus)
-                    ear.wait(lambda e: e.of(Account) and e.of(Account)[-1].messages > 50 and e.of(Status, 7))
-                    last = ear.of(Account)[-1]
+                    ear.wait(
+                        lambda e: e.of(GatewayCounters) and e.of(GatewayCounters)[-1].messages > 50 and e.of(Status, 7)
+                    )
+                    last = ear.of(GatewayCounters)[-1]
                 session.close()
                 assert last.unsent > 0 and last.router
-                assert (last.unsure > 0) is gone
+                assert (last.unconfirmed > 0) is gone
         finally:
             stop.set()
             radio.join(PATIENCE_S)

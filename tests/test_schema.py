@@ -8,7 +8,7 @@ import pytest
 from fleet import cli
 from fleet.contract import COLUMNS, TOPICS, Prediction, WhatIf
 from fleet.health import machine
-from fleet.health.finding import Finding
+from fleet.health.finding import CheckResult
 
 
 def shown(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
@@ -26,7 +26,7 @@ def test_the_table_names_every_key_with_its_encoding(capsys: pytest.CaptureFixtu
 def test_one_topic_shows_fields_units_defaults_and_parts(capsys: pytest.CaptureFixture[str]) -> None:
     lines = [" ".join(line.split()) for line in shown(capsys, "schema", "model").splitlines()]
     assert "window_s float = 0.0 length of the identification window [s]" in lines
-    assert "longitudinal Linear or null = null" in lines
+    assert "longitudinal LinearModel or null = null" in lines
     assert "states list of str required state names: u w q theta | phi psi p r v" in lines
     assert "not_identifiable" in lines
     assert any(line.startswith("attachment 16 bytes") for line in lines)
@@ -66,6 +66,6 @@ def test_doctor_gives_a_line_each_and_fails_only_on_what_is_bad(
     assert [line.split()[1] for line in lines[:2]] == ["python", "packages"]
     assert ".".join(map(str, sys.version_info[:3])) in lines[0]
 
-    monkeypatch.setattr(machine, "packages", lambda: [Finding("BAD", "packages", "missing numpy; make setup")])
+    monkeypatch.setattr(machine, "packages", lambda: [CheckResult("BAD", "packages", "missing numpy; make setup")])
     assert cli.main(["doctor", "--router", router]) == 1
     assert cli.main(["doctor", "--router", "nonsense"]) == 2

@@ -12,12 +12,12 @@ import pytest
 from conftest import ROOT, unused_port
 from examples import EXAMPLES
 
-from fleet.access.entry import Entry
-from fleet.access.roles import LIVE, SAID
+from fleet.access.entry import BusConfig
+from fleet.access.roles import LIVE, TOPIC_RULES
 from fleet.access.roles import ROOT as WIRE
 from fleet.bus.codec import decode, encode, encoding
 from fleet.bus.session import connect
-from fleet.commands.live.router import text
+from fleet.commands.live.router import format_settings
 from fleet.contract import TOPICS
 from tests.bench.security.attack import attack
 from tests.bench.security.bombs import bombs
@@ -162,14 +162,14 @@ def test_whoever_reads_the_bus_survives(victim: Victim, open_site: Site, caplog:
 
 def test_the_knock_says_who_refused_whom_and_what_to_do(guarded: Site, foreign: Path, tmp_path: Path) -> None:
     with pytest.raises(ConnectionError, match=r"certificate not valid .* copy the site's ca\.pem here"):
-        connect(Entry(guarded.at, "viewer", foreign))
+        connect(BusConfig(guarded.at, "viewer", foreign))
     mixed = Path(shutil.copytree(foreign, tmp_path / "mixed"))
     shutil.copy(guarded.folder / "ca.pem", mixed)
     with pytest.raises(ConnectionError, match=r"certificate of viewer rejected \(.*\), expected one signed"):
-        connect(Entry(guarded.at, "viewer", mixed))
+        connect(BusConfig(guarded.at, "viewer", mixed))
     shutil.copy(guarded.folder / "viewer.key", mixed)
     with pytest.raises(ValueError, match=r"do not match .* create them again: certificates\.sh role"):
-        connect(Entry(guarded.at, "viewer", mixed))
+        connect(BusConfig(guarded.at, "viewer", mixed))
     with connect(guarded.entry("viewer")) as bus:
         assert bus.router
 
@@ -178,9 +178,9 @@ def test_the_knock_says_who_refused_whom_and_what_to_do(guarded: Site, foreign: 
 
 
 def test_every_topic_has_a_writer_and_a_size() -> None:
-    assert set(TOPICS) <= set(SAID)
+    assert set(TOPICS) <= set(TOPIC_RULES)
     for kind, example in EXAMPLES.items():
-        assert len(encode(example)) * 10 < SAID[kind.topic].most
+        assert len(encode(example)) * 10 < TOPIC_RULES[kind.topic].max_bytes
 
 
 @pytest.mark.parametrize(
@@ -189,6 +189,6 @@ def test_every_topic_has_a_writer_and_a_size() -> None:
     ids=["loopback", "site"],
 )
 def test_the_files_of_deploy_are_what_the_table_makes(file: str, listen: Any, site: bool, papers: Path) -> None:
-    entry = Entry("tls/127.0.0.1:7447", "tools", papers) if site else Entry()
-    made = text(entry.router(listen)).replace(str(papers), "/etc/parauav/certificates")
+    entry = BusConfig("tls/127.0.0.1:7447", "tools", papers) if site else BusConfig()
+    made = format_settings(entry.router_settings(listen)).replace(str(papers), "/etc/parauav/certificates")
     assert (ROOT / "deploy" / file).read_text() == made + "\n", f"make it again: fleet router > deploy/{file}"

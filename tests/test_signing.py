@@ -12,9 +12,9 @@ from oracle import ours
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import T0, Ears, Talker
 
-from fleet.telemetry.mavlink.intake import Intake
-from gateway.admission.admission import Gate, gates_of
-from gateway.admission.signing import FORGED, REPLAYED, STALE, UNSIGNED, Signing, pick, read_keys, stamp_now
+from fleet.telemetry.mavlink.intake import MavlinkReceiver
+from gateway.admission.admission import Admission, make_admissions
+from gateway.admission.signing import REPLAYED, STALE, UNSIGNED, WRONG, Signing, read_keys, select_key, stamp_now
 from gateway.settings.link_spec import read_spec
 
 KEY, OTHER = bytes(range(32)), bytes(32)
@@ -39,8 +39,8 @@ def passed(guard, *frames):
     """Whether each frame passes, and why not."""
     refused = Counter()
     heard = ours(list(frames))
-    assert len(heard.at) == len(frames)
-    return guard.passes(heard, refused).tolist(), dict(refused)
+    assert len(heard.headers) == len(frames)
+    return guard.verify(heard, refused).tolist(), dict(refused)
 
 
 def test_what_pymavlink_signed_passes_and_the_unsigned_where_it_may():
@@ -48,7 +48,7 @@ def test_what_pymavlink_signed_passes_and_the_unsigned_where_it_may():
     old = Talker().pack(mav.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3), v1=True)
     assert passed(signing(), plain, signed, old) == ([False, True, False], {UNSIGNED: 2})
     assert passed(signing(require=False), plain, signed, old) == ([True] * 3, {})
-    assert passed(signing(require=False), Signer(OTHER).heartbeat()) == ([False], {FORGED: 1})
+    assert passed(signing(require=False), Signer(OTHER).heartbeat()) == ([False], {WRONG: 1})
 
 
 def test_pymavlink_takes_what_we_sign():
@@ -77,7 +77,7 @@ def test_a_forged_stamp_from_the_far_future_locks_nobody_out():
     guard, genuine = signing(), Signer()
     assert passed(guard, genuine.heartbeat())[0] == [True]
     forged = Signer(OTHER, stamp=FAR - 10).heartbeat()
-    assert passed(guard, forged) == ([False], {FORGED: 1})
+    assert passed(guard, forged) == ([False], {WRONG: 1})
     assert passed(guard, genuine.heartbeat(), genuine.attitude(1.0))[0] == [True, True]
     begun_by_forger = signing()
     assert passed(begun_by_forger, forged)[0] == [False]
@@ -114,24 +114,24 @@ def test_no_changed_byte_of_a_signed_frame_passes(at, by):
     crc = mav.x25crc(bytes(frame[1 : body - 2]) + bytes([mav.MAVLink_heartbeat_message.crc_extra])).crc
     frame[body - 2 : body] = crc.to_bytes(2, "little")  # whoever forges can reckon a checksum
     heard = ours([bytes(frame)])
-    assert not signing().passes(heard, refused).any()
+    assert not signing().verify(heard, refused).any()
 
 
 def test_a_link_that_requires_signatures_knows_no_unsigned_aircraft():
     spec = read_spec("udpin:127.0.0.1:14550#sign=require")
-    intake = Intake(admit=Gate(spec.sieve, Signing(KEY, require=True)).admit)
-    intake.hear(
+    intake = MavlinkReceiver(admit=Admission(spec.message_filter, Signing(KEY, require=True)).admit)
+    intake.receive(
         T0, Talker(6).heartbeat() + Signer(OTHER, stamp_now(), 8).heartbeat() + Signer(KEY, stamp_now()).heartbeat()
     )
     intake.flush(T0)
-    assert [craft.uav for craft in intake.crafts.values()] == [7]
-    assert intake.refused == {UNSIGNED: 1, FORGED: 1}
+    assert [craft.uav for craft in intake.aircraft.values()] == [7]
+    assert intake.rejected == {UNSIGNED: 1, WRONG: 1}
 
 
 def test_our_own_words_are_signed_where_a_link_has_a_key(tmp_path):
     file = keys(tmp_path, f"a {KEY.hex()}\nb {OTHER.hex()} # of the others\n\n")
     specs = [read_spec(f"udpin:h:1#{text}") for text in ("", "sign=accept&key=a", "sign=require&key=b")]
-    found, frame = gates_of(specs, 0, file), Talker(255).heartbeat()
+    found, frame = make_admissions(specs, 0, file), Talker(255).heartbeat()
     assert [gate.sign(frame)[2] & 1 for gate in found] == [0, 1, 1]
     assert passed(Signing(OTHER, require=True), found[2].sign(frame))[0] == [True]
     (heard,) = Ears().feed(found[1].sign(frame))
@@ -177,10 +177,10 @@ def test_a_line_that_is_no_key_is_named_without_telling_it(tmp_path, line):
 
 
 def test_the_key_of_a_link_is_the_one_it_names_or_the_only_one():
-    assert pick({"a": KEY}, "", "udpin") == pick({"a": KEY, "b": OTHER}, "a", "udpin") == KEY
+    assert select_key({"a": KEY}, "", "udpin") == select_key({"a": KEY, "b": OTHER}, "a", "udpin") == KEY
     for found, name in (({}, ""), ({"a": KEY, "b": OTHER}, ""), ({"a": KEY}, "c")):
         with pytest.raises(ValueError, match=r"link udpin: found .*, expected one of --keys FILE"):
-            pick(found, name, "udpin")
+            select_key(found, name, "udpin")
 
 
 def test_a_hundred_senders_are_told_apart():

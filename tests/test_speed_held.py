@@ -5,23 +5,23 @@ import pytest
 from flights import T0
 
 from fleet.contract import Array, Rows, Sample
-from twin_worker.estimation.airspeed_setpoint import held_to
-from twin_worker.telemetry.history import History
+from twin_worker.estimation.airspeed_setpoint import inferred_setpoint
+from twin_worker.telemetry.history import TelemetryHistory
 
 SPEEDS = np.array([20.0, 22.5, 25.0])
 
 
-def heard(Va) -> History:
+def heard(Va) -> TelemetryHistory:
     """Give half a minute of airspeeds at 10 Hz, reported by nobody but VFR_HUD."""
     t = T0 + 0.1 * np.arange(len(Va))
-    history = History()
+    history = TelemetryHistory()
     x = np.column_stack([Va, np.full(len(Va), 0.5), np.zeros(len(Va))])
     history.add(Sample(uav=1, t=float(t[-1]), air=Rows(Array.of(t, "<f8"), Array.of(x))))
     return history
 
 
 def held(Va, speeds=SPEEDS) -> float:
-    return held_to(heard(Va), T0 + 0.1 * (len(Va) - 1), speeds)
+    return inferred_setpoint(heard(Va), T0 + 0.1 * (len(Va) - 1), speeds)
 
 
 @pytest.mark.parametrize("speed", SPEEDS)

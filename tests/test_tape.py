@@ -12,13 +12,13 @@ import pytest
 from pymavlink import mavutil
 from talker import T0, Talker
 
-from fleet.telemetry.mavlink.parsing.received import Heard
+from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
 from fleet.telemetry.recording.recordings import replay_messages
 from gateway.links.link import Batch
 from gateway.record import recorder as module
-from gateway.record.recorder import Recorder, Tapped
-from gateway.record.size import in_words, read_size
-from gateway.record.tape import AGAIN_S, LONGEST_S, Budget, Tape
+from gateway.record.recorder import LinkRecorder, RecordedQueue
+from gateway.record.size import format_size, read_size
+from gateway.record.tape import MAX_FILE_S, RETRY_S, DiskBudget, TlogWriter
 
 MORE = 10**9
 
@@ -30,14 +30,14 @@ def frames(n=200, system=7):
 
 def recorded(folder, pieces, budget=MORE, names=("udpin:127.0.0.1:14550",)):
     """Record pieces (link, arrival, sender, bytes); give the counters once everything is written."""
-    with Recorder(Budget(folder, budget), names) as recorder:
+    with LinkRecorder(DiskBudget(folder, budget), names) as recorder:
         for link, t, sender, data in pieces:
-            recorder.hear(link, Heard.of([(t, sender, data)]))
-    return recorder.account()
+            recorder.add(link, ReceivedBytes.from_pieces([(t, sender, data)]))
+    return recorder.counters()
 
 
 def adds_up(taped):
-    return taped.heard == taped.recorded + taped.noise + taped.lost + taped.dropped + taped.waiting
+    return taped.received == taped.recorded + taped.noise + taped.lost + taped.dropped + taped.waiting
 
 
 def read(folder, name="*.tlog"):
@@ -95,8 +95,8 @@ def test_links_have_files_of_their_own_and_the_oldest_make_room(tmp_path):
     foreign, budget = tmp_path / "monday.tlog", 1_000_000
     foreign.write_bytes(bytes(2_000_000))
     frame = frames(2)[1]
-    shelf = Budget(tmp_path, budget)
-    with Tape("a:1", shelf, 2) as one, Tape("b:2", shelf, 2) as other:
+    shelf = DiskBudget(tmp_path, budget)
+    with TlogWriter("a:1", shelf, 2) as one, TlogWriter("b:2", shelf, 2) as other:
         for k in range(400):
             for tape in (one,) if k % 10 else (one, other):  # the other hears little and keeps its file for long
                 assert tape.write(frame * 100, float(k)) == 0
@@ -105,12 +105,12 @@ def test_links_have_files_of_their_own_and_the_oldest_make_room(tmp_path):
     assert foreign.stat().st_size == 2_000_000
     assert shelf.removed >= 1 and {path.name[0] for path in ours} == {"a", "b"}
     assert one.written + other.written > budget
-    assert Budget(tmp_path, budget).used == shelf.used  # the next run goes on from there
+    assert DiskBudget(tmp_path, budget).used == shelf.used  # the next run goes on from there
 
 
 def test_an_old_file_is_followed_by_another(tmp_path):
-    with Tape("a", Budget(tmp_path, MORE)) as tape:
-        for now in (0.0, LONGEST_S - 1, LONGEST_S + 1):
+    with TlogWriter("a", DiskBudget(tmp_path, MORE)) as tape:
+        for now in (0.0, MAX_FILE_S - 1, MAX_FILE_S + 1):
             tape.write(b"12345678", now)
     assert len(list(tmp_path.glob("*.tlog"))) == 2
 
@@ -127,25 +127,25 @@ def files_no_longer_than(size):
 
 def test_a_disk_that_takes_no_more_is_said_and_counted_and_later_tried_again(tmp_path):
     records = bytes(1000)
-    with Tape("a", Budget(tmp_path, MORE)) as tape:
+    with TlogWriter("a", DiskBudget(tmp_path, MORE)) as tape:
         with files_no_longer_than(10_500):
             fates = [tape.write(records, 0.0) for _ in range(20)]
         assert fates == [0] * 10 + [1000] * 10 and (tape.written, tape.lost) == (10_000, 10_000)
-        assert "File too large" in tape.trouble and "free space" in tape.trouble
+        assert "File too large" in tape.fault and "free space" in tape.fault
         (path,) = tmp_path.glob("*.tlog")
         assert path.stat().st_size == 10_000  # no half of a record stays
-        assert tape.write(records, AGAIN_S / 2) == 1000
-        assert tape.write(records, AGAIN_S + 0.1) == 0 and tape.trouble == ""
+        assert tape.write(records, RETRY_S / 2) == 1000
+        assert tape.write(records, RETRY_S + 0.1) == 0 and tape.fault == ""
 
 
 def test_a_disk_that_takes_nothing_is_left_without_empty_files(tmp_path):
     records = bytes(1000)
-    with Tape("a", Budget(tmp_path, MORE)) as tape:
+    with TlogWriter("a", DiskBudget(tmp_path, MORE)) as tape:
         with files_no_longer_than(500):
             for k in range(10):
-                assert tape.write(records, k * (AGAIN_S + 0.1)) == 1000
-                assert "free space" in tape.trouble and not list(tmp_path.iterdir())
-        assert tape.write(records, 10 * (AGAIN_S + 0.1)) == 0  # there is room again
+                assert tape.write(records, k * (RETRY_S + 0.1)) == 1000
+                assert "free space" in tape.fault and not list(tmp_path.iterdir())
+        assert tape.write(records, 10 * (RETRY_S + 0.1)) == 0  # there is room again
     (path,) = tmp_path.iterdir()
     assert path.stat().st_size == 1000
 
@@ -161,15 +161,15 @@ def test_a_full_disk_loses_nothing_silently(tmp_path, monkeypatch, caplog):
 
     monkeypatch.setattr(Path, "open", lambda path, mode, buffering: Disk(path, mode))
     said = frames(300)
-    with Recorder(Budget(tmp_path, MORE), ["udpin:h:1"]) as recorder:
+    with LinkRecorder(DiskBudget(tmp_path, MORE), ["udpin:h:1"]) as recorder:
         for k, frame in enumerate(said):
-            recorder.hear(0, Heard.of([(T0 + k, "air", frame)]))
+            recorder.add(0, ReceivedBytes.from_pieces([(T0 + k, "air", frame)]))
             if k == 100:
                 recorder.write()
                 full.set()
         recorder.write()
-        (taped,) = recorder.account()
-        assert "No space left on device" in taped.trouble and taped.trouble in caplog.text
+        (taped,) = recorder.counters()
+        assert "No space left on device" in taped.fault and taped.fault in caplog.text
     assert taped.recorded == sum(map(len, said[:101])) and taped.lost == sum(map(len, said[101:])) and adds_up(taped)
     assert [frame for _, frame in read(tmp_path)] == said[:101]
 
@@ -177,29 +177,29 @@ def test_a_full_disk_loses_nothing_silently(tmp_path, monkeypatch, caplog):
 def test_a_disk_too_slow_costs_counted_bytes_and_no_memory(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "MOST", 10_000)
     said = frames(1000)
-    with Recorder(Budget(tmp_path, MORE), ["a"]) as recorder:
+    with LinkRecorder(DiskBudget(tmp_path, MORE), ["a"]) as recorder:
         with recorder._lock:  # the thread waits, as for a disk
             recorder._lock = threading.Lock()
             for frame in said:
-                recorder.hear(0, Heard.of([(T0, "air", frame)]))
-        (taped,) = recorder.account()
-        assert taped.dropped > 0 and taped.dropped + 10_000 >= taped.heard and adds_up(taped)
-    (taped,) = recorder.account()
-    assert taped.recorded == taped.heard - taped.dropped and taped.waiting == 0
+                recorder.add(0, ReceivedBytes.from_pieces([(T0, "air", frame)]))
+        (taped,) = recorder.counters()
+        assert taped.dropped > 0 and taped.dropped + 10_000 >= taped.received and adds_up(taped)
+    (taped,) = recorder.counters()
+    assert taped.recorded == taped.received - taped.dropped and taped.waiting == 0
 
 
 def test_what_no_longer_fits_into_the_queue_is_recorded_all_the_same(tmp_path):
-    with Recorder(Budget(tmp_path, MORE), ["a"]) as recorder:
-        tapped = Tapped(1, recorder)
-        tapped.put_nowait(Batch(0, Heard.of([(T0, "air", frames(1)[0])])))
+    with LinkRecorder(DiskBudget(tmp_path, MORE), ["a"]) as recorder:
+        tapped = RecordedQueue(1, recorder)
+        tapped.put_nowait(Batch(0, ReceivedBytes.from_pieces([(T0, "air", frames(1)[0])])))
         with pytest.raises(module.queue.Full):
-            tapped.put_nowait(Batch(0, Heard.of([(T0, "air", frames(2)[1])])))
-    assert recorder.account()[0].frames == 2 and tapped.qsize() == 1
+            tapped.put_nowait(Batch(0, ReceivedBytes.from_pieces([(T0, "air", frames(2)[1])])))
+    assert recorder.counters()[0].frames == 2 and tapped.qsize() == 1
 
 
 def test_the_queue_is_bounded_in_bytes_too_and_has_room_again_once_something_was_taken():
-    heard = Batch(0, Heard.of([(T0, "air", frames(1)[0])]))
-    tapped = Tapped(100, None, most_bytes=3 * heard.size)
+    heard = Batch(0, ReceivedBytes.from_pieces([(T0, "air", frames(1)[0])]))
+    tapped = RecordedQueue(100, None, max_bytes=3 * heard.size)
     for _ in range(3):
         tapped.put_nowait(heard)
     with pytest.raises(module.queue.Full):
@@ -221,10 +221,10 @@ def test_what_is_no_size_stops_at_start(text):
 
 
 def test_sizes_in_words():
-    assert [in_words(n) for n in (7, 1500, 123_456, 2.5e9)] == ["7 B", "1.5 kB", "123 kB", "2.5 GB"]
+    assert [format_size(n) for n in (7, 1500, 123_456, 2.5e9)] == ["7 B", "1.5 kB", "123 kB", "2.5 GB"]
 
 
 def test_a_folder_that_cannot_be_made_stops_at_start(tmp_path):
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(OSError, match=r"^--record: .*; name another folder$"):
-        Budget(tmp_path / "file", MORE)
+        DiskBudget(tmp_path / "file", MORE)

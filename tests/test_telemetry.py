@@ -6,17 +6,17 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import T0, Ears, Talker, assert_finite, of
 
 from fleet.contract import COLUMNS, Sample, Status
-from fleet.telemetry.mavlink.arrays.row_arbiter import RANKS, YIELD_S
-from fleet.telemetry.mavlink.intake import Intake
+from fleet.telemetry.mavlink.arrays.row_arbiter import RANK_COUNT, SOURCE_TIMEOUT_S
+from fleet.telemetry.mavlink.intake import MavlinkReceiver
 from fleet.telemetry.mavlink.parsing.decode import IDS, Decoder
-from fleet.telemetry.mavlink.parsing.received import Heard
+from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
 from fleet.telemetry.tables.mavlink import TABLE, own_seconds
-from fleet.telemetry.tables.row import HIGHEST, believable
+from fleet.telemetry.tables.row import MAX_MAGNITUDE, is_plausible
 
 
 def columns(message: str, field: str, sent, autopilot: str = "ardupilot") -> dict[str, float]:
     """Send one message through the wire and the table."""
-    frames = Decoder().feed(Heard.of([(T0, None, Talker().pack(sent))]))
+    frames = Decoder().decode(ReceivedBytes.from_pieces([(T0, None, Talker().pack(sent))]))
     named = [r for r in TABLE if r.message == message and r.field == field]
     (row,) = [r for r in named if not r.autopilots or autopilot in r.autopilots]
     columns = row.columns(frames.fields(np.array([0]), message))
@@ -28,9 +28,9 @@ def test_every_row_names_a_message_and_fills_its_columns():
         assert row.message in IDS
         kind = mav.mavlink_map[IDS[row.message]]
         frame = _frame(7, kind, bytes([1]) * kind.unpacker.size)
-        fields = Decoder().feed(Heard.of([(T0, None, frame)])).fields(np.array([0]), row.message)
-        assert len(row.columns(fields)) == len(COLUMNS[row.field]) == len(HIGHEST[row.field])
-        assert 0 <= row.rank < RANKS and row.given in ("", *COLUMNS)
+        fields = Decoder().decode(ReceivedBytes.from_pieces([(T0, None, frame)])).fields(np.array([0]), row.message)
+        assert len(row.columns(fields)) == len(COLUMNS[row.field]) == len(MAX_MAGNITUDE[row.field])
+        assert 0 <= row.rank < RANK_COUNT and row.requires in ("", *COLUMNS)
         assert np.isfinite(own_seconds(row, fields)).all()
 
 
@@ -38,8 +38,8 @@ def test_fields_and_messages_are_those_of_pymavlink_for_every_message():
     rng = np.random.default_rng(5)
     for number, kind in mav.mavlink_map.items():
         said = _frame(7, kind, rng.bytes(kind.unpacker.size))
-        frames = Decoder().feed(Heard.of([(T0, None, said)]))
-        assert len(frames.at) == 1, kind.msgname
+        frames = Decoder().decode(ReceivedBytes.from_pieces([(T0, None, said)]))
+        assert len(frames.headers) == 1, kind.msgname
         expected, (got,) = mav.MAVLink(None).decode(bytearray(said)), frames.messages(np.array([0]))
         fields = frames.fields(np.array([0]), kind.msgname)
         assert fields.rows.dtype.itemsize == kind.unpacker.size
@@ -72,8 +72,8 @@ def test_position_stays_integer_and_velocity_becomes_metres():
 
 def heard(*sent) -> Sample:
     """What an aircraft's rows are after one heartbeat, one attitude and these."""
-    intake, talker = Intake(), Talker()
-    intake.hear(T0, talker.heartbeat() + talker.attitude(5.0) + b"".join(map(talker.pack, sent)))
+    intake, talker = MavlinkReceiver(), Talker()
+    intake.receive(T0, talker.heartbeat() + talker.attitude(5.0) + b"".join(map(talker.pack, sent)))
     (sample,) = of(Sample, intake.flush(T0 + 0.1))
     return sample
 
@@ -137,23 +137,23 @@ def test_the_attitude_target_of_px4_is_a_command_that_leaves_errors_untold():
     got = columns("ATTITUDE_TARGET", "command", sent, "px4")
     assert (got.pop("phi_c"), got.pop("theta_c")) == pytest.approx((0.5, 0.0), abs=1e-6)
     assert all(math.isnan(value) for value in got.values())
-    assert believable("command", np.array([0.1, 0.1, np.nan, np.nan, np.nan]))
-    assert not believable("command", np.array([np.nan, 0.1, 0.0, 0.0, 0.0]))
+    assert is_plausible("command", np.array([0.1, 0.1, np.nan, np.nan, np.nan]))
+    assert not is_plausible("command", np.array([np.nan, 0.1, 0.0, 0.0, 0.0]))
 
 
 def test_only_servo_port_0_counts():
-    intake, talker = Intake(), Talker()
-    intake.hear(T0, talker.heartbeat() + talker.attitude(5.0))
+    intake, talker = MavlinkReceiver(), Talker()
+    intake.receive(T0, talker.heartbeat() + talker.attitude(5.0))
     for port in (0, 1):
         pulses = [1100 + 100 * port + i for i in range(8)]
-        intake.hear(T0, talker.pack(mav.MAVLink_servo_output_raw_message(5_010_000 + port, port, *pulses)))
+        intake.receive(T0, talker.pack(mav.MAVLink_servo_output_raw_message(5_010_000 + port, port, *pulses)))
     (sample,) = of(Sample, intake.flush(T0 + 0.1))
     assert sample.servo.x.numpy().tolist() == [[1100 + i for i in range(8)]]
 
 
 def test_the_better_imu_wins_and_the_other_returns_after_a_silence():
-    intake, talker = Intake(), Talker()
-    intake.hear(T0, talker.heartbeat())
+    intake, talker = MavlinkReceiver(), Talker()
+    intake.receive(T0, talker.heartbeat())
 
     def raw(t):
         return talker.pack(mav.MAVLink_raw_imu_message(round(t * 1e6), 0, 0, -1000, 0, 0, 0, 0, 0, 0))
@@ -161,10 +161,10 @@ def test_the_better_imu_wins_and_the_other_returns_after_a_silence():
     def high(t):
         return talker.pack(mav.MAVLink_highres_imu_message(round(t * 1e6), 0, 0, -9.5, *[0.0] * 10, 63))
 
-    intake.hear(T0, talker.attitude(5.0) + high(5.0) + raw(5.1))
+    intake.receive(T0, talker.attitude(5.0) + high(5.0) + raw(5.1))
     for step in range(1, 40):
-        intake.hear(T0 + 0.1 * step, talker.attitude(5.0 + 0.1 * step))
-    intake.hear(T0 + 4.0, raw(9.0))
+        intake.receive(T0 + 0.1 * step, talker.attitude(5.0 + 0.1 * step))
+    intake.receive(T0 + 4.0, raw(9.0))
     (sample,) = of(Sample, intake.flush(T0 + 4.1))
     assert sample.imu.x.numpy()[:, 2] == pytest.approx([-9.5, -9.80665], abs=1e-5)
 
@@ -180,10 +180,10 @@ def ground(t: float, v_n: float, *, rounded: bool, lat: int = 474_000_000):
 
 def flown(messages) -> tuple[np.ndarray, list[float], int]:
     """Boot times [s] and north velocities [m/s] made of (boot time, message); and how many rows were rejected."""
-    intake, talker = Intake(), Talker()
-    intake.hear(T0, talker.heartbeat() + talker.attitude(5.0))
+    intake, talker = MavlinkReceiver(), Talker()
+    intake.receive(T0, talker.heartbeat() + talker.attitude(5.0))
     for t, message in messages:
-        intake.hear(T0 + t - 5.0, talker.pack(message))
+        intake.receive(T0 + t - 5.0, talker.pack(message))
     news = intake.flush(T0 + 20.0)
     rows = [s.velocity for s in of(Sample, news) if s.velocity is not None]
     t = np.concatenate([r.t.numpy() for r in rows]) - T0 + 5.0 if rows else np.empty(0)
@@ -210,7 +210,7 @@ def test_velocity_that_ceases_is_taken_from_the_other_source_again():
     said += [(at, ground(at, 2.0, rounded=False)) for at in t if at < 8.0]
     t, v_n, rejected = flown(sorted(said, key=lambda one: one[0]))
     assert v_n[-1] == 1.0 and 2.0 in v_n and rejected == 0
-    assert t[v_n.index(2.0) + v_n.count(2.0)] == pytest.approx(7.9 + YIELD_S, abs=0.11)
+    assert t[v_n.index(2.0) + v_n.count(2.0)] == pytest.approx(7.9 + SOURCE_TIMEOUT_S, abs=0.11)
 
 
 @pytest.mark.parametrize("whole", [0.0, math.nan])
@@ -231,9 +231,9 @@ def test_velocity_without_a_fix_is_not_taken():
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e30])
 def test_unbelievable_values_are_refused_counted_and_said(bad):
-    assert not believable("velocity", np.array([0.0, bad, 0.0]))
-    intake, talker = Intake(), Talker()
-    intake.hear(T0, talker.heartbeat() + talker.attitude(1.0, phi=bad) + talker.attitude(1.1))
+    assert not is_plausible("velocity", np.array([0.0, bad, 0.0]))
+    intake, talker = MavlinkReceiver(), Talker()
+    intake.receive(T0, talker.heartbeat() + talker.attitude(1.0, phi=bad) + talker.attitude(1.1))
     news = intake.flush(T0 + 0.1)
     (sample,), (status,) = of(Sample, news), of(Status, news)
     assert len(sample.attitude.t.numpy()) == 1
@@ -242,8 +242,8 @@ def test_unbelievable_values_are_refused_counted_and_said(bad):
 
 
 def test_no_fix_is_no_position():
-    intake, talker = Intake(), Talker()
-    intake.hear(
+    intake, talker = MavlinkReceiver(), Talker()
+    intake.receive(
         T0, talker.heartbeat() + talker.pack(mav.MAVLink_global_position_int_message(9, 0, 0, 5, 5, 0, 0, 0, 0))
     )
     assert of(Sample, intake.flush(T0 + 0.1)) == []
@@ -284,14 +284,14 @@ def test_a_broken_checksum_costs_one_frame():
 
 def test_every_message_with_random_content_passes_through():
     rng = np.random.default_rng(11)
-    intake = Intake()
-    intake.hear(T0, Talker().heartbeat() + Talker(8).heartbeat(mav.MAV_TYPE_QUADROTOR, mav.MAV_AUTOPILOT_PX4))
+    intake = MavlinkReceiver()
+    intake.receive(T0, Talker().heartbeat() + Talker(8).heartbeat(mav.MAV_TYPE_QUADROTOR, mav.MAV_AUTOPILOT_PX4))
     sender = mav.MAVLink(None, srcSystem=7, srcComponent=1)
     for step, kind in enumerate(list(mav.mavlink_map.values()) * 3):
         payload = rng.bytes(kind.unpacker.size)
         for sender.srcSystem in (7, 8, 255):
             frame = _frame(sender.srcSystem, kind, payload)
-            intake.hear(T0 + step * 0.01, frame)
+            intake.receive(T0 + step * 0.01, frame)
         for news in intake.flush(T0 + step * 0.01):
             assert_finite(news)
 

@@ -6,8 +6,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import T0, Talker, of
 
 from fleet.contract import Status
-from fleet.telemetry.mavlink.intake import Intake
-from fleet.telemetry.mavlink.timing import Timing
+from fleet.telemetry.mavlink.intake import MavlinkReceiver
+from fleet.telemetry.mavlink.timing import LinkTiming
 from fleet.telemetry.tables import clock as c
 
 
@@ -25,11 +25,11 @@ def flight(seconds, drift=0.0, jitter_s=0.05, boot=100.0, seed=1):
 @pytest.mark.parametrize("drift", [-2e-4, 0.0, 5e-5, 2e-4])
 def test_jitter_and_drift_leave_a_few_milliseconds(drift):
     clocks = c.new_clocks()
-    timing, told, error = Timing(lambda: clocks), {}, []
+    timing, told, error = LinkTiming(lambda: clocks), {}, []
     for k, (true, own, arrival) in enumerate(zip(*flight(1200.0, drift), strict=True)):
-        t = c.tell(clocks, c.BOOT, own, arrival)
+        t = c.message_time(clocks, c.BOOT, own, arrival)
         error.append(t - true - 0.03)  # the quickest way cannot be known
-        told = timing.told(arrival) if k % 25 == 0 else told
+        told = timing.status_fields(arrival) if k % 25 == 0 else told
     late = np.abs(error[25 * 60 :])
     assert np.median(late) < 5e-3 and np.quantile(late, 0.99) < 12e-3
     assert told["clock_drift"] == pytest.approx(drift, abs=2e-5)
@@ -39,21 +39,21 @@ def test_jitter_and_drift_leave_a_few_milliseconds(drift):
 
 def test_the_worst_delay_is_taken_and_begins_anew():
     clocks = c.new_clocks()
-    timing = Timing(lambda: clocks)
+    timing = LinkTiming(lambda: clocks)
     for k in range(100):
-        c.tell(clocks, c.BOOT, 50 + 0.1 * k, T0 + 0.1 * k + (0.7 if k == 60 else 0.0))
-    assert timing.told(T0 + 10)["latency_worst_s"] == pytest.approx(0.7, abs=5e-3)
-    assert timing.told(T0 + 11)["latency_worst_s"] == 0.0
+        c.message_time(clocks, c.BOOT, 50 + 0.1 * k, T0 + 0.1 * k + (0.7 if k == 60 else 0.0))
+    assert timing.status_fields(T0 + 10)["latency_worst_s"] == pytest.approx(0.7, abs=5e-3)
+    assert timing.status_fields(T0 + 11)["latency_worst_s"] == 0.0
 
 
 def test_after_a_restart_and_over_a_wrap_time_goes_on_and_drift_is_learnt_anew():
     clocks = c.new_clocks()
-    timing, times, told = Timing(lambda: clocks), [], {}
+    timing, times, told = LinkTiming(lambda: clocks), [], {}
     for first, boot in ((0.0, c.WRAP_BOOT_S - 300.0), (600.0, 2.0)):
         for k, (_, own, arrival) in enumerate(zip(*flight(600.0, 1e-4, boot=boot), strict=True)):
-            t = c.tell(clocks, c.BOOT, own % c.WRAP_BOOT_S, arrival + first)
+            t = c.message_time(clocks, c.BOOT, own % c.WRAP_BOOT_S, arrival + first)
             times += [] if np.isnan(t) else [(t, arrival + first)]
-            told = timing.told(arrival + first) if k % 25 == 0 else told
+            told = timing.status_fields(arrival + first) if k % 25 == 0 else told
         assert told["clock_drift"] == pytest.approx(1e-4, abs=3e-5)
         assert c.jumps(clocks) == (first > 0)
     t, arrival = np.array(times).T
@@ -62,16 +62,16 @@ def test_after_a_restart_and_over_a_wrap_time_goes_on_and_drift_is_learnt_anew()
 
 
 def test_satellites_and_a_question_and_answer_tell_the_absolute_delay():
-    intake, plane = Intake(), Talker()
+    intake, plane = MavlinkReceiver(), Talker()
     for k in range(200):
         t, boot = T0 + 0.1 * k, 500 + 0.1 * k
-        intake.hear(t, plane.heartbeat() if k % 10 == 0 else plane.attitude(boot), "air")
+        intake.receive(t, plane.heartbeat() if k % 10 == 0 else plane.attitude(boot), "air")
         if k % 10 == 5:  # satellite time says it was sent 0.2 s ago
-            intake.hear(
+            intake.receive(
                 t, plane.pack(mav.MAVLink_system_time_message(round((t - 0.2) * 1e6), round(boot * 1e3))), "air"
             )
-            intake.hear(t, plane.pack(mav.MAVLink_timesync_message(1, round((t - 0.3 - 0.001 * k) * 1e9))), "air")
-            intake.hear(t, plane.pack(mav.MAVLink_timesync_message(0, 77)), "air")  # a question of its own
+            intake.receive(t, plane.pack(mav.MAVLink_timesync_message(1, round((t - 0.3 - 0.001 * k) * 1e9))), "air")
+            intake.receive(t, plane.pack(mav.MAVLink_timesync_message(0, 77)), "air")  # a question of its own
         status = of(Status, intake.flush(t))
     status = of(Status, intake.flush(T0 + 21))[-1]
     assert status.gps_offset_s == pytest.approx(0.2, abs=5e-3)
@@ -80,10 +80,10 @@ def test_satellites_and_a_question_and_answer_tell_the_absolute_delay():
 
 def test_a_satellite_time_that_is_none_is_no_time():
     clocks = c.new_clocks()
-    timing = Timing(lambda: clocks)
-    timing.satellites(1.7e9, 5.0)  # before any time of its own
-    c.tell(clocks, c.BOOT, 5.0, T0)
-    timing.satellites(0.0, 5.0)
-    timing.trip(T0 + 1, T0)
-    told = timing.told(T0)
+    timing = LinkTiming(lambda: clocks)
+    timing.add_gps_time(1.7e9, 5.0)  # before any time of its own
+    c.message_time(clocks, c.BOOT, 5.0, T0)
+    timing.add_gps_time(0.0, 5.0)
+    timing.add_round_trip(T0 + 1, T0)
+    told = timing.status_fields(T0)
     assert told["gps_offset_s"] is None is told["round_trip_s"] is told["clock_drift"]

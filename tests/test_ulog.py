@@ -12,9 +12,9 @@ from ulog_writer import START_US, TRUTH, UTC_US, flight, read, release, rows, sa
 
 from fleet.contract import COLUMNS
 from fleet.telemetry.onboard_logs.ulog import sieve
-from fleet.telemetry.onboard_logs.ulog.reader import UlogLog, _lay
-from fleet.telemetry.onboard_logs.ulog.topic import Topic, in_order
-from fleet.telemetry.tables.ulog import ROWS, TABLE, TOPICS, mode
+from fleet.telemetry.onboard_logs.ulog.reader import UlogLog, _extract_rows
+from fleet.telemetry.onboard_logs.ulog.topic import Topic, time_order
+from fleet.telemetry.tables.ulog import ROWS, TABLE, TOPICS, mode_name
 
 VERSIONS = ((1, 6), (1, 8), (1, 11), (1, 13), (1, 14), (1, 16))
 SAMPLE = "real/px4_vtol_cubeorange_6s_reader_test.ulg"
@@ -66,7 +66,7 @@ def test_the_sample_lands_and_disarms(sample):
     assert said(sample, "armed") == [True, False]
     assert said(sample, "mode") == ["MANUAL"]
     landed, disarmed = (
-        next(s.t for c in sample.chunks() for s in c.said if s.value == value)
+        next(s.t for c in sample.chunks() for s in c.events if s.value == value)
         for value in ((6, "[commander] Landing detected"), (6, "[commander] Disarmed by landing"))
     )
     assert (landed - 20.309, disarmed - 20.309) == pytest.approx((3.5, 5.5), abs=0.1)
@@ -84,7 +84,7 @@ def test_stamps_before_the_start_and_the_bogus_last_one_do_not_stretch_the_sampl
 
 def test_the_sample_reads_equal_to_plain_pyulog(sample_bytes):
     plain = ULog(io.BytesIO(sample_bytes), sorted(TOPICS - {"mission"}))
-    sieved = ULog(sieve.Sieve(lambda: io.BytesIO(sample_bytes), TOPICS, []), sorted(TOPICS))
+    sieved = ULog(sieve.UlogFilter(lambda: io.BytesIO(sample_bytes), TOPICS, []), sorted(TOPICS))
     assert plain.data_list == sieved.data_list
     assert plain.initial_parameters == sieved.initial_parameters
     assert plain.logged_messages == sieved.logged_messages
@@ -124,7 +124,7 @@ def test_every_row_of_the_table_is_exercised_and_tells_the_truth():
         topics = read(ulog(said_as))._topics
         for field in ROWS:
             for row in ROWS[field]:
-                laid = _lay(row, topics[row.message]) if row.message in topics else None
+                laid = _extract_rows(row, topics[row.message]) if row.message in topics else None
                 if laid is not None and len(laid[0]):
                     applied.add(id(row))
                     if row.message not in ("actuator_motors",):
@@ -181,7 +181,7 @@ def test_a_vtol_tells_its_transitions_and_a_changed_parameter_its_time():
         (6, "VTOL: transition to fixed wing"),
         (6, "VTOL: flies as a fixed wing"),
     ]
-    times = [(s.t, s.value) for c in log.chunks() for s in c.said if s.what == "param"]
+    times = [(s.t, s.value) for c in log.chunks() for s in c.events if s.kind == "param"]
     assert [value for _, value in times] == [("FW_P", 1.0), ("FW_P", 2.5)]
     assert times[1][0] == pytest.approx(START_US * 1e-6 + 2.0, abs=0.11)
 
@@ -208,8 +208,8 @@ def test_the_kind_of_vehicle_is_found_wherever_it_stands(status, params, expecte
 
 
 def test_a_nav_state_is_named_as_its_release_meant_it():
-    assert [mode(6, v) for v in ((1, 8), (1, 15))] == ["RCRECOVER", "POSITION_SLOW"]
-    assert [mode(s, (1, 13)) for s in (3, 4, 5, 2, 99)] == ["MISSION", "LOITER", "RTL", "POSCTL", "nav_state 99"]
+    assert [mode_name(6, v) for v in ((1, 8), (1, 15))] == ["RCRECOVER", "POSITION_SLOW"]
+    assert [mode_name(s, (1, 13)) for s in (3, 4, 5, 2, 99)] == ["MISSION", "LOITER", "RTL", "POSCTL", "nav_state 99"]
 
 
 def test_what_was_said_before_the_log_began_is_in_force_when_it_begins():
@@ -234,7 +234,7 @@ def test_chunks_are_half_a_minute_and_follow_each_other():
 def test_stray_stamps_do_not_take_good_rows_with_them():
     stamp = np.arange(0, 100_000_000, 100_000)
     stamp[[50, 300]] = stamp[500], 0
-    order = in_order(stamp)
+    order = time_order(stamp)
     assert len(order) == 998
     assert (np.diff(stamp[order]) > 0).all()
 
@@ -271,5 +271,5 @@ def test_the_table_reads_the_columns_of_a_px4_1_13_flight(recordings):
 
 
 def _all(candidates, topics) -> list:
-    laid = [_lay(row, topics[row.message]) for row in candidates if row.message in topics]
+    laid = [_extract_rows(row, topics[row.message]) for row in candidates if row.message in topics]
     return [x for x in laid if x is not None]

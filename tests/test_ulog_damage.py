@@ -110,7 +110,7 @@ class Endless(io.RawIOBase):
 
 @pytest.mark.parametrize("noise", [bytes(1000), random.Random(3).randbytes(4096)])
 def test_an_endless_stream_is_read_up_to_a_size_and_that_is_said(noise, monkeypatch):
-    monkeypatch.setattr(sieve, "LARGEST", 3 << 20)
+    monkeypatch.setattr(sieve, "MAX_FILE_BYTES", 3 << 20)
     stream = Endless(ulog(flight((1, 11))), noise)
     log = UlogLog(lambda: stream, "endless.ulg")
     assert stream.given <= 4 << 20
@@ -119,7 +119,7 @@ def test_an_endless_stream_is_read_up_to_a_size_and_that_is_said(noise, monkeypa
 
 
 def test_after_much_noise_the_rest_is_left_unread(monkeypatch):
-    monkeypatch.setattr(sieve, "HOPELESS", 3 << 20)
+    monkeypatch.setattr(sieve, "MAX_SILENT_BYTES", 3 << 20)
     stream = Endless(ulog(flight((1, 11))), bytes(1000))
     log = UlogLog(lambda: stream, "endless.ulg")
     assert any("the rest was not read" in sentence for sentence in log.skipped)
@@ -173,4 +173,4 @@ def test_a_jump_of_the_clock_costs_twenty_rows_whatever_is_logged_between():
     assert not set(between) & TOPICS
     log = read(ulog({"sensor_combined": imu} | between))
     assert "20 rows of sensor_combined with an implausible stamp skipped" in log.skipped
-    assert len(rows(log)["imu"][0]) == len(imu["timestamp"]) - sieve.COMPANY
+    assert len(rows(log)["imu"][0]) == len(imu["timestamp"]) - sieve.MIN_AGREEING

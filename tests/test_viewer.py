@@ -18,23 +18,23 @@ from fleet.contract import (
     Model,
     Outcome,
     Prediction,
-    State,
     Status,
+    TwinState,
     Verdict,
 )
 from fleet.frames import Origin, body_to_ned, to_geodetic
-from viewer.panels.charts import band, scale
-from viewer.panels.detail import about, facts, law, why
-from viewer.panels.event_list import listing
-from viewer.scene.camera import FOV, frame, near
-from viewer.scene.routes import route
+from viewer.panels.charts import axis_range, band
+from viewer.panels.detail import figures_html, law_html, limitations, status_html
+from viewer.panels.event_list import event_list_html
+from viewer.scene.camera import FOV, frame, within_reach
+from viewer.scene.routes import mission_lines
 from viewer.scene.scene import DASHES, cut_at_horizon
-from viewer.scene.selection.tube import curtain, marks, rings, skin
-from viewer.server.view import ROOM, outgrown
-from viewer.store.place import UNIT_M, Place, scene_quat
-from viewer.store.store import Feed
-from viewer.text.words import empty, summary, table
-from viewer.theme.palette import DARK, LIGHT, line_colour, rgb, shown_line
+from viewer.scene.selection.tube import curtain, marked_look_aheads, rings, tube_faces
+from viewer.server.view import FRAME_MARGIN, outgrown
+from viewer.store.place import UNIT_M, SceneFrame, scene_quat
+from viewer.store.store import FleetStore
+from viewer.text.words import empty_html, summary_html, table
+from viewer.theme.palette import DARK, LIGHT, displayed_colour, line_colour, rgb
 from viewer.theme.shapes import aircraft, diamond, rotorcraft
 
 
@@ -65,29 +65,29 @@ def test_a_line_is_shown_in_the_colour_asked_for(palette) -> None:
         vertex = line_colour(wanted)
         if vertex.min() > 0 and vertex.max() < 255:  # else the tone mapping cannot show it at all
             reached += 1
-            assert np.abs(shown_line(vertex) - wanted).max() < 3, name
+            assert np.abs(displayed_colour(vertex) - wanted).max() < 3, name
     assert reached >= 5
 
 
 def test_without_the_inversion_a_line_would_be_washed_out() -> None:
-    assert np.abs(shown_line(rgb("#56B4E9")) - [185, 214, 222]).max() <= 1  # as measured in the browser
+    assert np.abs(displayed_colour(rgb("#56B4E9")) - [185, 214, 222]).max() <= 1  # as measured in the browser
 
 
 # --- frames ---
 
 
 def test_positions_land_where_they_should() -> None:
-    place = Place(HOME)
+    place = SceneFrame(HOME)
     ned = np.array([[100.0, 250.0, -40.0], [-3000.0, 20.0, 5.0]])
-    scene = place.geodetic(*to_geodetic(HOME, ned).T)
+    scene = place.from_geodetic(*to_geodetic(HOME, ned).T)
     assert np.allclose(scene * UNIT_M, [[250, 100, 40], [20, -3000, -5]], atol=0.02)
 
 
 def test_a_path_from_another_origin_lands_on_the_same_spot() -> None:
     lat, lon, alt = to_geodetic(HOME, np.array([[900.0, -700.0, -120.0]]))[0]
-    other, place = Origin(int(lat), int(lon), int(alt)), Place(HOME)
+    other, place = Origin(int(lat), int(lon), int(alt)), SceneFrame(HOME)
     ned = np.array([[10.0, 20.0, -30.0]])
-    assert np.allclose(place.local(other, ned), place.local(HOME, ned + np.array([900, -700, -120])), atol=0.01)
+    assert np.allclose(place.from_ned(other, ned), place.from_ned(HOME, ned + np.array([900, -700, -120])), atol=0.01)
 
 
 @pytest.mark.parametrize(("phi", "theta", "psi"), [(0, 0, 0), (0.5, 0.2, 1.0), (-0.4, -0.3, 3.0), (0.1, 0.6, -2.0)])
@@ -109,7 +109,7 @@ def test_the_mesh_points_where_the_aircraft_points(phi: float, theta: float, psi
 @pytest.mark.parametrize("bad", [np.nan, 9.5e8, 4e8])
 def test_a_place_off_this_earth_or_far_away_is_refused(bad: float) -> None:
     with pytest.raises(ValueError, match="position"):
-        Place(HOME).geodetic(np.array([bad]), np.array([8e7]), np.array([0.0]))
+        SceneFrame(HOME).from_geodetic(np.array([bad]), np.array([8e7]), np.array([0.0]))
 
 
 # --- shapes ---
@@ -118,11 +118,11 @@ def test_a_place_off_this_earth_or_far_away_is_refused(bad: float) -> None:
 @pytest.mark.parametrize("apart", [1_000.0, 5_000.0])
 def test_however_far_apart_somebody_is_in_view(apart: float) -> None:
     points = np.array([[0.0, 0.0, 0.0], [apart, 0.0, 0.0]])
-    assert len(near(points, 2_000.0)) == (2 if apart < 2_000 else 1)
+    assert len(within_reach(points, 2_000.0)) == (2 if apart < 2_000 else 1)
 
 
 def test_the_picture_moves_only_when_a_path_has_outgrown_it() -> None:
-    framed, spare = np.array([[0, 0, 0], [100.0, 0, 0]]), 0.4 * (ROOM - 1) * 100
+    framed, spare = np.array([[0, 0, 0], [100.0, 0, 0]]), 0.4 * (FRAME_MARGIN - 1) * 100
     assert not outgrown(np.array([[-0.9 * spare, 0, 0], [100 + 0.9 * spare, 0, 0]]), framed)
     assert outgrown(np.array([[50, 1.1 * spare, 0]]), framed) and outgrown(np.array([[-1.1 * spare, 0, 0]]), framed)
 
@@ -133,7 +133,7 @@ def test_the_tube_is_as_wide_as_told() -> None:
     hoops = rings(path, axes)
     assert np.allclose(np.ptp(hoops[:, :, 1], axis=1), 4.0)
     assert np.allclose(np.ptp(hoops[:, :, 2], axis=1), 1.0)
-    assert skin(21).max() == hoops.shape[0] * hoops.shape[1] - 1
+    assert tube_faces(21).max() == hoops.shape[0] * hoops.shape[1] - 1
 
 
 def test_the_tube_stays_finite_where_the_path_stands_still_or_climbs_upright() -> None:
@@ -157,8 +157,8 @@ def test_dashes_end_at_the_horizon_and_begin_at_the_aircraft() -> None:
 
 
 def test_time_marks_leave_room_before_the_horizon() -> None:
-    assert marks(26.0) == [5, 10, 20]
-    assert marks(4.0) == []
+    assert marked_look_aheads(26.0) == [5, 10, 20]
+    assert marked_look_aheads(4.0) == []
 
 
 def test_the_camera_sees_every_point() -> None:
@@ -197,8 +197,8 @@ def test_the_nose_is_in_front() -> None:
 
 def test_a_route_joins_its_items_at_their_heights() -> None:
     one = PretendUav(2)
-    found = route(one.mission(T), Place(HOME), ground=-3.0)
-    assert found.legs.shape == (8, 2, 3) and found.back.shape == (1, 2, 3) and len(found.circles) == 48
+    found = mission_lines(one.mission(T), SceneFrame(HOME), ground=-3.0)
+    assert found.legs.shape == (8, 2, 3) and found.returns.shape == (1, 2, 3) and len(found.circles) == 48
     assert np.allclose(found.legs[0, 0, 2] * UNIT_M, -one.ned(-one.phase / one.rate)[2], atol=0.5)
     radii = np.linalg.norm(found.circles[:, 0, :2] - found.legs[-1, 1, :2], axis=1) * UNIT_M
     assert np.allclose(radii, 70, atol=0.5)
@@ -223,7 +223,7 @@ HOSTILE_ITEMS = {
 
 @pytest.mark.parametrize("items", HOSTILE_ITEMS.values(), ids=HOSTILE_ITEMS)
 def test_a_hostile_mission_is_survived(items: tuple[Item, ...]) -> None:
-    found = route(Mission(uav=0, t=T, items=items), Place(HOME), ground=0.0)
+    found = mission_lines(Mission(uav=0, t=T, items=items), SceneFrame(HOME), ground=0.0)
     for part in found:
         assert np.isfinite(part).all()
     assert all(part.shape[1:] == (2, 3) for part in found[:3])
@@ -236,63 +236,66 @@ def test_a_hostile_mission_is_survived(items: tuple[Item, ...]) -> None:
 def test_what_comes_over_the_bus_is_escaped_everywhere(clock: Clock) -> None:
     feed, _, bus = feed_of(clock, 2, hostile=0)
     bus.publish(Alert(uav=0, t=T, kind=AlertKind.GROUND, sentence=HOSTILE))
-    page = about(feed.vehicles[0], DARK, clock.now) + facts(feed.vehicles[0], clock.now)
-    page += listing(feed.vehicles[0].events, DARK) + summary(feed.all(), feed, DARK, clock.now)
+    page = status_html(feed.vehicles[0], DARK, clock.now) + figures_html(feed.vehicles[0], clock.now)
+    page += event_list_html(feed.vehicles[0].events, DARK) + summary_html(feed.all(), feed, DARK, clock.now)
     page += table(feed.all(), DARK, clock.now, total=2, pick="{}", selected=0)
     assert "<img" not in page and page.count("&lt;img") >= 6
 
 
 def test_who_has_no_prediction_is_told_why(clock: Clock) -> None:
     feed, _, bus = feed_of(clock, 2)
-    assert "needs a verified model" in " ".join(why(feed.vehicles[1], clock.now))
-    assert "window has 41 samples" in about(feed.vehicles[1], DARK, clock.now)
+    assert "needs a verified model" in " ".join(limitations(feed.vehicles[1], clock.now))
+    assert "window has 41 samples" in status_html(feed.vehicles[1], DARK, clock.now)
     bus.publish(Status(uav=1, t=T, link=Link.LOST, sentence="no heartbeat for 6 s"))
     clock.now += 6
-    told = " ".join(why(feed.vehicles[1], clock.now))
+    told = " ".join(limitations(feed.vehicles[1], clock.now))
     assert "No sample for 6 s" in told and "no heartbeat for 6 s" in told
 
 
 def test_the_panel_says_measured_coverage(clock: Clock) -> None:
     feed, _, _ = feed_of(clock, 1)
-    assert "90 % region: coverage 91 %, n = 412" in facts(feed.vehicles[0], clock.now)
+    assert "90 % region: coverage 91 %, n = 412" in figures_html(feed.vehicles[0], clock.now)
 
 
 def test_the_law_and_its_parameters_are_shown_by_how_each_is_known() -> None:
-    shown = law(Controller(law="L<1>", received={"NAVL1_PERIOD": 17.0}, default={"TECS_TIME_CONST": 5.0}))
+    shown = law_html(Controller(law="L<1>", received={"NAVL1_PERIOD": 17.0}, default={"TECS_TIME_CONST": 5.0}))
     assert "L&lt;1&gt;" in shown and "received from the autopilot" in shown and "NAVL1_PERIOD 17" in shown
     assert shown.index("assumed: the autopilot&#x27;s default" if "&#x27;" in shown else "assumed") < shown.index(
         "TECS"
     )
-    assert "identified in flight" not in shown and law(None) == ""
+    assert "identified in flight" not in shown and law_html(None) == ""
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, 1e300])
 def test_wild_numbers_in_good_messages_do_not_stop_the_page(clock: Clock, value: float) -> None:
     feed, _, bus = feed_of(clock, 2)
     one = PretendUav(0)
-    told = {**fields(one.prediction(T + 1, 0.0)), "horizon_s": value, "held": value, "coast_s": value}
+    told = {**fields(one.prediction(T + 1, 0.0)), "horizon_s": value, "coverage": value, "coast_s": value}
     bus.publish(Prediction(**told), STAMP)
-    bus.publish(Prediction(**{**told, "t": T + 2, "tube": Array.of(np.full((81, 3), value), "<f8")}), STAMP)
+    bus.publish(
+        Prediction(**{**told, "t": T + 2, "prediction_region_half_axes": Array.of(np.full((81, 3), value), "<f8")}),
+        STAMP,
+    )
     verdict = Verdict(
         outcome=Outcome.DIVERGED, sentence="", fit={"u": value, "w": 50.0}, threshold=value, horizon_s=value
     )
     bus.publish(Model(uav=0, t=T + 2, method="paper", verdict=verdict), STAMP)
-    row = FleetRow(uav=0, state=State.VERIFIED, verdict="", horizon_s=value, t10_s=value, fit={"u": value}, epoch=1)
+    row = FleetRow(uav=0, state=TwinState.VERIFIED, verdict="", horizon_s=value, t10_s=value, fit={"u": value}, epoch=1)
     bus.publish(FleetState(t=value, rows=(row,)), STAMP)
     vehicle = feed.vehicles[0]
     assert vehicle.model.verdict is not None and vehicle.row.epoch == 1 and vehicle.forecast.t == T + 2
-    assert np.isfinite(vehicle.forecast.until) and np.isfinite(vehicle.forecast.tube).all()
-    assert "UAV-000" in about(vehicle, DARK, clock.now) and "fit per state" in facts(vehicle, clock.now)
-    assert "2 UAVs" in summary(feed.all(), feed, DARK, clock.now)
+    assert np.isfinite(vehicle.forecast.horizon_s) and np.isfinite(vehicle.forecast.tube).all()
+    assert "UAV-000" in status_html(vehicle, DARK, clock.now) and "fit per state" in figures_html(vehicle, clock.now)
+    assert "2 UAVs" in summary_html(feed.all(), feed, DARK, clock.now)
     assert "UAV-000" in table(feed.all(), DARK, clock.now, total=2, pick="{}", selected=0)
     assert all(np.isfinite(part).all() for part in band(vehicle, np.zeros((0, 30)))[2:3])
 
 
 def test_a_chart_keeps_its_scale_while_its_values_stay_within() -> None:
     wave = np.sin(np.linspace(0, 6, 50))
-    assert scale(600 + 40 * wave) == scale(601 + 40.5 * wave)
+    assert axis_range(600 + 40 * wave) == axis_range(601 + 40.5 * wave)
     for y in (wave, wave * 0, 1e5 + wave, np.array([np.nan, 3.0])):
-        low, high = scale(y)
+        low, high = axis_range(y)
         assert (
             low <= np.nanmin(y)
             and high > np.nanmax(y)
@@ -301,9 +304,9 @@ def test_a_chart_keeps_its_scale_while_its_values_stay_within() -> None:
 
 
 def test_an_empty_page_says_what_it_listens_to(clock: Clock) -> None:
-    feed = Feed(MemoryBus(), clock)
+    feed = FleetStore(MemoryBus(), clock)
     clock.now += 42
-    page = empty(feed, clock.now)
+    page = empty_html(feed, clock.now)
     assert "parauav/*/sample" in page and "for 42 s" in page and "0 messages" in page
 
 
@@ -314,6 +317,8 @@ def test_the_worst_and_shortest_stand_first(clock: Clock) -> None:
     order = [int(part.split('"')[0]) for part in page.split('data-uav="')[1:]]
     assert set(order[:3]) == {2, 4, 6} and order[3:5] == [5, 1]  # two alerts and a mismatch first
     horizons = [
-        feed.vehicles[uav].forecast.until for uav in order[4:] if feed.vehicles[uav].row.state is State.PREDICTING
+        feed.vehicles[uav].forecast.horizon_s
+        for uav in order[4:]
+        if feed.vehicles[uav].row.state is TwinState.PREDICTING
     ]
     assert horizons == sorted(horizons)

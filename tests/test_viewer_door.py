@@ -22,15 +22,15 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
 from fleet.bus.memory_bus import MemoryBus
-from viewer.browser.http_server import POLICY, REFUSED, VIOLATION, doorman, quiet, serve
+from viewer.browser.http_server import POLICY, REFUSED, VIOLATION, request_filter, serve, without_stdout
 from viewer.server.app import App
 
 PASSED = "the library's own answer"
 
 
 def answer(path: str = "/", *, anyone: bool = False, **headers: str):
-    ask = doorman(
-        lambda connection, request: PASSED, {"localhost", "127.0.0.1", "::1", "twin.example.org"}, anyone=anyone
+    ask = request_filter(
+        lambda connection, request: PASSED, {"localhost", "127.0.0.1", "::1", "twin.example.org"}, any_host=anyone
     )
     return ask(None, Request(path, Headers({name.capitalize(): value for name, value in headers.items()})))
 
@@ -90,7 +90,7 @@ def server() -> Iterator[SimpleNamespace]:
     port = unused_port()
     one = serve("127.0.0.1", port)
     yield SimpleNamespace(viser=one, port=port)
-    with quiet():
+    with without_stdout():
         one.stop()
 
 
@@ -236,4 +236,4 @@ def test_to_hear_and_to_ask_is_all_it_needs_of_the_bus(server: SimpleNamespace) 
     app = App(Mute(), server.viser)
     for tick in range(12):
         app.tick(tick)
-    app.feed.catch_up()
+    app.store.request_latest()

@@ -14,10 +14,10 @@ from test_viewer_timeline import fly, tape_of, timeline
 
 from fleet.contract import Alert, AlertKind, Status
 from fleet.frames import to_geodetic
-from viewer.export.film import Film
+from viewer.export.film import FlightAnimation
 from viewer.export.panel import Export
 from viewer.export.picture import picture, png
-from viewer.export.table import COLUMNS, plain, table
+from viewer.export.table import COLUMNS, escape_formula, table
 from viewer.theme.palette import DARK, rgb
 
 
@@ -35,10 +35,10 @@ def flown():
 
 def test_the_table_says_where_it_was_and_no_word_becomes_a_formula(flown) -> None:
     one, feed = flown
-    rows = list(csv.DictReader(io.StringIO(table(tape_of(one), feed.place))))
+    rows = list(csv.DictReader(io.StringIO(table(tape_of(one), feed.scene_frame))))
     assert tuple(rows[0]) == COLUMNS and len(rows) == len(tape_of(one))
     for row in rows:
-        lat, lon, _ = to_geodetic(feed.place.origin, np.zeros(3))
+        lat, lon, _ = to_geodetic(feed.scene_frame.origin, np.zeros(3))
         assert abs(float(row["lat_deg"]) - lat * 1e-7) < 0.02 and abs(float(row["lon_deg"]) - lon * 1e-7) < 0.02
     uav = PretendUav(0)
     ends = [float(rows[k]["alt_m"]) for k in (5, -1)]
@@ -47,19 +47,19 @@ def test_the_table_says_where_it_was_and_no_word_becomes_a_formula(flown) -> Non
     assert rows[5]["utc"].startswith("2023-11-14T22:13") and rows[-20]["state"] == "predicting"
     assert rows[-20]["alerts"] == "'=HYPERLINK(1)" and {row["mode"] for row in rows} <= {"AUTO", "'@SUM(1)", ""}
     assert all(not value.startswith(("=", "@", "+")) for row in rows for value in row.values())
-    assert plain("-3.5") == "-3.5" and plain("-cmd") == "'-cmd"
+    assert escape_formula("-3.5") == "-3.5" and escape_formula("-cmd") == "'-cmd"
 
 
 def test_the_flight_is_a_page_that_needs_nobody(flown) -> None:
     one, feed = flown
     shares: list[float] = []
-    text = Film(feed, one._tapes, DARK).html(0, shares.append)
+    text = FlightAnimation(feed, one._recordings, DARK).html(0, shares.append)
     data = re.search(r'__VISER_EMBED_DATA__="([^"]+)"', text)
     assert data is not None and len(base64.b64decode(data[1])) > 20_000 and len(text) < 8_000_000
     assert "<title>ParaUAV" in text and shares == sorted(shares) and shares[-1] == 1.0
     assert len(shares) == pytest.approx(50, abs=3)  # two instants a second
     with pytest.raises(ValueError, match="export: found no recording of uav-9"):
-        Film(feed, one._tapes, DARK).html(9)
+        FlightAnimation(feed, one._recordings, DARK).html(9)
 
 
 def test_a_picture_has_the_sky_where_nothing_is_drawn() -> None:
@@ -81,14 +81,14 @@ def test_a_picture_is_no_larger_than_a_browser_can_make() -> None:
 def test_what_goes_wrong_is_said_on_the_page(flown) -> None:
     one, feed = flown
     client, chosen = MagicMock(), [None]
-    export = Export(client, feed, one._tapes, DARK, lambda: chosen[0])
-    export._hand(export._table)
-    assert "found no selection" in export._said.content and not client.send_file_download.called
+    export = Export(client, feed, one._recordings, DARK, lambda: chosen[0])
+    export._export(export._table)
+    assert "found no selection" in export._status.content and not client.send_file_download.called
     chosen[0] = 0
-    export._hand(export._table)
+    export._export(export._table)
     name, data = client.send_file_download.call_args.args
     assert re.fullmatch(r"parauav-uav-0-[\w.-]+\.csv", name) and data.startswith(b"t_s,utc")
     client.camera.image_width = client.camera.image_height = 100
     client.get_render.side_effect = TimeoutError("no answer")
-    export._hand(export._picture)
-    assert "no answer" in export._said.content
+    export._export(export._picture)
+    assert "no answer" in export._status.content

@@ -15,12 +15,12 @@ from pretend_feed import PretendFleet
 
 from fleet.bus.memory_bus import MemoryBus
 from tests.bench.viewing.watcher import Watcher
-from viewer.browser.http_server import quiet, serve
-from viewer.browser.remembered import Remembered
-from viewer.panels.panels import NOBODY
+from viewer.browser.http_server import serve, without_stdout
+from viewer.browser.remembered import PagePreferences
+from viewer.panels.panels import NO_UAV
 from viewer.server.app import App
 from viewer.server.view import View
-from viewer.text.clicks import click, clicked
+from viewer.text.clicks import encode_click, parse_click
 from viewer.text.words import table
 from viewer.theme.palette import DARK, LIGHT
 
@@ -43,12 +43,12 @@ def site() -> Iterator[SimpleNamespace]:
     yield SimpleNamespace(app=app, run=run, views=[app.views[n] for n in sorted(app.views)])
     for page in pages:
         page.close()
-    with quiet():
+    with without_stdout():
         server.stop()
 
 
 def broken(view: View) -> str:
-    return view.panels._broken.content
+    return view.panels._error.content
 
 
 def test_a_defect_of_one_page_is_said_there_and_in_the_log_and_the_others_go_on(site, caplog) -> None:
@@ -64,7 +64,7 @@ def test_a_defect_of_one_page_is_said_there_and_in_the_log_and_the_others_go_on(
     del first.scene.draw_heads
     site.run()
     assert broken(first)  # it may stumble again at once
-    first._stumbled -= 10.0
+    first._error_time -= 10.0
     site.run()
     assert broken(first) == ""
 
@@ -81,8 +81,8 @@ def test_a_page_that_cannot_be_opened_is_left_alone(site, caplog, monkeypatch) -
 
 def test_every_page_has_its_own_colours_and_goes_on_where_it_was(site) -> None:
     first, second = site.views
-    first.choose(3)
-    first.browser.paint(light=True)
+    first.select(3)
+    first.browser.set_theme(light=True)
     site.run()
     again = site.app.views[first.client.client_id]
     assert again is not first and again.palette is LIGHT and again.selected == 3 and again.camera is first.camera
@@ -92,15 +92,15 @@ def test_every_page_has_its_own_colours_and_goes_on_where_it_was(site) -> None:
 
 def test_a_click_on_an_alert_selects_and_shows_its_time(site) -> None:
     view = site.views[0]
-    tape = site.app.tapes.of[4]
-    while not tape.stood or tape.t[-1] - tape.stood[0].t < 0.2:
+    tape = site.app.recordings.by_uav[4]
+    while not tape.states or tape.t[-1] - tape.states[0].t < 0.2:
         site.run()
-    then = float(tape.stood[0].t) + 0.1
-    view.panels._pick(click(4, then))
+    then = float(tape.states[0].t) + 0.1
+    view.panels._pick(encode_click(4, then))
     assert view.selected == 4 and view.timeline.player.t == pytest.approx(then, abs=2e-3) and view.dirty
-    site.app.answer()
-    assert view.chosen().then == pytest.approx(then, abs=2e-3) and site.views[1].timeline.player.live
-    view.panels._pick(click(2, float("nan")))  # a time that is none: selected, as a row is
+    site.app.draw_selections()
+    assert view.selected_vehicle().shown_t == pytest.approx(then, abs=2e-3) and site.views[1].timeline.player.live
+    view.panels._pick(encode_click(2, float("nan")))  # a time that is none: selected, as a row is
     assert view.selected == 2
     for mischief in ("", "x", "7@", "9999999", "1@1e400", "1@nan", "1@-3", "²", "3@" + "9" * 100):
         view.panels._pick(mischief)
@@ -109,9 +109,9 @@ def test_a_click_on_an_alert_selects_and_shows_its_time(site) -> None:
 
 def test_who_is_selected_is_drawn_ahead_of_lists_and_charts(site, monkeypatch) -> None:
     view = site.views[0]
-    view.choose(3)
+    view.select(3)
     monkeypatch.setattr(view.panels, "draw", told := MagicMock(wraps=view.panels.draw))
-    site.app.answer()
+    site.app.draw_selections()
     assert view.selection.tags[0].text.startswith("UAV-003") and not told.called
     site.run(1)
     assert told.called
@@ -132,16 +132,20 @@ def test_nothing_is_held_back_while_lists_are_made(site, monkeypatch) -> None:
 
 def test_a_click_is_written_as_it_is_read() -> None:
     for uav, t in ((0, 0.0), (7, 1_700_000_000.125), (999_999, 3.9e9)):
-        assert clicked(click(uav, t)) == (uav, pytest.approx(t, abs=1e-3))
-    assert clicked(click(5, np.inf)) == (5, None) and clicked("5") == (5, None) and clicked("5@x") is None
+        assert parse_click(encode_click(uav, t)) == (uav, pytest.approx(t, abs=1e-3))
+    assert (
+        parse_click(encode_click(5, np.inf)) == (5, None)
+        and parse_click("5") == (5, None)
+        and parse_click("5@x") is None
+    )
 
 
-def remembered(text: str | None, *, error: type[Exception] | None = None) -> Remembered:
+def remembered(text: str | None, *, error: type[Exception] | None = None) -> PagePreferences:
     client = MagicMock()
     client.local_storage.get_item.side_effect = error
     client.local_storage.get_item.return_value = text
     told = threading.Event()
-    one = Remembered(client, told.set)
+    one = PagePreferences(client, told.set)
     assert told.wait(10)
     return one
 
@@ -150,11 +154,11 @@ def test_a_page_that_reloads_has_its_aircraft_and_colours_again(site) -> None:
     one = remembered('{"uav": 3, "light": true}')
     assert one.uav == 3 and one.light is True
     view = site.views[0]
-    view.browser.remembered = one
+    view.browser.preferences = one
     site.run()
     again = site.app.views[view.client.client_id]
     assert again.selected == 3 and again.palette is LIGHT and one.uav is None
-    again.choose(1)
+    again.select(1)
     site.run()
     assert one._client.local_storage.set_item.call_args.args[1] == '{"uav": 1, "light": true}'
 
@@ -169,7 +173,7 @@ def test_what_else_a_browser_says_is_nothing(text: str | None) -> None:
 
 def test_who_was_selected_is_not_forgotten_before_it_is_there_again() -> None:
     one = remembered('{"uav": 40}')
-    one.keep(1)  # another is shown meanwhile
+    one.save(1)  # another is shown meanwhile
     with contextlib.suppress(IndexError):
         assert one._client.local_storage.set_item.call_args.args[1] == '{"uav": 40, "light": null}'
     assert one.uav == 40 and remembered(None, error=TimeoutError).uav is None
@@ -182,8 +186,8 @@ def test_the_menu_offers_the_rows_of_the_table_and_both_those_that_pass_the_sear
         return tuple(f"UAV-{int(uav):03d}" for uav in re.findall(r'data-uav="(\d+)"', panels._table.content))
 
     site.run()
-    assert sorted(rows()) == [f"UAV-{uav:03d}" for uav in range(5)] and panels._menu.options == (NOBODY, *rows())
+    assert sorted(rows()) == [f"UAV-{uav:03d}" for uav in range(5)] and panels._menu.options == (NO_UAV, *rows())
     assert list(rows()) != sorted(rows())  # the worst first
     panels._search.value = "uav-003"
     site.run()
-    assert rows() == ("UAV-003",) and panels._menu.options == (NOBODY, "UAV-003")
+    assert rows() == ("UAV-003",) and panels._menu.options == (NO_UAV, "UAV-003")

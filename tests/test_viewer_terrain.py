@@ -8,10 +8,10 @@ import pytest
 from PIL import Image, TiffImagePlugin
 from pretend_feed import HOME
 
-from viewer.scene.terrain.land import MOST_CONTOURS, Land, Shape, contours
-from viewer.scene.terrain.raster import KEYS, NO_DATA, SCALE, TIEPOINT, read
+from viewer.scene.terrain.land import MAX_CONTOURS, HeightGrid, TerrainLayer, contours
+from viewer.scene.terrain.raster import KEYS, NO_DATA, SCALE, TIEPOINT, read_raster
 from viewer.scene.terrain.utm import to_utm
-from viewer.store.place import UNIT_M, Place
+from viewer.store.place import UNIT_M, SceneFrame
 from viewer.theme.palette import DARK
 
 LAT, LON = HOME.lat_e7 * 1e-7, HOME.lon_e7 * 1e-7
@@ -63,19 +63,19 @@ def test_a_place_in_metres_of_its_zone(lat, lon, zone, north, easting, northing)
 
 
 def test_heights_are_found_where_they_lie_and_nowhere_else(degrees: str) -> None:
-    raster = read(degrees, colours=False)
-    assert float(raster.at(LAT - 1e-4, LON)) == pytest.approx(600.0, abs=0.01)  # the middle of row 100
-    assert float(raster.at(LAT + 0.01, LON)) == pytest.approx(549.5, abs=0.01)
-    assert np.isnan(raster.at(np.array([LAT + 0.5, LAT]), np.array([LON, LON + 0.5]))).all()
-    assert np.isnan(raster.at(LAT + 0.0199, LON - 0.0199))  # no data
+    raster = read_raster(degrees, colours=False)
+    assert float(raster.sample(LAT - 1e-4, LON)) == pytest.approx(600.0, abs=0.01)  # the middle of row 100
+    assert float(raster.sample(LAT + 0.01, LON)) == pytest.approx(549.5, abs=0.01)
+    assert np.isnan(raster.sample(np.array([LAT + 0.5, LAT]), np.array([LON, LON + 0.5]))).all()
+    assert np.isnan(raster.sample(LAT + 0.0199, LON - 0.0199))  # no data
 
 
 def test_the_same_hill_in_utm_lies_in_the_same_place(tmp_path: Path) -> None:
     e, n = (float(x) for x in to_utm(np.array(LAT), np.array(LON), 32, north=True))
     values = np.repeat(500.0 + np.arange(200, dtype=np.float32)[:, None], 200, axis=1)
     path = geotiff(tmp_path / "utm.tif", values, (e - 1000, n + 1000), 10.0, k1024=1, k1025=1, k3072=32632)
-    raster = read(str(path), colours=False)
-    assert float(raster.at(LAT, LON)) == pytest.approx(599.5, abs=0.1)
+    raster = read_raster(str(path), colours=False)
+    assert float(raster.sample(LAT, LON)) == pytest.approx(599.5, abs=0.1)
 
 
 @pytest.mark.parametrize("way", ["bounds", "world"])
@@ -89,9 +89,9 @@ def test_a_picture_with_bounds_or_a_world_file(tmp_path: Path, way: str) -> None
         text += f"@{LAT - 0.01},{LON - 0.02},{LAT + 0.01},{LON + 0.02}"
     else:
         path.with_suffix(".pgw").write_text(f"0.0002\n0\n0\n-0.0002\n{LON - 0.0199}\n{LAT + 0.0099}\n")
-    raster = read(text, colours=True)
-    assert raster.at(LAT + 0.005, LON)[0] == 200 and raster.at(LAT - 0.005, LON + 0.019)[2] == 90
-    assert np.isnan(raster.at(LAT + 0.0101, LON)).all()
+    raster = read_raster(text, colours=True)
+    assert raster.sample(LAT + 0.005, LON)[0] == 200 and raster.sample(LAT - 0.005, LON + 0.019)[2] == 90
+    assert np.isnan(raster.sample(LAT + 0.0101, LON)).all()
 
 
 # --- what is refused ---
@@ -112,14 +112,14 @@ def test_what_is_no_raster_is_refused_in_one_sentence(tmp_path: Path, degrees: s
         (str(cut), "cut.tif: found "),
     ):
         with pytest.raises(ValueError, match="expected") as refused:
-            read(text, colours=False)
+            read_raster(text, colours=False)
         assert words in str(refused.value) and "\n" not in str(refused.value)
     colour = tmp_path / "rgb.png"
     Image.fromarray(np.zeros((9, 9, 3), np.uint8)).save(colour)
     with pytest.raises(ValueError, match="expected one band of metres"):
-        read(f"{colour}@1,2,3,4", colours=False)
+        read_raster(f"{colour}@1,2,3,4", colours=False)
     with pytest.raises(FileNotFoundError):
-        read(str(tmp_path / "none.tif"), colours=False)
+        read_raster(str(tmp_path / "none.tif"), colours=False)
 
 
 # --- in the scene ---
@@ -130,7 +130,7 @@ def client(number: int) -> MagicMock:
 
 
 def test_the_ground_is_laid_once_and_shown_once_on_every_page(degrees: str) -> None:
-    land, place = Land(read(degrees, colours=False), None), Place(HOME)
+    land, place = TerrainLayer(read_raster(degrees, colours=False), None), SceneFrame(HOME)
     pages = client(1), client(2)
     for page in (*pages, *pages):
         land.show(page, None, DARK, 0.0)
@@ -149,12 +149,12 @@ def test_the_ground_is_laid_once_and_shown_once_on_every_page(degrees: str) -> N
 def test_a_picture_without_heights_lies_flat_and_one_of_elsewhere_is_said(tmp_path: Path, degrees: str) -> None:
     path = tmp_path / "aerial.png"
     Image.fromarray(np.full((40, 40, 3), 128, np.uint8)).save(path)
-    picture = read(f"{path}@{LAT - 0.01},{LON - 0.01},{LAT + 0.01},{LON + 0.01}", colours=True)
+    picture = read_raster(f"{path}@{LAT - 0.01},{LON - 0.01},{LAT + 0.01},{LON + 0.01}", colours=True)
     page = client(1)
-    Land(None, picture).show(page, Place(HOME), DARK, -7.0)
+    TerrainLayer(None, picture).show(page, SceneFrame(HOME), DARK, -7.0)
     assert np.allclose(page.scene.add_mesh_trimesh.call_args.args[1].vertices[:, 2], -7.1)
-    abroad = Land(read(degrees, colours=False), picture)
-    abroad.show(client(2), Place(HOME._replace(lat_e7=-338_000_000)), DARK, 0.0)
+    abroad = TerrainLayer(read_raster(degrees, colours=False), picture)
+    abroad.show(client(2), SceneFrame(HOME._replace(lat_e7=-338_000_000)), DARK, 0.0)
     assert abroad.sentence.startswith("dem.tif and aerial.png: found no data within 15 km")
 
 
@@ -163,9 +163,9 @@ def test_contours_lie_at_whole_steps_and_are_few() -> None:
     e = np.linspace(-50, 50, n)
     up = np.exp(-(e[:, None] ** 2 + e**2) / 800) * 30.0
     up[:4, :4] = np.nan
-    lines = contours(Shape(e, e, up))
+    lines = contours(HeightGrid(e, e, up))
     levels = np.unique(np.round((lines[..., 2] - 0.05) * UNIT_M, 3))
-    assert np.allclose(levels % 20, 0) and 4 < len(levels) <= MOST_CONTOURS
+    assert np.allclose(levels % 20, 0) and 4 < len(levels) <= MAX_CONTOURS
     assert np.isfinite(lines).all()
     where = lines.reshape(-1, 3)[::50]
     true = np.exp(-(where[:, 0] ** 2 + where[:, 1] ** 2) / 800) * 30.0

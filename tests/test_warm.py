@@ -24,18 +24,18 @@ from numba.core.dispatcher import Dispatcher
 
 from fleet.bus.codec import encode
 from fleet.contract import History, Sample
-from twin_worker.ownership.handover import Load, packed, unpacked
-from twin_worker.ownership.history_decoder import read
-from twin_worker.twin.state.state import hear
+from twin_worker.ownership.handover import Snapshot, decode_snapshot, encode_snapshot
+from twin_worker.ownership.history_decoder import decode_history
+from twin_worker.twin.state.state import ingest
 
 ours = [name for name in sys.modules if name.startswith(("twin_worker", "fleet"))]
 kernels = {f"{name}.{key}": one for name in ours for key, one in vars(sys.modules[name]).items()
            if isinstance(one, Dispatcher)}
 before = {name: len(one.signatures) for name, one in kernels.items()}
 twin, _ = flights.learnt(folder)
-twin = unpacked(packed(Load(twin)), twin.uav).twin
+twin = decode_snapshot(encode_snapshot(Snapshot(twin)), twin.config.uav).twin
 past = tuple(one for one in heard if isinstance(one, Sample))[-100:]
-hear(twin, read(encode(History(uav=twin.uav, t=past[-1].t, samples=past))))
+ingest(twin, decode_history(encode(History(uav=twin.config.uav, t=past[-1].t, samples=past))))
 print(len(kernels), *(name for name, one in kernels.items() if len(one.signatures) != before[name]))
 """
 

@@ -24,7 +24,7 @@ def options(*words: str) -> argparse.Namespace:
 def test_a_mission_file_becomes_a_question(tmp_path):
     path = tmp_path / "other.waypoints"
     path.write_text(WPL)
-    got = command.question(options("--items", str(path), "--seq", "1", "--param", "WP_RADIUS=40", "--wind=-3,2"))
+    got = command.build_request(options("--items", str(path), "--seq", "1", "--param", "WP_RADIUS=40", "--wind=-3,2"))
     assert [(i.seq, i.command, i.lat_e7, i.param2) for i in got.items] == [
         (0, 16, 474_000_000, 0.0), (1, 16, 474_100_000, 0.0), (2, 177, 0, -1.0)
     ]  # fmt: skip
@@ -48,7 +48,7 @@ def test_a_file_that_is_no_mission_is_refused_by_its_line(tmp_path, text, words)
     path = tmp_path / "odd.waypoints"
     path.write_text(text)
     with pytest.raises(ValueError, match=words):
-        command.question(options("--items", str(path)))
+        command.build_request(options("--items", str(path)))
 
 
 @pytest.mark.parametrize(
@@ -56,12 +56,12 @@ def test_a_file_that_is_no_mission_is_refused_by_its_line(tmp_path, text, words)
 )
 def test_an_option_that_makes_no_sense_is_refused(words):
     with pytest.raises(ValueError, match=r"found .*expected"):
-        command.question(options(*words))
+        command.build_request(options(*words))
 
 
 def test_the_path_is_told_in_a_few_lines(holder, monkeypatch, capsys):
     monkeypatch.setattr(command, "connect", lambda _: holder.bus)
-    holder.bus.ask(Prediction, 1)
+    holder.bus.get(Prediction, 1)
     assert command.run(options("--speed", "18")) == 0
     lines = capsys.readouterr().out.splitlines()
     assert "it flew at 18 m/s" in lines[0] and "horizon" in lines[1]

@@ -9,8 +9,8 @@ from odd_missions import ODD
 
 from fleet.contract import MAX_ITEMS, Prediction, WhatIf
 from twin_worker.twin.state.state import Twin
-from twin_worker.whatif.answer import answer
-from twin_worker.whatif.query import MOST_BYTES
+from twin_worker.whatif.answer import answer_query
+from twin_worker.whatif.query import MAX_BYTES
 
 NAN, INF = float("nan"), float("inf")
 PLACE = {"lat_e7": 470_000_000, "lon_e7": 80_000_000, "alt_mm": 500_000}
@@ -19,7 +19,7 @@ REFUSED = {
     "not msgpack": (b"\xc1", "no msgpack map"),
     "no map": (b"\x93\x01\x02\x03", "Expected `object`"),
     "too deep": (b"\x91" * 5000 + b"\xc0", "invalid payload"),
-    "too long": (bytes(MOST_BYTES + 1), "bytes, expected at most"),
+    "too long": (bytes(MAX_BYTES + 1), "bytes, expected at most"),
     "a slip of the pen": ({"sped": 18}, "unknown field `sped`"),
     "text for a number": ({"speed": "fast"}, r"Expected `float \| null`"),
     "too many items": ({"items": MANY}, "1,001 mission items, expected at most 1,000; shorten"),
@@ -50,29 +50,29 @@ def test_a_hostile_question_is_refused_in_one_sentence(holder, name):
     payload, words = REFUSED[name]
     payload = payload if isinstance(payload, bytes) else msgpack.packb(payload)
     with pytest.raises(ValueError, match=words) as refused:
-        holder.bus.inquire(Prediction, 1, payload)
+        holder.bus.get_one(Prediction, 1, payload)
     said = str(refused.value)
     assert said.startswith("what if: ") and "expected" in said and "\n" not in said and len(said) < 300
-    assert holder.bus.ask(Prediction, 1) != []
+    assert holder.bus.get(Prediction, 1) != []
 
 
 def test_a_question_for_everybody_is_refused(holder):
-    (reply,) = holder.bus._reply[Prediction]
+    (reply,) = holder.bus._query_handlers[Prediction]
     with pytest.raises(ValueError, match="every aircraft, expected one"):
         reply(None, {}, msgspec.msgpack.encode(WhatIf()))
 
 
 def test_a_twin_that_has_heard_nothing_says_so():
     with pytest.raises(ValueError, match="uav-4 has sent no position yet"):
-        answer(Twin(4), WhatIf(speed=10.0))
-    early = Twin(4)
+        answer_query(Twin.of(4), WhatIf(speed=10.0))
+    early = Twin.of(4)
     f.drive(early, f.messages(f.turn(0.5), uav=4))
     with pytest.raises(ValueError, match="too few recent positions"):
-        answer(early, WhatIf(speed=10.0))
+        answer_query(early, WhatIf(speed=10.0))
 
 
 @pytest.mark.parametrize("name", ODD)
 def test_an_odd_mission_is_flown_or_refused_in_a_sentence(winged, name):
-    made = answer(winged, WhatIf(items=ODD[name][0]))
+    made = answer_query(winged, WhatIf(items=ODD[name][0]))
     assert np.isfinite(made.path.numpy()).all()
     assert made.method != "imm" or "mission" in made.sentence or "item" in made.sentence

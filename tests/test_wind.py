@@ -72,7 +72,7 @@ def test_a_wind_that_cannot_be_is_never_told():
     filt = flown(60.0)
     before = filt.wind
     for odd in (np.inf, np.nan, 1e4):
-        filt.blow(filt.t, np.array([odd, 0.0, 0.0]))
-        filt.jump(np.array([odd, 0.0, 0.0]), 1.0, 0.1)
-    filt.jump(np.zeros(3), np.inf, 0.1)
+        filt.reset_wind(filt.t, np.array([odd, 0.0, 0.0]))
+        filt.inflate_after_step(np.array([odd, 0.0, 0.0]), 1.0, 0.1)
+    filt.inflate_after_step(np.zeros(3), np.inf, 0.1)
     assert np.array_equal(filt.wind, before) and np.isfinite(filt.P).all()

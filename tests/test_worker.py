@@ -18,14 +18,14 @@ from fleet.contract import (
     Prediction,
     Predictions,
     Sample,
-    State,
     Status,
+    TwinState,
 )
-from twin_worker.ownership.twin_store import INBOX
+from twin_worker.ownership.twin_store import INBOX_SIZE
 from twin_worker.service import worker as live
-from twin_worker.service.queries import told as told_of
+from twin_worker.service.queries import latest_prediction as told_of
 from twin_worker.service.worker import Worker
-from twin_worker.whatif.resample import resample, wanted
+from twin_worker.whatif.resample import read_grid, resample
 
 NAN = float("nan")
 
@@ -34,7 +34,7 @@ class Bus(MemoryBus):
     """A bus in memory that also carries what a query asks for."""
 
     def query(self, kind: type, uav: int | None = None, **asked: str) -> list:
-        found = (answer for reply in self._reply[kind] for answer in reply(uav, asked, b""))
+        found = (answer for reply in self._query_handlers[kind] for answer in reply(uav, asked, b""))
         return [(decode(kind, encode(message)), stamp) for message, stamp in found]
 
 
@@ -54,7 +54,7 @@ def clock(monkeypatch) -> list[float]:
 @pytest.fixture
 def worker(bus, clock) -> Worker:
     made = Worker(bus, range(2, 5), omega=0.0)
-    made.listen()
+    made.connect()
     return made
 
 
@@ -79,8 +79,8 @@ def fly(bus: Bus, uav: int, seconds: float = 6.0) -> None:
 def test_it_holds_its_range_and_nothing_else(bus, worker):
     for uav in (1, 2, 4, 5, 900):
         fly(bus, uav, 3.0)
-    worker.turn()
-    assert [held.twin.uav for held in worker.holding()] == [2, 4]
+    worker.sweep()
+    assert [held.twin.config.uav for held in worker.owned_twins()] == [2, 4]
     assert [row.uav for row in worker.state().rows] == [2, 4]
 
 
@@ -88,11 +88,11 @@ def test_a_recorded_flight_is_learnt_live(bus, worker, heard):
     models, made = told(bus, Model), told(bus, Prediction)
     for message in heard:
         bus.publish(msgspec.structs.replace(message, uav=3))
-    assert worker.turn() == len(heard)
+    assert worker.sweep() == len(heard)
     assert "verified" in {m.verdict.outcome for m, _ in models}
     assert {"dynamics", "hybrid", "both"} & {p.method for p, _ in made}
     (row,) = worker.state().rows
-    assert (row.uav, row.state) == (3, State.PREDICTING)
+    assert (row.uav, row.state) == (3, TwinState.PREDICTING)
     assert row.worker == f"{bus.writer:016x}" and row.epoch > 1.6e12
     assert row.fit and row.verdict.startswith("uav-3: ")
     assert row.sample_age_s == pytest.approx(0.0)
@@ -101,10 +101,10 @@ def test_a_recorded_flight_is_learnt_live(bus, worker, heard):
 def test_the_paper_s_method_may_be_asked_for(bus, clock, heard):
     models = told(bus, Model)
     worker = Worker(bus, range(1, 2), omega=0.0, method="paper")
-    worker.listen()
+    worker.connect()
     for message in heard:
         bus.publish(message)
-    worker.turn()
+    worker.sweep()
     assert models and {m.method for m, _ in models} == {"paper"}
     assert all(m.derivatives is None for m, _ in models)
     assert any(m.longitudinal is not None for m, _ in models)
@@ -113,53 +113,55 @@ def test_the_paper_s_method_may_be_asked_for(bus, clock, heard):
 def test_results_carry_the_claim(bus, worker):
     made = told(bus, Prediction)
     fly(bus, 2)
-    worker.turn()
-    (held,) = worker.holding()
+    worker.sweep()
+    (held,) = worker.owned_twins()
     assert made and {stamp for _, stamp in made} == {Stamp(held.epoch, bus.writer)}
 
 
 def test_wildcard_queries_are_answered_with_stamps(bus, worker):
-    assert bus.ask(Prediction) == []
+    assert bus.get(Prediction) == []
     for uav in (2, 3, 4):
         fly(bus, uav)
-    worker.turn()
-    found = bus.ask(Prediction)
+    worker.sweep()
+    found = bus.get(Prediction)
     assert [p.uav for p, _ in found] == [2, 3, 4]
     assert all(stamp is not None and stamp.writer == bus.writer for _, stamp in found)
-    assert [p.uav for p, _ in bus.ask(Prediction, 3)] == [3]
-    assert bus.ask(Prediction, 9) == []
-    ((table, _),) = bus.ask(FleetState)
+    assert [p.uav for p, _ in bus.get(Prediction, 3)] == [3]
+    assert bus.get(Prediction, 9) == []
+    ((table, _),) = bus.get(FleetState)
     assert [row.uav for row in table.rows] == [2, 3, 4]
 
 
 def test_one_answer_has_them_all(bus, worker):
-    assert [one.predictions for one, _ in bus.ask(Predictions)] == [()]
+    assert [one.predictions for one, _ in bus.get(Predictions)] == [()]
     for uav in (2, 3):
         fly(bus, uav)
-    worker.turn()
-    each = bus.ask(Prediction)
-    ((batch, _),) = bus.ask(Predictions)
+    worker.sweep()
+    each = bus.get(Prediction)
+    ((batch, _),) = bus.get(Predictions)
     assert [decode(Prediction, bytes(raw)) for raw in batch.predictions] == [made for made, _ in each]
     assert list(batch.epochs) == [stamp.epoch for _, stamp in each]
 
 
 def test_an_answer_is_packed_once_and_anew_when_there_is_another_prediction(bus, worker):
     fly(bus, 2)
-    worker.turn()
-    (held,) = worker.holding()
+    worker.sweep()
+    (held,) = worker.owned_twins()
     first = told_of(held)
-    assert told_of(held) is first and first.message().controller == held.twin.control.wire()
-    held.twin.prediction = msgspec.structs.replace(held.twin.prediction, t=held.twin.prediction.t + 1.0)
+    assert told_of(held) is first and first.message().controller == held.twin.prediction.controller.to_message()
+    held.twin.prediction.latest = msgspec.structs.replace(
+        held.twin.prediction.latest, t=held.twin.prediction.latest.t + 1.0
+    )
     assert told_of(held).message().t == first.message().t + 1.0
 
 
 def test_a_query_chooses_horizon_and_step(bus, worker):
     fly(bus, 2)
-    worker.turn()
+    worker.sweep()
     ((whole, _),) = bus.query(Prediction)
     ((asked, _),) = bus.query(Prediction, horizon="30", step="0.5")
     assert np.array_equal(asked.ahead.numpy(), np.arange(0, 30.25, 0.5))
-    assert asked.path.shape == asked.tube.shape == (61, 3)
+    assert asked.path.shape == asked.prediction_region_half_axes.shape == (61, 3)
     assert np.allclose(asked.path.numpy()[::2], whole.path.numpy()[:31])
     assert np.allclose(asked.path.numpy()[1], whole.path.numpy()[:2].mean(axis=0), atol=1.0)
     assert (asked.t, asked.horizon_s) == (whole.t, whole.horizon_s)
@@ -167,16 +169,18 @@ def test_a_query_chooses_horizon_and_step(bus, worker):
 
 def test_a_query_cuts_no_corner_where_look_aheads_are_far_apart(bus, worker):
     fly(bus, 2)
-    worker.turn()
+    worker.sweep()
     ((whole, _),) = bus.query(Prediction)
     t = whole.ahead.numpy().astype(float)
     path = 80.0 * np.column_stack([np.cos(t / 4), np.sin(t / 4), 0 * t])
     circle = msgspec.structs.replace(whole, path=Array.of(path))
-    asked = resample(circle, wanted({"horizon": "180"}))
+    asked = resample(circle, read_grid({"horizon": "180"}))
     assert len(asked.path.numpy()) == 181
     assert np.allclose(np.linalg.norm(asked.path.numpy(), axis=1), 80.0, atol=2.0)  # a chord lies 10 m inside
-    cut = {name: Array.of(getattr(whole, name).numpy()[:70]) for name in ("ahead", "path", "tube")}
-    short = resample(msgspec.structs.replace(whole, **cut), wanted({"horizon": "180"}))
+    cut = {
+        name: Array.of(getattr(whole, name).numpy()[:70]) for name in ("ahead", "path", "prediction_region_half_axes")
+    }
+    short = resample(msgspec.structs.replace(whole, **cut), read_grid({"horizon": "180"}))
     assert short.ahead.numpy()[-1] == 96.0  # no further than it was flown
 
 
@@ -204,16 +208,16 @@ def test_absurd_queries_are_refused_with_a_sentence(bus, worker, asked):
 
 
 def test_what_a_query_may_ask():
-    assert wanted({}) is None and wanted({"colour": "red"}) is None
-    assert wanted({"horizon": "2"}).tolist() == [0.0, 1.0, 2.0]
-    assert len(wanted({"step": "0.18"})) == 1001
-    assert wanted({"horizon": "180", "step": "60"}).tolist() == [0.0, 60.0, 120.0, 180.0]
-    assert len(wanted({"horizon": "60", "step": "60"})) == 2
+    assert read_grid({}) is None and read_grid({"colour": "red"}) is None
+    assert read_grid({"horizon": "2"}).tolist() == [0.0, 1.0, 2.0]
+    assert len(read_grid({"step": "0.18"})) == 1001
+    assert read_grid({"horizon": "180", "step": "60"}).tolist() == [0.0, 60.0, 120.0, 180.0]
+    assert len(read_grid({"horizon": "60", "step": "60"})) == 2
 
 
 def test_resampling_nothing_gives_the_whole(bus, worker):
     fly(bus, 2)
-    worker.turn()
+    worker.sweep()
     ((whole, _),) = bus.query(Prediction)
     assert resample(whole, None) is whole
 
@@ -221,12 +225,16 @@ def test_resampling_nothing_gives_the_whole(bus, worker):
 def test_it_asks_for_what_was_said_before_it_came(bus):
     mission = Mission(uav=3, t=f.T0, items=(item(0), item(1, north=100.0)), complete=True)
     for message in (mission, Params(uav=3, t=f.T0, values={"A": 1.0}), Status(uav=3, t=f.T0, mode="AUTO")):
-        bus.answer(type(message), lambda uav, asked, payload, message=message: [(message, None)])
+        bus.declare_queryable(type(message), lambda uav, asked, payload, message=message: [(message, None)])
     worker = Worker(bus, range(2, 5), omega=0.0)
-    worker.listen()
-    worker.turn()
-    (held,) = worker.holding()
-    assert held.twin.mission == mission and held.twin.params.values == {"A": 1.0} and held.twin.status.mode == "AUTO"
+    worker.connect()
+    worker.sweep()
+    (held,) = worker.owned_twins()
+    assert (
+        held.twin.onboard.mission == mission
+        and held.twin.onboard.params.values == {"A": 1.0}
+        and held.twin.onboard.status.mode == "AUTO"
+    )
 
 
 GARBAGE = (
@@ -246,9 +254,9 @@ def test_garbage_of_one_does_not_stop_the_others(bus, worker):
     for message in GARBAGE:
         bus.publish(message)
         fly(bus, 3, 3.0)
-        worker.turn()
+        worker.sweep()
         fly(bus, 2, 3.0)
-        worker.turn()
+        worker.sweep()
     assert 3 in {p.uav for p, _ in made}
     assert [row.uav for row in worker.state().rows] == [2, 3]
     assert worker.state().sentence == ""  # nothing even failed
@@ -258,7 +266,7 @@ def test_a_failure_of_one_is_counted_said_and_stays_its_own(bus, worker, monkeyp
     advance = live.advance
 
     def fragile(twin, *told):
-        if twin.uav == 2:
+        if twin.config.uav == 2:
             raise RuntimeError("a defect")
         return advance(twin, *told)
 
@@ -266,54 +274,56 @@ def test_a_failure_of_one_is_counted_said_and_stays_its_own(bus, worker, monkeyp
     made = told(bus, Prediction)
     for uav in (2, 3):
         fly(bus, uav)
-    worker.turn()
+    worker.sweep()
     assert {p.uav for p, _ in made} == {3}
     assert "uav-2" in worker.state().sentence and "a defect" in worker.state().sentence
     monkeypatch.setattr(live, "advance", advance)
     fly(bus, 2, 8.0)
-    worker.turn()
+    worker.sweep()
     assert {p.uav for p, _ in made} == {2, 3}  # and it goes on with the next message
 
 
 def test_a_flood_sheds_the_oldest_and_says_so(bus, worker):
     status = Status(uav=2, t=f.T0)
-    for _ in range(INBOX + 7):
+    for _ in range(INBOX_SIZE + 7):
         bus.publish(status)
-    assert worker.turn() == INBOX
+    assert worker.sweep() == INBOX_SIZE
     assert "7 messages dropped" in worker.state().sentence
 
 
 def test_a_silent_aircraft_ages_by_the_wall_clock(bus, worker, clock):
     made = told(bus, Prediction)
     fly(bus, 2)
-    worker.turn()
+    worker.sweep()
     for _ in range(4):
         clock[0] += 1.0
-        worker.turn()
-    assert made[-1][0].state is State.LINK_LOST and made[-1][0].coast_s == pytest.approx(4.0, abs=0.5)
+        worker.sweep()
+    assert made[-1][0].state is TwinState.LINK_LOST and made[-1][0].coast_s == pytest.approx(4.0, abs=0.5)
     (row,) = worker.state().rows
-    assert row.sample_age_s == pytest.approx(4.0, abs=0.5) and row.state is State.LINK_LOST
+    assert row.sample_age_s == pytest.approx(4.0, abs=0.5) and row.state is TwinState.LINK_LOST
 
 
 def test_garbled_bytes_on_the_bus_are_counted(bus, worker):
     bus.deliver(Sample, b"\xc1 no msgpack", "application/msgpack;parauav.sample.1")
     bus.deliver(Sample, b"\x80", "application/msgpack;parauav.sample.99")
-    assert bus.bad == 2 and worker.turn() == 0
+    assert bus.bad == 2 and worker.sweep() == 0
 
 
 def test_who_has_no_news_is_left_alone_until_it_falls_silent(bus, worker, clock, monkeypatch):
     fly(bus, 2)
     fly(bus, 3)
-    worker.turn()
+    worker.sweep()
     turned, really = [], live._advance_all
-    monkeypatch.setattr(live, "_advance_all", lambda held, *more: turned.append(held.twin.uav) or really(held, *more))
-    assert worker.turn() == 0 and turned == []
+    monkeypatch.setattr(
+        live, "_advance_all", lambda held, *more: turned.append(held.twin.config.uav) or really(held, *more)
+    )
+    assert worker.sweep() == 0 and turned == []
     bus.publish(f.messages(f.turn(7.0), uav=3)[-1])
-    assert worker.turn() == 1 and turned == [3]
+    assert worker.sweep() == 1 and turned == [3]
     for _ in range(2):
         clock[0] += 0.75
-        worker.turn()
+        worker.sweep()
     assert sorted(turned) == [2, 3, 3]
-    with worker.holding()[0].lock:  # it is worked on, which must not be waited for
+    with worker.owned_twins()[0].lock:  # it is worked on, which must not be waited for
         bus.publish(f.messages(f.turn(7.0), uav=2)[-1])
-        assert worker.turn() == 1 and turned.count(2) == 1
+        assert worker.sweep() == 1 and turned.count(2) == 1

@@ -8,8 +8,8 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from fleet.frames import G
-from fleet.physics.dynamics import LOST, free_runs, jacobian, rates_of_change, step
-from fleet.physics.wrench import N_AERO, N_PAR, NAMES, OFFSETS, ROW, WIND, slopes, terms, wrench
+from fleet.physics.dynamics import DIVERGENCE_LIMIT, free_runs, jacobian, rates_of_change, step
+from fleet.physics.wrench import N_AERO, N_PAR, NAMES, OFFSETS, ROW, WIND, terms, wrench, wrench_jacobian
 from fleet.window import STATES
 
 RANDOM = np.random.default_rng(7)
@@ -83,7 +83,7 @@ def test_every_derivative_is_named_after_what_it_drives():
 def test_slopes_are_slopes(speeds):
     by_air, by_rate, h = np.empty((6, 3)), np.empty((6, 3)), 1e-6
     for par, x, delta, at in some(speeds=speeds):
-        slopes(par, x[:3].copy(), x[3:6].copy(), delta, at, by_air, by_rate)
+        wrench_jacobian(par, x[:3].copy(), x[3:6].copy(), delta, at, by_air, by_rate)
         ends = [[np.array(wrench(par, *(x[:6] + s * h * e), delta, at)) for s in (1, -1)] for e in np.eye(6)]
         want = np.array([(up - down) / (2 * h) for up, down in ends]).T
         assert np.allclose(np.hstack([by_air, by_rate]), want, rtol=1e-6, atol=1e-6)
@@ -180,7 +180,7 @@ def test_free_runs_begin_end_and_leave_their_envelope():
     start = level(par) + 0.1
     free_runs(start[None], np.zeros(1, np.int64), 40, delta, wild, AT, DT, out)
     lost = np.flatnonzero(~np.isfinite(out).all(axis=1))
-    assert 0 < lost[0] < 40 and (np.diff(lost) == 1).all() and np.abs(out[: lost[0]]).max() < LOST
+    assert 0 < lost[0] < 40 and (np.diff(lost) == 1).all() and np.abs(out[: lost[0]]).max() < DIVERGENCE_LIMIT
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])

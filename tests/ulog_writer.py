@@ -215,4 +215,4 @@ def rows(log: UlogLog) -> dict:
 
 
 def said(log: UlogLog, what: str) -> list:
-    return [s.value for chunk in log.chunks() for s in chunk.said if s.what == what]
+    return [s.value for chunk in log.chunks() for s in chunk.events if s.kind == what]

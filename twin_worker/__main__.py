@@ -14,23 +14,25 @@ from typing import TYPE_CHECKING
 from fleet.access.roles import WORKER
 from fleet.airframes import GENERIC, load
 from fleet.bus.session import connect
-from fleet.cli import guarded, id_range, parser_for, stop_on_signal
-from fleet.config import entry, router_arguments
+from fleet.cli import id_range, make_parser, run_command, stop_on_signal
+from fleet.config import bus_config_from, router_arguments
 from fleet.contract import FleetState
-from fleet.metrics import address, served
-from fleet.process.logs import log_arguments, say
-from fleet.process.malloc_trim import give_back
+from fleet.metrics import parse_address, serve
+from fleet.process.logs import log_arguments, report_status
+from fleet.process.malloc_trim import enable_malloc_trim
 from twin_worker.service.processes import run_many
-from twin_worker.twin.state.schedule import read_pace
+from twin_worker.twin.state.schedule import parse_schedule
 
 if TYPE_CHECKING:
     from twin_worker.diagnosis.model.baseline import Baseline
 
-SWITCH_S = 5e-4  # maximum wait of a bus thread for the interpreter [s]
-END_S = 10.0  # time from a stop signal to a forced exit [s]
-BEHIND = 5  # increment of the nice value of the warm-up thread
-GARBAGE = 50_000  # allocations between garbage collections
-LARGE = 256 * 1024  # malloc block size above which memory is returned: a snapshot would fragment the heap [bytes]
+SWITCH_INTERVAL_S = 5e-4  # maximum wait of a bus thread for the interpreter [s]
+EXIT_TIMEOUT_S = 10.0  # time from a stop signal to a forced exit [s]
+NICE_INCREMENT = 5  # increment of the nice value of the warm-up thread
+GC_THRESHOLD = 50_000  # allocations between garbage collections
+MMAP_THRESHOLD_B = (
+    256 * 1024
+)  # malloc block size above which memory is returned: a snapshot would fragment the heap [bytes]
 EXAMPLES = """
   twin_worker --uavs 0-49
   twin_worker --uavs 0-199 --pace identify=5,predict=5,ensemble=5,renew=0.1       many aircraft, 10 Hz extrapolation
@@ -41,74 +43,74 @@ EXAMPLES = """
 """
 
 
-def _two_metres(text: str) -> tuple[float, float]:
+def _parse_separation(text: str) -> tuple[float, float]:
     """Parse `--separation 50,20` [m]."""
     try:
-        wide, high = (float(part) for part in text.split(","))
+        horizontal, vertical = (float(part) for part in text.split(","))
     except ValueError:
-        wide = high = float("nan")
-    if not (0 < wide < 1e5 and 0 < high < 1e5):
+        horizontal = vertical = float("nan")
+    if not (0 < horizontal < 1e5 and 0 < vertical < 1e5):
         raise argparse.ArgumentTypeError(f"found {text!r}, expected two distances in m, e.g. 50,20; correct it")
-    return wide, high
+    return horizontal, vertical
 
 
-def _bases(given: list[str]) -> "dict[int, Baseline]":
+def _load_baselines(options: list[str]) -> "dict[int, Baseline]":
     """Load the comparison models by UAV id; that of `ALL_UAVS` applies to all others.
 
     Raises:
         ValueError: when a file is no model; the message states the error.
         OSError: when it cannot be read; check the path.
     """
-    if not given:
+    if not options:
         return {}
     from twin_worker.diagnosis.output.keep import load as load_baseline
-    from twin_worker.mismatch.coordinator import ALL
+    from twin_worker.mismatch.coordinator import ALL_UAVS
 
-    pairs = [text.partition("=") if text.partition("=")[0].isdecimal() else ("", "", text) for text in given]
-    return {int(uav) if uav else ALL: load_baseline(Path(path))[0] for uav, _, path in pairs}
+    pairs = [text.partition("=") if text.partition("=")[0].isdecimal() else ("", "", text) for text in options]
+    return {int(uav) if uav else ALL_UAVS: load_baseline(Path(path))[0] for uav, _, path in pairs}
 
 
-def _share() -> None:
+def _tune_runtime() -> None:
     """Shorten thread switching and collect garbage rarely: twins and messages create no reference cycles."""
-    sys.setswitchinterval(SWITCH_S)
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
     gc.freeze()
-    gc.set_threshold(GARBAGE, *gc.get_threshold()[1:])
-    give_back(LARGE)
+    gc.set_threshold(GC_THRESHOLD, *gc.get_threshold()[1:])
+    enable_malloc_trim(MMAP_THRESHOLD_B)
 
 
-def _end_in_any_case(stop: threading.Event) -> None:
+def _force_exit(stop: threading.Event) -> None:
     """Exit some time after the stop signal, even on an overloaded machine."""
     stop.wait()
-    threading.Event().wait(END_S)
-    logging.getLogger(__name__).error("found no end within %.0f s of the stop signal; exit forced", END_S)
+    threading.Event().wait(EXIT_TIMEOUT_S)
+    logging.getLogger(__name__).error("found no end within %.0f s of the stop signal; exit forced", EXIT_TIMEOUT_S)
     os._exit(1)
 
 
-def _get_ready() -> None:
+def _prepare() -> None:
     """Import and compile at low priority, because other workers on the machine need the CPU."""
     if sys.platform == "linux":
-        me = threading.get_native_id()
-        os.setpriority(os.PRIO_PROCESS, me, os.getpriority(os.PRIO_PROCESS, me) + BEHIND)
+        thread_id = threading.get_native_id()
+        os.setpriority(os.PRIO_PROCESS, thread_id, os.getpriority(os.PRIO_PROCESS, thread_id) + NICE_INCREMENT)
     from twin_worker.service.warm_up import warm_up  # numba imports slowly: report the state first
 
     warm_up()  # before any claim: a compiling worker cannot take over aircraft
 
 
 def _run(args: argparse.Namespace) -> int:
-    airframe, bases = load(args.airframe), _bases(args.baseline)
+    airframe, baselines = load(args.airframe), _load_baselines(args.baseline)
     stop = stop_on_signal()
-    threading.Thread(target=_end_in_any_case, args=(stop,), daemon=True).start()
-    with connect(entry(args, WORKER)) as bus:
+    threading.Thread(target=_force_exit, args=(stop,), daemon=True).start()
+    with connect(bus_config_from(args, WORKER)) as bus:
         bus.publish(FleetState(t=0.0, sentence="compiling the twin's physics, once"))
-        with ThreadPoolExecutor(1) as hand:  # a thread can lower its priority but not raise it again
-            hand.submit(_get_ready).result()
+        with ThreadPoolExecutor(1) as pool:  # a thread can lower its priority but not raise it again
+            pool.submit(_prepare).result()
         from twin_worker.alerts.conflict_probability import Separation
-        from twin_worker.mismatch.coordinator import Live
-        from twin_worker.mismatch.process import Background
+        from twin_worker.mismatch.coordinator import Coordinator
+        from twin_worker.mismatch.process import DiagnosisProcess
         from twin_worker.service.metrics import counters
         from twin_worker.service.worker import Worker
 
-        aside = Background()
+        executor = DiagnosisProcess()
         worker = Worker(
             bus,
             args.uavs,
@@ -116,16 +118,16 @@ def _run(args: argparse.Namespace) -> int:
             method=args.method,
             airframe=airframe,
             separation=Separation(*args.separation),
-            pace=args.pace,
-            diagnosis=None if args.no_diagnosis else Live(aside, bases, adapt=not args.no_adapt),
+            schedule=args.pace,
+            diagnosis=None if args.no_diagnosis else Coordinator(executor, baselines, adapt=not args.no_adapt),
         )
-        _share()
-        say(f"twin_worker {bus.writer:016x}", f"serves UAV ids {args.uavs.start}-{args.uavs.stop - 1}")
-        with contextlib.ExitStack() as held:
-            held.callback(aside.close)
+        _tune_runtime()
+        report_status(f"twin_worker {bus.writer:016x}", f"serves UAV ids {args.uavs.start}-{args.uavs.stop - 1}")
+        with contextlib.ExitStack() as stack:
+            stack.callback(executor.close)
             if args.metrics:
-                where = held.enter_context(served(args.metrics, counters(worker.state, bus)))
-                say("twin_worker", f"metrics at {where}")
+                url = stack.enter_context(serve(args.metrics, counters(worker.state, bus)))
+                report_status("twin_worker", f"metrics at {url}")
             worker.run(stop)
     return 0
 
@@ -140,14 +142,14 @@ def _run_many(args: argparse.Namespace) -> int:
         raise ValueError(f"--processes: found {args.processes}, expected 1 to 256; set one per core")
     options = [[*args.options, "--processes=1"] for _ in range(args.processes)]
     if args.metrics:
-        host, port = address(args.metrics)
-        options = [[*each, f"--metrics={host}:{port + k}"] for k, each in enumerate(options)]
+        host, port = parse_address(args.metrics)
+        options = [[*arguments, f"--metrics={host}:{port + k}"] for k, arguments in enumerate(options)]
     return run_many(options, stop_on_signal())
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the worker until a stop signal."""
-    parser = parser_for("twin_worker", "Identify, verify and predict each UAV of a range.", EXAMPLES)
+    parser = make_parser("twin_worker", "Identify, verify and predict each UAV of a range.", EXAMPLES)
     parser.add_argument("--uavs", type=id_range, default=range(50), metavar="LO-HI", help="UAV ids to serve (0-49)")
     router_arguments(parser)
     methods = ("auto", "dynamics", "hybrid", "paper")
@@ -163,7 +165,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--omega", type=float, default=0.0, help="minimum mean fit to verify, %% (0, as in the paper)")
     parser.add_argument(
         "--separation",
-        type=_two_metres,
+        type=_parse_separation,
         default=(50.0, 20.0),
         metavar="M,M",
         help="horizontal and vertical separation minima; below both, separation is lost (50,20)",
@@ -177,7 +179,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument(
         "--pace",
-        type=read_pace,
+        type=parse_schedule,
         metavar="WORK=S,…",
         help="periods of rollouts, identifications, ensembles, renewals (predict=1,identify=1,ensemble=10; no renew) "
         "and size and look-ahead of an ensemble (members=24,span=180)",
@@ -193,7 +195,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     args = parser.parse_args(argv)
     args.options = sys.argv[1:] if argv is None else argv
-    return guarded("twin_worker", _run if args.processes == 1 else _run_many, args)
+    return run_command("twin_worker", _run if args.processes == 1 else _run_many, args)
 
 
 if __name__ == "__main__":

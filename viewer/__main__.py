@@ -6,17 +6,19 @@ import sys
 
 from fleet.access.roles import VIEWER
 from fleet.bus.session import connect
-from fleet.cli import guarded, parser_for, stop_on_signal
-from fleet.config import entry, router_arguments
-from fleet.process.logs import log_arguments, say
-from fleet.process.malloc_trim import give_back
-from viewer.browser.http_server import quiet, serve
-from viewer.scene.terrain.land import Land
-from viewer.scene.terrain.raster import read
+from fleet.cli import make_parser, run_command, stop_on_signal
+from fleet.config import bus_config_from, router_arguments
+from fleet.process.logs import log_arguments, report_status
+from fleet.process.malloc_trim import enable_malloc_trim
+from viewer.browser.http_server import serve, without_stdout
+from viewer.scene.terrain.land import TerrainLayer
+from viewer.scene.terrain.raster import read_raster
 from viewer.server.app import App
 
-RARELY = 50_000, 10, 10  # a large fleet allocates 10,000 objects per second, almost none in cycles
-LARGE = 48 * 1024  # smaller than a receive buffer of the bus, which one queued message keeps allocated [bytes]
+GC_THRESHOLDS = 50_000, 10, 10  # a large fleet allocates 10,000 objects per second, almost none in cycles
+LARGE_BLOCK_BYTES = (
+    48 * 1024
+)  # smaller than a receive buffer of the bus, which one queued message keeps allocated [bytes]
 EXAMPLES = """
   viewer
   viewer --port 8081 --light
@@ -27,7 +29,7 @@ EXAMPLES = """
 
 def main(argv: list[str] | None = None) -> int:
     """Run `viewer`."""
-    parser = parser_for(
+    parser = make_parser(
         "viewer", "Show the fleet in a browser: flown paths, predictions and their confidence.", EXAMPLES
     )
     parser.add_argument("--port", type=int, default=8080, help="port of the page (default 8080)")
@@ -51,7 +53,7 @@ def main(argv: list[str] | None = None) -> int:
         "--imagery", metavar="FILE", help="ground imagery: GeoTIFF, PNG or JPEG, or FILE@south,west,north,east"
     )
     parser.add_argument("--light", action="store_true", help="light theme, for bright surroundings")
-    return guarded("viewer", run, parser.parse_args(argv))
+    return run_command("viewer", run, parser.parse_args(argv))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -64,18 +66,18 @@ def run(args: argparse.Namespace) -> int:
     if not 0 < args.port < 65536:
         raise ValueError(f"--port: found {args.port}, expected 1 to 65535; choose another port")
     stop = stop_on_signal()
-    gc.set_threshold(*RARELY)
-    give_back(LARGE)
-    terrain = read(args.terrain, colours=False) if args.terrain else None
-    land = Land(terrain, read(args.imagery, colours=True) if args.imagery else None)
-    with connect(entry(args, VIEWER), patient=True) as bus:  # the page shows a missing router
+    gc.set_threshold(*GC_THRESHOLDS)
+    enable_malloc_trim(LARGE_BLOCK_BYTES)
+    terrain = read_raster(args.terrain, colours=False) if args.terrain else None
+    terrain_layer = TerrainLayer(terrain, read_raster(args.imagery, colours=True) if args.imagery else None)
+    with connect(bus_config_from(args, VIEWER), retry=True) as bus:  # the page shows a missing router
         server = serve(args.host, args.port, args.name)
         try:
-            app = App(bus, server, light=args.light, land=land)
-            say("viewer", f"http://{args.host}:{args.port}")
+            app = App(bus, server, light=args.light, terrain_layer=terrain_layer)
+            report_status("viewer", f"http://{args.host}:{args.port}")
             app.run(stop)
         finally:
-            with quiet():
+            with without_stdout():
                 server.stop()
     return 0
 

@@ -4,18 +4,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fleet.access.papers import Papers, papers_of, password_of
-from fleet.access.roles import MESSAGE_MOST, ROLES, ROUTER_ROLE, TOOLS
-from fleet.access.rules import CERTIFICATE, PASSWORD, access_control, limits
+from fleet.access.papers import CertificatePair, find_certificate, read_password
+from fleet.access.roles import MAX_MESSAGE_BYTES, ROLES, ROUTER_ROLE, TOOLS
+from fleet.access.rules import CERTIFICATE, PASSWORD, access_control, message_limits
 
 ROUTER = "tcp/127.0.0.1:7447"
 _TLS = "transport/link/tls"
-_WORDS = "transport/auth/usrpwd"
-_FULL = "transport/link/tx/queue/congestion_control"
-_REFUSED_MS = 10_000  # an accepted session takes less, also on a busy machine
+_AUTH = "transport/auth/usrpwd"
+_CONGESTION = "transport/link/tx/queue/congestion_control"
+_CONNECT_TIMEOUT_MS = 10_000  # an accepted session takes less, also on a busy machine
 
 
-def endpoint(router: str) -> tuple[str, int]:
+def parse_endpoint(router: str) -> tuple[str, int]:
     """Split `tcp/127.0.0.1:7447` into host and port.
 
     Raises:
@@ -29,7 +29,7 @@ def endpoint(router: str) -> tuple[str, int]:
 
 
 @dataclass(frozen=True)
-class Entry:
+class BusConfig:
     """Address of the router and credentials of one process.
 
     Attributes:
@@ -39,7 +39,7 @@ class Entry:
         passwords: file of lines `role:password`; None: no passwords
     """
 
-    at: str = ROUTER
+    endpoint: str = ROUTER
     role: str = TOOLS
     certificates: Path | None = None
     passwords: Path | None = None
@@ -50,48 +50,51 @@ class Entry:
         Raises:
             ValueError: when endpoint and certificates do not match.
         """
-        endpoint(self.at)
-        if self.at.startswith("tls/") != (self.certificates is not None):
-            with_ = "without" if self.certificates is None else "with"
+        parse_endpoint(self.endpoint)
+        if self.endpoint.startswith("tls/") != (self.certificates is not None):
+            presence = "without" if self.certificates is None else "with"
             raise ValueError(
-                f"--router: found {self.at} {with_} certificates, expected tls/… and `certificates` in the file of "
+                f"--router: found {self.endpoint} {presence} certificates, expected tls/… and `certificates` "
+                "in the file of "
                 "--config, or neither; see deploy/README.md"
             )
 
     @property
-    def mutual(self) -> bool:
+    def mutual_tls(self) -> bool:
         """Return whether a certificate identifies the role."""
         return self.certificates is not None and self.passwords is None
 
-    def papers(self) -> Papers | None:
+    def certificate_pair(self) -> CertificatePair | None:
         """Find the certificate of this role; None where the role uses a password or nothing.
 
         Raises:
             ValueError: when it is missing, expired, or readable by others.
             OSError: when it cannot be read.
         """
-        return papers_of(self.certificates, self.role) if self.certificates and not self.passwords else None
+        return find_certificate(self.certificates, self.role) if self.certificates and not self.passwords else None
 
-    def session(self, *, patient: bool = False) -> dict[str, Any]:
+    def session_settings(self, *, retry: bool = False) -> dict[str, Any]:
         """Return the settings of a client session by Zenoh configuration path; `retry`: start without a router, too.
 
         Raises:
             ValueError: when a file is missing, expired, or readable by others.
             OSError: when one cannot be read.
         """
-        out = _common("peer" if patient else "client", connect=[self.at], listen=[])  # a client would wait in `open`
-        out |= {"connect/timeout_ms": -1 if patient else _REFUSED_MS, "connect/exit_on_failure": not patient}
+        out = _common_settings(
+            "peer" if retry else "client", connect=[self.endpoint], listen=[]
+        )  # a client would wait in `open`
+        out |= {"connect/timeout_ms": -1 if retry else _CONNECT_TIMEOUT_MS, "connect/exit_on_failure": not retry}
         if self.certificates is not None:
             out[f"{_TLS}/root_ca_certificate"] = str(self.certificates / "ca.pem")
-        if (own := self.papers()) is not None:
-            out[f"{_TLS}/connect_certificate"] = str(own.certificate)
-            out[f"{_TLS}/connect_private_key"] = str(own.key)
+        if (pair := self.certificate_pair()) is not None:
+            out[f"{_TLS}/connect_certificate"] = str(pair.certificate)
+            out[f"{_TLS}/connect_private_key"] = str(pair.key)
             out[f"{_TLS}/enable_mtls"] = True
         if self.passwords is not None:
-            out |= {f"{_WORDS}/user": self.role, f"{_WORDS}/password": password_of(self.passwords, self.role)}
+            out |= {f"{_AUTH}/user": self.role, f"{_AUTH}/password": read_password(self.passwords, self.role)}
         return out
 
-    def router(self, listen: list[str] | None = None, beside: list[str] | None = None) -> dict[str, Any]:
+    def router_settings(self, listen: list[str] | None = None, peers: list[str] | None = None) -> dict[str, Any]:
         """Return the settings of the router by Zenoh configuration path.
 
         Args:
@@ -101,30 +104,30 @@ class Entry:
             ValueError: as `session`.
             OSError: as `session`.
         """
-        out = _common("router", connect=beside or [], listen=listen or [self.at]) | limits()
+        out = _common_settings("router", connect=peers or [], listen=listen or [self.endpoint]) | message_limits()
         out |= {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
         if self.certificates is not None:
-            papers = papers_of(self.certificates, ROUTER_ROLE)
-            ways = ("listen", "connect") if beside and self.mutual else ("listen",)
-            for way in ways:
-                out[f"{_TLS}/{way}_certificate"] = str(papers.certificate)
-                out[f"{_TLS}/{way}_private_key"] = str(papers.key)
+            pair = find_certificate(self.certificates, ROUTER_ROLE)
+            directions = ("listen", "connect") if peers and self.mutual_tls else ("listen",)
+            for direction in directions:
+                out[f"{_TLS}/{direction}_certificate"] = str(pair.certificate)
+                out[f"{_TLS}/{direction}_private_key"] = str(pair.key)
             out[f"{_TLS}/root_ca_certificate"] = str(self.certificates / "ca.pem")
-            out[f"{_TLS}/enable_mtls"] = self.mutual
+            out[f"{_TLS}/enable_mtls"] = self.mutual_tls
             out[f"{_TLS}/close_link_on_expiration"] = True
         if self.passwords is not None:
             for role in ROLES:
-                password_of(self.passwords, role)
-            out[f"{_WORDS}/dictionary_file"] = str(self.passwords)
-            if beside:
-                own = password_of(self.passwords, ROUTER_ROLE)
-                out |= {f"{_WORDS}/user": ROUTER_ROLE, f"{_WORDS}/password": own}
-        if self.mutual or self.passwords is not None:
-            out["access_control"] = access_control(CERTIFICATE if self.mutual else PASSWORD)
+                read_password(self.passwords, role)
+            out[f"{_AUTH}/dictionary_file"] = str(self.passwords)
+            if peers:
+                password = read_password(self.passwords, ROUTER_ROLE)
+                out |= {f"{_AUTH}/user": ROUTER_ROLE, f"{_AUTH}/password": password}
+        if self.mutual_tls or self.passwords is not None:
+            out["access_control"] = access_control(CERTIFICATE if self.mutual_tls else PASSWORD)
         return out
 
 
-def _common(mode: str, *, connect: list[str], listen: list[str]) -> dict[str, Any]:
+def _common_settings(mode: str, *, connect: list[str], listen: list[str]) -> dict[str, Any]:
     return {
         "mode": mode,
         "connect/endpoints": connect,
@@ -135,7 +138,7 @@ def _common(mode: str, *, connect: list[str], listen: list[str]) -> dict[str, An
         "transport/link/tx/lease": 1000,
         "transport/link/tx/keep_alive": 4,
         "transport/link/tx/queue/size/data_low": 16,  # batches of 64 kB: enough for large replies on a busy machine
-        f"{_FULL}/drop/max_wait_before_drop_fragments": 500_000,  # total for a large reply [us]
-        "transport/link/rx/max_message_size": MESSAGE_MOST,
+        f"{_CONGESTION}/drop/max_wait_before_drop_fragments": 500_000,  # total for a large reply [us]
+        "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
         "transport/shared_memory/enabled": False,  # a killed process would leave its segment mapped by all others
     }

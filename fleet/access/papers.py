@@ -10,42 +10,44 @@ from cryptography import x509
 
 from fleet.access.roles import ROUTER_ROLE
 
-HOW = "create them with deploy/certificates.sh"
-MOST_PASSWORD = 1024
+CREATE_HINT = "create them with deploy/certificates.sh"
+MAX_PASSWORD_CHARS = 1024
 
 
-class Papers(NamedTuple):
+class CertificatePair(NamedTuple):
     """A certificate and its key."""
 
     certificate: Path
     key: Path
 
 
-def papers_of(folder: Path, role: str) -> Papers:
+def find_certificate(folder: Path, role: str) -> CertificatePair:
     """Find the certificate of a role and its key.
 
     Raises:
         ValueError: when one is missing, has expired, or the key is readable by others.
         OSError: when one cannot be read.
     """
-    papers = Papers(folder / f"{role}.pem", folder / f"{role}.key")
-    for path in (folder / "ca.pem", *papers):
+    pair = CertificatePair(folder / f"{role}.pem", folder / f"{role}.key")
+    for path in (folder / "ca.pem", *pair):
         if not path.is_file():
-            raise ValueError(f"certificates: found no {path}, expected it for the role {role}; {HOW}, or copy it here")
-    private(papers.key)
-    for path in (folder, folder / "ca.pem", papers.certificate):
-        _unaltered(path)
-    ends, now = ending(papers.certificate), datetime.now(UTC)
-    if ends < now:
+            raise ValueError(
+                f"certificates: found no {path}, expected it for the role {role}; {CREATE_HINT}, or copy it here"
+            )
+    check_private(pair.key)
+    for path in (folder, folder / "ca.pem", pair.certificate):
+        _check_unwritable(path)
+    expiry, now = expiry_of(pair.certificate), datetime.now(UTC)
+    if expiry < now:
         names = "router FOLDER NAME..." if role == ROUTER_ROLE else f"role FOLDER {role}"
         raise ValueError(
-            f"certificates: found {papers.certificate} expired on {ends:%Y-%m-%d %H:%M} UTC, the time here is "
+            f"certificates: found {pair.certificate} expired on {expiry:%Y-%m-%d %H:%M} UTC, the time here is "
             f"{now:%Y-%m-%d %H:%M}; renew it: certificates.sh {names}, and copy it here"
         )
-    return papers
+    return pair
 
 
-def ending(certificate: Path) -> datetime:
+def expiry_of(certificate: Path) -> datetime:
     """Return the latest expiry of the certificates in a file; a file of authorities may contain two.
 
     Raises:
@@ -53,34 +55,34 @@ def ending(certificate: Path) -> datetime:
         OSError: when it cannot be read.
     """
     try:
-        return max(one.not_valid_after_utc for one in x509.load_pem_x509_certificates(certificate.read_bytes()))
+        return max(parsed.not_valid_after_utc for parsed in x509.load_pem_x509_certificates(certificate.read_bytes()))
     except ValueError as error:
-        raise ValueError(f"certificates: found no certificate in {certificate} ({error}); {HOW}") from None
+        raise ValueError(f"certificates: found no certificate in {certificate} ({error}); {CREATE_HINT}") from None
 
 
-def private(path: Path) -> None:
+def check_private(path: Path) -> None:
     """Check that a secret is readable by owner and group only, and writable by its owner only.
 
     Raises:
         ValueError: when it is not.
         OSError: when its status cannot be read.
     """
-    found = path.stat()
-    mode = stat.S_IMODE(found.st_mode)
-    if not stat.S_ISREG(found.st_mode) or mode & 0o037:
+    status = path.stat()
+    mode = stat.S_IMODE(status.st_mode)
+    if not stat.S_ISREG(status.st_mode) or mode & 0o037:
         raise ValueError(
             f"certificates: found {path} with mode {mode:04o}, expected owner and group only; chmod 640 {path}"
         )
-    if found.st_uid not in (0, os.geteuid()) and os.geteuid() != 0:
+    if status.st_uid not in (0, os.geteuid()) and os.geteuid() != 0:
         raise ValueError(
-            f"certificates: found {path} with owner {found.st_uid}, expected {os.geteuid()}, this user, or root; "
+            f"certificates: found {path} with owner {status.st_uid}, expected {os.geteuid()}, this user, or root; "
             f"chown it, or create another"
         )
     if not os.access(path, os.R_OK):
         raise ValueError(f"certificates: found {path} not readable by this user; chown it to the user of ParaUAV")
 
 
-def _unaltered(path: Path) -> None:
+def _check_unwritable(path: Path) -> None:
     """Check that no other user may replace a certificate or its folder.
 
     Raises:
@@ -95,16 +97,16 @@ def _unaltered(path: Path) -> None:
         )
 
 
-def password_of(path: Path, role: str) -> str:
+def read_password(path: Path, role: str) -> str:
     """Read a role's password from a file of lines `role:password`.
 
     Raises:
         ValueError: when there is none, or the file is readable by others.
         OSError: when it cannot be read.
     """
-    private(path)
+    check_private(path)
     for line in path.read_text().splitlines():
         name, colon, password = line.partition(":")
-        if colon and name == role and 0 < len(password) <= MOST_PASSWORD:
+        if colon and name == role and 0 < len(password) <= MAX_PASSWORD_CHARS:
             return password
     raise ValueError(f"passwords: found none for the role {role} in {path}, expected a line {role}:PASSWORD; add it")

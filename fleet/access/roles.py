@@ -9,11 +9,11 @@ ROLES = (GATEWAY, WORKER, VIEWER, TOOLS)
 """Roles that a certificate or a password proves; the commands of `fleet` have the role `tools`."""
 
 KB, MB = 1 << 10, 1 << 20
-MOST_ASKED = 512 * KB  # payload of a query: a mission of 1,000 items, or 1,000 ids [bytes]
+MAX_QUERY_BYTES = 512 * KB  # payload of a query: a mission of 1,000 items, or 1,000 ids [bytes]
 LIVE = "@live"  # liveliness tokens of processes
 
 
-class Said(NamedTuple):
+class TopicRule(NamedTuple):
     """Permissions and size limit of one topic.
 
     Attributes:
@@ -22,31 +22,31 @@ class Said(NamedTuple):
         queriers: roles that may query it
     """
 
-    by: tuple[str, ...]
-    most: int
-    asked: tuple[str, ...] = ROLES
+    publishers: tuple[str, ...]
+    max_bytes: int
+    queriers: tuple[str, ...] = ROLES
 
 
-SAID: dict[str, Said] = {
-    "sample": Said((GATEWAY,), 256 * KB),
-    "status": Said((GATEWAY,), 64 * KB),
-    "mission": Said((GATEWAY,), MB),
-    "params": Said((GATEWAY,), MB),
-    "history": Said((GATEWAY,), 32 * MB),
-    "model": Said((WORKER,), 256 * KB),
-    "prediction": Said((WORKER,), 256 * KB),
-    "mismatch": Said((WORKER,), 256 * KB),
-    "alert": Said((GATEWAY, WORKER), 64 * KB),  # from the gateway: a second sender
-    "@fleet/state": Said((WORKER,), MB),
-    "@fleet/prediction": Said((WORKER,), 32 * MB),  # 4 KB for each of its aircraft
-    "@gateway": Said((GATEWAY,), MB),
-    "@claim": Said((WORKER,), MB),
-    "@handover": Said((WORKER,), 32 * MB, asked=(WORKER,)),  # the complete twin of an aircraft
+TOPIC_RULES: dict[str, TopicRule] = {
+    "sample": TopicRule((GATEWAY,), 256 * KB),
+    "status": TopicRule((GATEWAY,), 64 * KB),
+    "mission": TopicRule((GATEWAY,), MB),
+    "params": TopicRule((GATEWAY,), MB),
+    "history": TopicRule((GATEWAY,), 32 * MB),
+    "model": TopicRule((WORKER,), 256 * KB),
+    "prediction": TopicRule((WORKER,), 256 * KB),
+    "mismatch": TopicRule((WORKER,), 256 * KB),
+    "alert": TopicRule((GATEWAY, WORKER), 64 * KB),  # from the gateway: a second sender
+    "@fleet/state": TopicRule((WORKER,), MB),
+    "@fleet/prediction": TopicRule((WORKER,), 32 * MB),  # 4 KB for each of its aircraft
+    "@gateway": TopicRule((GATEWAY,), MB),
+    "@claim": TopicRule((WORKER,), MB),
+    "@handover": TopicRule((WORKER,), 32 * MB, queriers=(WORKER,)),  # the complete twin of an aircraft
 }
-MOST = max(said.most for said in SAID.values())
-MESSAGE_MOST = MOST + MB  # largest message that a session reassembles from fragments [bytes]
+MAX_BYTES = max(rule.max_bytes for rule in TOPIC_RULES.values())
+MAX_MESSAGE_BYTES = MAX_BYTES + MB  # largest message that a session reassembles from fragments [bytes]
 
 
-def keys(topic: str) -> str:
+def topic_keys(topic: str) -> str:
     """Return the keys of one topic: `parauav/*/sample`, `parauav/@claim/*`."""
     return f"{ROOT}/{topic}/*" if topic.startswith("@") else f"{ROOT}/*/{topic}"

@@ -12,7 +12,7 @@ from fleet.frames import G
 
 RHO = 1.225  # air at sea level [kg/m3]
 GENERIC = "small_fixed_wing"
-_FADE = 2.5  # thrust lapse of a fixed-pitch propeller, -(V / T) dT/dV at 0.7 of its zero-thrust J [-]
+_THRUST_LAPSE = 2.5  # thrust lapse of a fixed-pitch propeller, -(V / T) dT/dV at 0.7 of its zero-thrust J [-]
 _HERE = Path(__file__).parent
 _NUMBERS = ("mass", "J_x", "J_y", "J_z", "J_xz", "S", "b", "c", "speed", "thrust", "doubt")
 _POSITIVE = ("mass", "J_x", "J_y", "J_z", "S", "b", "c", "speed", "doubt")
@@ -47,59 +47,59 @@ class Airframe:
     span: float | None = None
 
 
-def load(which: str) -> Airframe:
+def load(name_or_path: str) -> Airframe:
     """Read an airframe by the name of a file shipped with ParaUAV, or by a path.
 
     Raises:
         ValueError: when it is not an airframe; the text names the field to correct.
         OSError: when there is no such file.
     """
-    path = _HERE / f"{which}.toml"
-    path = path if "/" not in which and path.exists() else Path(which)
+    path = _HERE / f"{name_or_path}.toml"
+    path = path if "/" not in name_or_path and path.exists() else Path(name_or_path)
     if not path.exists():
-        known = ", ".join(sorted(found.stem for found in _HERE.glob("*.toml")))
-        raise OSError(f"{which}: found no airframe, expected a TOML file or one of {known}; check the path")
+        known = ", ".join(sorted(file.stem for file in _HERE.glob("*.toml")))
+        raise OSError(f"{name_or_path}: found no airframe, expected a TOML file or one of {known}; check the path")
     try:
-        read = tomllib.loads(path.read_text())
+        document = tomllib.loads(path.read_text())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path.name}: found invalid TOML ({error}), expected an airframe; correct it") from None
-    value = _numbers(path.name, read, _NUMBERS)
+    value = _numbers(path.name, document, _NUMBERS)
     for name in _POSITIVE:
         if value[name] <= 0:
             raise ValueError(f"{path.name}: found {name} = {value[name]:g}, expected more than 0; correct it")
     if value["J_x"] * value["J_z"] <= value["J_xz"] ** 2:
         raise ValueError(f"{path.name}: found J_xz = {value['J_xz']:g}, expected less than sqrt(J_x J_z); correct it")
-    throw = _numbers(path.name, read.get("throw", {}), _THROWS)
-    coefficient = _numbers(path.name, read.get("coefficients", {}), _COEFFICIENTS)
-    named = str(read.get("name", path.stem))
-    span = _numbers(path.name, read, ("span",))["span"] if "span" in read else None
-    source, scale = str(read.get("source", "")), bool(read.get("scale", False))
-    return Airframe(named, source, value, throw, coefficient, scale, span)
+    throw = _numbers(path.name, document.get("throw", {}), _THROWS)
+    coefficient = _numbers(path.name, document.get("coefficients", {}), _COEFFICIENTS)
+    airframe_name = str(document.get("name", path.stem))
+    span = _numbers(path.name, document, ("span",))["span"] if "span" in document else None
+    source, scale = str(document.get("source", "")), bool(document.get("scale", False))
+    return Airframe(airframe_name, source, value, throw, coefficient, scale, span)
 
 
 def _numbers(file: str, table: object, names: tuple[str, ...]) -> dict[str, float]:
-    found = table if isinstance(table, dict) else {}
+    values = table if isinstance(table, dict) else {}
     for name in names:
-        value = found.get(name)
+        value = values.get(name)
         if not isinstance(value, int | float) or isinstance(value, bool) or not isfinite(value):
             raise ValueError(f"{file}: found {name} = {value!r}, expected a number; correct it")
-    return {name: float(found[name]) for name in names}
+    return {name: float(values[name]) for name in names}
 
 
-def derivatives(of: Airframe, V: float) -> dict[str, float]:
+def derivatives(airframe: Airframe, V: float) -> dict[str, float]:
     """Return the dimensional derivatives at airspeed V in level flight, by their names in `fleet.physics.wrench`.
 
     Specific force [m/s2] and angular acceleration [rad/s2] per m/s, rad/s and full command; without offsets.
     Body axes at a small angle of attack: lift along -z, drag and thrust lapse along -x.
     """
-    a, k, t = of.value, of.coefficient, of.throw
+    a, k, t = airframe.value, airframe.coefficient, airframe.throw
     pressure = 0.5 * RHO * V * V * a["S"]
     lift = a["mass"] * G / pressure
     drag = k["C_D_0"] + k["C_D_k"] * lift**2
     force, span, chord = pressure / a["mass"], a["b"] / (2 * V), a["c"] / (2 * V)
     pitch = pressure * a["c"] / a["J_y"]
     out = {
-        "X_u": -(2 + _FADE) * force * drag / V,  # thrust equals drag in level flight
+        "X_u": -(2 + _THRUST_LAPSE) * force * drag / V,  # thrust equals drag in level flight
         "X_w": force * (lift - 2 * k["C_D_k"] * lift * k["C_L_alpha"]) / V,
         "X_de": 0.0,
         "X_dt": a["thrust"],
@@ -114,11 +114,11 @@ def derivatives(of: Airframe, V: float) -> dict[str, float]:
         "M_de": pitch * k["C_m_delta_e"] * t["delta_e"],
         "M_dt": 0.0,
     }
-    by = {"v": ("beta", 1 / V), "p": ("p", span), "r": ("r", span)}
-    by |= {"da": ("delta_a", t["delta_a"]), "dr": ("delta_r", t["delta_r"])}
+    lateral_terms = {"v": ("beta", 1 / V), "p": ("p", span), "r": ("r", span)}
+    lateral_terms |= {"da": ("delta_a", t["delta_a"]), "dr": ("delta_r", t["delta_r"])}
     gamma = a["J_x"] * a["J_z"] - a["J_xz"] ** 2
     roll = pressure * a["b"] / gamma
-    for short, (name, factor) in by.items():
+    for short, (name, factor) in lateral_terms.items():
         l, n = k[f"C_l_{name}"], k[f"C_n_{name}"]
         out[f"Y_{short}"] = force * k[f"C_Y_{name}"] * factor
         out[f"L_{short}"] = roll * (a["J_z"] * l + a["J_xz"] * n) * factor

@@ -13,24 +13,24 @@ import numpy as np
 
 from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane.l1 import to_roll
-from fleet.autopilots.common.kernels import clip, making
+from fleet.autopilots.common.kernels import array_kernel, clip
 from fleet.frames import G
 from fleet.mission import KIND, LAND, VA_C
 
 LAW = "greybox: L1 on the route, lags for the rest"
 
-TAU_PHI, TAU_V, TAU_H, TAU_CLIMB, CRUISE, SHARE, CLIMB, SINK = range(8)
+TAU_PHI, TAU_V, TAU_H, TAU_CLIMB, CRUISE, TAS_RATIO, CLIMB, SINK = range(8)
 N_PAR = 8
 """Time constants of bank, speed, height, climb [s]; default true airspeed [m/s]; true over commanded airspeed [-];
 maximum climb and sink rate [m/s]."""
 
 
-@making
+@array_kernel
 def follow(
     ctl: np.ndarray,
     par: np.ndarray,
     legs: np.ndarray,
-    grey: np.ndarray,
+    lags: np.ndarray,
     start: np.ndarray,
     wind: np.ndarray,
     dt: float,
@@ -54,22 +54,22 @@ def follow(
         out[k] = p
         if landed:
             continue
-        level = sqrt(max(V * V - h_dot * h_dot, 1.0))
-        v[0], v[1], v[2] = level * cos(psi) + wind[0], level * sin(psi) + wind[1], -h_dot
+        V_horizontal = sqrt(max(V * V - h_dot * h_dot, 1.0))
+        v[0], v[1], v[2] = V_horizontal * cos(psi) + wind[0], V_horizontal * sin(psi) + wind[1], -h_dot
         euler[0], euler[2] = phi, psi
-        a_lat, over = leg_rules.steer(ctl, par, legs, p, v, euler, dt)
+        a_lat, leg_done = leg_rules.steer(ctl, par, legs, p, v, euler, dt)
         h_sp = leg_rules.height_demand(ctl, par, legs, p)
-        i = leg_rules.current(ctl, legs)
-        wanted = legs[i, VA_C] * grey[SHARE] if legs[i, VA_C] > 0.0 else grey[CRUISE]
-        phi += (to_roll(par, a_lat, 0.0) - phi) * min(dt / grey[TAU_PHI], 1.0)
+        i = leg_rules.current_leg(ctl, legs)
+        Va_c = legs[i, VA_C] * lags[TAS_RATIO] if legs[i, VA_C] > 0.0 else lags[CRUISE]
+        phi += (to_roll(par, a_lat, 0.0) - phi) * min(dt / lags[TAU_PHI], 1.0)
         psi += G * tan(clip(phi, -1.2, 1.2)) / max(V, 3.0) * dt
-        V += (wanted - V) * min(dt / grey[TAU_V], 1.0)
-        climb = clip((h_sp + p[2]) / grey[TAU_H], -grey[SINK], grey[CLIMB])
-        h_dot += (climb - h_dot) * min(dt / grey[TAU_CLIMB], 1.0)
+        V += (Va_c - V) * min(dt / lags[TAU_V], 1.0)
+        h_dot_c = clip((h_sp + p[2]) / lags[TAU_H], -lags[SINK], lags[CLIMB])
+        h_dot += (h_dot_c - h_dot) * min(dt / lags[TAU_CLIMB], 1.0)
         for j in range(3):
             p[j] += v[j] * dt
         if int(legs[i, KIND]) == LAND:
             along, length = leg_rules.along_line(ctl, legs[i], p)
             landed = along >= length
-        if over and i + 1 < legs.shape[0]:
+        if leg_done and i + 1 < legs.shape[0]:
             leg_rules.begin(ctl, par, legs, i + 1, p)

@@ -19,25 +19,25 @@ import numpy as np
 
 from fleet.autopilots import arduplane, px4_fixedwing, textbook
 from fleet.autopilots.arduplane import legs as leg_rules
+from fleet.autopilots.arduplane.guide import align_integrators as shift_arduplane
+from fleet.autopilots.arduplane.guide import assume_commanded_speed
 from fleet.autopilots.arduplane.guide import fly as fly_arduplane
-from fleet.autopilots.arduplane.guide import settle
-from fleet.autopilots.arduplane.guide import shift as shift_arduplane
 from fleet.autopilots.common.controller_state import LEG
-from fleet.autopilots.common.kernels import kernel, making
+from fleet.autopilots.common.kernels import array_kernel, kernel
 from fleet.autopilots.common.parameter_vector import ARDUPLANE, LAW, PX4, TEXTBOOK, W_E, W_N, padded
-from fleet.autopilots.common.parameters import Row, find
+from fleet.autopilots.common.parameters import ParameterSpec, lookup
 
 inlined = nb.njit(cache=True, error_model="numpy", inline="always")
 
 
-class Law(NamedTuple):
+class ControlLaw(NamedTuple):
     """One control law: description, code in `par`, parameter function, parameter names and parameter table."""
 
-    sentence: str
-    mark: float
+    description: str
+    code: float
     parameters: Callable[[Mapping[str, float], float], tuple[np.ndarray, tuple[str, ...]]]
     names: tuple[str, ...]
-    table: tuple[Row, ...]
+    table: tuple[ParameterSpec, ...]
 
     @property
     def defaults(self) -> dict[str, float]:
@@ -46,9 +46,9 @@ class Law(NamedTuple):
 
 
 LAWS = {
-    "arduplane": Law(arduplane.LAW, ARDUPLANE, arduplane.parameters, arduplane.NAMES, arduplane.TABLE),
-    "px4": Law(px4_fixedwing.LAW, PX4, px4_fixedwing.parameters, px4_fixedwing.NAMES, px4_fixedwing.TABLE),
-    "textbook": Law(textbook.LAW, TEXTBOOK, textbook.parameters, textbook.NAMES, textbook.TABLE),
+    "arduplane": ControlLaw(arduplane.LAW, ARDUPLANE, arduplane.parameters, arduplane.NAMES, arduplane.TABLE),
+    "px4": ControlLaw(px4_fixedwing.LAW, PX4, px4_fixedwing.parameters, px4_fixedwing.NAMES, px4_fixedwing.TABLE),
+    "textbook": ControlLaw(textbook.LAW, TEXTBOOK, textbook.parameters, textbook.NAMES, textbook.TABLE),
 }
 NAMES = frozenset(name for law in LAWS.values() for name in law.names)
 """Names of all parameters that at least one law reads."""
@@ -69,23 +69,23 @@ def parameters(law: str, values: Mapping[str, float], altitude_m: float = 0.0) -
     return (padded(par, ARDUPLANE) if law == "arduplane" else par), absent
 
 
-def vector(law: str, found: Mapping[str, float], altitude_m: float = 0.0) -> np.ndarray:
+def vector(law: str, resolved: Mapping[str, float], altitude_m: float = 0.0) -> np.ndarray:
     """Convert the result of `read` to the parameter vector of one law, without wind, (N_PAR,)."""
     if law == "arduplane":
-        return padded(arduplane.vector(found, altitude_m), ARDUPLANE)
-    return LAWS[law].parameters(found, altitude_m)[0]
+        return padded(arduplane.vector(resolved, altitude_m), ARDUPLANE)
+    return LAWS[law].parameters(resolved, altitude_m)[0]
 
 
 def read(law: str, values: Mapping[str, float]) -> tuple[dict[str, float], tuple[str, ...]]:
     """Return all parameters of a law by current name, in the units of the autopilot, and the names at defaults."""
     if law == "arduplane":
         return arduplane.read(values)
-    found = {row.name: find(row, values) for row in LAWS[law].table}
-    absent = tuple(name for name, value in found.items() if value is None)
-    return {**LAWS[law].defaults, **{name: value for name, value in found.items() if value is not None}}, absent
+    matches = {row.name: lookup(row, values) for row in LAWS[law].table}
+    absent = tuple(name for name, value in matches.items() if value is None)
+    return {**LAWS[law].defaults, **{name: value for name, value in matches.items() if value is not None}}, absent
 
 
-def blown(par: np.ndarray, w_n: float, w_e: float) -> np.ndarray:
+def with_wind(par: np.ndarray, w_n: float, w_e: float) -> np.ndarray:
     """Return a copy of `par` with a wind, NED, direction it blows to [m/s]."""
     par = par.copy()
     par[W_N], par[W_E] = w_n, w_e
@@ -93,12 +93,12 @@ def blown(par: np.ndarray, w_n: float, w_e: float) -> np.ndarray:
 
 
 @inlined
-def mark(par: np.ndarray) -> float:
+def law_code(par: np.ndarray) -> float:
     """Return the code of the law; a last element that is no code belongs to an ArduPlane vector."""
     return par[par.shape[0] + LAW]
 
 
-@making
+@array_kernel
 def init(
     par: np.ndarray,
     legs: np.ndarray,
@@ -112,7 +112,7 @@ def init(
     delta_t: float,
 ) -> np.ndarray:
     """Initialise on leg `k` with bumpless transfer of pitch and throttle; arguments as for `arduplane.init`."""
-    law = mark(par)
+    law = law_code(par)
     if law == PX4:
         return px4_fixedwing.init(par, legs, k, start, p, v, euler, Va, theta_c, delta_t)
     if law == TEXTBOOK:
@@ -120,7 +120,7 @@ def init(
     return arduplane.init(par, legs, k, start, p, v, euler, Va, theta_c, delta_t)
 
 
-@making
+@array_kernel
 def engage(
     par: np.ndarray,
     legs: np.ndarray,
@@ -134,15 +134,15 @@ def engage(
 ) -> np.ndarray:
     """Initialise on the first leg in steady state of the speed demand; arguments as for `init`."""
     ctl = init(par, legs, 0, start, p, v, euler, Va, theta_c, delta_t)
-    if mark(par) >= ARDUPLANE:
-        settle(ctl, par, legs)
+    if law_code(par) >= ARDUPLANE:
+        assume_commanded_speed(ctl, par, legs)
     return ctl
 
 
 @kernel
 def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndarray) -> None:
     """Switch to leg `k` at the aircraft position `p`, NED (3,) [m]."""
-    law = mark(par)
+    law = law_code(par)
     if law == PX4:
         px4_fixedwing.begin(ctl, par, legs, k, p)
     elif law == TEXTBOOK:
@@ -164,7 +164,7 @@ def fly(
     dt: float,
 ) -> tuple[float, float, float, bool]:
     """Run one guidance step on the current leg; return the result of `guide` and whether the leg is complete."""
-    law = mark(par)
+    law = law_code(par)
     if law == PX4:
         return px4_fixedwing.fly(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
     if law == TEXTBOOK:
@@ -173,7 +173,7 @@ def fly(
 
 
 @kernel
-def _guide_other(
+def _guide_generic(
     ctl: np.ndarray,
     par: np.ndarray,
     legs: np.ndarray,
@@ -185,8 +185,8 @@ def _guide_other(
     dt: float,
 ) -> tuple[float, float, float]:
     """Run one guidance step of a law other than ArduPlane."""
-    phi_c, theta_c, delta_t, over = fly(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
-    if over and int(ctl[LEG]) + 1 < legs.shape[0]:
+    phi_c, theta_c, delta_t, leg_done = fly(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
+    if leg_done and int(ctl[LEG]) + 1 < legs.shape[0]:
         begin(ctl, par, legs, int(ctl[LEG]) + 1, p)
     return phi_c, theta_c, delta_t
 
@@ -207,11 +207,11 @@ def guide(
 
     Arguments and result as for `arduplane.guide`.
     """
-    if mark(par) < ARDUPLANE:
-        return _guide_other(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
+    if law_code(par) < ARDUPLANE:
+        return _guide_generic(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
     # `arduplane.guide` inlined: a further call costs 10 % of the time
-    phi_c, theta_c, delta_t, over = fly_arduplane(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
-    if over and int(ctl[LEG]) + 1 < legs.shape[0]:
+    phi_c, theta_c, delta_t, leg_done = fly_arduplane(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
+    if leg_done and int(ctl[LEG]) + 1 < legs.shape[0]:
         leg_rules.begin(ctl, par, legs, int(ctl[LEG]) + 1, p)
     return phi_c, theta_c, delta_t
 
@@ -228,7 +228,7 @@ def stabilise(
     dt: float,
 ) -> tuple[float, float, float]:
     """Return the surfaces for a commanded attitude at about 50 Hz; arguments as for `arduplane.stabilise`."""
-    law = mark(par)
+    law = law_code(par)
     if law >= ARDUPLANE:
         return arduplane.stabilise(ctl, par, phi_c, theta_c, euler, rates, Va, dt)
     if law == PX4:
@@ -237,21 +237,21 @@ def stabilise(
 
 
 @kernel
-def shift(ctl: np.ndarray, par: np.ndarray, miss: np.ndarray, told: np.ndarray) -> None:
+def align_integrators(ctl: np.ndarray, par: np.ndarray, residual: np.ndarray, reported: np.ndarray) -> None:
     """Shift the integrators by the output residuals; arguments as for ArduPlane."""
-    law = mark(par)
+    law = law_code(par)
     if law == PX4:
-        px4_fixedwing.shift(ctl, par, miss, told)
+        px4_fixedwing.align_integrators(ctl, par, residual, reported)
     elif law == TEXTBOOK:
-        textbook.shift(ctl, par, miss, told)
+        textbook.align_integrators(ctl, par, residual, reported)
     else:
-        shift_arduplane(ctl, par, miss, told)
+        shift_arduplane(ctl, par, residual, reported)
 
 
 @kernel
 def height_demand(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndarray, v: np.ndarray) -> float:
     """Return the height demand above the origin [m]; p, v: position and ground velocity, NED, (3,)."""
-    law = mark(par)
+    law = law_code(par)
     if law == PX4:
         return px4_fixedwing.height_demand(ctl, par, legs, p, hypot(v[0], v[1]))
     if law == TEXTBOOK:

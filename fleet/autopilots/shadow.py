@@ -10,34 +10,34 @@ import numpy as np
 
 from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.common import controller_state as S
-from fleet.autopilots.common.kernels import kernel, making
-from fleet.autopilots.laws import begin, engage, fly, shift, stabilise
+from fleet.autopilots.common.kernels import array_kernel, kernel
+from fleet.autopilots.laws import align_integrators, begin, engage, fly, stabilise
 from fleet.frames import wrap
 from fleet.mission import SEQ
 
-_MEAN_OVER = 5.0  # window at the end for matching the outputs [s]
-_LONGEST = 0.2  # step length for longer gaps in telemetry [s]
+_MATCH_WINDOW = 5.0  # window at the end for matching the outputs [s]
+_MAX_STEP = 0.2  # step length for longer gaps in telemetry [s]
 
 
 @kernel
-def _find(ctl: np.ndarray, legs: np.ndarray, seq: float) -> int:
+def _leg_of_item(ctl: np.ndarray, legs: np.ndarray, seq: float) -> int:
     """Return the current or next leg with a reported item number; -1 if the route has none."""
-    now, n = leg_rules.current(ctl, legs), legs.shape[0]
+    i_current, n = leg_rules.current_leg(ctl, legs), legs.shape[0]
     for j in range(n):
-        i = (max(now, 0) + j) % n
+        i = (max(i_current, 0) + j) % n
         if legs[i, SEQ] == seq:
             return i
     return -1
 
 
 @kernel
-def _known(x: np.ndarray) -> bool:
+def _is_finite(x: np.ndarray) -> bool:
     """Return whether all three elements are finite; unlike `numpy.all` without allocating an array."""
     return isfinite(x[0]) and isfinite(x[1]) and isfinite(x[2])
 
 
-@making
-def shadow(
+@array_kernel
+def replay_controller(
     par: np.ndarray,
     legs: np.ndarray,
     start: np.ndarray,
@@ -71,61 +71,69 @@ def shadow(
     """
     n = t.shape[0]
     ctl = np.zeros(S.N_CTL)
-    miss = np.full((n, 6), nan)  # reported minus replayed: theta_c, delta_t, delta_a, delta_e, delta_r, phi_c
+    residual = np.full((n, 6), nan)  # reported minus replayed: theta_c, delta_t, delta_a, delta_e, delta_r, phi_c
     last = -1
     for k in range(n):
-        if not (_known(p[k]) and _known(v[k]) and _known(euler[k])):
+        if not (_is_finite(p[k]) and _is_finite(v[k]) and _is_finite(euler[k])):
             continue
         if last < 0:
             ctl = engage(par, legs, start, p[k], v[k], euler[k], Va[k], theta_c[k], delta[k, 3])
             last = k
-        dt = min(max(t[k] - t[last], 0.0), _LONGEST)
+        dt = min(max(t[k] - t[last], 0.0), _MAX_STEP)
         last = k
-        _force(ctl, par, legs, seq[k], p[k])
+        _follow_reported_item(ctl, par, legs, seq[k], p[k])
         if not dt > 0.0:
             continue
         phi_k, theta_k, thr_k, _ = fly(ctl, par, legs, p[k], v[k], euler[k], Va[k], nan, dt)
-        miss[k, 0], miss[k, 1], miss[k, 5] = theta_c[k] - theta_k, delta[k, 3] - thr_k, wrap(phi_c[k] - phi_k)
-        if _known(rates[k]):
+        residual[k, 0], residual[k, 1], residual[k, 5] = (
+            theta_c[k] - theta_k,
+            delta[k, 3] - thr_k,
+            wrap(phi_c[k] - phi_k),
+        )
+        if _is_finite(rates[k]):
             roll = phi_c[k] if np.isfinite(phi_c[k]) else phi_k
             pitch = theta_c[k] if np.isfinite(theta_c[k]) else theta_k
             delta_a, delta_e, delta_r = stabilise(ctl, par, roll, pitch, euler[k], rates[k], Va[k], dt)
-            miss[k, 2], miss[k, 3], miss[k, 4] = delta[k, 0] - delta_a, delta[k, 1] - delta_e, delta[k, 2] - delta_r
+            residual[k, 2], residual[k, 3], residual[k, 4] = (
+                delta[k, 0] - delta_a,
+                delta[k, 1] - delta_e,
+                delta[k, 2] - delta_r,
+            )
     if last >= 0:
-        told = np.array([phi_c[n - 1], theta_c[n - 1], delta[n - 1, 3], Va[n - 1]])
-        shift(ctl, par, _usual(miss[t >= t[n - 1] - _MEAN_OVER]), told)
-    return ctl, sqrt(_mean(miss[:, 5] ** 2, nan))
+        reported = np.array([phi_c[n - 1], theta_c[n - 1], delta[n - 1, 3], Va[n - 1]])
+        align_integrators(ctl, par, _typical_residual(residual[t >= t[n - 1] - _MATCH_WINDOW]), reported)
+    return ctl, sqrt(_mean(residual[:, 5] ** 2, nan))
 
 
-@making
-def _mean(values: np.ndarray, otherwise: float) -> float:
+@array_kernel
+def _mean(values: np.ndarray, default: float) -> float:
     """Return the mean of the finite values, or the default if there are none."""
-    kept = values[np.isfinite(values)]
-    return np.mean(kept) if kept.size else otherwise
+    finite = values[np.isfinite(values)]
+    return np.mean(finite) if finite.size else default
 
 
-@making
-def _median(values: np.ndarray, otherwise: float) -> float:
+@array_kernel
+def _median(values: np.ndarray, default: float) -> float:
     """Return the median of the finite values, robust to short peaks from commands with a wrong time stamp."""
-    kept = values[np.isfinite(values)]
-    return np.median(kept) if kept.size else otherwise
+    finite = values[np.isfinite(values)]
+    return np.median(finite) if finite.size else default
 
 
-@making
-def _usual(miss: np.ndarray) -> np.ndarray:
+@array_kernel
+def _typical_residual(residual: np.ndarray) -> np.ndarray:
     """Return the typical residual of pitch, throttle and surfaces; 0 without data, (5,)."""
     out = np.empty(5)
     for j in range(5):
-        out[j] = _mean(miss[:, j], 0.0) if j < 2 else _median(miss[:, j], 0.0)
+        out[j] = _mean(residual[:, j], 0.0) if j < 2 else _median(residual[:, j], 0.0)
     return out
 
 
 @kernel
-def _force(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, seq: float, p: np.ndarray) -> None:
+def _follow_reported_item(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, seq: float, p: np.ndarray) -> None:
     """Switch to the leg of the mission item that the aircraft reports."""
-    i = leg_rules.current(ctl, legs)
+    i = leg_rules.current_leg(ctl, legs)
     if i < 0 or not np.isfinite(seq) or legs[i, SEQ] == seq:
         return
-    j = _find(ctl, legs, seq)
+    j = _leg_of_item(ctl, legs, seq)
     if j >= 0 and j != int(ctl[S.LEG]):
         begin(ctl, par, legs, j, p)

@@ -5,23 +5,23 @@ import json
 import sys
 from pathlib import Path
 
-from fleet.blind_test.seal import seal
-from fleet.cli import guarded
-from fleet.process.logs import tell
-from fleet.simulator.conceal.exam import exam
+from fleet.blind_test.seal import encrypt
+from fleet.cli import run_command
+from fleet.process.logs import report_progress
+from fleet.simulator.conceal.exam import simulate_exam
 
-_EVERY = 10
+_REPORT_EVERY = 10
 
 
-def _progress(name: str, done: int, of: int) -> None:
+def _progress(name: str, done: int, total: int) -> None:
     """Log the number of flights done; the order of the flights is independent of their labels."""
-    if done % _EVERY == 0 or done == of:
-        tell("prove", f"{done} of {of} flights simulated")
+    if done % _REPORT_EVERY == 0 or done == total:
+        report_progress("prove", f"{done} of {total} flights simulated")
 
 
 def _run(args: argparse.Namespace) -> int:
-    labels = exam(args.seed, args.flights, args.out, _progress, args.jobs)
-    seal(json.dumps(labels, sort_keys=True).encode(), args.sealed, args.key)
+    labels = simulate_exam(args.seed, args.flights, args.out, _progress, args.jobs)
+    encrypt(json.dumps(labels, sort_keys=True).encode(), args.sealed, args.key)
     return 0
 
 
@@ -33,7 +33,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, required=True)
     for name in ("out", "sealed", "key"):
         parser.add_argument(f"--{name}", type=Path, required=True)
-    return guarded("prove", _run, parser.parse_args(argv))
+    return run_command("prove", _run, parser.parse_args(argv))
 
 
 if __name__ == "__main__":

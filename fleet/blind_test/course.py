@@ -8,14 +8,14 @@ from tempfile import TemporaryDirectory
 from threading import Event
 from typing import Any
 
-from fleet.blind_test.mark import Mark, mark
-from fleet.blind_test.seal import digest, taken, unseal
+from fleet.blind_test.mark import GradedFlight, grade
+from fleet.blind_test.seal import consume_key, decrypt, digest
 from fleet.process.children import run_until
 
-Say = Callable[[str], None]
+LogFunction = Callable[[str], None]
 
 
-class Ended(Exception):
+class RunAborted(Exception):
     """Signal that a step failed or was stopped; `code` is the exit status."""
 
     def __init__(self, code: int) -> None:
@@ -24,7 +24,7 @@ class Ended(Exception):
 
 
 @dataclass(frozen=True)
-class Paper:
+class BlindTestConfig:
     """Configuration of one blind test.
 
     Attributes:
@@ -38,76 +38,80 @@ class Paper:
     flights: int
     folder: Path
     jobs: int
-    pages: bool
+    write_pages: bool
 
     @property
-    def sealed(self) -> Path:
+    def sealed_labels(self) -> Path:
         """Return the path of the encrypted labels."""
         return self.folder / "labels.sealed"
 
 
 @dataclass(frozen=True)
-class Marked:
+class BlindTestResult:
     """Result of a blind test: graded flights, and the hashes committed before the labels were decrypted."""
 
-    marks: list[Mark]
-    sealed: str
-    reports: str
+    results: list[GradedFlight]
+    labels_sha256: str
+    reports_sha256: str
 
 
-def examine(paper: Paper, stop: Event, say: Say) -> Marked:
+def run_blind_test(config: BlindTestConfig, stop: Event, log: LogFunction) -> BlindTestResult:
     """Run a blind test.
 
     Raises:
         Ended: when a step fails or is stopped.
         ValueError: when the encrypted labels or the reports changed after their hash was committed.
     """
-    with TemporaryDirectory(prefix="parauav-key-") as elsewhere:
-        key = Path(elsewhere) / "key"
-        _conceal(paper, key, stop)
-        sealed, secret = digest(paper.sealed), taken(key)
-    say(f"labels encrypted, key only in this process: sha256 {sealed}")
-    written = [_diagnose(paper, folder, stop, say) for folder in _airframes(paper.folder)]
-    reports = digest(*written)
-    say(f"reports committed: sha256 {reports}")
-    labels: dict[str, Any] = json.loads(unseal(paper.sealed, secret, sealed))
-    say("labels decrypted, hash matches")
-    (paper.folder / "labels.json").write_text(json.dumps(labels, indent=1) + "\n")
-    if digest(*written) != reports:
+    with TemporaryDirectory(prefix="parauav-key-") as key_folder:
+        key = Path(key_folder) / "key"
+        _conceal(config, key, stop)
+        labels_hash, key_bytes = digest(config.sealed_labels), consume_key(key)
+    log(f"labels encrypted, key only in this process: sha256 {labels_hash}")
+    report_paths = [_diagnose(config, folder, stop, log) for folder in _airframe_folders(config.folder)]
+    reports_hash = digest(*report_paths)
+    log(f"reports committed: sha256 {reports_hash}")
+    labels: dict[str, Any] = json.loads(decrypt(config.sealed_labels, key_bytes, labels_hash))
+    log("labels decrypted, hash matches")
+    (config.folder / "labels.json").write_text(json.dumps(labels, indent=1) + "\n")
+    if digest(*report_paths) != reports_hash:
         raise ValueError(
             "reports: found them changed after the labels were decrypted, expected the committed hash; restart the test"
         )
-    told = {one["flight"]: one for path in written for one in json.loads(path.read_text())}
-    marks = [mark(name, label, told.get(name)) for name, label in labels.items() if label["role"] != "nominal"]
-    return Marked(marks, sealed, reports)
+    report_by_flight = {report["flight"]: report for path in report_paths for report in json.loads(path.read_text())}
+    results = [
+        grade(name, label, report_by_flight.get(name)) for name, label in labels.items() if label["role"] != "nominal"
+    ]
+    return BlindTestResult(results, labels_hash, reports_hash)
 
 
-def _airframes(folder: Path) -> list[Path]:
+def _airframe_folders(folder: Path) -> list[Path]:
     """Return the folders of the simulated airframes."""
     return sorted(path.parent for path in folder.glob("*/*.card.json"))
 
 
-def _conceal(paper: Paper, key: Path, stop: Event) -> None:
-    given = {"seed": paper.seed, "flights": paper.flights, "jobs": paper.jobs, "out": paper.folder}
-    options = [f"--{name}={value}" for name, value in (given | {"sealed": paper.sealed, "key": key}).items()]
-    _step(stop, "fleet.blind_test.concealer", *options)
+def _conceal(config: BlindTestConfig, key: Path, stop: Event) -> None:
+    settings = {"seed": config.seed, "flights": config.flights, "jobs": config.jobs, "out": config.folder}
+    options = [f"--{name}={value}" for name, value in (settings | {"sealed": config.sealed_labels, "key": key}).items()]
+    _run_step(stop, "fleet.blind_test.concealer", *options)
 
 
-def _diagnose(paper: Paper, folder: Path, stop: Event, say: Say) -> Path:
+def _diagnose(config: BlindTestConfig, folder: Path, stop: Event, log: LogFunction) -> Path:
     """Calibrate on the nominal flights of one airframe and diagnose the others; return the file of reports."""
-    nominal, unknown = (sorted(map(str, folder.glob(f"{kind}_*.tlog"))) for kind in ("cal", "rec"))
+    nominal, test_flights = (sorted(map(str, folder.glob(f"{prefix}_*.tlog"))) for prefix in ("cal", "rec"))
     model, reports = folder / "model.json", folder / "reports.json"
-    say(f"{folder.name}: calibrating on {len(nominal)} nominal flights")
+    log(f"{folder.name}: calibrating on {len(nominal)} nominal flights")
     card = folder / f"{folder.name}.card.json"
-    _step(stop, "twin_worker.diagnosis.learn", f"--airframe={card}", f"--out={model}", "--", *nominal)
-    say(f"{folder.name}: diagnosing {len(unknown)} flights without labels")
-    pages = [f"--report={folder / 'pages'}"] if paper.pages else []
-    told = [f"--model={model}", f"--json={reports}", f"--jobs={paper.jobs}", *pages]
-    _step(stop, "twin_worker.diagnosis", *told, "--", *unknown, fine=(0, 1))  # a rejected flight is graded as missed
+    _run_step(stop, "twin_worker.diagnosis.learn", f"--airframe={card}", f"--out={model}", "--", *nominal)
+    log(f"{folder.name}: diagnosing {len(test_flights)} flights without labels")
+    page_options = [f"--report={folder / 'pages'}"] if config.write_pages else []
+    options = [f"--model={model}", f"--json={reports}", f"--jobs={config.jobs}", *page_options]
+    _run_step(
+        stop, "twin_worker.diagnosis", *options, "--", *test_flights, accepted_codes=(0, 1)
+    )  # a rejected flight is graded as missed
     return reports
 
 
-def _step(stop: Event, module: str, *options: str, fine: tuple[int, ...] = (0,)) -> None:
+def _run_step(stop: Event, module: str, *options: str, accepted_codes: tuple[int, ...] = (0,)) -> None:
     code = run_until(stop, module, *options)
-    if stop.is_set() or code not in fine:
-        raise Ended(0 if stop.is_set() else code)
+    if stop.is_set() or code not in accepted_codes:
+        raise RunAborted(0 if stop.is_set() else code)

@@ -42,12 +42,12 @@ CHANNELS: Mapping[str, tuple[str, ...]] = {  # effect: correct channels
     "heading_bias": ("heading",),
     "baro_bias": ("baro",),
 }
-_SPAN_DEG = 45.0  # direction error that counts as an error of 100 %
-_LEAST = {"density_ratio": 0.01, "scale": 0.01}  # smallest |ratio - 1| used as denominator
+_DIRECTION_SCALE_DEG = 45.0  # direction error that counts as an error of 100 %
+_MIN_RATIO_CHANGE = {"density_ratio": 0.01, "scale": 0.01}  # smallest |ratio - 1| used as denominator
 
 
 @dataclass(frozen=True)
-class Size:
+class ScoredParameter:
     """One parameter: name, true value, reported value and its standard deviation; None where not reported."""
 
     name: str
@@ -61,26 +61,26 @@ class Size:
         if self.told is None:
             return 1.0
         if self.name == "from_deg":
-            return self.away / _SPAN_DEG
-        if self.name in _LEAST:
-            return self.away / max(abs(self.truth - 1.0), _LEAST[self.name])
-        least = 1.0 if self.name.endswith("_deg") and self.name != "bias_deg" else 1e-6
-        return self.away / max(abs(self.truth), least)
+            return self.deviation / _DIRECTION_SCALE_DEG
+        if self.name in _MIN_RATIO_CHANGE:
+            return self.deviation / max(abs(self.truth - 1.0), _MIN_RATIO_CHANGE[self.name])
+        floor = 1.0 if self.name.endswith("_deg") and self.name != "bias_deg" else 1e-6
+        return self.deviation / max(abs(self.truth), floor)
 
     @property
-    def away(self) -> float:
+    def deviation(self) -> float:
         """Return |reported - true|; directions modulo 360 degrees."""
-        off = (self.told or 0.0) - self.truth
-        return abs((off + 180.0) % 360.0 - 180.0 if self.name == "from_deg" else off)
+        difference = (self.told or 0.0) - self.truth
+        return abs((difference + 180.0) % 360.0 - 180.0 if self.name == "from_deg" else difference)
 
     @property
     def covered(self) -> bool | None:
         """Return whether the true value lies within two standard deviations; None where none is reported."""
-        return self.away <= 2.0 * self.sigma if self.sigma else None
+        return self.deviation <= 2.0 * self.sigma if self.sigma else None
 
 
 @dataclass(frozen=True)
-class Mark:
+class GradedFlight:
     """Grade of one flight.
 
     Attributes:
@@ -104,7 +104,7 @@ class Mark:
     sentence: str
     rivals: tuple[tuple[str, ...], ...] = ()
     late: tuple[tuple[float, float], ...] = ()
-    sizes: tuple[tuple[str, Size], ...] = ()
+    sizes: tuple[tuple[str, ScoredParameter], ...] = ()
     located: tuple[bool, ...] = ()
     surfaces: tuple[bool, ...] = ()
     before: float | None = None
@@ -112,7 +112,7 @@ class Mark:
     acts: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def said(self) -> tuple[str, ...]:
+    def reported_names(self) -> tuple[str, ...]:
         """Return the reported names, else `unknown` or `nothing`."""
         return self.named or ("unknown" if self.verdict == "unknown" else "nothing",)
 
@@ -133,39 +133,42 @@ class Mark:
         return self.hit or (bool(self.named) and self.concealed[0] in self.rivals[0])
 
 
-def mark(flight: str, label: Mapping[str, Any], report: Mapping[str, Any] | None) -> Mark:
+def grade(flight: str, label: Mapping[str, Any], report: Mapping[str, Any] | None) -> GradedFlight:
     """Grade one report; a flight without a report was rejected."""
-    said = report or {"verdict": "none", "sentence": "no report: the flight was rejected", "named": []}
-    named = tuple(name.split(":")[0] for name in said["named"])
-    late, sizes, located, surfaces = [], [], [], []
+    diagnosis = report or {"verdict": "none", "sentence": "no report: the flight was rejected", "named": []}
+    named = tuple(name.split(":")[0] for name in diagnosis["named"])
+    onset_errors, sizes, located, surfaces = [], [], [], []
     for effect in label["effects"]:
         if effect["name"] not in named:
             continue
         i = named.index(effect["name"])
-        where = said["located"][i]
-        located.append(where["channel"] in CHANNELS[effect["name"]])
+        location = diagnosis["located"][i]
+        located.append(location["channel"] in CHANNELS[effect["name"]])
         if effect.get("surface"):
-            surfaces.append(where["surface"] == effect["surface"])
-        if effect.get("t0") and where["segments"]:
-            late.append((where["segments"][0][0] - effect["t0"], 5.0 + 0.2 * effect.get("ramp_s", 0.0)))
+            surfaces.append(location["surface"] == effect["surface"])
+        if effect.get("t0") and location["segments"]:
+            onset_errors.append((location["segments"][0][0] - effect["t0"], 5.0 + 0.2 * effect.get("ramp_s", 0.0)))
         sizes += [
-            (effect["name"], Size(name, truth, said["parameters"][i].get(name), said["sigma"][i].get(name)))
+            (
+                effect["name"],
+                ScoredParameter(name, truth, diagnosis["parameters"][i].get(name), diagnosis["sigma"][i].get(name)),
+            )
             for name, truth in effect["params"].items()
         ]
-    return Mark(
+    return GradedFlight(
         flight=flight,
         airframe=label["airframe"],
         role=label["role"],
         concealed=tuple(effect["name"] for effect in label["effects"]),
         named=named,
-        verdict=said["verdict"],
-        sentence=said["sentence"],
-        rivals=tuple(tuple(one) for one in said.get("equivalents", ())),
-        late=tuple(late),
+        verdict=diagnosis["verdict"],
+        sentence=diagnosis["sentence"],
+        rivals=tuple(tuple(names) for names in diagnosis.get("equivalents", ())),
+        late=tuple(onset_errors),
         sizes=tuple(sizes),
         located=tuple(located),
         surfaces=tuple(surfaces),
-        before=said.get("fit_before") if named else None,
-        after=said.get("fit_after") if named else None,
+        before=diagnosis.get("fit_before") if named else None,
+        after=diagnosis.get("fit_after") if named else None,
         acts=label.get("acts", {}),
     )

@@ -9,87 +9,89 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from fleet.blind_test.course import Marked, Paper
-from fleet.blind_test.mark import Mark
-from fleet.blind_test.score import ASKED, lines, met
+from fleet.blind_test.course import BlindTestConfig, BlindTestResult
+from fleet.blind_test.mark import GradedFlight
+from fleet.blind_test.score import REQUIREMENTS, meets_requirement, score_rows
 
 
-def written(paper: Paper, marked: Marked, scores: Mapping[str, Any]) -> dict[str, Any]:
+def as_json_values(config: BlindTestConfig, outcome: BlindTestResult, scores: Mapping[str, Any]) -> dict[str, Any]:
     """Return the result as JSON values: scores, hashes, requirements met, confusion counts, every flight."""
     return {
         **scores,
-        "seed": paper.seed,
-        "flights": paper.flights,
-        "labels_sha256": marked.sealed,
-        "reports_sha256": marked.reports,
-        "asked_met": {name: met(name, scores[name]) for name in ASKED},
-        "confusion": [[*pair, count] for pair, count in sorted(confusion(marked.marks).items())],
-        "marks": [asdict(one) | {"hit": one.hit} for one in marked.marks],
+        "seed": config.seed,
+        "flights": config.flights,
+        "labels_sha256": outcome.labels_sha256,
+        "reports_sha256": outcome.reports_sha256,
+        "asked_met": {name: meets_requirement(name, scores[name]) for name in REQUIREMENTS},
+        "confusion": [[*pair, count] for pair, count in sorted(confusion(outcome.results).items())],
+        "marks": [asdict(result) | {"hit": result.hit} for result in outcome.results],
     }
 
 
-def confusion(marks: Sequence[Mark]) -> Counter[tuple[str, str]]:
+def confusion(results: Sequence[GradedFlight]) -> Counter[tuple[str, str]]:
     """Count pairs of true and reported names, one pair for each true or reported effect."""
     pairs: Counter[tuple[str, str]] = Counter()
-    for one in marks:
-        right = set(one.concealed) & set(one.named)
-        pairs.update((name, name) for name in right)
-        missed = [name for name in one.concealed if name not in right]
-        extra = [name for name in one.named if name not in right]
-        nothing = one.said[0] if not one.named else "nothing"
+    for result in results:
+        correct = set(result.concealed) & set(result.named)
+        pairs.update((name, name) for name in correct)
+        missed = [name for name in result.concealed if name not in correct]
+        extra = [name for name in result.named if name not in correct]
+        no_name = result.reported_names[0] if not result.named else "nothing"
         for k in range(max(len(missed), len(extra))):
-            pairs[(missed[k] if k < len(missed) else "nothing", extra[k] if k < len(extra) else nothing)] += 1
-        if not one.concealed and not one.named:
-            pairs["nothing", nothing] += 1
+            pairs[(missed[k] if k < len(missed) else "nothing", extra[k] if k < len(extra) else no_name)] += 1
+        if not result.concealed and not result.named:
+            pairs["nothing", no_name] += 1
     return pairs
 
 
-def ordered(marks: Sequence[Mark]) -> list[Mark]:
+def misses_first(results: Sequence[GradedFlight]) -> list[GradedFlight]:
     """Sort the flights, misses first."""
-    return sorted(marks, key=lambda one: (one.hit, one.role, one.concealed, one.flight))
+    return sorted(results, key=lambda one: (one.hit, one.role, one.concealed, one.flight))
 
 
-def table(marks: Sequence[Mark], scores: Mapping[str, Any]) -> RenderableType:
+def table(results: Sequence[GradedFlight], scores: Mapping[str, Any]) -> RenderableType:
     """Render the flights, misses first, and the scores."""
-    return Group(_flights(marks), Text(""), _scores(scores))
+    return Group(_flights(results), Text(""), _scores(scores))
 
 
-def _flights(marks: Sequence[Mark]) -> Table:
-    out = Table(box=None, pad_edge=False)
+def _flights(results: Sequence[GradedFlight]) -> Table:
+    flight_table = Table(box=None, pad_edge=False)
     for heading in ("", "flight", "concealed", "named", "reported (true)", "onset", "held out"):
-        out.add_column(heading, overflow="fold")
-    for one in ordered(marks):
-        out.add_row(
-            Text("ok", "green") if one.hit else Text("MISS", "red"),
-            f"{one.airframe} {one.flight}",
-            ", ".join(one.concealed) or "nothing",
-            ", ".join(one.said),
-            "\n".join(numbers(one)),
-            "\n".join(f"{dt:+.1f} s" for dt, _ in one.late),
-            fit(one),
+        flight_table.add_column(heading, overflow="fold")
+    for result in misses_first(results):
+        flight_table.add_row(
+            Text("ok", "green") if result.hit else Text("MISS", "red"),
+            f"{result.airframe} {result.flight}",
+            ", ".join(result.concealed) or "nothing",
+            ", ".join(result.reported_names),
+            "\n".join(parameter_texts(result)),
+            "\n".join(f"{dt:+.1f} s" for dt, _ in result.late),
+            fit_text(result),
         )
-    return out
+    return flight_table
 
 
-def numbers(one: Mark) -> list[str]:
+def parameter_texts(result: GradedFlight) -> list[str]:
     """Format each parameter: reported value, standard deviation and true value."""
-    out = []
-    for _, size in one.sizes:
-        told = "not reported" if size.told is None else f"{size.told:.3g}"
-        doubt = f" ± {size.sigma:.2g}" if size.sigma else ""
-        out.append(f"{size.name} {told}{doubt} ({size.truth:.3g})")
-    return out
+    texts = []
+    for _, parameter in result.sizes:
+        value = "not reported" if parameter.told is None else f"{parameter.told:.3g}"
+        deviation = f" ± {parameter.sigma:.2g}" if parameter.sigma else ""
+        texts.append(f"{parameter.name} {value}{deviation} ({parameter.truth:.3g})")
+    return texts
 
 
-def fit(one: Mark) -> str:
+def fit_text(result: GradedFlight) -> str:
     """Format the residual on held-out blocks before and after."""
-    return f"{one.before:.2f} → {one.after:.2f}" if one.before and one.after is not None else ""
+    return f"{result.before:.2f} → {result.after:.2f}" if result.before and result.after is not None else ""
 
 
 def _scores(scores: Mapping[str, Any]) -> Table:
-    out = Table(box=None, pad_edge=False)
+    score_table = Table(box=None, pad_edge=False)
     for heading in ("", "score", "required", "achieved"):
-        out.add_column(heading)
-    for one in lines(scores):
-        out.add_row(Text("met", "green") if one.met else Text("missed", "red"), one.words, one.asked, one.reached)
-    return out
+        score_table.add_column(heading)
+    for row in score_rows(scores):
+        score_table.add_row(
+            Text("met", "green") if row.met else Text("missed", "red"), row.meaning, row.required, row.achieved
+        )
+    return score_table

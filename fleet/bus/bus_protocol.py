@@ -6,31 +6,31 @@ from functools import lru_cache
 from typing import Any, Protocol, TypeVar
 
 from fleet.access.roles import ROOT
-from fleet.bus.codec import Stamp, Wire, timely
+from fleet.bus.codec import EncodedMessage, Stamp, is_plausible_epoch
 from fleet.contract import PER_UAV
 
 M = TypeVar("M")
-Heard = Callable[[Any, Stamp | None], None]
-Overheard = Callable[[bytes, str, Stamp | None], None]
-Letter = tuple[int | None, bytes, str, Stamp | None]
+Callback = Callable[[Any, Stamp | None], None]
+RawCallback = Callable[[bytes, str, Stamp | None], None]
+RawMessage = tuple[int | None, bytes, str, Stamp | None]
 """UAV id of the key, payload, encoding, stamp."""
-Collected = Callable[[list[Letter]], None]
-Answers = Iterable[tuple[Any, Stamp | None]]
-Answer = Callable[[int | None, dict[str, str], bytes], Answers]
-Token = Callable[[str, bool], None]
-Wants = Callable[[int], bool]
+BatchCallback = Callable[[list[RawMessage]], None]
+Replies = Iterable[tuple[Any, Stamp | None]]
+QueryHandler = Callable[[int | None, dict[str, str], bytes], Replies]
+LivelinessCallback = Callable[[str, bool], None]
+Filter = Callable[[int], bool]
 
 
-def key(kind: type, who: int | str) -> str:
+def key_of(kind: type, target: int | str) -> str:
     """Return the key of a message class: `parauav/7/sample`, `parauav/@fleet/state/{writer}`; `target` may be `*`."""
     topic: str = kind.topic  # type: ignore[attr-defined]
-    return f"{ROOT}/{who}/{topic}" if kind in PER_UAV else f"{ROOT}/{topic}/{who}"
+    return f"{ROOT}/{target}/{topic}" if kind in PER_UAV else f"{ROOT}/{topic}/{target}"
 
 
 @lru_cache(maxsize=16_384)
-def uav_in(name: str) -> int | None:
+def uav_of_key(key_name: str) -> int | None:
     """Parse the UAV id of a key; None where the chunk is a wildcard or not a number."""
-    chunk = name.split("/")[1] if name.count("/") >= 2 else ""
+    chunk = key_name.split("/")[1] if key_name.count("/") >= 2 else ""
     return int(chunk) if chunk.isdecimal() and len(chunk) <= 9 else None
 
 
@@ -43,14 +43,14 @@ class Bus(AbstractContextManager, Protocol):
     def publish(self, message: Any, stamp: Stamp | None = None) -> None:
         """Publish one message."""
 
-    def put(self, wire: Wire, stamp: Stamp | None = None) -> None:
+    def put(self, encoded: EncodedMessage, stamp: Stamp | None = None) -> None:
         """Publish one encoded message."""
 
     @property
     def router(self) -> str:
         """Return the id of the connected router; empty while none is connected (the bus keeps retrying)."""
 
-    def subscribe(self, kind: type, heard: Heard, wants: Wants | None = None) -> None:
+    def subscribe(self, kind: type, callback: Callback, accepts: Filter | None = None) -> None:
         """Call `callback(message, stamp)` for every message of a class; undecodable messages are counted only.
 
         Args:
@@ -59,10 +59,10 @@ class Bus(AbstractContextManager, Protocol):
             accepts: filter by UAV id, applied before decoding; None: all
         """
 
-    def overhear(self, kind: type, heard: Overheard) -> None:
+    def subscribe_raw(self, kind: type, callback: RawCallback) -> None:
         """Call `callback(payload, encoding, stamp)` for every message of a class, without decoding it."""
 
-    def collect(self, kind: type, heard: Collected) -> None:
+    def subscribe_buffered(self, kind: type, callback: BatchCallback) -> None:
         """Buffer every message of a class until `dispatch`; needs no thread.
 
         Args:
@@ -70,24 +70,26 @@ class Bus(AbstractContextManager, Protocol):
             callback: called with all buffered messages in order of arrival, undecoded
         """
 
-    def hand_out(self, newest: Container[type] = ()) -> None:
+    def dispatch(self, latest_only: Container[type] = ()) -> None:
         """Pass the buffered messages to their callbacks on this thread; a full buffer drops its oldest messages.
 
         Args:
             latest_only: classes of which only the newest message of each key is passed on
         """
 
-    def answer(self, kind: type, reply: Answer) -> None:
+    def declare_queryable(self, kind: type, handler: QueryHandler) -> None:
         """Declare one wildcard queryable for a class: `handler(uav or None, parameters, payload)`."""
 
-    def ask(self, kind: type[M], who: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
+    def get(self, kind: type[M], target: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
         """Query all writers of a class for at most `timeout_s` [s]; return the reply of highest epoch per aircraft.
 
         Raises:
             ConnectionError: when the session is closed; join the router again.
         """
 
-    def inquire(self, kind: type[M], who: int, payload: bytes, timeout_s: float = 5.0) -> tuple[M, Stamp | None] | None:
+    def get_one(
+        self, kind: type[M], target: int, payload: bytes, timeout_s: float = 5.0
+    ) -> tuple[M, Stamp | None] | None:
         """Query one aircraft with a payload; None without a reply.
 
         Raises:
@@ -95,55 +97,55 @@ class Bus(AbstractContextManager, Protocol):
             ConnectionError: when the session is closed; join the router again.
         """
 
-    def gather(self, kind: type[M], who: int | str, payload: bytes, timeout_s: float) -> Iterator[M]:
+    def get_stream(self, kind: type[M], target: int | str, payload: bytes, timeout_s: float) -> Iterator[M]:
         """Query with a payload and yield every reply on arrival, for at most `timeout_s` [s]; omits error replies.
 
         Raises:
             ConnectionError: when the session is closed; join the router again.
         """
 
-    def fetch(self, kind: type, who: int | str, timeout_s: float) -> Iterator[bytes]:
+    def get_payloads(self, kind: type, target: int | str, timeout_s: float) -> Iterator[bytes]:
         """Query and yield the payload of every reply on arrival, for at most `timeout_s` [s]; skip other versions.
 
         Raises:
             ConnectionError: when the session is closed; join the router again.
         """
 
-    def present(self, name: str) -> None:
+    def declare_liveliness(self, name: str) -> None:
         """Declare the liveliness token `parauav/@live/{name}` for the lifetime of this process."""
 
-    def attend(self, told: Token) -> None:
+    def watch_liveliness(self, callback: LivelinessCallback) -> None:
         """Call `callback(name, alive)` for every liveliness token now, and on every later change."""
 
-    def recount(self, told: Token) -> None:
+    def list_liveliness(self, callback: LivelinessCallback) -> None:
         """Call `callback(name, True)` for every current liveliness token."""
 
     def close(self) -> None:
         """Close the connection to the bus."""
 
 
-def newest(found: list[tuple[M, Stamp | None]]) -> list[tuple[M, Stamp | None]]:
+def select_latest(replies: list[tuple[M, Stamp | None]]) -> list[tuple[M, Stamp | None]]:
     """Select the reply of highest plausible epoch, then the newest, per UAV (and alert); keep all without a UAV."""
     best: dict[tuple[int, str], tuple[M, Stamp | None]] = {}
-    rest = []
-    for message, stamp in found:
+    without_uav = []
+    for message, stamp in replies:
         uav = getattr(message, "uav", None)
         if uav is None:
-            rest.append((message, stamp))
+            without_uav.append((message, stamp))
             continue
-        if stamp is not None and not timely(stamp.epoch):
+        if stamp is not None and not is_plausible_epoch(stamp.epoch):
             continue
-        what = uav, str(getattr(message, "about", ""))
-        held = best.get(what)
-        if held is None or _rank(message, stamp) > _rank(*held):
-            best[what] = (message, stamp)
-    return [best[what] for what in sorted(best)] + rest
+        identity = uav, str(getattr(message, "about", ""))
+        current = best.get(identity)
+        if current is None or _rank(message, stamp) > _rank(*current):
+            best[identity] = (message, stamp)
+    return [best[identity] for identity in sorted(best)] + without_uav
 
 
 def _rank(message: Any, stamp: Stamp | None) -> tuple[Stamp, float]:
     return stamp or Stamp(0, 0), message.t
 
 
-def asked_for(uav: int | None, answers: Answers) -> Answers:
+def replies_about(uav: int | None, replies: Replies) -> Replies:
     """Filter replies lazily by UAV id; None keeps all."""
-    return ((m, stamp) for m, stamp in answers if uav is None or getattr(m, "uav", uav) == uav)
+    return ((m, stamp) for m, stamp in replies if uav is None or getattr(m, "uav", uav) == uav)

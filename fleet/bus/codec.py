@@ -7,16 +7,16 @@ from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
-from fleet.access.roles import SAID
+from fleet.access.roles import TOPIC_RULES
 from fleet.contract import PER_UAV, TOPICS
 
 M = TypeVar("M")
-EPOCH_AHEAD_MS = 300_000  # an epoch further ahead of the local clock is forged or of a wrong clock
+MAX_EPOCH_AHEAD_MS = 300_000  # an epoch further ahead of the local clock is forged or of a wrong clock
 _STAMP = struct.Struct("<QQ")
 _PACK = msgspec.msgpack.Encoder()
 _UNPACK: dict[str, Any] = {topic: msgspec.msgpack.Decoder(kind) for topic, kind in TOPICS.items()}
 
-_NAMED = {
+_ENCODINGS = {
     kind: f"application/msgpack;parauav.{topic.lstrip('@').replace('/', '.')}.{kind.version}"  # type: ignore[attr-defined]
     for topic, kind in TOPICS.items()
 }
@@ -29,17 +29,17 @@ class Stamp(NamedTuple):
     writer: int
 
 
-def timely(epoch: int, wall_s: float | None = None) -> bool:
+def is_plausible_epoch(epoch: int, wall_s: float | None = None) -> bool:
     """Return whether an epoch is plausible: a time [ms since 1970], at most 5 minutes ahead of the reader's clock.
 
     Args:
         epoch: of a claim
         wall_s: the reader's clock; None: now [s since 1970]
     """
-    return 0 <= epoch <= (time.time() if wall_s is None else wall_s) * 1e3 + EPOCH_AHEAD_MS
+    return 0 <= epoch <= (time.time() if wall_s is None else wall_s) * 1e3 + MAX_EPOCH_AHEAD_MS
 
 
-class Wire(NamedTuple):
+class EncodedMessage(NamedTuple):
     """An encoded message."""
 
     kind: type  # from `fleet.contract`
@@ -54,15 +54,15 @@ class Wire(NamedTuple):
 
 def encode(message: Any) -> bytes:
     """Encode one message as a msgpack map; return the payload of an encoded message unchanged."""
-    return message.payload if isinstance(message, Wire) else _PACK.encode(message)
+    return message.payload if isinstance(message, EncodedMessage) else _PACK.encode(message)
 
 
 def encoding(kind: type) -> str:
     """Return the Zenoh encoding of a message class, e.g. `application/msgpack;parauav.sample.1`."""
-    return _NAMED[kind]
+    return _ENCODINGS[kind]
 
 
-def decode(kind: type[M], payload: bytes, named: str = "") -> M:
+def decode(kind: type[M], payload: bytes, encoding_name: str = "") -> M:
     """Decode one message of class `kind`.
 
     Args:
@@ -73,32 +73,33 @@ def decode(kind: type[M], payload: bytes, named: str = "") -> M:
         ValueError: when the version differs, or the payload is too large or invalid; upgrade the older side.
     """
     expected = encoding(kind)
-    if named and named != expected:
+    if encoding_name and encoding_name != expected:
         raise ValueError(
-            f"{kind.__name__}: found encoding {_short(repr(named))}, expected {expected!r}; upgrade the older side"
+            f"{kind.__name__}: found encoding {_shorten(repr(encoding_name))}, expected {expected!r}; upgrade "
+            "the older side"
         )
-    if len(payload) > (most := SAID[kind.topic].most):  # type: ignore[attr-defined]
-        raise ValueError(f"{kind.__name__}: found {len(payload):,} bytes, expected at most {most:,}; send less")
+    if len(payload) > (max_bytes := TOPIC_RULES[kind.topic].max_bytes):  # type: ignore[attr-defined]
+        raise ValueError(f"{kind.__name__}: found {len(payload):,} bytes, expected at most {max_bytes:,}; send less")
     try:
         return _UNPACK[kind.topic].decode(payload)  # type: ignore[attr-defined]
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        what = f"{len(payload)} bytes that do not fit ({_short(str(error))})"
-        raise ValueError(f"{kind.__name__}: found {what}; resend") from None
+        problem = f"{len(payload)} bytes that do not fit ({_shorten(str(error))})"
+        raise ValueError(f"{kind.__name__}: found {problem}; resend") from None
 
 
-def decode_from(kind: type[M], uav: int | None, payload: bytes, named: str = "") -> M:
+def decode_for_key(kind: type[M], uav: int | None, payload: bytes, encoding_name: str = "") -> M:
     """Decode one message received under the key of a UAV, as `decode`.
 
     Raises:
         ValueError: as `decode`, and when the message is of another UAV: permission for one key covers no other.
     """
-    message: Any = decode(kind, payload, named)
+    message: Any = decode(kind, payload, encoding_name)
     if kind in PER_UAV and message.uav != uav:
         raise ValueError(f"{kind.__name__}: found one of uav {message.uav} under the key of {uav}, expected its own")
     return message  # type: ignore[no-any-return]
 
 
-def _short(text: str) -> str:
+def _shorten(text: str) -> str:
     """Shorten untrusted text of any length by omitting its middle."""
     return text if len(text) <= 200 else f"{text[:80]} … {text[-80:]}"
 

@@ -4,17 +4,19 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
-from fleet.bus.codec import Stamp, timely
+from fleet.bus.codec import Stamp, is_plausible_epoch
 
-GIVE_UP_S = 10.0  # a writer silent for this long loses its claim: a lower one (a restarted fleet) is accepted [s]
+WRITER_TIMEOUT_S = (
+    10.0  # a writer silent for this long loses its claim: a lower one (a restarted fleet) is accepted [s]
+)
 
 
-class _Believed(NamedTuple):
+class _AcceptedWriter(NamedTuple):
     rank: Stamp
-    heard: float
+    received_t: float
 
 
-class Fence:
+class EpochFence:
     """Accepted writer by UAV id; hides the brief double writing during a handover.
 
     Args:
@@ -23,15 +25,15 @@ class Fence:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._by_uav: dict[int, _Believed] = {}
+        self._by_uav: dict[int, _AcceptedWriter] = {}
 
-    def believes(self, uav: int, stamp: Stamp | None) -> bool:
+    def accepts(self, uav: int, stamp: Stamp | None) -> bool:
         """Return whether a result is accepted: no writer with a higher plausible claim wrote recently."""
         rank, now = stamp or Stamp(0, 0), self._clock()
-        if not timely(rank.epoch):
+        if not is_plausible_epoch(rank.epoch):
             return False
-        held = self._by_uav.get(uav)
-        if held is not None and rank < held.rank and now - held.heard < GIVE_UP_S:
+        current = self._by_uav.get(uav)
+        if current is not None and rank < current.rank and now - current.received_t < WRITER_TIMEOUT_S:
             return False
-        self._by_uav[uav] = _Believed(rank, now)
+        self._by_uav[uav] = _AcceptedWriter(rank, now)
         return True

@@ -8,8 +8,17 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from fleet.bus.bus_protocol import Answer, Collected, Heard, Overheard, Token, Wants, asked_for, newest
-from fleet.bus.codec import Stamp, Wire, decode, encode, encoding
+from fleet.bus.bus_protocol import (
+    BatchCallback,
+    Callback,
+    Filter,
+    LivelinessCallback,
+    QueryHandler,
+    RawCallback,
+    replies_about,
+    select_latest,
+)
+from fleet.bus.codec import EncodedMessage, Stamp, decode, encode, encoding
 
 M = TypeVar("M")
 
@@ -21,124 +30,130 @@ class MemoryBus(AbstractContextManager):
 
     def __init__(self) -> None:
         self.writer = secrets.randbits(63)
-        self._heard: dict[type, list[Heard]] = {}
-        self._overheard: dict[type, list[Overheard]] = {}
-        self._reply: dict[type, list[Answer]] = {}
-        self._present: list[str] = []
-        self._attends: list[Token] = []
+        self._callbacks: dict[type, list[Callback]] = {}
+        self._raw_callbacks: dict[type, list[RawCallback]] = {}
+        self._query_handlers: dict[type, list[QueryHandler]] = {}
+        self._tokens: list[str] = []
+        self._token_callbacks: list[LivelinessCallback] = []
         self.bad = 0
 
     def publish(self, message: Any, stamp: Stamp | None = None) -> None:
         """Publish one message."""
         self.deliver(type(message), encode(message), encoding(type(message)), stamp)
 
-    def put(self, wire: Wire, stamp: Stamp | None = None) -> None:
+    def put(self, encoded: EncodedMessage, stamp: Stamp | None = None) -> None:
         """Publish one encoded message."""
-        self.deliver(wire.kind, wire.payload, encoding(wire.kind), stamp)
+        self.deliver(encoded.kind, encoded.payload, encoding(encoded.kind), stamp)
 
-    def deliver(self, kind: type, payload: bytes, named: str, stamp: Stamp | None = None) -> None:
+    def deliver(self, kind: type, payload: bytes, encoding_name: str, stamp: Stamp | None = None) -> None:
         """Pass a payload to the subscribers as if received; count payloads that do not decode."""
-        for overheard in self._overheard.get(kind, []):
-            overheard(payload, named, stamp)
-        for heard in self._heard.get(kind, []):
+        for raw_callback in self._raw_callbacks.get(kind, []):
+            raw_callback(payload, encoding_name, stamp)
+        for callback in self._callbacks.get(kind, []):
             try:
-                message: Any = decode(kind, payload, named)
+                message: Any = decode(kind, payload, encoding_name)
             except ValueError:
                 self.bad += 1
                 continue
-            heard(message, stamp)
+            callback(message, stamp)
 
-    def subscribe(self, kind: type, heard: Heard, wants: Wants | None = None) -> None:
+    def subscribe(self, kind: type, callback: Callback, accepts: Filter | None = None) -> None:
         """Call `callback(message, stamp)` for every message of a class that `accepts` admits."""
-        if wants is not None:
-            heard = partial(_wanted, heard, wants)
-        self._heard.setdefault(kind, []).append(heard)
+        if accepts is not None:
+            callback = partial(_call_if_accepted, callback, accepts)
+        self._callbacks.setdefault(kind, []).append(callback)
 
-    def overhear(self, kind: type, heard: Overheard) -> None:
+    def subscribe_raw(self, kind: type, callback: RawCallback) -> None:
         """Call `callback(payload, encoding, stamp)` for every message of a class, undecoded."""
-        self._overheard.setdefault(kind, []).append(heard)
+        self._raw_callbacks.setdefault(kind, []).append(callback)
 
-    def collect(self, kind: type, heard: Collected) -> None:
+    def subscribe_buffered(self, kind: type, callback: BatchCallback) -> None:
         """Call `callback` with every message of a class immediately."""
-        self.overhear(kind, lambda payload, *rest: heard([(_whose(payload), payload, *rest)]))
+        self.subscribe_raw(kind, lambda payload, *rest: callback([(_uav_of_payload(payload), payload, *rest)]))
 
-    def hand_out(self, newest: Container[type] = ()) -> None:
+    def dispatch(self, latest_only: Container[type] = ()) -> None:
         """Do nothing: this bus has no buffer."""
 
-    def answer(self, kind: type, reply: Answer) -> None:
+    def declare_queryable(self, kind: type, handler: QueryHandler) -> None:
         """Declare one wildcard queryable for a class."""
-        self._reply.setdefault(kind, []).append(reply)
+        self._query_handlers.setdefault(kind, []).append(handler)
 
-    def ask(self, kind: type[M], who: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
+    def get(self, kind: type[M], target: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
         """Query all handlers of a class; return the reply of highest epoch per aircraft."""
-        uav = who if isinstance(who, int) else None
-        found: list[tuple[M, Stamp | None]] = []
-        for reply in self._reply.get(kind, []):
+        uav = target if isinstance(target, int) else None
+        pairs: list[tuple[M, Stamp | None]] = []
+        for handler in self._query_handlers.get(kind, []):
             try:
-                answers = list(asked_for(uav, reply(uav, {}, b"")))
+                replies = list(replies_about(uav, handler(uav, {}, b"")))
             except ValueError:
                 continue  # on Zenoh this is an error reply, which `get` omits
-            found += [(decode(kind, encode(message), encoding(kind)), stamp) for message, stamp in answers]
-        return newest(found)
+            pairs += [(decode(kind, encode(message), encoding(kind)), stamp) for message, stamp in replies]
+        return select_latest(pairs)
 
-    def inquire(self, kind: type[M], who: int, payload: bytes, timeout_s: float = 5.0) -> tuple[M, Stamp | None] | None:
+    def get_one(
+        self, kind: type[M], target: int, payload: bytes, timeout_s: float = 5.0
+    ) -> tuple[M, Stamp | None] | None:
         """Query one aircraft with a payload; errors of the handler propagate."""
-        answers = [pair for reply in self._reply.get(kind, []) for pair in asked_for(who, reply(who, {}, payload))]
-        found = newest([(decode(kind, encode(message), encoding(kind)), stamp) for message, stamp in answers])
-        return found[0] if found else None
+        replies = [
+            pair
+            for handler in self._query_handlers.get(kind, [])
+            for pair in replies_about(target, handler(target, {}, payload))
+        ]
+        pairs = select_latest([(decode(kind, encode(message), encoding(kind)), stamp) for message, stamp in replies])
+        return pairs[0] if pairs else None
 
-    def gather(self, kind: type[M], who: int | str, payload: bytes, timeout_s: float) -> Iterator[M]:
+    def get_stream(self, kind: type[M], target: int | str, payload: bytes, timeout_s: float) -> Iterator[M]:
         """Query with a payload and yield every reply."""
-        uav = who if isinstance(who, int) else None
-        for reply in self._reply.get(kind, []):
+        uav = target if isinstance(target, int) else None
+        for handler in self._query_handlers.get(kind, []):
             with suppress(ValueError):
-                for message, _ in reply(uav, {}, payload):
+                for message, _ in handler(uav, {}, payload):
                     yield decode(kind, encode(message), encoding(kind))
 
-    def fetch(self, kind: type, who: int | str, timeout_s: float) -> Iterator[bytes]:
+    def get_payloads(self, kind: type, target: int | str, timeout_s: float) -> Iterator[bytes]:
         """Query and yield the payload of every reply."""
-        return map(encode, self.gather(kind, who, b"", timeout_s))
+        return map(encode, self.get_stream(kind, target, b"", timeout_s))
 
-    def present(self, name: str) -> None:
+    def declare_liveliness(self, name: str) -> None:
         """Declare a liveliness token."""
-        self._present.append(name)
-        for told in self._attends:
-            told(name, True)
+        self._tokens.append(name)
+        for callback in self._token_callbacks:
+            callback(name, True)
 
-    def attend(self, told: Token) -> None:
+    def watch_liveliness(self, callback: LivelinessCallback) -> None:
         """Call `callback(name, alive)` for every current and later liveliness token."""
-        self._attends.append(told)
-        self.recount(told)
+        self._token_callbacks.append(callback)
+        self.list_liveliness(callback)
 
-    def recount(self, told: Token) -> None:
+    def list_liveliness(self, callback: LivelinessCallback) -> None:
         """Call `callback(name, True)` for every current liveliness token."""
-        for name in self._present:
-            told(name, True)
+        for name in self._tokens:
+            callback(name, True)
 
     def close(self) -> None:
         """Remove all subscribers and query handlers."""
-        self._heard.clear()
-        self._overheard.clear()
-        self._reply.clear()
+        self._callbacks.clear()
+        self._raw_callbacks.clear()
+        self._query_handlers.clear()
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
 
-class _Whose(msgspec.Struct):
+class _MessageUav(msgspec.Struct):
     """The UAV id of a message, without its other fields."""
 
     uav: int | None = None
 
 
-def _whose(payload: bytes) -> int | None:
+def _uav_of_payload(payload: bytes) -> int | None:
     """Read the UAV id from a payload (on Zenoh it is part of the key); None where there is none."""
     try:
-        return msgspec.msgpack.decode(payload, type=_Whose).uav
+        return msgspec.msgpack.decode(payload, type=_MessageUav).uav
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None
 
 
-def _wanted(heard: Heard, wants: Wants, message: Any, stamp: Stamp | None) -> None:
-    if wants(message.uav):
-        heard(message, stamp)
+def _call_if_accepted(callback: Callback, accepts: Filter, message: Any, stamp: Stamp | None) -> None:
+    if accepts(message.uav):
+        callback(message, stamp)

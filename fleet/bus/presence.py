@@ -3,10 +3,10 @@
 import re
 from typing import NamedTuple
 
-_FORM = re.compile(r"worker/([0-9a-f]{16})/(\d{1,9})-(\d{1,9})/(\d{1,18})", re.ASCII)
+_TOKEN_PATTERN = re.compile(r"worker/([0-9a-f]{16})/(\d{1,9})-(\d{1,9})/(\d{1,18})", re.ASCII)
 
 
-class Present(NamedTuple):
+class WorkerToken(NamedTuple):
     """Parsed liveliness token of a worker.
 
     Attributes:
@@ -17,18 +17,18 @@ class Present(NamedTuple):
 
     worker: str
     ids: range
-    born: int
+    started_ms: int
 
     @property
     def token(self) -> str:
         """Return the text of the token."""
-        return f"worker/{self.worker}/{self.ids.start}-{self.ids.stop - 1}/{self.born}"
+        return f"worker/{self.worker}/{self.ids.start}-{self.ids.stop - 1}/{self.started_ms}"
 
 
-def read(token: str) -> Present | None:
+def parse_token(token: str) -> WorkerToken | None:
     """Parse a token; None where it is not a worker's."""
-    found = _FORM.fullmatch(token)
-    if found is None:
+    match = _TOKEN_PATTERN.fullmatch(token)
+    if match is None:
         return None
-    worker, low, high, born = found.groups()
-    return Present(worker, range(int(low), int(high) + 1), int(born))
+    worker, low, high, started = match.groups()
+    return WorkerToken(worker, range(int(low), int(high) + 1), int(started))

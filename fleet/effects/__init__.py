@@ -28,7 +28,7 @@ import numpy as np
 SURFACES = ("aileron", "elevator", "rudder")
 ALL_SURFACES = "all surfaces"
 MEMORY = 32  # state variables of a servo
-FOLDERS = "PARAUAV_EFFECTS"  # environment variable: further folders of effects, separated like PATH
+FOLDERS_ENV = "PARAUAV_EFFECTS"  # environment variable: further folders of effects, separated like PATH
 
 INCREMENTS: dict[str, str] = {
     "w_n": "wind, the direction it blows to, north [m/s]",
@@ -88,7 +88,7 @@ class Parameter:
         unit, meaning: for display
         step: small observable change, for numerical derivatives
         low, high: physical limits
-        aside: nuisance parameter, estimated with the others but no evidence, e.g. an unknown point of application
+        nuisance: nuisance parameter, estimated with the others but no evidence, e.g. an unknown point of application
         least: minimum magnitude; a smaller value indicates another effect
     """
 
@@ -98,7 +98,7 @@ class Parameter:
     step: float
     low: float
     high: float
-    aside: bool = False
+    nuisance: bool = False
     least: float = 0.0
 
 
@@ -145,14 +145,14 @@ class Flow:
     rho: Any = 1.225
     q_bar: Any = 0.0
     T: Any = 0.0
-    used: Any = 0.0
+    throttle_time: Any = 0.0
     delta_t: Any = 0.0
     C_L: Any = 0.0
-    pitch: Any = 0.0
-    yaw: Any = 0.0
+    C_m_elevator: Any = 0.0
+    C_n_rudder: Any = 0.0
 
 
-def _as_they_are(effect: "Effect", par: np.ndarray, body: Body) -> dict[str, float]:
+def _parameter_values(effect: "Effect", par: np.ndarray, body: Body) -> dict[str, float]:
     return {p.name: float(x) for p, x in zip(effect.parameters, par, strict=True)}
 
 
@@ -185,23 +185,23 @@ class Effect:
     parameters: tuple[Parameter, ...]
     act: Callable[..., Any]
     examples: tuple[tuple[float, ...], ...]
-    told: Callable[["Effect", np.ndarray, Body], dict[str, float]] = _as_they_are
+    reported: Callable[["Effect", np.ndarray, Body], dict[str, float]] = _parameter_values
     onsets: tuple[Onset, ...] = (Onset.ALWAYS, Onset.STEP)
-    of: tuple[str, ...] = ()
-    starts: tuple[tuple[float, ...], ...] = ()
-    confused: Mapping[str, str] = field(default_factory=dict)
+    targets: tuple[str, ...] = ()
+    initial_guesses: tuple[tuple[float, ...], ...] = ()
+    confusable_with: Mapping[str, str] = field(default_factory=dict)
     variance: bool = False
     takes_lag: bool = False
 
     @property
-    def size(self) -> int:
+    def n_parameters(self) -> int:
         """Return the number of parameters."""
         return len(self.parameters)
 
     @property
-    def price(self) -> int:
+    def degrees_of_freedom(self) -> int:
         """Return the number of parameters without nuisance parameters."""
-        return sum(not p.aside for p in self.parameters)
+        return sum(not p.nuisance for p in self.parameters)
 
 
 @cache
@@ -211,22 +211,24 @@ def catalogue(folders: str | None = None) -> dict[str, Effect]:
     Raises:
         ValueError: when a file defines no EFFECT with the name of the file.
     """
-    named = os.environ.get(FOLDERS, "") if folders is None else folders
-    homes = [Path(__file__).parent, *map(Path, filter(None, named.split(os.pathsep)))]
-    files = [path for home in homes for path in sorted(home.glob("*.py")) if not path.stem.startswith("_")]
-    return {path.stem: _read(path) for path in files}
+    extra_folders = os.environ.get(FOLDERS_ENV, "") if folders is None else folders
+    directories = [Path(__file__).parent, *map(Path, filter(None, extra_folders.split(os.pathsep)))]
+    files = [
+        path for directory in directories for path in sorted(directory.glob("*.py")) if not path.stem.startswith("_")
+    ]
+    return {path.stem: _import_effect(path) for path in files}
 
 
-def _read(path: Path) -> Effect:
-    own = path.parent == Path(__file__).parent
-    module = importlib.import_module(f"{__name__}.{path.stem}") if own else _load(path)
+def _import_effect(path: Path) -> Effect:
+    is_builtin = path.parent == Path(__file__).parent
+    module = importlib.import_module(f"{__name__}.{path.stem}") if is_builtin else _load_plugin(path)
     effect = getattr(module, "EFFECT", None)
     if not isinstance(effect, Effect) or effect.name != path.stem:
         raise ValueError(f"{path.name}: found no EFFECT named {path.stem!r}, expected one; name it like the file")
     return effect
 
 
-def _load(path: Path) -> ModuleType:
+def _load_plugin(path: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(f"parauav_effect_{path.stem}", path)
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)

@@ -19,9 +19,9 @@ EFFECT = Effect(
     parameters=(Parameter("bias_mps2", "m/s2", "specific force added", step=0.1, low=-5.0, high=5.0),),
     act=act,
     onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
-    of=("x", "y", "z"),
+    targets=("x", "y", "z"),
     examples=((0.2,), (-0.4,), (0.8,)),
-    confused={
+    confusable_with={
         "imu_misalignment": "follows the specific force: fly turns and pull-ups",
         "mass_change": "follows the load factor and is absent from the measured velocity: fly turns",
         "drag_increase": "decelerates the aircraft, a bias does not",

@@ -10,8 +10,8 @@ from fleet.physics.kernel import kernel
 def act(u: np.ndarray, memory: np.ndarray, dt: float, par: np.ndarray) -> None:
     """Apply backlash; memory[0] is the surface position."""
     for i in range(len(u)):
-        half = max(par[0, i], 0.0)
-        u[i] = min(max(memory[0], u[i] - half), u[i] + half)
+        half_width = max(par[0, i], 0.0)
+        u[i] = min(max(memory[0], u[i] - half_width), u[i] + half_width)
         memory[0] = u[i]
 
 
@@ -23,10 +23,10 @@ EFFECT = Effect(
     source="Nordin & Gutman 2002, Automatica 38, section 2 (backlash)",
     parameters=(Parameter("half_width", "-", "half the backlash", step=0.02, low=0.0, high=0.6),),
     act=act,
-    of=SURFACES,
-    starts=((0.02,), (0.04,), (0.08,), (0.15,)),
+    targets=SURFACES,
+    initial_guesses=((0.02,), (0.04,), (0.08,), (0.15,)),
     examples=((0.03,), (0.06,), (0.12,)),
-    confused={
+    confusable_with={
         "actuator_lag": "a lag attenuates fast movements, backlash small ones",
         "actuator_rate_limit": "a rate limit attenuates large movements, backlash small ones",
         "control_effectiveness_loss": "the same fraction of small and large movements is lost",

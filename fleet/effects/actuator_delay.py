@@ -27,10 +27,10 @@ EFFECT = Effect(
     source="Stevens, Lewis & Johnson 2016, section 3.5; Klein & Morelli 2006, section 11.1 (time skew)",
     parameters=(Parameter("delay_s", "s", "delay added", step=0.02, low=0.0, high=1.0),),
     act=act,
-    of=(*SURFACES, ALL_SURFACES),
-    starts=((0.06,), (0.12,), (0.2,), (0.3,), (0.45,)),
+    targets=(*SURFACES, ALL_SURFACES),
+    initial_guesses=((0.06,), (0.12,), (0.2,), (0.3,), (0.45,)),
     examples=((0.08,), (0.15,), (0.3,)),
-    confused={
+    confusable_with={
         "actuator_lag": "equal at low frequency: fly sharp inputs",
         "actuator_rate_limit": "a delay is the same for small and large inputs",
     },

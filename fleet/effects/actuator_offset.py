@@ -21,9 +21,9 @@ EFFECT = Effect(
     source="Klein & Morelli 2006, section 10.2 (control surface bias)",
     parameters=(Parameter("offset", "-", "travel added", step=0.03, low=-0.6, high=0.6),),
     act=act,
-    of=SURFACES,
+    targets=SURFACES,
     examples=((0.05,), (-0.1,), (0.18,)),
-    confused={
+    confusable_with={
         "actuator_stuck": "a stuck surface does not respond: fly inputs",
         "cg_shift": "its moment does not grow with dynamic pressure: fly at two speeds",
         "cg_shift_side": "its moment does not grow with dynamic pressure: fly at two speeds",

@@ -22,10 +22,10 @@ EFFECT = Effect(
     source="Stevens, Lewis & Johnson 2016, section 3.5 (limits of actuators)",
     parameters=(Parameter("lost", "-", "travel lost at each end", step=0.1, low=0.0, high=0.99),),
     act=act,
-    of=SURFACES,
-    starts=((0.5,), (0.6,), (0.7,), (0.8,), (0.88,), (0.94,)),
+    targets=SURFACES,
+    initial_guesses=((0.5,), (0.6,), (0.7,), (0.8,), (0.88,), (0.94,)),
     examples=((0.6,), (0.75,), (0.85,)),
-    confused={
+    confusable_with={
         "control_effectiveness_loss": "the same fraction of small and large movements is lost",
         "actuator_rate_limit": "a travel limit affects slow inputs too",
         "actuator_stuck": "a stuck surface does not follow small movements either",

@@ -24,10 +24,10 @@ EFFECT = Effect(
         Parameter("position", "-", "stuck position", step=0.05, low=-1.0, high=1.0),
     ),
     act=act,
-    of=SURFACES,
-    starts=tuple((1.0, position / 25.0) for position in range(-8, 9, 2)),
+    targets=SURFACES,
+    initial_guesses=tuple((1.0, position / 25.0) for position in range(-8, 9, 2)),
     examples=((1.0, 0.0), (1.0, 0.04), (1.0, -0.08)),
-    confused={
+    confusable_with={
         "actuator_offset": "a surface with an offset responds: fly inputs",
         "control_effectiveness_loss": "a surface with reduced effectiveness responds in part: fly inputs",
     },

@@ -12,7 +12,7 @@ def act(flow: Flow, share: Any) -> dict[str, Any]:
     return {"rho": share}
 
 
-def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
+def reported(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
     """Return the density ratio to the standard atmosphere."""
     return {"density_ratio": 1.0 + float(par[0])}
 
@@ -25,10 +25,10 @@ EFFECT = Effect(
     source="ICAO Doc 7488 1993 (the standard atmosphere); Beard & McLain 2012, section 7.3",
     parameters=(Parameter("share", "-", "relative increment of density", step=0.02, low=-0.5, high=0.5),),
     act=act,
-    told=told,
+    reported=reported,
     onsets=(Onset.ALWAYS,),
     examples=((-0.05,), (0.08,), (-0.2,)),
-    confused={
+    confusable_with={
         "airspeed_scale": "a sensor error leaves moments and forces unchanged",
         "thrust_loss": "low density reduces lift and moments too",
         "icing": "low density reduces moments too and changes indicated airspeed relative to ground speed",

@@ -20,7 +20,7 @@ EFFECT = Effect(
     act=act,
     onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
     examples=((1.0,), (-2.0,), (4.0,)),
-    confused={
+    confusable_with={
         "airspeed_scale": "a scale error grows with speed: fly at two speeds",
         "wind_steady": "wind depends on heading: fly a full turn",
     },

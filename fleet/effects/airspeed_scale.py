@@ -13,7 +13,7 @@ def act(readings: dict[str, Any], log_scale: Any) -> dict[str, Any]:
     return {"Va": readings["Va"] * np.exp(log_scale)}
 
 
-def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
+def reported(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
     """Return the scale."""
     return {"scale": exp(float(par[0]))}
 
@@ -26,10 +26,10 @@ EFFECT = Effect(
     source="Beard & McLain 2012, section 7.3 (differential pressure)",
     parameters=(Parameter("log_scale", "-", "logarithm of the scale", step=0.02, low=-0.7, high=0.7),),
     act=act,
-    told=told,
+    reported=reported,
     onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
     examples=((-0.05,), (0.1,), (-0.2,)),
-    confused={
+    confusable_with={
         "airspeed_bias": "a scale error grows with speed: fly at two speeds",
         "air_density": "low density reduces moments and forces too, a sensor error does not",
     },

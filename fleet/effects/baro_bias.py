@@ -20,5 +20,5 @@ EFFECT = Effect(
     act=act,
     onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
     examples=((5.0,), (-12.0,), (30.0,)),
-    confused={"gps_latency": "vanishes in level flight", "air_density": "affects airspeed and moments too"},
+    confusable_with={"gps_latency": "vanishes in level flight", "air_density": "affects airspeed and moments too"},
 )

@@ -7,7 +7,7 @@ from fleet.effects import Effect, Flow, Onset, Parameter, Stage
 
 def act(flow: Flow, sag: Any) -> dict[str, Any]:
     """Reduce thrust in proportion to the integral of throttle."""
-    return {"thrust": -sag * flow.used / 100.0}
+    return {"thrust": -sag * flow.throttle_time / 100.0}
 
 
 EFFECT = Effect(
@@ -22,7 +22,7 @@ EFFECT = Effect(
     act=act,
     onsets=(Onset.ALWAYS,),
     examples=((0.15,), (0.25,), (0.4,)),
-    confused={
+    confusable_with={
         "thrust_loss": "develops at once or with time, not with the charge used",
         "drag_increase": "drag grows with dynamic pressure, not with the charge used",
     },

@@ -19,7 +19,7 @@ EFFECT = Effect(
     parameters=(Parameter("dx_m", "m", "shift forward", step=0.01, low=-0.5, high=0.5),),
     act=act,
     examples=((0.015,), (-0.03,), (0.06,)),
-    confused={
+    confusable_with={
         "mass_change": "changes lift too; a dropped payload often causes both: fly pull-ups",
         "actuator_offset": "the moment of an elevator offset grows with dynamic pressure: fly at two speeds",
         "slipstream_tail": "follows the throttle",

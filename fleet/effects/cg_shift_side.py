@@ -19,7 +19,7 @@ EFFECT = Effect(
     parameters=(Parameter("dy_m", "m", "shift to the right", step=0.01, low=-1.0, high=1.0),),
     act=act,
     examples=((0.01,), (-0.03,), (0.06,)),
-    confused={
+    confusable_with={
         "actuator_offset": "the moment of an aileron offset grows with dynamic pressure: fly at two speeds",
         "prop_torque": "follows the throttle",
     },

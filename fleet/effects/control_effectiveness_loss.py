@@ -21,9 +21,9 @@ EFFECT = Effect(
     source="Ducard 2009, Fault-tolerant Flight Control and Guidance Systems (loss of effectiveness)",
     parameters=(Parameter("loss", "-", "fraction lost; below zero: more effective", step=0.1, low=-0.5, high=1.0),),
     act=act,
-    of=SURFACES,
+    targets=SURFACES,
     examples=((0.2,), (0.35,), (0.5,)),
-    confused={
+    confusable_with={
         "actuator_stuck": "a stuck surface does not respond at all: fly inputs",
         "actuator_saturation": "lost travel affects large inputs only",
         "actuator_lag": "a lag attenuates fast movements only",

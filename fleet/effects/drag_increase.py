@@ -18,10 +18,10 @@ EFFECT = Effect(
     source="Beard & McLain 2012, eq. 4.11",
     parameters=(
         Parameter("dCD", "-", "drag coefficient added", step=0.005, low=-0.05, high=0.5),
-        Parameter("dCm", "-", "associated pitching moment coefficient", step=0.002, low=-0.3, high=0.3, aside=True),
+        Parameter("dCm", "-", "associated pitching moment coefficient", step=0.002, low=-0.3, high=0.3, nuisance=True),
     ),
     act=act,
     onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
     examples=((0.01, 0.0), (0.03, 0.002), (0.08, -0.004)),
-    confused={"thrust_loss": "drag grows with dynamic pressure, thrust with throttle: fly at two speeds"},
+    confusable_with={"thrust_loss": "drag grows with dynamic pressure, thrust with throttle: fly at two speeds"},
 )

@@ -23,7 +23,7 @@ EFFECT = Effect(
     ),
     act=act,
     examples=((0.1, 0.006, -0.01), (0.2, 0.015, -0.02), (0.35, 0.035, -0.035)),
-    confused={
+    confusable_with={
         "drag_increase": "changes neither lift nor moment: compare the angle of attack",
         "icing": "ice reduces lift and develops slowly",
         "mass_change": "less weight adds no drag",

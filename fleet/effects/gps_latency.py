@@ -6,13 +6,13 @@ import numpy as np
 
 from fleet.effects import Effect, Parameter, Stage
 
-LATE = ("v_n", "v_e", "v_d", "h")
+DELAYED_READINGS = ("v_n", "v_e", "v_d", "h")
 
 
 def act(readings: dict[str, Any], latency: Any) -> dict[str, Any]:
     """Return the delayed readings; the negated parameter is the inverse to first order."""
     t = readings["t"]
-    return {name: np.interp(t - latency, t, readings[name]) for name in LATE}
+    return {name: np.interp(t - latency, t, readings[name]) for name in DELAYED_READINGS}
 
 
 EFFECT = Effect(
@@ -28,7 +28,7 @@ EFFECT = Effect(
     ),
     act=act,
     examples=((0.1,), (0.2,), (0.4,)),
-    confused={
+    confusable_with={
         "wind_steady": "wind keeps velocity in phase with acceleration and attitude",
         "imu_misalignment": "follows the measured vector, not its rate of change",
     },

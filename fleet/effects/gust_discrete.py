@@ -1,7 +1,7 @@
 """Single horizontal gust: a transient of shape 1 - cos."""
 
 from fleet.effects import Effect, Onset, Parameter, Stage
-from fleet.effects.wind_steady import act, told
+from fleet.effects.wind_steady import act, reported
 
 EFFECT = Effect(
     name="gust_discrete",
@@ -14,10 +14,10 @@ EFFECT = Effect(
         Parameter("w_e", "m/s", "peak wind to the east", step=0.5, low=-25.0, high=25.0),
     ),
     act=act,
-    told=told,
+    reported=reported,
     onsets=(Onset.BUMP,),
     examples=((2.0, -1.0), (-3.0, 4.0), (6.0, 6.0)),
-    confused={
+    confusable_with={
         "turbulence": "random throughout the flight, not one coherent transient",
         "wind_steady": "a gust ends, a change of wind persists",
         "updraft": "a horizontal gust changes airspeed and sideslip, an updraft the angle of attack",

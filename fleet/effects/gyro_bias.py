@@ -12,7 +12,7 @@ def act(readings: dict[str, Any], bias: Any, of: str = "p") -> dict[str, Any]:
     return {of: readings[of] + bias}
 
 
-def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
+def reported(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
     """Return the bias in degrees per second."""
     return {"bias_dps": float(np.degrees(par[0]))}
 
@@ -25,9 +25,9 @@ EFFECT = Effect(
     source="Beard & McLain 2012, section 7.2 (rate gyros)",
     parameters=(Parameter("bias", "rad/s", "rate added", step=0.005, low=-0.3, high=0.3),),
     act=act,
-    told=told,
+    reported=reported,
     onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
-    of=("p", "q", "r"),
+    targets=("p", "q", "r"),
     examples=((0.01,), (-0.02,), (0.05,)),
-    confused={"imu_misalignment": "vanishes without turning", "heading_bias": "a constant angle, not a rate"},
+    confusable_with={"imu_misalignment": "vanishes without turning", "heading_bias": "a constant angle, not a rate"},
 )

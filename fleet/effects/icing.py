@@ -19,12 +19,12 @@ EFFECT = Effect(
     parameters=(
         Parameter("lift_loss", "-", "fraction of lift lost", step=0.03, low=-0.02, high=0.7),
         Parameter("dCD", "-", "drag coefficient added", step=0.005, low=-0.02, high=0.3),
-        Parameter("dCm", "-", "associated pitching moment coefficient", step=0.002, low=-0.3, high=0.3, aside=True),
+        Parameter("dCm", "-", "associated pitching moment coefficient", step=0.002, low=-0.3, high=0.3, nuisance=True),
     ),
     act=act,
     onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
     examples=((0.06, 0.01, 0.0), (0.12, 0.02, 0.002), (0.2, 0.04, 0.004)),
-    confused={
+    confusable_with={
         "drag_increase": "does not reduce lift: compare the angle of attack",
         "air_density": "low density reduces moments too",
         "mass_change": "more weight adds no drag at the same lift",

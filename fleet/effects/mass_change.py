@@ -12,7 +12,7 @@ def act(flow: Flow, share: Any) -> dict[str, Any]:
     return {"mass": share}
 
 
-def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
+def reported(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
     """Return the added mass; a relative value without an airframe file."""
     return {"dmass_kg": float(par[0]) * body.mass}
 
@@ -25,9 +25,9 @@ EFFECT = Effect(
     source="Beard & McLain 2012, eq. 3.16 (translational dynamics)",
     parameters=(Parameter("share", "-", "relative increment of mass", step=0.02, low=-0.6, high=1.0),),
     act=act,
-    told=told,
+    reported=reported,
     examples=((0.05,), (-0.09,), (0.15,)),
-    confused={
+    confusable_with={
         "cg_shift": "changes the pitching moment, not lift; a dropped payload often causes both",
         "icing": "ice adds drag too",
         "air_density": "low density reduces moments too",

@@ -29,7 +29,7 @@ EFFECT = Effect(
     ),
     act=act,
     examples=((0.3,), (-0.6,), (1.0,)),
-    confused={
+    confusable_with={
         "thrust_asymmetry": "does not follow the angle of attack: fly slow and fast at one power",
         "prop_torque": "is a rolling moment, not a yawing moment",
         "actuator_offset": "a rudder offset does not follow the throttle",

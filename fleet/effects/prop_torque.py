@@ -4,12 +4,12 @@ from typing import Any
 
 from fleet.effects import Effect, Flow, Parameter, Stage
 
-FULL = 0.25 * 9.80665  # thrust at full throttle, per mass [N/kg]
+FULL_THRUST_PER_MASS = 0.25 * 9.80665  # thrust at full throttle, per mass [N/kg]
 
 
 def act(flow: Flow, ratio: Any) -> dict[str, Any]:
     """Add a rolling moment proportional to throttle, independent of thrust."""
-    return {"L": ratio * flow.body.D * FULL * flow.body.mass * flow.delta_t}
+    return {"L": ratio * flow.body.D * FULL_THRUST_PER_MASS * flow.body.mass * flow.delta_t}
 
 
 EFFECT = Effect(
@@ -23,7 +23,7 @@ EFFECT = Effect(
     ),
     act=act,
     examples=((0.03,), (-0.08,), (0.15,)),
-    confused={
+    confusable_with={
         "actuator_offset": "an offset follows dynamic pressure, torque follows the throttle: fly at two power settings",
         "cg_shift_side": "a lateral shift of weight does not follow the throttle",
     },

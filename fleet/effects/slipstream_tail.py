@@ -6,15 +6,15 @@ import numpy as np
 
 from fleet.effects import Effect, Flow, Parameter, Stage
 
-SLOW = 20.0  # smallest dynamic pressure for momentum theory [Pa]
-MILLING = -0.5  # limit for a windmilling propeller
+MIN_Q_BAR = 20.0  # smallest dynamic pressure for momentum theory [Pa]
+MIN_THRUST_RATIO = -0.5  # limit for a windmilling propeller
 
 
 def act(flow: Flow, share: Any) -> dict[str, Any]:
     """Scale the moments of the surfaces with the dynamic pressure that the propeller adds."""
     disc = np.pi * flow.body.D**2 / 4.0
-    jet = share * np.maximum(flow.T / (np.maximum(flow.q_bar, SLOW) * disc), MILLING)
-    return {"C_m": flow.pitch * jet, "C_n": flow.yaw * jet}
+    jet = share * np.maximum(flow.T / (np.maximum(flow.q_bar, MIN_Q_BAR) * disc), MIN_THRUST_RATIO)
+    return {"C_m": flow.C_m_elevator * jet, "C_n": flow.C_n_rudder * jet}
 
 
 EFFECT = Effect(
@@ -26,7 +26,7 @@ EFFECT = Effect(
     parameters=(Parameter("share", "-", "fraction of the tail in the slipstream", step=0.1, low=-1.0, high=3.0),),
     act=act,
     examples=((0.3,), (0.6,), (1.0,)),
-    confused={
+    confusable_with={
         "control_effectiveness_loss": "does not follow the throttle: fly inputs at two power settings",
         "cg_shift": "does not follow the throttle",
     },

@@ -6,13 +6,13 @@ import numpy as np
 
 from fleet.effects import Effect, Flow, Onset, Parameter, Stage
 
-BREAKS = {f"{angle} deg": np.radians(angle) for angle in (8, 10, 12, 14)}  # alpha_s
+STALL_ANGLES = {f"{angle} deg": np.radians(angle) for angle in (8, 10, 12, 14)}  # alpha_s
 
 
 def act(flow: Flow, slope_lost: Any, drag_slope: Any, of: str = "12 deg") -> dict[str, Any]:
     """Reduce lift and add drag in proportion to the angle of attack beyond the break."""
-    over = np.maximum(flow.alpha - BREAKS[of], 0.0)
-    return {"C_L": -slope_lost * over, "C_D": drag_slope * over}
+    excess_alpha = np.maximum(flow.alpha - STALL_ANGLES[of], 0.0)
+    return {"C_L": -slope_lost * excess_alpha, "C_D": drag_slope * excess_alpha}
 
 
 EFFECT = Effect(
@@ -27,10 +27,10 @@ EFFECT = Effect(
     ),
     act=act,
     onsets=(Onset.ALWAYS,),
-    of=tuple(BREAKS),
-    starts=((2.0, 0.5), (5.0, 1.0), (8.0, 2.0)),
+    targets=tuple(STALL_ANGLES),
+    initial_guesses=((2.0, 0.5), (5.0, 1.0), (8.0, 2.0)),
     examples=((1.5, 0.3), (3.0, 0.8), (5.0, 1.5)),
-    confused={
+    confusable_with={
         "drag_increase": "drag at every angle of attack",
         "icing": "lift lost at every angle of attack",
         "mass_change": "more weight at every angle of attack",

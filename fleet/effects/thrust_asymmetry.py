@@ -19,7 +19,7 @@ EFFECT = Effect(
     parameters=(Parameter("arm_m", "m", "thrust line left of the centre of gravity", step=0.02, low=-3.0, high=3.0),),
     act=act,
     examples=((0.03,), (-0.08,), (0.2,)),
-    confused={
+    confusable_with={
         "p_factor": "follows the angle of attack: fly slow and fast at one power",
         "actuator_offset": "a rudder offset does not follow the throttle",
         "thrust_loss": "adds no moment",

@@ -20,7 +20,7 @@ EFFECT = Effect(
     act=act,
     onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
     examples=((0.08,), (0.15,), (0.3,)),
-    confused={
+    confusable_with={
         "drag_increase": "drag grows with dynamic pressure, thrust with throttle: fly at two speeds",
         "battery_sag": "battery sag follows the charge used, not time",
         "icing": "ice reduces lift too",

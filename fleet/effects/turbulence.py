@@ -15,8 +15,8 @@ def _frequencies(rng: np.random.Generator) -> np.ndarray:
 
     The energy below omega is 2/pi atan(omega TAU); each axis draws its own, so that the axes do not correlate.
     """
-    share = (np.arange(SINES) + rng.uniform(0.25, 0.75, (3, SINES))) / SINES
-    return np.tan(0.5 * np.pi * share) / TAU
+    quantile = (np.arange(SINES) + rng.uniform(0.25, 0.75, (3, SINES))) / SINES
+    return np.tan(0.5 * np.pi * quantile) / TAU
 
 
 _RNG = np.random.default_rng(8785)
@@ -39,6 +39,6 @@ EFFECT = Effect(
     parameters=(Parameter("intensity_mps", "m/s", "standard deviation per axis", step=0.2, low=0.0, high=10.0),),
     act=act,
     examples=((0.5,), (1.5,), (3.0,)),
-    confused={"gust_discrete": "one coherent transient, not random throughout the flight"},
+    confusable_with={"gust_discrete": "one coherent transient, not random throughout the flight"},
     variance=True,
 )

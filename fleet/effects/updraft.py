@@ -20,7 +20,7 @@ EFFECT = Effect(
     act=act,
     onsets=(Onset.BUMP,),
     examples=((2.5,), (-4.0,), (6.0,)),
-    confused={
+    confusable_with={
         "gust_discrete": "a horizontal gust changes airspeed and sideslip, depending on heading",
         "turbulence": "random throughout the flight, not one coherent transient",
     },

@@ -6,16 +6,16 @@ import numpy as np
 
 from fleet.effects import Body, Effect, Flow, Onset, Parameter, Stage
 
-REFERENCE = 100.0  # height of zero change, so that a mean wind is not counted twice [m]
+REFERENCE_HEIGHT = 100.0  # height of zero change, so that a mean wind is not counted twice [m]
 
 
 def act(flow: Flow, w_n: Any, w_e: Any) -> dict[str, Any]:
     """Add wind in proportion to height."""
-    up = (flow.height - REFERENCE) / 100.0
-    return {"w_n": w_n * up, "w_e": w_e * up}
+    height_ratio = (flow.height - REFERENCE_HEIGHT) / 100.0
+    return {"w_n": w_n * height_ratio, "w_e": w_e * height_ratio}
 
 
-def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
+def reported(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
     """Return the change per 100 m and the direction from which the wind added above blows."""
     w_n, w_e = map(float, par[:2])
     return {"mps_per_100m": float(np.hypot(w_n, w_e)), "from_deg": float(np.degrees(np.arctan2(-w_e, -w_n)) % 360.0)}
@@ -32,10 +32,10 @@ EFFECT = Effect(
         Parameter("w_e", "m/s", "change of east wind per 100 m of height", step=0.5, low=-20.0, high=20.0),
     ),
     act=act,
-    told=told,
+    reported=reported,
     onsets=(Onset.ALWAYS,),
     examples=((1.5, -1.0), (0.7, -4.0), (5.0, 4.0)),
-    confused={
+    confusable_with={
         "wind_steady": "a mean wind is the same at every height: climb and descend",
     },
 )

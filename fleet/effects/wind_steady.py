@@ -12,7 +12,7 @@ def act(flow: Flow, w_n: Any, w_e: Any) -> dict[str, Any]:
     return {"w_n": w_n, "w_e": w_e}
 
 
-def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
+def reported(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
     """Return speed and the direction from which the wind blows."""
     w_n, w_e = map(float, par[:2])
     return {"speed_mps": float(np.hypot(w_n, w_e)), "from_deg": float(np.degrees(np.arctan2(-w_e, -w_n)) % 360.0)}
@@ -29,10 +29,10 @@ EFFECT = Effect(
         Parameter("w_e", "m/s", "wind to the east", step=0.5, low=-40.0, high=40.0),
     ),
     act=act,
-    told=told,
+    reported=reported,
     onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
     examples=((2.0, -1.0), (-3.0, 4.0), (6.0, 6.0)),
-    confused={
+    confusable_with={
         "airspeed_bias": "wind depends on heading: fly a full turn",
         "heading_bias": "a heading error turns with the aircraft: fly a full turn",
     },

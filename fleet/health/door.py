@@ -8,113 +8,117 @@ from pathlib import Path
 
 from cryptography import x509
 
-from fleet.access.entry import Entry, endpoint
-from fleet.access.knock import answers
-from fleet.access.papers import ending, papers_of, private
+from fleet.access.entry import BusConfig, parse_endpoint
+from fleet.access.knock import probe_router
+from fleet.access.papers import check_private, expiry_of, find_certificate
 from fleet.access.roles import ROLES, ROUTER_ROLE
-from fleet.health.finding import BAD, NOTE, OK, Finding
-from fleet.health.machine import free
+from fleet.health.finding import BAD, NOTE, OK, CheckResult
+from fleet.health.machine import is_port_free
 
-SOON = timedelta(days=14)
+RENEWAL_PERIOD = timedelta(days=14)
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
-def papers(at: Entry) -> Iterator[Finding]:
+def check_certificates(entry: BusConfig) -> Iterator[CheckResult]:
     """Check every certificate in the folder: key present and private, not expired."""
-    if at.certificates is None:
-        where = "on loopback" if endpoint(at.at)[0] in LOOPBACK else "over the network"
+    if entry.certificates is None:
+        where = "on loopback" if parse_endpoint(entry.endpoint)[0] in LOOPBACK else "over the network"
         grade = OK if where == "on loopback" else NOTE
-        known = "password authentication" if at.passwords else "no authentication"
-        cure = "" if grade == OK else "; use --config with certificates to encrypt: deploy/README.md"
-        yield Finding(grade, "certificates", f"not used: {where}, unencrypted, {known}{cure}")
-        yield from _passwords(at)
+        access = "password authentication" if entry.passwords else "no authentication"
+        remedy = "" if grade == OK else "; use --config with certificates to encrypt: deploy/README.md"
+        yield CheckResult(grade, "certificates", f"not used: {where}, unencrypted, {access}{remedy}")
+        yield from _passwords(entry)
         return
-    roles = [role for role in (*ROLES, ROUTER_ROLE) if (at.certificates / f"{role}.pem").is_file()]
-    if at.mutual and at.role not in roles:
-        roles.append(at.role)
+    roles = [role for role in (*ROLES, ROUTER_ROLE) if (entry.certificates / f"{role}.pem").is_file()]
+    if entry.mutual_tls and entry.role not in roles:
+        roles.append(entry.role)
     for role in roles:
         try:
-            papers_of(at.certificates, role)
+            find_certificate(entry.certificates, role)
             names = "router FOLDER NAME..." if role == ROUTER_ROLE else f"role FOLDER {role}"
-            yield _until(role, at.certificates / f"{role}.pem", f"certificates.sh {names}, and copy it here")
+            yield _check_expiry(role, entry.certificates / f"{role}.pem", f"certificates.sh {names}, and copy it here")
         except (ValueError, OSError) as error:
-            yield Finding(BAD, "certificates", str(error).removeprefix("certificates: "))
-    yield _authority(at.certificates)
-    yield from _passwords(at)
+            yield CheckResult(BAD, "certificates", str(error).removeprefix("certificates: "))
+    yield _authority(entry.certificates)
+    yield from _passwords(entry)
 
 
-def _passwords(at: Entry) -> Iterator[Finding]:
+def _passwords(entry: BusConfig) -> Iterator[CheckResult]:
     """Check the password file."""
-    if at.passwords is not None:
+    if entry.passwords is not None:
         try:
-            private(at.passwords)
+            check_private(entry.passwords)
         except (ValueError, OSError) as error:
-            yield Finding(BAD, "passwords", str(error).removeprefix("certificates: "))
+            yield CheckResult(BAD, "passwords", str(error).removeprefix("certificates: "))
 
 
-def _authority(folder: Path) -> Finding:
+def _authority(folder: Path) -> CheckResult:
     try:
-        found = _until("authority", folder / "ca.pem", "certificates.sh next-ca FOLDER: Renewal in deploy/README.md")
+        result = _check_expiry(
+            "authority", folder / "ca.pem", "certificates.sh next-ca FOLDER: Renewal in deploy/README.md"
+        )
     except (ValueError, OSError) as error:
-        return Finding(BAD, "certificates", str(error).removeprefix("certificates: "))
-    if found.grade == OK and (folder / "ca.key").exists():
-        return Finding(
+        return CheckResult(BAD, "certificates", str(error).removeprefix("certificates: "))
+    if result.grade == OK and (folder / "ca.key").exists():
+        return CheckResult(
             NOTE, "certificates", f"{folder / 'ca.key'} can issue any role; store it offline, on one machine"
         )
-    return found
+    return result
 
 
-def _until(whose: str, path: Path, cure: str) -> Finding:
-    return _judged(whose, ending(path), cure)
+def _check_expiry(subject: str, path: Path, remedy: str) -> CheckResult:
+    return _grade_expiry(subject, expiry_of(path), remedy)
 
 
-def _judged(whose: str, end: datetime, cure: str) -> Finding:
-    left = end - datetime.now(UTC)
-    if left < timedelta(0):
-        return Finding(BAD, "certificates", f"{whose}: expired on {end:%Y-%m-%d %H:%M} UTC; renew it: {cure}")
-    if left < SOON:
-        return Finding(
-            NOTE, "certificates", f"{whose}: expires on {end:%Y-%m-%d}, in {left.days} days; renew it: {cure}"
+def _grade_expiry(subject: str, end: datetime, remedy: str) -> CheckResult:
+    remaining = end - datetime.now(UTC)
+    if remaining < timedelta(0):
+        return CheckResult(BAD, "certificates", f"{subject}: expired on {end:%Y-%m-%d %H:%M} UTC; renew it: {remedy}")
+    if remaining < RENEWAL_PERIOD:
+        return CheckResult(
+            NOTE, "certificates", f"{subject}: expires on {end:%Y-%m-%d}, in {remaining.days} days; renew it: {remedy}"
         )
-    return Finding(OK, "certificates", f"{whose}: valid until {end:%Y-%m-%d}")
+    return CheckResult(OK, "certificates", f"{subject}: valid until {end:%Y-%m-%d}")
 
 
-def router(at: Entry) -> Generator[Finding, None, bool]:
+def check_router(entry: BusConfig) -> Generator[CheckResult, None, bool]:
     """Check the router endpoint; return whether a router answers and accepts the connection."""
     try:
-        there = answers(at)
+        reachable = probe_router(entry)
     except (ValueError, OSError) as error:
-        yield Finding(BAD, "router", str(error))
+        yield CheckResult(BAD, "router", str(error))
         return False
-    if there:
-        yield Finding(OK, "router", f"{at.at} answers")
-        if at.certificates is not None:
-            yield from _shown(at, at.certificates)
+    if reachable:
+        yield CheckResult(OK, "router", f"{entry.endpoint} answers")
+        if entry.certificates is not None:
+            yield from _router_certificate(entry, entry.certificates)
         return True
-    host, port = endpoint(at.at)
-    if free(socket.SOCK_STREAM, host, port):
-        yield Finding(OK, "router", f"{at.at} is free; `fleet up` will open a router there")
+    host, port = parse_endpoint(entry.endpoint)
+    if is_port_free(socket.SOCK_STREAM, host, port):
+        yield CheckResult(OK, "router", f"{entry.endpoint} is free; `fleet up` will open a router there")
     else:
-        yield Finding(
-            BAD, "router", f"{at.at} is in use and does not answer; start `zenohd` there or choose another --router"
+        yield CheckResult(
+            BAD,
+            "router",
+            f"{entry.endpoint} is in use and does not answer; start `zenohd` there or choose another --router",
         )
     return False
 
 
-def _shown(at: Entry, folder: Path) -> Iterator[Finding]:
+def _router_certificate(entry: BusConfig, folder: Path) -> Iterator[CheckResult]:
     """Check the expiry of the router certificate from a TLS handshake; it was verified before."""
     context = ssl.create_default_context(cafile=str(folder / "ca.pem"))
     context.verify_flags &= ~ssl.VERIFY_X509_STRICT
     try:
-        if (own := at.papers()) is not None:  # avoids an error in the router log
-            context.load_cert_chain(*own)
+        if (own_papers := entry.certificate_pair()) is not None:  # avoids an error in the router log
+            context.load_cert_chain(*own_papers)
         with (
-            socket.create_connection(endpoint(at.at), timeout=3.0) as plain,
-            context.wrap_socket(plain, server_hostname=endpoint(at.at)[0]) as secure,
+            socket.create_connection(parse_endpoint(entry.endpoint), timeout=3.0) as raw_socket,
+            context.wrap_socket(raw_socket, server_hostname=parse_endpoint(entry.endpoint)[0]) as tls_socket,
         ):
-            shown = secure.getpeercert(binary_form=True)
+            certificate = tls_socket.getpeercert(binary_form=True)
     except OSError:
         return
-    if shown:
-        end = x509.load_der_x509_certificate(shown).not_valid_after_utc
-        yield _judged("router", end, "certificates.sh router FOLDER NAME..., and restart it")
+    if certificate:
+        end = x509.load_der_x509_certificate(certificate).not_valid_after_utc
+        yield _grade_expiry("router", end, "certificates.sh router FOLDER NAME..., and restart it")

@@ -5,7 +5,7 @@ from typing import NamedTuple
 OK, NOTE, BAD = "ok", "note", "BAD"
 
 
-class Finding(NamedTuple):
+class CheckResult(NamedTuple):
     """Grade `ok`, `note` (optional part missing, or future problem) or `BAD` (the fleet cannot run correctly)."""
 
     grade: str

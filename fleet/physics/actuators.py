@@ -19,11 +19,11 @@ def lagged(commands: np.ndarray, dt: float, tau: np.ndarray) -> np.ndarray:
         dt: sample time [s]
         tau: time constants, (4,) [s]
     """
-    share = 1.0 - np.exp(-dt / tau)
-    out, now = np.empty_like(commands), commands[0].copy()
+    gain = 1.0 - np.exp(-dt / tau)
+    out, state = np.empty_like(commands), commands[0].copy()
     for k in range(len(commands)):
         for i in range(4):
-            step = share[i] * (commands[k, i] - now[i])
-            out[k, i] = now[i] + 0.5 * step
-            now[i] += step
+            step = gain[i] * (commands[k, i] - state[i])
+            out[k, i] = state[i] + 0.5 * step
+            state[i] += step
     return out

@@ -15,32 +15,32 @@ from math import cos, sin
 import numpy as np
 
 from fleet.frames import G
-from fleet.physics.kernel import bare, kernel
-from fleet.physics.wrench import WIND, slopes, terms, wrench
+from fleet.physics.kernel import kernel, no_alloc_kernel
+from fleet.physics.wrench import WIND, terms, wrench, wrench_jacobian
 
 N_X = 9
-STEEP = 1.5  # pitch limit of the integration, keeps cos(theta) away from zero [rad]
-LOST = 1e4  # magnitude of a state beyond any flight envelope
+MAX_PITCH = 1.5  # pitch limit of the integration, keeps cos(theta) away from zero [rad]
+DIVERGENCE_LIMIT = 1e4  # magnitude of a state beyond any flight envelope
 
 
-@bare
-def lost(x: np.ndarray) -> bool:
+@no_alloc_kernel
+def is_diverged(x: np.ndarray) -> bool:
     """Return whether a state, (9,), is beyond any flight envelope, or nan."""
-    far = False
+    outside = False
     for i in range(N_X):
-        far |= not abs(x[i]) < LOST
-    return far
+        outside |= not abs(x[i]) < DIVERGENCE_LIMIT
+    return outside
 
 
-@bare
-def rates_of_change(x: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.ndarray, out: np.ndarray) -> None:
+@no_alloc_kernel
+def rates_of_change(x: np.ndarray, delta: np.ndarray, par: np.ndarray, trim: np.ndarray, out: np.ndarray) -> None:
     """Compute x', (9,), into `out`."""
     u, v, w, p, q, r = x[0], x[1], x[2], x[3], x[4], x[5]
-    phi, theta, psi = x[6], min(max(x[7], -STEEP), STEEP), x[8]
+    phi, theta, psi = x[6], min(max(x[7], -MAX_PITCH), MAX_PITCH), x[8]
     cf, sf, ct, st, cp, sp = cos(phi), sin(phi), cos(theta), sin(theta), cos(psi), sin(psi)
     ahead, right = cp * par[WIND] + sp * par[WIND + 1], cp * par[WIND + 1] - sp * par[WIND]
     u_a, v_a, w_a = u - ct * ahead, v - sf * st * ahead - cf * right, w - cf * st * ahead + sf * right
-    X, Y, Z, L, M, N = wrench(par, u_a, v_a, w_a, p, q, r, delta, at)
+    X, Y, Z, L, M, N = wrench(par, u_a, v_a, w_a, p, q, r, delta, trim)
     out[0] = r * v - q * w - G * st + X
     out[1] = p * w - r * u + G * ct * sf + Y
     out[2] = q * u - p * v + G * ct * cf + Z
@@ -51,8 +51,8 @@ def rates_of_change(x: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.nd
     out[8] = turn
 
 
-@bare
-def step(x: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.ndarray, dt: float, work: np.ndarray) -> None:
+@no_alloc_kernel
+def step(x: np.ndarray, delta: np.ndarray, par: np.ndarray, trim: np.ndarray, dt: float, work: np.ndarray) -> None:
     """Advance x by dt with constant delta: Runge-Kutta of order four.
 
     Args:
@@ -64,16 +64,16 @@ def step(x: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.ndarray, dt: 
         work: scratch, (3, 9)
     """
     k, total, trial = work[0], work[1], work[2]
-    rates_of_change(x, delta, par, at, k)
+    rates_of_change(x, delta, par, trim, k)
     for i in range(N_X):
         total[i] = k[i]
         trial[i] = x[i] + 0.5 * dt * k[i]
-    for ahead in (0.5, 1.0):
-        rates_of_change(trial, delta, par, at, k)
+    for fraction in (0.5, 1.0):
+        rates_of_change(trial, delta, par, trim, k)
         for i in range(N_X):
             total[i] += 2.0 * k[i]
-            trial[i] = x[i] + ahead * dt * k[i]
-    rates_of_change(trial, delta, par, at, k)
+            trial[i] = x[i] + fraction * dt * k[i]
+    rates_of_change(trial, delta, par, trim, k)
     for i in range(N_X):
         x[i] += dt / 6.0 * (total[i] + k[i])
 
@@ -85,7 +85,7 @@ def free_runs(
     length: int,
     delta: np.ndarray,
     par: np.ndarray,
-    at: np.ndarray,
+    trim: np.ndarray,
     dt: float,
     out: np.ndarray,
 ) -> None:
@@ -105,11 +105,11 @@ def free_runs(
     for m in range(len(begins)):
         x[:] = starts[m]
         for k in range(begins[m], min(begins[m] + length, len(out))):
-            if lost(x):
+            if is_diverged(x):
                 break
             for i in range(N_X):
                 out[k, i] = x[i]
-            step(x, delta[k], par, at, dt, work)
+            step(x, delta[k], par, trim, dt, work)
 
 
 @kernel
@@ -117,14 +117,14 @@ def jacobian(
     x: np.ndarray,
     delta: np.ndarray,
     par: np.ndarray,
-    at: np.ndarray,
+    trim: np.ndarray,
     F: np.ndarray,
     by_wind: np.ndarray,
     term: np.ndarray,
 ) -> None:
     """Compute F = d x' / d x (9, 9), d x' / d (w_n, w_e) (9, 2), and the terms of the derivatives (35,)."""
     u, v, w, p, q, r, phi, psi = x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[8]
-    theta = min(max(x[7], -STEEP), STEEP)
+    theta = min(max(x[7], -MAX_PITCH), MAX_PITCH)
     cf, sf, ct, st, cp, sp = cos(phi), sin(phi), cos(theta), sin(theta), cos(psi), sin(psi)
     w_n, w_e = par[WIND], par[WIND + 1]
     R = np.array(  # NED to body, its first two columns
@@ -136,9 +136,9 @@ def jacobian(
     )
     wu, wv, ww = R[0, 0] * w_n + R[0, 1] * w_e, R[1, 0] * w_n + R[1, 1] * w_e, R[2, 0] * w_n + R[2, 1] * w_e
     along, across = cp * w_n + sp * w_e, -sp * w_n + cp * w_e
-    terms(u - wu, v - wv, w - ww, x[3:6], delta, at, term)
+    terms(u - wu, v - wv, w - ww, x[3:6], delta, trim, term)
     by_air, by_rate = np.empty((6, 3)), np.empty((6, 3))
-    slopes(par, np.array((u - wu, v - wv, w - ww)), x[3:6], delta, at, by_air, by_rate)
+    wrench_jacobian(par, np.array((u - wu, v - wv, w - ww)), x[3:6], delta, trim, by_air, by_rate)
     turn = np.array(  # d(u_a v_a w_a) / d(phi theta psi): minus the rotated wind
         (
             (0.0, st * along, -ct * across),
@@ -172,8 +172,8 @@ def jacobian(
     F[1, 7] -= G * st * sf
     F[2, 6] -= G * ct * sf
     F[2, 7] -= G * st * cf
-    spin, pull = q * sf + r * cf, q * cf - r * sf
+    spin, theta_dot = q * sf + r * cf, q * cf - r * sf
     tan, sec = st / ct, 1.0 / ct
-    F[6, 3], F[6, 4], F[6, 5], F[6, 6], F[6, 7] = 1.0, sf * tan, cf * tan, pull * tan, spin * sec * sec
+    F[6, 3], F[6, 4], F[6, 5], F[6, 6], F[6, 7] = 1.0, sf * tan, cf * tan, theta_dot * tan, spin * sec * sec
     F[7, 4], F[7, 5], F[7, 6] = cf, -sf, -spin
-    F[8, 4], F[8, 5], F[8, 6], F[8, 7] = sf * sec, cf * sec, pull * sec, spin * tan * sec
+    F[8, 4], F[8, 5], F[8, 6], F[8, 7] = sf * sec, cf * sec, theta_dot * sec, spin * tan * sec

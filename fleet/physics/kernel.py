@@ -5,10 +5,10 @@ Functions that create no array use `no_alloc_kernel`: reference counting would t
 
 import numba as nb
 
-_FREE = {"contract", "reassoc", "arcp", "afn", "nsz"}  # all of fastmath except nnan and ninf
+_FASTMATH = {"contract", "reassoc", "arcp", "afn", "nsz"}  # all of fastmath except nnan and ninf
 
 kernel = nb.njit(
-    cache=True, fastmath=_FREE, error_model="numpy", nogil=True
+    cache=True, fastmath=_FASTMATH, error_model="numpy", nogil=True
 )  # identification and prediction run in parallel threads
-bare = nb.njit(cache=True, fastmath=_FREE, error_model="numpy", nogil=True, _nrt=False)  # type: ignore[call-overload]
-inlined = nb.njit(cache=True, fastmath=_FREE, error_model="numpy", inline="always")
+no_alloc_kernel = nb.njit(cache=True, fastmath=_FASTMATH, error_model="numpy", nogil=True, _nrt=False)  # type: ignore[call-overload]
+inlined_kernel = nb.njit(cache=True, fastmath=_FASTMATH, error_model="numpy", inline="always")

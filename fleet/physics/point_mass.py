@@ -16,16 +16,16 @@ import numpy as np
 
 from fleet.autopilots.laws import guide
 from fleet.frames import G, wrap
-from fleet.physics.kernel import inlined, kernel
+from fleet.physics.kernel import inlined_kernel, kernel
 
 STEP = 0.1  # of guidance and integration [s]
-COARSE = 0.25  # the same for ensembles [s]
+COARSE_STEP = 0.25  # the same for ensembles [s]
 GAMMA_S = 0.6  # time constant of the flight-path angle [s]
-_INNER = 4  # substeps of the lags per step
+_LAG_SUBSTEPS = 4  # substeps of the lags per step
 _THROTTLE_S = 0.3  # of the motor from idle to full [s]
 _SHEAR = 1 / 7  # wind over height, open ground [-]
-_LOWEST = 5.0  # minimum height of the wind's power law [m]
-_STEEPEST = 1.3  # maximum bank; the model diverges beyond [rad]
+_MIN_SHEAR_HEIGHT = 5.0  # minimum height of the wind's power law [m]
+_MAX_BANK = 1.3  # maximum bank; the model diverges beyond [rad]
 
 # columns of `parameters`: identified
 WN_PHI, ZETA_PHI, B_PHI = 0, 1, 2  # [rad/s, -, rad]
@@ -34,7 +34,7 @@ K_PSI, B_PSI = 6, 7  # [-, rad/s]
 A_0, A_N = 8, 9  # [rad]
 C_0, C_T, C_V, C_N = 10, 11, 12, 13  # [m/s2, m/s2, 1/s, m/s2]
 T_0, V_0 = 14, 15  # reference throttle and true airspeed [-, m/s]
-N_BODY = 16
+N_PARAMETERS = 16
 
 # columns of `air`
 W_N, W_E = 0, 1  # mean wind at height H_0 [m/s]
@@ -45,19 +45,19 @@ DRIFT, DRIFT_S, REST, REST_S = 10, 11, 12, 13  # standard deviation and time con
 N_AIR = 14
 
 # columns of `start`
-V, PSI, PHI, P_RATE, THETA, Q_RATE, GAMMA, THR = range(3, 11)  # after p_n p_e p_d
+V, PSI, PHI, P_RATE, THETA, Q_RATE, GAMMA, THROTTLE = range(3, 11)  # after p_n p_e p_d
 N_START = 11
 
 
 @kernel
-def fly(
+def simulate_route(
     ctl: np.ndarray,
     par: np.ndarray,
     legs: np.ndarray,
-    body: np.ndarray,
+    parameters: np.ndarray,
     air: np.ndarray,
     start: np.ndarray,
-    chance: np.ndarray,
+    draws: np.ndarray,
     dt: float,
     out: np.ndarray,
 ) -> int:
@@ -76,33 +76,38 @@ def fly(
     """
     p, v, euler, wind = start[:3].copy(), np.zeros(3), np.zeros(3), air[DRIFT_N : REST_E + 1].copy()
     speed, psi, phi, p_rate = start[V], start[PSI], start[PHI], start[P_RATE]
-    theta, q_rate, gamma, thr = start[THETA], start[Q_RATE], start[GAMMA], start[THR]
-    fade_d, fade_r = exp(-dt / air[DRIFT_S]), exp(-dt / air[REST_S])
-    kick_d = air[DRIFT] * sqrt(1.0 - exp(-2.0 / air[DRIFT_S]))
-    kick_r = air[REST] * sqrt(1.0 - exp(-2.0 / air[REST_S]))
-    follow, each, higher = 1.0 - exp(-dt / GAMMA_S), round(1.0 / dt), 1.0
+    theta, q_rate, gamma, thr = start[THETA], start[Q_RATE], start[GAMMA], start[THROTTLE]
+    drift_decay, rest_decay = exp(-dt / air[DRIFT_S]), exp(-dt / air[REST_S])
+    drift_std = air[DRIFT] * sqrt(1.0 - exp(-2.0 / air[DRIFT_S]))
+    rest_std = air[REST] * sqrt(1.0 - exp(-2.0 / air[REST_S]))
+    gamma_gain, steps_per_s, shear = 1.0 - exp(-dt / GAMMA_S), round(1.0 / dt), 1.0
     Va, rate = speed / air[SCALE], 0.0
     for k in range(len(out)):
         for j in range(3):
             out[k, j] = p[j]
-        if not (3.0 < speed < 3.0 * body[V_0] and abs(phi) < _STEEPEST):
+        if not (3.0 < speed < 3.0 * parameters[V_0] and abs(phi) < _MAX_BANK):
             return k
-        c, s, level = cos(psi + air[D_PSI]), sin(psi + air[D_PSI]), cos(gamma)
-        was = (wind[0] + wind[2]) * c + (wind[1] + wind[3]) * s
+        c, s, cos_gamma = cos(psi + air[D_PSI]), sin(psi + air[D_PSI]), cos(gamma)
+        tailwind_before = (wind[0] + wind[2]) * c + (wind[1] + wind[3]) * s
         if k > 0:
-            wind[0], wind[1], wind[2], wind[3] = wind[0] * fade_d, wind[1] * fade_d, wind[2] * fade_r, wind[3] * fade_r
-        if k % each == 0:
+            wind[0], wind[1], wind[2], wind[3] = (
+                wind[0] * drift_decay,
+                wind[1] * drift_decay,
+                wind[2] * rest_decay,
+                wind[3] * rest_decay,
+            )
+        if k % steps_per_s == 0:
             if air[H_0] > 0.0:
-                higher = (max(air[GROUND] - p[2], _LOWEST) / air[H_0]) ** _SHEAR
-            if k // each < len(chance):
-                z = chance[k // each]
-                wind[0], wind[1] = wind[0] + kick_d * z[0], wind[1] + kick_d * z[1]
-                wind[2], wind[3] = wind[2] + kick_r * z[2], wind[3] + kick_r * z[3]
-        speed -= level * (
-            (wind[0] + wind[2]) * c + (wind[1] + wind[3]) * s - was
+                shear = (max(air[GROUND] - p[2], _MIN_SHEAR_HEIGHT) / air[H_0]) ** _SHEAR
+            if k // steps_per_s < len(draws):
+                z = draws[k // steps_per_s]
+                wind[0], wind[1] = wind[0] + drift_std * z[0], wind[1] + drift_std * z[1]
+                wind[2], wind[3] = wind[2] + rest_std * z[2], wind[3] + rest_std * z[3]
+        speed -= cos_gamma * (
+            (wind[0] + wind[2]) * c + (wind[1] + wind[3]) * s - tailwind_before
         )  # a gust does not change the ground velocity
-        v[0] = speed * level * c + air[W_N] * higher + wind[0] + wind[2]
-        v[1] = speed * level * s + air[W_E] * higher + wind[1] + wind[3]
+        v[0] = speed * cos_gamma * c + air[W_N] * shear + wind[0] + wind[2]
+        v[1] = speed * cos_gamma * s + air[W_E] * shear + wind[1] + wind[3]
         v[2] = -speed * sin(gamma)
         euler[0], euler[1], euler[2] = phi, theta, psi
         rate += min(5.0 * dt, 1.0) * ((speed / air[SCALE] - Va) / dt - rate) if k > 0 else 0.0
@@ -110,36 +115,41 @@ def fly(
         phi_c, theta_c, delta_t = guide(ctl, par, legs, p, v, euler, Va, rate, dt)
         thr += min(max(delta_t - thr, -dt / _THROTTLE_S), dt / _THROTTLE_S)
         n = 1.0 / cos(phi)
-        theta, q_rate = _lag(theta, q_rate, theta_c, body[WN_THETA : B_THETA + 1], dt)
-        phi, p_rate = _lag(phi, p_rate, phi_c, body[WN_PHI : B_PHI + 1], dt)
-        alpha = body[A_0] + body[A_N] * (n * (body[V_0] / speed) ** 2 - 1.0)
-        gamma += follow * (theta - alpha - gamma)
-        pull = body[C_0] + body[C_T] * (thr - body[T_0]) + body[C_V] * (speed - body[V_0]) + body[C_N] * (n * n - 1.0)
-        psi = wrap(psi + dt * (body[K_PSI] * G * tan(phi) / speed + body[B_PSI]))
-        speed += dt * (pull + G * v[2] / speed)
+        theta, q_rate = _lag(theta, q_rate, theta_c, parameters[WN_THETA : B_THETA + 1], dt)
+        phi, p_rate = _lag(phi, p_rate, phi_c, parameters[WN_PHI : B_PHI + 1], dt)
+        alpha = parameters[A_0] + parameters[A_N] * (n * (parameters[V_0] / speed) ** 2 - 1.0)
+        gamma += gamma_gain * (theta - alpha - gamma)
+        accel = (
+            parameters[C_0]
+            + parameters[C_T] * (thr - parameters[T_0])
+            + parameters[C_V] * (speed - parameters[V_0])
+            + parameters[C_N] * (n * n - 1.0)
+        )
+        psi = wrap(psi + dt * (parameters[K_PSI] * G * tan(phi) / speed + parameters[B_PSI]))
+        speed += dt * (accel + G * v[2] / speed)
         for j in range(3):
             p[j] += dt * v[j]
     return len(out)
 
 
-@inlined
-def _lag(at: float, rate: float, command: float, lag: np.ndarray, dt: float) -> tuple[float, float]:
+@inlined_kernel
+def _lag(angle: float, rate: float, command: float, lag: np.ndarray, dt: float) -> tuple[float, float]:
     """Advance a second-order lag [wn, zeta, bias] by dt."""
-    h, stiff, damp = dt / _INNER, lag[0] * lag[0], 2.0 * lag[1] * lag[0]
-    for _ in range(_INNER):
-        rate += h * (stiff * (command + lag[2] - at) - damp * rate)
-        at += h * rate
-    return at, rate
+    h, stiff, damp = dt / _LAG_SUBSTEPS, lag[0] * lag[0], 2.0 * lag[1] * lag[0]
+    for _ in range(_LAG_SUBSTEPS):
+        rate += h * (stiff * (command + lag[2] - angle) - damp * rate)
+        angle += h * rate
+    return angle, rate
 
 
 @kernel
-def bundle(
+def simulate_ensemble(
     control: tuple[np.ndarray, np.ndarray, np.ndarray],
-    body: np.ndarray,
+    parameters: np.ndarray,
     air: np.ndarray,
     start: np.ndarray,
-    chance: np.ndarray,
-    at: np.ndarray,
+    draws: np.ndarray,
+    steps: np.ndarray,
     out: np.ndarray,
 ) -> None:
     """Simulate the members of an ensemble in steps of `COARSE_STEP`; arguments of `simulate_route`, one row per member.
@@ -150,10 +160,12 @@ def bundle(
         steps: look-ahead of each stored position, in steps of `COARSE_STEP`, increasing, (k,)
         out: positions, output, nan after a member diverged, (m, k, 3) [m]
     """
-    flown = np.empty((at[-1] + 1, 3))
+    path = np.empty((steps[-1] + 1, 3))
     out[:] = nan
-    for i in range(len(body)):
-        done = fly(control[0].copy(), control[1], control[2], body[i], air[i], start[i], chance[i], COARSE, flown)
-        for k in range(len(at)):
-            if at[k] < done:
-                out[i, k] = flown[at[k]]
+    for i in range(len(parameters)):
+        n_valid = simulate_route(
+            control[0].copy(), control[1], control[2], parameters[i], air[i], start[i], draws[i], COARSE_STEP, path
+        )
+        for k in range(len(steps)):
+            if steps[k] < n_valid:
+                out[i, k] = path[steps[k]]

@@ -27,28 +27,28 @@ def _body_to_ned(u: float, v: float, w: float, phi: float, theta: float, psi: fl
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
-def _linear_axis(D: np.ndarray, at: np.ndarray, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+def _linear_axis(D: np.ndarray, mean: np.ndarray, x: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Return the next state x' = x_mean + A (x - x_mean) + B (u - u_mean) + c; D = [A B c], mean = [x_mean u_mean]."""
     n, m = len(x), len(u)
     out = np.empty(n)
     for i in range(n):
-        s = at[i] + D[i, n + m]
+        s = mean[i] + D[i, n + m]
         for j in range(n):
-            s += D[i, j] * (x[j] - at[j])
+            s += D[i, j] * (x[j] - mean[j])
         for j in range(m):
-            s += D[i, n + j] * (u[j] - at[n + j])
+            s += D[i, n + j] * (u[j] - mean[n + j])
         out[i] = s
     return out
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
 def _linear_step(
-    lon: np.ndarray, lon_at: np.ndarray, lat: np.ndarray, lat_at: np.ndarray, x: np.ndarray, delta: np.ndarray
+    lon: np.ndarray, lon_mean: np.ndarray, lat: np.ndarray, lat_mean: np.ndarray, x: np.ndarray, delta: np.ndarray
 ) -> None:
     """Advance both linear axes, x (9,) in the order of `fleet.window`."""
     bank = np.tan(x[6]) * sin(x[6])
-    x_lon = _linear_axis(lon, lon_at, np.array([x[0], x[2], x[4], x[7]]), np.array([delta[1], delta[3], bank]))
-    x_lat = _linear_axis(lat, lat_at, np.array([x[6], x[8], x[3], x[5], x[1]]), np.array([delta[0], delta[2]]))
+    x_lon = _linear_axis(lon, lon_mean, np.array([x[0], x[2], x[4], x[7]]), np.array([delta[1], delta[3], bank]))
+    x_lat = _linear_axis(lat, lat_mean, np.array([x[6], x[8], x[3], x[5], x[1]]), np.array([delta[0], delta[2]]))
     x[0], x[2], x[4], x[7] = x_lon
     x[6], x[8], x[3], x[5], x[1] = x_lat
 
@@ -83,19 +83,19 @@ def simulate(
     Returns:
         number of valid rows of `out`; fewer than len(out) after divergence
     """
-    lon, lon_at, lat, lat_at, aero, at, tau = plant
+    lon, lon_mean, lat, lat_mean, aero, trim, tau = plant
     coupled = len(aero) > 0
     p, x = state[:3].copy(), state[3:].copy()
     phi_c, theta_c = command[0], command[1]
-    delta, acting, share = command[2:].copy(), command[2:].copy(), 1.0 - np.exp(-dt / tau)
-    change, middle = np.empty(4), np.empty(4)  # the loop allocates no array
+    delta, actuator_state, gain = command[2:].copy(), command[2:].copy(), 1.0 - np.exp(-dt / tau)
+    change, delta_mean = np.empty(4), np.empty(4)  # the loop allocates no array
     work, v, euler = np.empty((3, N_X)), np.empty(3), np.empty(3)
     Va_last, Va_dot = (sqrt(x[0] ** 2 + x[1] ** 2 + x[2] ** 2) + air[3]) / air[2], 0.0
-    fade, left = exp(-dt / GUST_S), 1.0
-    fast = 3.0 * max(at[0], 5.0)
+    gust_decay, gust_fraction = exp(-dt / GUST_S), 1.0
+    max_speed = 3.0 * max(trim[0], 5.0)
     for k in range(len(out)):
         V = sqrt(x[0] ** 2 + x[1] ** 2 + x[2] ** 2)
-        if not (abs(x[6]) < 1.4 and abs(x[7]) < 1.2 and 3.0 < V < fast):
+        if not (abs(x[6]) < 1.4 and abs(x[7]) < 1.2 and 3.0 < V < max_speed):
             return k
         for i in range(3):
             out[k, i] = p[i]
@@ -105,7 +105,7 @@ def simulate(
         v[0], v[1], v[2] = _body_to_ned(x[0], x[1], x[2], x[6], x[7], x[8])
         v[0] += air[0]
         v[1] += air[1]
-        Va = (V + left * air[3]) / air[2]
+        Va = (V + gust_fraction * air[3]) / air[2]
         euler[0], euler[1], euler[2] = x[6], x[7], out[k, 11]
         if k % GUIDE_EVERY == 0:
             Va_dot += 0.25 * ((Va - Va_last) / (GUIDE_EVERY * dt) - Va_dot)
@@ -114,20 +114,20 @@ def simulate(
         delta[0], delta[1], delta[2] = stabilise(ctl, par, phi_c, theta_c, euler, x[3:6], Va, dt)
         if coupled:
             for i in range(4):
-                change[i] = share[i] * (delta[i] - acting[i])
-                middle[i] = acting[i] + 0.5 * change[i]
-            step(x, middle, aero, at, dt, work)
+                change[i] = gain[i] * (delta[i] - actuator_state[i])
+                delta_mean[i] = actuator_state[i] + 0.5 * change[i]
+            step(x, delta_mean, aero, trim, dt, work)
             for i in range(4):
-                acting[i] += change[i]
+                actuator_state[i] += change[i]
         else:
-            _linear_step(lon, lon_at, lat, lat_at, x, delta)
-        left *= fade
+            _linear_step(lon, lon_mean, lat, lat_mean, x, delta)
+        gust_fraction *= gust_decay
         for i in range(3):
             p[i] += v[i] * dt
     return len(out)
 
 
-def linear_plant(lon: np.ndarray, lon_at: np.ndarray, lat: np.ndarray, lat_at: np.ndarray) -> tuple:
+def linear_plant(lon: np.ndarray, lon_mean: np.ndarray, lat: np.ndarray, lat_mean: np.ndarray) -> tuple:
     """Create a plant of two linear axes.
 
     Args:
@@ -135,12 +135,12 @@ def linear_plant(lon: np.ndarray, lon_at: np.ndarray, lat: np.ndarray, lat_at: n
         lon_mean: reference of the deviations, states then inputs, (7,)
         lat, lat_mean: the same of phi psi p r v | delta_a delta_r, (5, 8) and (7,)
     """
-    return lon, lon_at, lat, lat_at, np.empty(0), lon_at[:2].copy(), TAU
+    return lon, lon_mean, lat, lat_mean, np.empty(0), lon_mean[:2].copy(), TAU
 
 
-def coupled_plant(par: np.ndarray, at: np.ndarray) -> tuple:
+def coupled_plant(par: np.ndarray, trim: np.ndarray) -> tuple:
     """Create a plant of derivatives, (37,), see `fleet.physics.wrench`, at U0 W0, (2,) [m/s]; air-relative, no wind."""
     windless = par.copy()
     windless[WIND:] = 0.0
-    nothing = np.empty((0, 0))
-    return nothing, np.empty(0), nothing, np.empty(0), windless, at, TAU
+    no_axis = np.empty((0, 0))
+    return no_axis, np.empty(0), no_axis, np.empty(0), windless, trim, TAU

@@ -14,7 +14,7 @@ Source: Beard & McLain 2012, section 5.5 (dimensional derivatives); Klein & More
 
 import numpy as np
 
-from fleet.physics.kernel import bare, inlined, kernel
+from fleet.physics.kernel import inlined_kernel, kernel, no_alloc_kernel
 
 NAMES = (
     *("X_0", "X_u", "X_w", "X_de", "X_dt", "X_ww"),
@@ -32,11 +32,11 @@ N_AERO = N_PAR - 2  # without the wind
 X, Z, M, Y, L, N, WIND = 0, 6, 11, 17, 23, 29, 35  # index of the first term of each row
 OFFSETS = tuple(NAMES.index(name) for name in ("X_0", "Z_0", "M_0", "Y_0", "L_0", "N_0"))
 ROW = np.array([0] * 6 + [2] * 5 + [4] * 6 + [1] * 6 + [3] * 6 + [5] * 6)  # state whose rate each derivative drives
-SLOW, FAST = 0.4, 2.0  # limits of u_a / U0; the derivatives are constant beyond [-]
+MIN_SPEED_RATIO, MAX_SPEED_RATIO = 0.4, 2.0  # limits of u_a / U0; the derivatives are constant beyond [-]
 
 
-@inlined
-def wrench(par, u_a, v_a, w_a, p, q, r, delta, at):  # type: ignore[no-untyped-def]
+@inlined_kernel
+def wrench(par, u_a, v_a, w_a, p, q, r, delta, trim):  # type: ignore[no-untyped-def]
     """Return X Y Z [m/s2], L M N [rad/s2].
 
     Args:
@@ -46,9 +46,9 @@ def wrench(par, u_a, v_a, w_a, p, q, r, delta, at):  # type: ignore[no-untyped-d
         delta: actuator state delta_a delta_e delta_r delta_t, (4,)
         trim: U0, W0 of the derivatives, (2,) [m/s]
     """
-    s = min(max(u_a / at[0], SLOW), FAST)
+    s = min(max(u_a / trim[0], MIN_SPEED_RATIO), MAX_SPEED_RATIO)
     s2 = s * s
-    du, dw = u_a - at[0], w_a - at[1] * s
+    du, dw = u_a - trim[0], w_a - trim[1] * s
     v_s, p_s, q_s, r_s, w_s = v_a * s, p * s, q * s, r * s, dw * s
     a_s, e_s, r_d = delta[0] * s2, delta[1] * s2, delta[2] * s2
     return (
@@ -61,12 +61,12 @@ def wrench(par, u_a, v_a, w_a, p, q, r, delta, at):  # type: ignore[no-untyped-d
     )
 
 
-@bare
-def terms(u_a: float, v_a: float, w_a: float, rates: np.ndarray, delta: np.ndarray, at: np.ndarray, out: np.ndarray):  # type: ignore[no-untyped-def]
+@no_alloc_kernel
+def terms(u_a: float, v_a: float, w_a: float, rates: np.ndarray, delta: np.ndarray, trim: np.ndarray, out: np.ndarray):  # type: ignore[no-untyped-def]
     """Compute the factor of each derivative, (35,), in the order of `NAMES`; arguments as for `wrench`."""
-    s = min(max(u_a / at[0], SLOW), FAST)
+    s = min(max(u_a / trim[0], MIN_SPEED_RATIO), MAX_SPEED_RATIO)
     s2 = s * s
-    du, dw = u_a - at[0], w_a - at[1] * s
+    du, dw = u_a - trim[0], w_a - trim[1] * s
     p, q, r = rates[0], rates[1], rates[2]
     out[0], out[1], out[2], out[3], out[4], out[5] = 1.0, du, dw, delta[1] * s2, delta[3], dw * dw
     out[6], out[7], out[8], out[9], out[10] = s2, du, dw * s, q * s, delta[1] * s2
@@ -77,20 +77,20 @@ def terms(u_a: float, v_a: float, w_a: float, rates: np.ndarray, delta: np.ndarr
 
 
 @kernel
-def slopes(
+def wrench_jacobian(
     par: np.ndarray,
     air: np.ndarray,
     rates: np.ndarray,
     delta: np.ndarray,
-    at: np.ndarray,
+    trim: np.ndarray,
     by_air: np.ndarray,
     by_rate: np.ndarray,
 ) -> None:
     """Compute the derivative of the wrench by air-relative velocity and by body rates, each (6, 3)."""
-    s = min(max(air[0] / at[0], SLOW), FAST)
-    ds = 1.0 / at[0] if SLOW < air[0] / at[0] < FAST else 0.0
-    dw = air[2] - at[1] * s
-    dw_u = -at[1] * ds
+    s = min(max(air[0] / trim[0], MIN_SPEED_RATIO), MAX_SPEED_RATIO)
+    ds = 1.0 / trim[0] if MIN_SPEED_RATIO < air[0] / trim[0] < MAX_SPEED_RATIO else 0.0
+    dw = air[2] - trim[1] * s
+    dw_u = -trim[1] * ds
     d_a, d_e, d_r = delta[0], delta[1], delta[2]
     p, q, r = rates[0], rates[1], rates[2]
     by_air[:] = 0.0

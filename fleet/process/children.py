@@ -9,12 +9,12 @@ import time
 from collections import deque
 from contextlib import AbstractContextManager
 
-from fleet.process.interrupt import PARENT, deferred
-from fleet.process.logs import untimed
-from fleet.process.sanitise import plain
+from fleet.process.interrupt import PARENT, interrupt_deferred
+from fleet.process.logs import strip_time
+from fleet.process.sanitise import printable
 
-_PATIENCE_S = 8.0  # between SIGTERM and SIGKILL [s]
-_ALONE_S = 10.0  # longest wait for a single child after SIGTERM [s]
+_STOP_TIMEOUT_S = 8.0  # between SIGTERM and SIGKILL [s]
+_SINGLE_TIMEOUT_S = 10.0  # longest wait for a single child after SIGTERM [s]
 
 
 def run_until(stop: threading.Event, module: str, *options: str) -> int:
@@ -26,7 +26,7 @@ def run_until(stop: threading.Event, module: str, *options: str) -> int:
     finally:
         if child.poll() is None:
             child.terminate()
-    code = child.wait(_ALONE_S)
+    code = child.wait(_SINGLE_TIMEOUT_S)
     return code if code >= 0 else 128 - code
 
 
@@ -34,13 +34,13 @@ def run_to_end(module: str, *options: str) -> tuple[int, str]:
     """Run `python -m module options…` to its end and return its exit code and standard error; Ctrl-C ends it too."""
     child = None
     try:
-        with deferred():  # otherwise Ctrl-C could leave it running
+        with interrupt_deferred():  # otherwise Ctrl-C could leave it running
             command = [sys.executable, "-m", module, *options]
             child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         _, errors = child.communicate()
         return child.returncode, errors
     finally:
-        with deferred():
+        with interrupt_deferred():
             if child is not None and child.poll() is None:
                 child.kill()
                 child.communicate()
@@ -51,8 +51,8 @@ class Children(AbstractContextManager):
 
     def __init__(self) -> None:
         self._running: dict[str, subprocess.Popen[str]] = {}
-        self._words: dict[str, deque[str]] = {}
-        self._ears: dict[str, threading.Thread] = {}
+        self._last_lines: dict[str, deque[str]] = {}
+        self._readers: dict[str, threading.Thread] = {}
 
     def start(self, name: str, module: str, *options: str) -> None:
         """Start `python -m module options…` and store its last lines of output."""
@@ -67,50 +67,52 @@ class Children(AbstractContextManager):
             env=os.environ | {"PYTHONUNBUFFERED": "1", PARENT: str(os.getpid())},
         )
         self._running[name] = child
-        self._words[name] = deque(maxlen=6)
-        self._ears[name] = threading.Thread(target=self._listen, args=(name, child), daemon=True)
-        self._ears[name].start()
+        self._last_lines[name] = deque(maxlen=6)
+        self._readers[name] = threading.Thread(target=self._read_output, args=(name, child), daemon=True)
+        self._readers[name].start()
 
-    def _listen(self, name: str, child: subprocess.Popen[str]) -> None:
+    def _read_output(self, name: str, child: subprocess.Popen[str]) -> None:
         assert child.stdout is not None
         with child.stdout:
             for line in child.stdout:
                 if line.strip():
-                    self._words[name].append(untimed(plain(line.rstrip())))  # the parent adds its own time
+                    self._last_lines[name].append(strip_time(printable(line.rstrip())))  # the parent adds its own time
 
-    def words(self) -> list[str]:
+    def last_lines(self) -> list[str]:
         """Return each child's last line."""
-        return [words[-1] for words in self._words.values() if words]
+        return [lines[-1] for lines in self._last_lines.values() if lines]
 
-    def done(self) -> list[str]:
+    def finished(self) -> list[str]:
         """Return the names of the children that ended with exit code 0."""
         return [name for name, child in self._running.items() if child.poll() == 0]
 
-    def dead(self) -> list[str]:
+    def failed_names(self) -> list[str]:
         """Return the names of the children that failed."""
         return [name for name, child in self._running.items() if child.poll()]
 
-    def failed(self) -> list[tuple[int, str]]:
+    def failures(self) -> list[tuple[int, str]]:
         """Return exit code and message of the failed children; exit code 2 uses the child's own message."""
-        found = []
+        results = []
         for name, child in self._running.items():
             if code := child.poll():
-                self._ears[name].join(timeout=1.0)  # its last lines may still be in the pipe
-                words = self._words[name]
-                refused = code == 2 and words
-                died = f"{name}: found it ended with exit code {code}, expected it to run until stopped; "
-                found.append((code, words[-1] if refused else died + f"last output: {' | '.join(words) or 'none'}"))
-        return found
+                self._readers[name].join(timeout=1.0)  # its last lines may still be in the pipe
+                lines = self._last_lines[name]
+                refused = code == 2 and lines
+                exit_text = f"{name}: found it ended with exit code {code}, expected it to run until stopped; "
+                results.append(
+                    (code, lines[-1] if refused else exit_text + f"last output: {' | '.join(lines) or 'none'}")
+                )
+        return results
 
     def stop(self) -> None:
         """Send SIGTERM to all, newest first, then SIGKILL to those still running."""
         for child in reversed(self._running.values()):
             if child.poll() is None:
                 child.send_signal(signal.SIGTERM)
-        patience = time.monotonic() + _PATIENCE_S
+        deadline = time.monotonic() + _STOP_TIMEOUT_S
         for child in self._running.values():
             try:
-                child.wait(timeout=max(patience - time.monotonic(), 0.0))
+                child.wait(timeout=max(deadline - time.monotonic(), 0.0))
             except subprocess.TimeoutExpired:
                 child.kill()
                 child.wait()

@@ -21,7 +21,7 @@ from typing import Any
 INTERRUPTED = 130  # exit code: 128 + SIGINT
 COMMANDS = ("fleet", "gateway", "twin_worker", "viewer")  # console scripts, and packages whose modules are run with -m
 PARENT = "PARAUAV_PARENT"  # process id of the parent that started this process as its child
-_AGAIN_S = 0.02  # before a dropped KeyboardInterrupt is raised again [s]
+_RETRY_S = 0.02  # before a dropped KeyboardInterrupt is raised again [s]
 
 
 class _State:
@@ -34,46 +34,46 @@ class _State:
     code: int | None = None  # exit code of the work, once it is done
 
 
-_now = _State()
+_state = _State()
 
 
-def interruptible(work: Callable[[], int]) -> int:
+def run_interruptible(work: Callable[[], int]) -> int:
     """Run the work of a command and return its exit code, or 130 after Ctrl-C.
 
     An exception into which a library converted the KeyboardInterrupt counts as Ctrl-C; others propagate.
     """
-    _now.arrived = _now.raised = False
+    _state.arrived = _state.raised = False
     try:
         try:
-            _now.working = True
+            _state.working = True
             code = work()
         finally:
-            _now.working = False
+            _state.working = False
     except KeyboardInterrupt:
         return INTERRUPTED
     except Exception:
-        if not _now.arrived:
+        if not _state.arrived:
             raise
         return INTERRUPTED
-    return INTERRUPTED if _now.arrived else code
+    return INTERRUPTED if _state.arrived else code
 
 
-def exits_with(code: int) -> int:
+def set_exit_code(code: int) -> int:
     """Store the exit code with which the process will end, and return it."""
-    _now.code = code
+    _state.code = code
     return code
 
 
 @contextmanager
-def deferred() -> Iterator[None]:
+def interrupt_deferred() -> Iterator[None]:
     """Defer Ctrl-C until the end of the block, for short steps that must be completed."""
-    _now.deferring = True
+    _state.deferring = True
     try:
         yield
     finally:
-        _now.deferring = False
-        if _now.arrived and _now.working and not _now.raised:
-            _now.raised = True
+        _state.deferring = False
+        if _state.arrived and _state.working and not _state.raised:
+            _state.raised = True
             raise KeyboardInterrupt
 
 
@@ -83,53 +83,53 @@ def install() -> None:
         return
     signal.signal(signal.SIGINT, _on_sigint)
     sys.unraisablehook = _on_unraisable
-    atexit.register(_exit)  # registered first, so it runs last
+    atexit.register(_exit_at_end)  # registered first, so it runs last
 
 
 def _on_sigint(*_: object) -> None:
-    _now.arrived = True
-    if _now.working and _now.deferring:
+    _state.arrived = True
+    if _state.working and _state.deferring:
         return
-    if not _now.working or _now.raised:  # nothing to clean up, or a second Ctrl-C during cleanup
-        _end()
-    _now.raised = True
+    if not _state.working or _state.raised:  # nothing to clean up, or a second Ctrl-C during cleanup
+        _exit_interrupted()
+    _state.raised = True
     raise KeyboardInterrupt
 
 
-def _on_unraisable(what: Any) -> None:
+def _on_unraisable(unraisable: Any) -> None:
     """Raise KeyboardInterrupt again where the interpreter dropped it: in callbacks from C and in `__del__`."""
-    if not issubclass(what.exc_type, KeyboardInterrupt):
-        sys.__unraisablehook__(what)
-    elif _now.working:
-        _now.raised = False
-        _thread.start_new_thread(_insist, ())  # raised here, in the hook, it would be dropped again
+    if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(unraisable)
+    elif _state.working:
+        _state.raised = False
+        _thread.start_new_thread(_raise_again, ())  # raised here, in the hook, it would be dropped again
 
 
-def _insist() -> None:
-    while _now.working and not _now.raised:
-        time.sleep(_AGAIN_S)
+def _raise_again() -> None:
+    while _state.working and not _state.raised:
+        time.sleep(_RETRY_S)
         _thread.interrupt_main()
 
 
-def _end() -> None:
+def _exit_interrupted() -> None:
     if not os.environ.get(PARENT):  # otherwise the parent reports it
         cursor = "\x1b[?25h" if os.isatty(2) else ""  # a progress bar hides the cursor
         os.write(2, f"{cursor}{_PROGRAM}: interrupted\n".encode())
     os._exit(INTERRUPTED)
 
 
-def _exit() -> None:
+def _exit_at_end() -> None:
     """End the process with its exit code without tearing down the interpreter; ignore Ctrl-C from here on."""
     if signal.getsignal(signal.SIGINT) is _on_sigint:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if _now.code is None:
+    if _state.code is None:
         return
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
         except (OSError, ValueError):  # closed, or a pipe without reader; the interpreter reports it
             return
-    os._exit(_now.code)
+    os._exit(_state.code)
 
 
 def _program() -> str:

@@ -12,10 +12,10 @@ import sys
 import time
 from datetime import UTC, datetime
 
-from fleet.process.sanitise import plain
+from fleet.process.sanitise import printable
 
-SAID = "parauav"  # logger of the regular status messages of a command
-_TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z ")
+STATUS_LOGGER = "parauav"  # logger of the regular status messages of a command
+_TIME_PATTERN = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z ")
 
 
 def log_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,39 +23,39 @@ def log_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--log-json", action="store_true", help="write all messages as lines of JSON to standard error")
 
 
-def begin(process: str, *, as_json: bool = False) -> None:
+def configure_logging(process: str, *, as_json: bool = False) -> None:
     """Configure logging: warnings and above as text, or everything as JSON."""
     handler = logging.StreamHandler()
-    handler.setFormatter(Lines(process) if as_json else Words(process))
+    handler.setFormatter(JsonFormatter(process) if as_json else TextFormatter(process))
     logging.basicConfig(level=logging.INFO if as_json else logging.WARNING, handlers=[handler])
 
 
-def timed(line: str, t: float | None = None) -> str:
+def add_time(line: str, t: float | None = None) -> str:
     """Prefix a log line with its time; `t`: None means now [s since 1970]."""
     at = datetime.fromtimestamp(time.time() if t is None else t, UTC)
     return f"{at.isoformat(timespec='milliseconds').removesuffix('+00:00')}Z {line}"
 
 
-def untimed(line: str) -> str:
+def strip_time(line: str) -> str:
     """Remove the time prefix of a log line, if any."""
-    found = _TIME.match(line)
-    return line if found is None else line[found.end() :]
+    match = _TIME_PATTERN.match(line)
+    return line if match is None else line[match.end() :]
 
 
-def say(process: str, sentence: str) -> None:
+def report_status(process: str, sentence: str) -> None:
     """Report a regular status message of a command on standard output, or as JSON."""
     if logging.getLogger().isEnabledFor(logging.INFO):
-        logging.getLogger(SAID).info("%s", sentence)
+        logging.getLogger(STATUS_LOGGER).info("%s", sentence)
     else:
-        print(timed(f"{process}: {plain(sentence)}"), flush=True)
+        print(add_time(f"{process}: {printable(sentence)}"), flush=True)
 
 
-def tell(process: str, sentence: str) -> None:
+def report_progress(process: str, sentence: str) -> None:
     """Report the progress of a command on standard error; standard output is for its result."""
-    print(timed(f"{process}: {plain(sentence)}"), file=sys.stderr, flush=True)
+    print(add_time(f"{process}: {printable(sentence)}"), file=sys.stderr, flush=True)
 
 
-def fail(process: str, sentence: str, *, logged: bool = True) -> None:
+def report_failure(process: str, sentence: str, *, logged: bool = True) -> None:
     """Report the reason for which a command fails.
 
     Args:
@@ -64,13 +64,13 @@ def fail(process: str, sentence: str, *, logged: bool = True) -> None:
         logged: True: write a log line with time; False: write the reason alone
     """
     if logging.getLogger().isEnabledFor(logging.INFO):
-        logging.getLogger(SAID).error("%s", sentence)
+        logging.getLogger(STATUS_LOGGER).error("%s", sentence)
     else:
-        line = f"{process}: {plain(sentence)}"
-        print(timed(line) if logged else line, file=sys.stderr)
+        line = f"{process}: {printable(sentence)}"
+        print(add_time(line) if logged else line, file=sys.stderr)
 
 
-class Words(logging.Formatter):
+class TextFormatter(logging.Formatter):
     """Format messages as text with time; escape control characters, because messages can contain untrusted text."""
 
     def __init__(self, process: str) -> None:
@@ -79,11 +79,11 @@ class Words(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the message, followed by the traceback of an exception."""
-        words = timed(f"{self._process}: {plain(record.getMessage())}", record.created)
-        return f"{words}\n{self.formatException(record.exc_info)}" if record.exc_info else words
+        text = add_time(f"{self._process}: {printable(record.getMessage())}", record.created)
+        return f"{text}\n{self.formatException(record.exc_info)}" if record.exc_info else text
 
 
-class Lines(logging.Formatter):
+class JsonFormatter(logging.Formatter):
     """Format messages as JSON: t (RFC 3339), level, process, from (module), message, and defect (traceback)."""
 
     def __init__(self, process: str) -> None:

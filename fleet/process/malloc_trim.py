@@ -5,11 +5,11 @@ import platform
 import threading
 
 _M_MMAP_THRESHOLD, _M_MMAP_MAX = -3, -4  # of mallopt(3)
-_MOST = 32_768  # mapped blocks; Linux allows 65,530 mappings per process, also for threads and files
-_EVERY_S = 20.0
+_MAX_MMAPS = 32_768  # mapped blocks; Linux allows 65,530 mappings per process, also for threads and files
+_TRIM_PERIOD_S = 20.0
 
 
-def give_back(large: int) -> None:
+def enable_malloc_trim(mmap_threshold: int) -> None:
     """Configure glibc to return freed memory to the operating system; do nothing with another C library.
 
     By default glibc raises its mmap threshold with every large block freed: later blocks up to that size lie on the
@@ -23,12 +23,12 @@ def give_back(large: int) -> None:
     if platform.libc_ver()[0] != "glibc":
         return
     libc = ctypes.CDLL(None)
-    libc.mallopt(_M_MMAP_THRESHOLD, large)
-    libc.mallopt(_M_MMAP_MAX, _MOST)
+    libc.mallopt(_M_MMAP_THRESHOLD, mmap_threshold)
+    libc.mallopt(_M_MMAP_MAX, _MAX_MMAPS)
     threading.Thread(target=_trim, args=(libc,), name="heap", daemon=True).start()
 
 
 def _trim(libc: ctypes.CDLL) -> None:
-    never = threading.Event()
-    while not never.wait(_EVERY_S):
+    timer = threading.Event()
+    while not timer.wait(_TRIM_PERIOD_S):
         libc.malloc_trim(0)

@@ -3,15 +3,15 @@
 from math import floor
 
 
-def plain(text: str) -> str:
+def printable(text: str) -> str:
     """Replace non-printable characters by `?`, because a terminal executes control characters in untrusted text."""
-    return "".join(letter if letter.isprintable() else "?" for letter in text)
+    return "".join(char if char.isprintable() else "?" for char in text)
 
 
-def below(found: float, needed: float) -> str:
+def format_below(value: float, limit: float) -> str:
     """Format a number below a limit with enough digits to show that it is below: 39.96 for a limit of 40, not 40."""
     for digits in range(4):
-        text = f"{found:.{digits}f}"
-        if float(text) < needed:
+        text = f"{value:.{digits}f}"
+        if float(text) < limit:
             return text
-    return f"{floor(found * 1e3) / 1e3:.3f}"
+    return f"{floor(value * 1e3) / 1e3:.3f}"

@@ -3,10 +3,10 @@
 from html import escape
 from pathlib import Path
 
-from fleet.process.sanitise import plain
+from fleet.process.sanitise import printable
 from fleet.report.ink import BAD, GOOD, GRID, INK, LINES, MUTED, ROUTE
 
-_GUARD = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # no external resources, no scripts
+_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # no external resources, no scripts
 _COLOURS = {"ink": INK, "muted": MUTED, "line": GRID, "good": GOOD, "bad": BAD, "doubt": LINES[3], "odd": ROUTE}
 
 
@@ -15,15 +15,16 @@ def document(title: str, body: str) -> str:
     colours = "".join(f"--{name}:{colour};" for name, colour in _COLOURS.items())
     style = f":root{{{colours}}}\n" + Path(__file__).with_name("page.css").read_text(encoding="utf-8")
     head = (
-        f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{_GUARD}">'
+        f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
     )
     return (
-        f'<!DOCTYPE html>\n<html lang="en"><head>{head}<title>{safe(title)}</title>\n<style>{style}</style></head>\n'
+        "<!DOCTYPE html>\n<html "
+        f'lang="en"><head>{head}<title>{escape_text(title)}</title>\n<style>{style}</style></head>\n'
         f"<body><main>\n{body}\n</main></body></html>\n"
     )
 
 
-def safe(text: str) -> str:
+def escape_text(text: str) -> str:
     """Escape untrusted text, such as a file name."""
-    return escape(plain(text))
+    return escape(printable(text))

@@ -22,18 +22,18 @@ _MODES = {
     "FBWA": "#A67C00",
     "STABILIZE": "#A67C00",
 }
-_OTHERS = ("#56B4E9", "#D55E9B", "#2BC49A", "#8C6D46", "#334155", "#9A8FD0")
-_MOST_POINTS = 3_000  # points of one line; more are not visible
+_EXTRA_COLOURS = ("#56B4E9", "#D55E9B", "#2BC49A", "#8C6D46", "#334155", "#9A8FD0")
+_MAX_POINTS = 3_000  # points of one line; more are not visible
 
 
 def mode_colours(modes: Iterable[str]) -> dict[str, str]:
     """Return a colour for every mode; common modes have the same colour on every page."""
     names = list(dict.fromkeys(modes))
     free = [name for name in names if name not in _MODES]
-    return {name: _MODES.get(name) or _OTHERS[free.index(name) % len(_OTHERS)] for name in names}
+    return {name: _MODES.get(name) or _EXTRA_COLOURS[free.index(name) % len(_EXTRA_COLOURS)] for name in names}
 
 
-def drawn(t: np.ndarray, y: np.ndarray, widest: float) -> tuple[np.ndarray, np.ndarray]:
+def downsample(t: np.ndarray, y: np.ndarray, max_interval: float) -> tuple[np.ndarray, np.ndarray]:
     """Downsample a line, keep its extremes, and insert NaN where an interval exceeds `max_interval`.
 
     Args:
@@ -41,17 +41,17 @@ def drawn(t: np.ndarray, y: np.ndarray, widest: float) -> tuple[np.ndarray, np.n
         y: values, (n,)
         max_interval: longest interval joined by a line [s]
     """
-    if len(t) > _MOST_POINTS:
-        parts = np.array_split(np.arange(len(t)), _MOST_POINTS // 2)
-        picked = np.sort(np.concatenate([[p[np.argmin(y[p])], p[np.argmax(y[p])]] for p in parts]))
-        widest = max(widest, 2.5 * (t[-1] - t[0]) / len(parts))
-        t, y = t[picked], y[picked]
-    after = np.flatnonzero(np.diff(t) > widest) + 1
+    if len(t) > _MAX_POINTS:
+        parts = np.array_split(np.arange(len(t)), _MAX_POINTS // 2)
+        extremes = np.sort(np.concatenate([[p[np.argmin(y[p])], p[np.argmax(y[p])]] for p in parts]))
+        max_interval = max(max_interval, 2.5 * (t[-1] - t[0]) / len(parts))
+        t, y = t[extremes], y[extremes]
+    after = np.flatnonzero(np.diff(t) > max_interval) + 1
     return np.insert(t, after, t[after] if len(after) else []), np.insert(np.asarray(y, float), after, np.nan)
 
 
-def spread(values: np.ndarray, room: float = 0.08, least: float = 1.0) -> tuple[float, float]:
+def axis_limits(values: np.ndarray, margin: float = 0.08, min_range: float = 1.0) -> tuple[float, float]:
     """Return axis limits that contain all values with a margin."""
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    more = max(room * (high - low), 0.5 * least)
-    return low - more, high + more
+    padding = max(margin * (high - low), 0.5 * min_range)
+    return low - padding, high + padding

@@ -9,13 +9,13 @@ from typing import Protocol
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
-from fleet.process.interrupt import deferred
+from fleet.process.interrupt import interrupt_deferred
 
 REFRESH_S = 0.5
 PLAIN_S = 10.0  # interval of lines without a terminal [s]
 
 
-class Played(Protocol):
+class ProgressSource(Protocol):
     """Source of progress."""
 
     @property
@@ -26,13 +26,17 @@ class Played(Protocol):
     def share(self) -> float:
         """Return the progress, 0..1."""
 
-    def words(self) -> str:
+    def progress_text(self) -> str:
         """Return additional text."""
 
 
 @contextmanager
-def shown(
-    played: Sequence[Played], say: Callable[[str], None], console: Console | None = None, *, leave: bool = True
+def show_progress(
+    sources: Sequence[ProgressSource],
+    write_line: Callable[[str], None],
+    console: Console | None = None,
+    *,
+    leave: bool = True,
 ) -> Iterator[None]:
     """Show progress while the block runs.
 
@@ -43,29 +47,29 @@ def shown(
         leave: keep the bars at the end
     """
     console = console or Console()
-    if not played:
+    if not sources:
         yield
         return
-    draw = _bars if console.is_terminal else _lines
-    with alongside(lambda done: draw(played, done, say, console, leave=leave)):
+    draw = _draw_progress if console.is_terminal else _write_lines
+    with run_alongside(lambda done: draw(sources, done, write_line, console, leave=leave)):
         yield
 
 
 @contextmanager
-def alongside(show: Callable[[threading.Event], None]) -> Iterator[None]:
+def run_alongside(show: Callable[[threading.Event], None]) -> Iterator[None]:
     """Run `show` on a thread while the block runs; its event argument is set at the end."""
     done = threading.Event()
     thread = threading.Thread(target=show, args=(done,), name="shown")
 
     def end() -> None:
-        with deferred():
+        with interrupt_deferred():
             done.set()
             if thread.ident is not None:
                 thread.join()
 
     try:
         try:
-            with deferred():
+            with interrupt_deferred():
                 thread.start()
             yield
         finally:
@@ -74,25 +78,30 @@ def alongside(show: Callable[[threading.Event], None]) -> Iterator[None]:
         end()  # Ctrl-C may interrupt the first call; a remaining thread would block process exit
 
 
-def _bars(
-    played: Sequence[Played], done: threading.Event, _: Callable[[str], None], console: Console, *, leave: bool
+def _draw_progress(
+    sources: Sequence[ProgressSource], done: threading.Event, _: Callable[[str], None], console: Console, *, leave: bool
 ) -> None:
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[words]}"))
     with Progress(*columns, console=console, transient=not leave) as progress:
-        bars = [progress.add_task(one.name, total=1.0, words="") for one in played]
+        task_ids = [progress.add_task(source.name, total=1.0, words="") for source in sources]
         ended = False
         while not ended:
             ended = done.wait(REFRESH_S)
-            for bar, one in zip(bars, played, strict=True):
-                progress.update(bar, completed=one.share, words=one.words())
+            for task_id, source in zip(task_ids, sources, strict=True):
+                progress.update(task_id, completed=source.share, words=source.progress_text())
 
 
-def _lines(
-    played: Sequence[Played], done: threading.Event, say: Callable[[str], None], _: Console, *, leave: bool
+def _write_lines(
+    sources: Sequence[ProgressSource],
+    done: threading.Event,
+    write_line: Callable[[str], None],
+    _: Console,
+    *,
+    leave: bool,
 ) -> None:
     del leave
     due = time.monotonic() + PLAIN_S
     while not done.wait(max(due - time.monotonic(), 0.0)):
         due += PLAIN_S
-        for one in played:
-            say(f"{one.name}: {one.share:.0%}, {one.words()}")
+        for source in sources:
+            write_line(f"{source.name}: {source.share:.0%}, {source.progress_text()}")

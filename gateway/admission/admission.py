@@ -5,14 +5,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fleet.telemetry.mavlink.parsing.decode import Frames
-from gateway.admission.signing import Signing, pick, read_keys
-from gateway.settings.link_spec import Spec
-from gateway.settings.message_filter import Sieve
+from gateway.admission.signing import Signing, read_keys, select_key
+from gateway.settings.link_spec import LinkSpec
+from gateway.settings.message_filter import MessageFilter
 
-SIEVED = "excluded by the filter of the link"
+FILTERED = "excluded by the filter of the link"
 
 
-class Gate:
+class Admission:
     """Admission of frames of one link.
 
     Args:
@@ -20,17 +20,17 @@ class Gate:
         signing: signature check; None: signatures are not checked
     """
 
-    def __init__(self, sieve: Sieve, signing: Signing | None = None) -> None:
-        self._sieve, self._signing = sieve, signing
+    def __init__(self, message_filter: MessageFilter, signing: Signing | None = None) -> None:
+        self._filter, self._signing = message_filter, signing
 
     def admit(self, frames: Frames, refused: Counter[str]) -> Frames:
         """Return the accepted frames, and count the refused ones by reason."""
-        if self._signing is not None and len(frames.at):
-            frames = frames.only(self._signing.passes(frames, refused))
-        if self._sieve.rules and len(frames.at):
-            kept = self._sieve.keep(frames.at)
-            refused[SIEVED] += int((~kept).sum())
-            frames = frames.only(kept)
+        if self._signing is not None and len(frames.headers):
+            frames = frames.subset(self._signing.verify(frames, refused))
+        if self._filter.rules and len(frames.headers):
+            passed = self._filter.passes(frames.headers)
+            refused[FILTERED] += int((~passed).sum())
+            frames = frames.subset(passed)
         return frames
 
     def sign(self, message: bytes) -> bytes:
@@ -38,7 +38,7 @@ class Gate:
         return message if self._signing is None else self._signing.sign(message)
 
 
-def gates_of(specs: Sequence[Spec], stations: int = 0, keys: Path | None = None) -> list[Gate]:
+def make_admissions(specs: Sequence[LinkSpec], stations: int = 0, keys: Path | None = None) -> list[Admission]:
     """Create the admission of each link; the filter of a station's link applies to frames sent there, not received.
 
     Args:
@@ -49,9 +49,15 @@ def gates_of(specs: Sequence[Spec], stations: int = 0, keys: Path | None = None)
         ValueError: when the file of keys is readable by others, or lacks the key of a link.
         OSError: when it cannot be read.
     """
-    known = read_keys(keys) if keys is not None else {}
-    found = []
+    keys_by_name = read_keys(keys) if keys is not None else {}
+    admissions = []
     for number, spec in enumerate(specs):
-        signing = Signing(pick(known, spec.key, spec.text), spec.sign == "require", number) if spec.sign else None
-        found.append(Gate(spec.sieve if number < len(specs) - stations else Sieve(), signing))
-    return found
+        signing = (
+            Signing(select_key(keys_by_name, spec.key, spec.text), spec.sign == "require", number)
+            if spec.sign
+            else None
+        )
+        admissions.append(
+            Admission(spec.message_filter if number < len(specs) - stations else MessageFilter(), signing)
+        )
+    return admissions

@@ -22,7 +22,7 @@ from fleet.telemetry.mavlink.parsing.decode import Frames
 from fleet.telemetry.mavlink.parsing.scan import COMPONENT, EXTRA, START, STOP, SYSTEM, V2
 from fleet.telemetry.mavlink.parsing.scan import SIGNED as FLAG
 
-FORGED, REPLAYED, STALE, UNSIGNED = (
+WRONG, REPLAYED, STALE, UNSIGNED = (
     "signature: wrong",
     "signature: its time was used before",
     "signature: its time lies more than a minute back",
@@ -32,7 +32,7 @@ _EPOCH_S = 1_420_070_400  # 2015-01-01 [s since 1970]
 _UNITS = 100_000  # of a time stamp [1/s]
 _WINDOW = 60 * _UNITS  # oldest time accepted from a new sender
 _TAIL, _STAMP, _SIGNATURE = 13, 6, 6  # link id, time, signature [bytes]
-MOST_SENDERS = 4096  # senders whose times are stored
+MAX_SENDERS = 4096  # senders whose times are stored
 
 
 def read_keys(path: Path) -> dict[str, bytes]:
@@ -43,26 +43,26 @@ def read_keys(path: Path) -> dict[str, bytes]:
         OSError: when it cannot be read.
     """
     with path.open() as file:
-        found = os.fstat(file.fileno())
-        mode = stat.S_IMODE(found.st_mode)
-        if not stat.S_ISREG(found.st_mode) or mode & 0o077 or found.st_uid not in (0, os.geteuid()):
-            whose = f"mode {mode:04o}, owner {found.st_uid}"
+        file_stat = os.fstat(file.fileno())
+        mode = stat.S_IMODE(file_stat.st_mode)
+        if not stat.S_ISREG(file_stat.st_mode) or mode & 0o077 or file_stat.st_uid not in (0, os.geteuid()):
+            permissions = f"mode {mode:04o}, owner {file_stat.st_uid}"
             raise ValueError(
-                f"keys {path}: found {whose}, expected a file readable only by its owner; chmod 600 {path}"
+                f"keys {path}: found {permissions}, expected a file readable only by its owner; chmod 600 {path}"
             )
         lines = [line.split("#")[0].split() for line in file.read().splitlines()]
     keys: dict[str, bytes] = {}
-    for number, words in enumerate(lines, start=1):
-        if words and (len(words) != 2 or not re.fullmatch(r"[0-9a-fA-F]{64}", words[1]) or words[0] in keys):
+    for number, fields in enumerate(lines, start=1):
+        if fields and (len(fields) != 2 or not re.fullmatch(r"[0-9a-fA-F]{64}", fields[1]) or fields[0] in keys):
             raise ValueError(
                 f"keys {path}: found invalid line {number}, expected a new name and 64 hex digits; correct it"
             )
-        if words:
-            keys[words[0]] = bytes.fromhex(words[1])
+        if fields:
+            keys[fields[0]] = bytes.fromhex(fields[1])
     return keys
 
 
-def pick(keys: dict[str, bytes], name: str, link: str) -> bytes:
+def select_key(keys: dict[str, bytes], name: str, link: str) -> bytes:
     """Return the key of a link: the named one, or the only one.
 
     Raises:
@@ -70,8 +70,8 @@ def pick(keys: dict[str, bytes], name: str, link: str) -> bytes:
     """
     if name in keys or (not name and len(keys) == 1):
         return keys.get(name) or next(iter(keys.values()))
-    found = f"no key {name!r}" if name else f"{len(keys)} keys and none named"
-    raise ValueError(f"link {link}: found {found}, expected one of --keys FILE; write #sign=require&key=NAME")
+    available = f"no key {name!r}" if name else f"{len(keys)} keys and none named"
+    raise ValueError(f"link {link}: found {available}, expected one of --keys FILE; write #sign=require&key=NAME")
 
 
 def stamp_now() -> int:
@@ -92,25 +92,27 @@ class Signing:
     def __init__(self, key: bytes, require: bool, link: int = 0, clock: Callable[[], int] = stamp_now) -> None:
         self._key, self._require, self._link, self._clock = key, require, link & 0xFF, clock
         self._last: dict[tuple[int, int, int], int] = {}  # newest verified time, by system, component, sender's link id
-        self._said = 0  # newest time sent
+        self._last_sent = 0  # newest time sent
 
-    def passes(self, frames: Frames, refused: Counter[str]) -> np.ndarray:
+    def verify(self, frames: Frames, refused: Counter[str]) -> np.ndarray:
         """Return whether each frame is accepted, (n,) bool; refused frames are counted by reason."""
-        passed = np.ones(len(frames.at), bool)
-        for i in range(len(frames.at)):
-            at = frames.at[i]
-            why = self._objection(frames.buf[at[START] : at[STOP]].tobytes(), int(at[SYSTEM]), int(at[COMPONENT]))
-            if why:
+        passed = np.ones(len(frames.headers), bool)
+        for i in range(len(frames.headers)):
+            columns = frames.headers[i]
+            reason = self._rejection_reason(
+                frames.buf[columns[START] : columns[STOP]].tobytes(), int(columns[SYSTEM]), int(columns[COMPONENT])
+            )
+            if reason:
                 passed[i] = False
-                refused[why] += 1
+                refused[reason] += 1
         return passed
 
-    def _objection(self, frame: bytes, system: int, component: int) -> str:
+    def _rejection_reason(self, frame: bytes, system: int, component: int) -> str:
         """Return the reason to refuse a frame; empty: it is accepted."""
         if frame[0] != V2 or not frame[2] & FLAG:
             return UNSIGNED if self._require else ""
         if not hmac.compare_digest(self._signature(frame[:-_SIGNATURE]), frame[-_SIGNATURE:]):
-            return FORGED
+            return WRONG
         sender = system, component, frame[-_TAIL]
         stamp = int.from_bytes(frame[-_TAIL + 1 : -_SIGNATURE], "little")
         last = self._last.get(sender)
@@ -118,10 +120,10 @@ class Signing:
             return REPLAYED
         if last is None and stamp < self._clock() - _WINDOW:
             return STALE
-        if last is None and len(self._last) >= MOST_SENDERS:
+        if last is None and len(self._last) >= MAX_SENDERS:
             self._last.pop(next(iter(self._last)))
         self._last[sender] = stamp
-        self._said = max(self._said, stamp)  # a peer whose clock is ahead would refuse ours as replayed
+        self._last_sent = max(self._last_sent, stamp)  # a peer whose clock is ahead would refuse ours as replayed
         return ""
 
     def sign(self, frame: bytes) -> bytes:
@@ -130,8 +132,8 @@ class Signing:
         body[2] |= FLAG
         extra = int(EXTRA[int.from_bytes(body[7:10], "little")])
         body += dialect.x25crc(bytes(body[1:]) + bytes([extra])).crc.to_bytes(2, "little")
-        self._said = max(self._said + 1, self._clock())
-        body += bytes([self._link]) + self._said.to_bytes(_STAMP, "little")
+        self._last_sent = max(self._last_sent + 1, self._clock())
+        body += bytes([self._link]) + self._last_sent.to_bytes(_STAMP, "little")
         return bytes(body) + self._signature(bytes(body))
 
     def _signature(self, signed: bytes) -> bytes:

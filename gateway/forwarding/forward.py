@@ -15,14 +15,14 @@ from fleet.telemetry.mavlink.parsing.decode import Frames
 from fleet.telemetry.mavlink.parsing.scan import START, STOP
 from gateway.forwarding.routes import Port, Routes
 from gateway.forwarding.targets import targets
-from gateway.links.link import Link
+from gateway.links.link import Endpoint
 
-DATAGRAM = 1_400  # size limit of combined messages: below the MTU of common networks [bytes]
-ASTRAY = "not forwarded: target unknown"
-DOUBLE = "not forwarded: another sender uses this component id"
+MAX_DATAGRAM = 1_400  # size limit of combined messages: below the MTU of common networks [bytes]
+NO_TARGET = "not forwarded: target unknown"
+DUPLICATE_SENDER = "not forwarded: another sender uses this component id"
 
 
-class Forward:
+class FrameForwarder:
     """Forwarding between the links of aircraft and the links of stations.
 
     Args:
@@ -31,85 +31,85 @@ class Forward:
         listen_only: send nothing to aircraft
     """
 
-    def __init__(self, links: Sequence[Link], stations: int, listen_only: bool = False) -> None:
+    def __init__(self, links: Sequence[Endpoint], stations: int, listen_only: bool = False) -> None:
         self._links, self._listen_only = links, listen_only
         self._air, self._ground = range(len(links) - stations), range(len(links) - stations, len(links))
         self._aircraft, self._stations = Routes(), Routes()
         self.forwarded = 0  # messages
         self.refused: Counter[str] = Counter()  # by reason
 
-    def take(self, link: int, frames: Frames) -> list[tuple[int, Frames]]:
+    def forward(self, link: int, frames: Frames) -> list[tuple[int, Frames]]:
         """Forward the frames of one link; return those sent to aircraft by stations: (link of the aircraft, frames)."""
         if link in self._ground:
-            return self._up(link, frames)
+            return self._to_aircraft(link, frames)
         if self._ground:
-            self._down(link, frames)
+            self._to_stations(link, frames)
         return []
 
-    def part(self, link: int, where: Hashable) -> None:
+    def remove_peer(self, link: int, where: Hashable) -> None:
         """Remove a peer that has disconnected."""
-        (self._stations if link in self._ground else self._aircraft).part(link, where)
+        (self._stations if link in self._ground else self._aircraft).remove_peer(link, where)
 
-    def tidy(self, now: float) -> None:
+    def remove_silent(self, now: float) -> None:
         """Remove peers after `ROUTE_TIMEOUT_S` of silence; `now` is fleet time [s since 1970]."""
-        self._aircraft.forget(now)
-        self._stations.forget(now)
+        self._aircraft.remove_silent(now)
+        self._stations.remove_silent(now)
 
-    def _down(self, link: int, frames: Frames) -> None:
+    def _to_stations(self, link: int, frames: Frames) -> None:
         """Forward frames of aircraft to the stations."""
-        owned = self._aircraft.learn(link, frames)
+        owned = self._aircraft.update(link, frames)
         if not owned.all():
-            self.refused[DOUBLE] += int((~owned).sum())
-        frames = frames.only(owned)
+            self.refused[DUPLICATE_SENDER] += int((~owned).sum())
+        frames = frames.subset(owned)
         system, component = targets(frames)
-        meant: dict[Port, list[int]] = {}
+        addressed: dict[Port, list[int]] = {}
         for i in np.flatnonzero(system).tolist():
-            for port in self._stations.to(int(system[i]), int(component[i])):
-                meant.setdefault(port, []).append(i)
+            for port in self._stations.ports_of(int(system[i]), int(component[i])):
+                addressed.setdefault(port, []).append(i)
         for number in self._ground:
-            kept = self._links[number].spec.sieve.keep(frames.at)
-            to_all = kept & (system == 0)
-            for where in self._ends(number, self._stations):
-                mine = to_all.copy()
-                mine[[i for i in meant.get(Port(number, where), []) if kept[i]]] = True
-                self._send(Port(number, where), frames, np.flatnonzero(mine))
+            passed = self._links[number].spec.message_filter.passes(frames.headers)
+            to_all = passed & (system == 0)
+            for where in self._peers(number, self._stations):
+                selected = to_all.copy()
+                selected[[i for i in addressed.get(Port(number, where), []) if passed[i]]] = True
+                self._send(Port(number, where), frames, np.flatnonzero(selected))
 
-    def _up(self, link: int, frames: Frames) -> list[tuple[int, Frames]]:
+    def _to_aircraft(self, link: int, frames: Frames) -> list[tuple[int, Frames]]:
         """Forward frames of stations to the aircraft."""
-        self._stations.learn(link, frames)
+        self._stations.update(link, frames)
         if self._listen_only:
             return []
-        meant: dict[Port, list[int]] = {}
+        addressed: dict[Port, list[int]] = {}
         for i, (system, component) in enumerate(zip(*map(np.ndarray.tolist, targets(frames)), strict=True)):
-            ports = self._aircraft.to(system, component) if system else self._everybody()
+            ports = self._aircraft.ports_of(system, component) if system else self._all_aircraft()
             if system and not ports:
-                self.refused[ASTRAY] += 1
+                self.refused[NO_TARGET] += 1
             for port in ports:
-                meant.setdefault(port, []).append(i)
-        heard: dict[int, set[int]] = {}
-        for port, which in meant.items():
+                addressed.setdefault(port, []).append(i)
+        received: dict[int, set[int]] = {}
+        for port, which in addressed.items():
             self._send(port, frames, which)
-            heard.setdefault(port.link, set()).update(which)
-        return [(number, frames.only(np.array(sorted(which)))) for number, which in heard.items()]
+            received.setdefault(port.link, set()).update(which)
+        return [(number, frames.subset(np.array(sorted(which)))) for number, which in received.items()]
 
-    def _everybody(self) -> list[Port]:
-        return [Port(number, where) for number in self._air for where in self._ends(number, self._aircraft)]
+    def _all_aircraft(self) -> list[Port]:
+        return [Port(number, where) for number in self._air for where in self._peers(number, self._aircraft)]
 
-    def _ends(self, number: int, routes: Routes) -> Iterable[Hashable]:
-        spoke = routes.ports(number)
-        if self._links[number].spec.kind == "udpbcast" and spoke:
-            return spoke  # peers that answered replace the broadcast address
-        return dict.fromkeys([*self._links[number].greets, *spoke])
+    def _peers(self, number: int, routes: Routes) -> Iterable[Hashable]:
+        senders = routes.peers(number)
+        if self._links[number].spec.kind == "udpbcast" and senders:
+            return senders  # peers that answered replace the broadcast address
+        return dict.fromkeys([*self._links[number].known_peers, *senders])
 
     def _send(self, port: Port, frames: Frames, which: Sequence[int] | np.ndarray) -> None:
         """Send raw frames, several per datagram."""
-        waiting, count = bytearray(), 0
-        for start, stop in frames.at[np.asarray(which, int)][:, (START, STOP)].tolist():
-            if count and len(waiting) + stop - start > DATAGRAM:
-                self._links[port.link].send(port.where, bytes(waiting), count)
-                waiting, count = bytearray(), 0
-            waiting += frames.buf[start:stop].tobytes()
+        datagram, count = bytearray(), 0
+        for start, stop in frames.headers[np.asarray(which, int)][:, (START, STOP)].tolist():
+            if count and len(datagram) + stop - start > MAX_DATAGRAM:
+                self._links[port.link].send(port.where, bytes(datagram), count)
+                datagram, count = bytearray(), 0
+            datagram += frames.buf[start:stop].tobytes()
             count += 1
             self.forwarded += 1
         if count:
-            self._links[port.link].send(port.where, bytes(waiting), count)
+            self._links[port.link].send(port.where, bytes(datagram), count)

@@ -5,11 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.telemetry.mavlink.aircraft_link import LOST_S
+from fleet.telemetry.mavlink.aircraft_link import LINK_LOST_S
 from fleet.telemetry.mavlink.parsing.decode import Frames
 from fleet.telemetry.mavlink.parsing.scan import COMPONENT, SYSTEM
 
-FORGET_S = 60.0  # silence after which a route is removed [s]
+ROUTE_TIMEOUT_S = 60.0  # silence after which a route is removed [s]
 
 
 class Port(NamedTuple):
@@ -23,40 +23,44 @@ class Routes:
     """Routes from received frames; the first sender of a component id owns it until it is silent."""
 
     def __init__(self) -> None:
-        self._of: dict[tuple[int, int], tuple[Port, float]] = {}  # port, and time of its last frame [s since 1970]
+        self._routes: dict[tuple[int, int], tuple[Port, float]] = {}  # port, and time of its last frame [s since 1970]
 
-    def learn(self, link: int, frames: Frames) -> np.ndarray:
+    def update(self, link: int, frames: Frames) -> np.ndarray:
         """Update routes from frames of one link; return whether each sender owns its component id, (n,) bool."""
-        key = (frames.sender << 16) + (frames.at[:, SYSTEM] << 8) + frames.at[:, COMPONENT]
+        key = (frames.sender << 16) + (frames.headers[:, SYSTEM] << 8) + frames.headers[:, COMPONENT]
         keys, last, number = np.unique(key[::-1], return_index=True, return_inverse=True)
         arrivals = frames.arrival[::-1][last].tolist()
         owns = [
-            self._owns(Port(link, frames.senders[one >> 16]), (one >> 8 & 0xFF, one & 0xFF), arrival)
-            for one, arrival in zip(keys.tolist(), arrivals, strict=True)
+            self._claim(
+                Port(link, frames.senders[packed_key >> 16]), (packed_key >> 8 & 0xFF, packed_key & 0xFF), arrival
+            )
+            for packed_key, arrival in zip(keys.tolist(), arrivals, strict=True)
         ]
         return np.array(owns, bool)[number[::-1]]
 
-    def _owns(self, port: Port, who: tuple[int, int], arrival: float) -> bool:
-        holder, heard = self._of.get(who, (port, arrival))
-        if holder != port and arrival - heard < LOST_S:
+    def _claim(self, port: Port, component_key: tuple[int, int], arrival: float) -> bool:
+        owner, last_t = self._routes.get(component_key, (port, arrival))
+        if owner != port and arrival - last_t < LINK_LOST_S:
             return False
-        self._of[who] = port, arrival
+        self._routes[component_key] = port, arrival
         return True
 
-    def to(self, system: int, component: int) -> list[Port]:
+    def ports_of(self, system: int, component: int) -> list[Port]:
         """Return the ports of a component; component 0: of all components of the system."""
         if component:
-            return [self._of[system, component][0]] if (system, component) in self._of else []
-        return list(dict.fromkeys(port for (one, _), (port, _) in self._of.items() if one == system))
+            return [self._routes[system, component][0]] if (system, component) in self._routes else []
+        return list(
+            dict.fromkeys(port for (owner_system, _), (port, _) in self._routes.items() if owner_system == system)
+        )
 
-    def ports(self, link: int) -> list[Hashable]:
+    def peers(self, link: int) -> list[Hashable]:
         """Return the peers of one link that have sent frames."""
-        return list(dict.fromkeys(port.where for port, _ in self._of.values() if port.link == link))
+        return list(dict.fromkeys(port.where for port, _ in self._routes.values() if port.link == link))
 
-    def part(self, link: int, where: Hashable) -> None:
+    def remove_peer(self, link: int, where: Hashable) -> None:
         """Remove the routes of a peer that has disconnected."""
-        self._of = {who: held for who, held in self._of.items() if held[0] != Port(link, where)}
+        self._routes = {key: route for key, route in self._routes.items() if route[0] != Port(link, where)}
 
-    def forget(self, now: float) -> None:
+    def remove_silent(self, now: float) -> None:
         """Remove routes after `ROUTE_TIMEOUT_S` of silence; `now` is fleet time [s since 1970]."""
-        self._of = {who: held for who, held in self._of.items() if now - held[1] <= FORGET_S}
+        self._routes = {key: route for key, route in self._routes.items() if now - route[1] <= ROUTE_TIMEOUT_S}

@@ -6,27 +6,29 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from fleet.telemetry.mavlink.parsing.decode import Frames, layout
 from fleet.telemetry.mavlink.parsing.scan import EXTRA, ID, PAYLOAD, SIZE
 
-NOWHERE = -1
+ABSENT = -1
 
 
-def _places(field: str) -> np.ndarray:
-    places = np.full(len(EXTRA), NOWHERE)
+def _field_offsets(field: str) -> np.ndarray:
+    offsets = np.full(len(EXTRA), ABSENT)
     for number, kind in dialect.mavlink_map.items():
         if field in kind.fieldnames:
-            places[number] = layout(kind.msgname).fields[field][1]  # type: ignore[index]
-    return places
+            offsets[number] = layout(kind.msgname).fields[field][1]  # type: ignore[index]
+    return offsets
 
 
-_SYSTEM, _COMPONENT = _places("target_system"), _places("target_component")
+_SYSTEM, _COMPONENT = _field_offsets("target_system"), _field_offsets("target_component")
 
 
 def targets(frames: Frames) -> tuple[np.ndarray, np.ndarray]:
     """Return the target system and component of every frame, (n,) each; 0: broadcast."""
-    return _read(frames, _SYSTEM), _read(frames, _COMPONENT)
+    return _read_field(frames, _SYSTEM), _read_field(frames, _COMPONENT)
 
 
-def _read(frames: Frames, places: np.ndarray) -> np.ndarray:
-    place, found = places[frames.at[:, ID]], np.zeros(len(frames.at), np.int64)
-    there = np.flatnonzero((place != NOWHERE) & (place < frames.at[:, SIZE]))  # trailing zeros are not transmitted
-    found[there] = frames.buf[frames.at[there, PAYLOAD] + place[there]]
-    return found
+def _read_field(frames: Frames, offsets: np.ndarray) -> np.ndarray:
+    frame_offsets, values = offsets[frames.headers[:, ID]], np.zeros(len(frames.headers), np.int64)
+    present = np.flatnonzero(
+        (frame_offsets != ABSENT) & (frame_offsets < frames.headers[:, SIZE])
+    )  # trailing zeros are not transmitted
+    values[present] = frames.buf[frames.headers[present, PAYLOAD] + frame_offsets[present]]
+    return values

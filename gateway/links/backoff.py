@@ -2,20 +2,20 @@
 
 import threading
 
-FIRST_S, LONGEST_S = 0.25, 5.0
+FIRST_S, MAX_S = 0.25, 5.0
 
 
 class BackOff:
     """Back-off between attempts to open a link."""
 
     def __init__(self) -> None:
-        self._next = FIRST_S
+        self._wait_s = FIRST_S
 
     def wait(self, stop: threading.Event) -> None:
         """Wait before the next attempt, or until `stop` is set."""
-        stop.wait(self._next)
-        self._next = min(2 * self._next, LONGEST_S)
+        stop.wait(self._wait_s)
+        self._wait_s = min(2 * self._wait_s, MAX_S)
 
     def reset(self) -> None:
         """Reset the delay after data from the peer."""
-        self._next = FIRST_S
+        self._wait_s = FIRST_S

@@ -8,17 +8,17 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from fleet.config import passed_on
+from fleet.config import router_options
 from fleet.process.children import PARENT
-from gateway.settings.link_spec import Spec
+from gateway.settings.link_spec import LinkSpec
 
-Say = Callable[[str], None]
+LogCallback = Callable[[str], None]
 Process = subprocess.Popen[bytes]
 
-_PATIENCE_S = 8.0  # between the request to terminate and the kill [s]
+_STOP_TIMEOUT_S = 8.0  # between the request to terminate and the kill [s]
 
 
-def divided(specs: Sequence[Spec]) -> tuple[list[Spec], list[Spec]]:
+def split_replays(specs: Sequence[LinkSpec]) -> tuple[list[LinkSpec], list[LinkSpec]]:
     """Return the links to open here, and the recordings to replay separately: all, if there is a live link."""
     files = [spec for spec in specs if spec.kind == "replay"]
     live = [spec for spec in specs if spec.kind != "replay"]
@@ -26,7 +26,9 @@ def divided(specs: Sequence[Spec]) -> tuple[list[Spec], list[Spec]]:
 
 
 @contextmanager
-def played_apart(files: Sequence[Spec], args: argparse.Namespace, say: Say) -> Iterator[Process | None]:
+def replay_process(
+    files: Sequence[LinkSpec], args: argparse.Namespace, report: LogCallback
+) -> Iterator[Process | None]:
     """Replay recordings in a separate process until they or the block end.
 
     Args:
@@ -38,13 +40,13 @@ def played_apart(files: Sequence[Spec], args: argparse.Namespace, say: Say) -> I
         yield None
         return
     options = [f"--link={spec.text.partition('#')[0]}#offset={spec.offset}" for spec in files]
-    options += [*passed_on(args), "--listen-only", f"--most-uavs={args.most_uavs}"]
+    options += [*router_options(args), "--listen-only", f"--most-uavs={args.most_uavs}"]
     options += ["--log-json"] if args.log_json else []
     command = [sys.executable, "-m", "gateway", *options]
     child = subprocess.Popen(command, stdin=subprocess.DEVNULL, env=os.environ | {PARENT: str(os.getpid())})
     ended = threading.Event()
-    watch = threading.Thread(target=_watched, args=(child, ended, say), daemon=True)
-    watch.start()
+    watcher = threading.Thread(target=_report_exit, args=(child, ended, report), daemon=True)
+    watcher.start()
     try:
         yield child
     finally:
@@ -52,14 +54,14 @@ def played_apart(files: Sequence[Spec], args: argparse.Namespace, say: Say) -> I
         if child.poll() is None:
             child.terminate()
         try:
-            child.wait(_PATIENCE_S)
+            child.wait(_STOP_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             child.kill()
             child.wait()
-        watch.join()
+        watcher.join()
 
 
-def _watched(child: Process, ended: threading.Event, say: Say) -> None:
+def _report_exit(child: Process, ended: threading.Event, report: LogCallback) -> None:
     code = child.wait()
     if code and not ended.is_set():
-        say(f"the replay of recordings ended with exit code {code}; the live links continue")
+        report(f"the replay of recordings ended with exit code {code}; the live links continue")

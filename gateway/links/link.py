@@ -6,9 +6,9 @@ import time
 from collections.abc import Hashable, Sequence
 from typing import Any, NamedTuple, Protocol
 
-from fleet.bus.codec import Wire
-from fleet.telemetry.mavlink.parsing.received import Heard
-from gateway.settings.link_spec import Spec
+from fleet.bus.codec import EncodedMessage
+from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
+from gateway.settings.link_spec import LinkSpec
 
 QUEUE = 20_000  # batches between receiving and decoding
 QUEUE_BYTES = 8 << 20  # limit of one link in the queue: a flood on one link must not delay the others for long
@@ -25,27 +25,27 @@ class Batch(NamedTuple):
     """Batch of one link: received bytes, or messages of a recording and of its copies."""
 
     link: int
-    heard: Heard | None = None
-    news: Sequence[Any] = ()
-    copies: Sequence[Wire] = ()
-    gone: Hashable = None  # a peer that disconnected: its resources are free
+    received: ReceivedBytes | None = None
+    messages: Sequence[Any] = ()
+    copies: Sequence[EncodedMessage] = ()
+    left_peer: Hashable = None  # a peer that disconnected: its resources are free
     ended: bool = False
 
     @property
     def size(self) -> int:
         """Return the number of bytes received."""
-        return len(self.heard.buf) if self.heard is not None else 0
+        return len(self.received.buf) if self.received is not None else 0
 
 
-class Link(Protocol):
+class Endpoint(Protocol):
     """Endpoint of bytes with its own thread."""
 
-    spec: Spec
+    spec: LinkSpec
     dropped: int  # datagrams, or pieces of a stream, lost because decoding fell behind
     unsent: int  # messages not sent: no peer, or send queue full
 
     @property
-    def greets(self) -> Sequence[Hashable]:
+    def known_peers(self) -> Sequence[Hashable]:
         """Return peers known before they send: some aircraft send only after they receive a message."""
 
     def start(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
@@ -58,27 +58,27 @@ class Link(Protocol):
         """Wait for the thread (the stop event is set) and free all resources."""
 
 
-class Outlet:
+class BatchWriter:
     """Writer of a link's batches to the queue; it never waits, and counts what does not fit."""
 
-    def __init__(self, number: int, out: "queue.Queue[Batch]", link: Link) -> None:
+    def __init__(self, number: int, out: "queue.Queue[Batch]", link: Endpoint) -> None:
         self._number, self._out, self._link = number, out, link
 
-    def put(self, heard: Heard) -> None:
+    def put(self, received: ReceivedBytes) -> None:
         """Queue received bytes."""
         try:
-            self._out.put_nowait(Batch(self._number, heard))
+            self._out.put_nowait(Batch(self._number, received))
         except queue.Full:
-            self._link.dropped += len(heard.start)
+            self._link.dropped += len(received.start)
 
     def piece(self, sender: Hashable, data: bytes) -> None:
         """Queue one piece of a stream, received now."""
-        self.put(Heard.of([(wall(), sender, data)]))
+        self.put(ReceivedBytes.from_pieces([(wall(), sender, data)]))
 
-    def gone(self, sender: Hashable, stop: threading.Event) -> None:
+    def peer_left(self, sender: Hashable, stop: threading.Event) -> None:
         """Queue the notice that a peer disconnected; this may wait."""
         while not stop.is_set():
             try:
-                return self._out.put(Batch(self._number, gone=sender), timeout=POLL_S)
+                return self._out.put(Batch(self._number, left_peer=sender), timeout=POLL_S)
             except queue.Full:
                 continue

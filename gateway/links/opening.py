@@ -1,24 +1,24 @@
 """Open a link from its specification."""
 
-from fleet.telemetry.recording.ids import Ids
-from gateway.links.link import Link
-from gateway.links.recorded import Replay
-from gateway.links.stream_client import Dialled
+from fleet.telemetry.recording.ids import IdAllocator
+from gateway.links.link import Endpoint
+from gateway.links.recorded import ReplayLink
+from gateway.links.stream_client import StreamClient
 from gateway.links.tcp_listener import TcpListener
 from gateway.links.udp import Udp
-from gateway.settings.link_spec import Spec
+from gateway.settings.link_spec import LinkSpec
 
 
-def open_link(spec: Spec, ids: Ids) -> Link:
+def open_link(spec: LinkSpec, ids: IdAllocator) -> Endpoint:
     """Open a link; a listening link binds its port now, an outgoing one connects in `start`.
 
     Raises:
         ValueError, OSError: when the recording does not exist, or the port is in use.
     """
     if spec.kind == "replay":
-        return Replay(spec, ids)
+        return ReplayLink(spec, ids)
     if spec.kind == "tcpin":
         return TcpListener(spec)
     if spec.kind in ("tcp", "serial"):
-        return Dialled(spec)
+        return StreamClient(spec)
     return Udp(spec)

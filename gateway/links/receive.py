@@ -14,53 +14,53 @@ from typing import Protocol
 import numba as nb
 import numpy as np
 
-from fleet.telemetry.mavlink.parsing.received import Heard, tight
+from fleet.telemetry.mavlink.parsing.received import ReceivedBytes, compact
 from gateway.links.link import wall
 
-MOST = 256  # datagrams per batch, at most 16 MB
-LONGEST = 65_536  # maximum size of a datagram [bytes]
+MAX_DATAGRAMS = 256  # datagrams per batch, at most 16 MB
+SLOT_BYTES = 65_536  # maximum size of a datagram [bytes]
 _PAGE = 4096  # memory page; a larger datagram touches more than one page of its slot [bytes]
 _ADDRESS = 28  # bytes of an IPv6 socket address; IPv4 takes 16
-_STAMPS = 35  # SO_TIMESTAMPNS: the system provides the arrival time of each datagram
-_STAMP = 4  # numbers of a time stamp message: length, kind, seconds, nanoseconds
-_STAMPED = socket.SOL_SOCKET | _STAMPS << 32
-_LATEST_S = 1.0  # upper bound of the delay of a datagram, for steps of the system's clock
-_MOST_KNOWN = 4096  # parsed addresses that are cached
+_TIMESTAMPNS = 35  # SO_TIMESTAMPNS: the system provides the arrival time of each datagram
+_STAMP_NUMBERS = 4  # numbers of a time stamp message: length, kind, seconds, nanoseconds
+_STAMPED = socket.SOL_SOCKET | _TIMESTAMPNS << 32
+_MAX_DELAY_S = 1.0  # upper bound of the delay of a datagram, for steps of the system's clock
+_MAX_ADDRESSES = 4096  # parsed addresses that are cached
 _DONTWAIT = getattr(socket, "MSG_DONTWAIT", 0)
 
 
 class Receiver(Protocol):
     """Receiver of the pending datagrams of a socket."""
 
-    def take(self) -> Heard | None:
+    def receive(self) -> ReceivedBytes | None:
         """Return the pending datagrams; None without any."""
 
 
-def receiver(sock: socket.socket) -> Receiver:
+def make_receiver(sock: socket.socket) -> Receiver:
     """Return the fastest way to read a socket on this machine."""
     try:
-        return Bulk(sock)
+        return BatchReceiver(sock)
     except (AttributeError, OSError):  # another system, or another C library
-        return OneByOne(sock)
+        return SingleReceiver(sock)
 
 
-class OneByOne:
+class SingleReceiver:
     """Portable receiver, one datagram per call."""
 
     def __init__(self, sock: socket.socket) -> None:
         sock.setblocking(False)
         self._sock = sock
 
-    def take(self) -> Heard | None:
+    def receive(self) -> ReceivedBytes | None:
         """Return the pending datagrams; None without any."""
         pieces: list[tuple[float, Hashable, bytes]] = []
-        while len(pieces) < MOST:
+        while len(pieces) < MAX_DATAGRAMS:
             try:
-                data, sender = self._sock.recvfrom(LONGEST)
+                data, sender = self._sock.recvfrom(SLOT_BYTES)
             except OSError:  # no more datagrams, or an earlier send failed
                 break
             pieces.append((wall(), sender, data))
-        return Heard.of(pieces) if pieces else None
+        return ReceivedBytes.from_pieces(pieces) if pieces else None
 
 
 class _Vector(ctypes.Structure):
@@ -83,7 +83,7 @@ class _Message(ctypes.Structure):
     _fields_ = (("header", _Header), ("length", ctypes.c_uint32))
 
 
-class Bulk:
+class BatchReceiver:
     """Receiver of up to `MAX_DATAGRAMS` per call; pages touched by long datagrams are returned to the system."""
 
     def __init__(self, sock: socket.socket) -> None:
@@ -91,74 +91,74 @@ class Bulk:
             raise AttributeError("recvmmsg: Linux only")
         sock.setblocking(False)
         self._sock = sock
-        self._call = ctypes.CDLL(None, use_errno=True).recvmmsg  # releases the interpreter during the call
-        self._call.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
-        self._memory = mmap.mmap(-1, MOST * LONGEST, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        self._recvmmsg = ctypes.CDLL(None, use_errno=True).recvmmsg  # releases the interpreter during the call
+        self._recvmmsg.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
+        self._memory = mmap.mmap(-1, MAX_DATAGRAMS * SLOT_BYTES, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
         self._slots = np.frombuffer(self._memory, np.uint8)
-        self._names = np.zeros((MOST, _ADDRESS), np.uint8)
-        self._stamps = np.zeros((MOST, _STAMP), np.int64)
+        self._names = np.zeros((MAX_DATAGRAMS, _ADDRESS), np.uint8)
+        self._stamps = np.zeros((MAX_DATAGRAMS, _STAMP_NUMBERS), np.int64)
         self._newest = 0.0  # arrival [s since 1970]
-        self._starts = np.arange(MOST) * LONGEST
-        self._vectors, self._messages = (_Vector * MOST)(), (_Message * MOST)()
+        self._starts = np.arange(MAX_DATAGRAMS) * SLOT_BYTES
+        self._vectors, self._messages = (_Vector * MAX_DATAGRAMS)(), (_Message * MAX_DATAGRAMS)()
         for i, (vector, message) in enumerate(zip(self._vectors, self._messages, strict=True)):
-            vector.base, vector.size = self._slots.ctypes.data + i * LONGEST, LONGEST
+            vector.base, vector.size = self._slots.ctypes.data + i * SLOT_BYTES, SLOT_BYTES
             message.header.name = self._names.ctypes.data + i * _ADDRESS
             message.header.vectors, message.header.vector_count = ctypes.addressof(vector), 1
             message.header.control = self._stamps.ctypes.data + i * self._stamps.strides[0]
-        sock.setsockopt(socket.SOL_SOCKET, _STAMPS, 1)
+        sock.setsockopt(socket.SOL_SOCKET, _TIMESTAMPNS, 1)
         self._lengths = self._column(_Message.length.offset)
         self._name_sizes = self._column(_Message.header.offset + _Header.name_size.offset)
         self._stamp_sizes = self._column(_Message.header.offset + _Header.control_size.offset)
-        self._known: dict[bytes, Hashable] = {}
-        numbered(self._names[:0], self._name_sizes[:0])  # compile before the first datagram
+        self._addresses: dict[bytes, Hashable] = {}
+        number_addresses(self._names[:0], self._name_sizes[:0])  # compile before the first datagram
 
     def _column(self, offset: int) -> np.ndarray:
         stride = ctypes.sizeof(_Message)
-        return np.ndarray((MOST,), np.uint32, memoryview(self._messages).cast("B"), offset, (stride,))
+        return np.ndarray((MAX_DATAGRAMS,), np.uint32, memoryview(self._messages).cast("B"), offset, (stride,))
 
-    def take(self) -> Heard | None:
+    def receive(self) -> ReceivedBytes | None:
         """Return the pending datagrams; None without any."""
-        self._name_sizes[:], self._stamp_sizes[:] = _ADDRESS, self._stamps.itemsize * _STAMP
-        count = self._call(self._sock.fileno(), ctypes.addressof(self._messages), MOST, _DONTWAIT, None)
+        self._name_sizes[:], self._stamp_sizes[:] = _ADDRESS, self._stamps.itemsize * _STAMP_NUMBERS
+        count = self._recvmmsg(self._sock.fileno(), ctypes.addressof(self._messages), MAX_DATAGRAMS, _DONTWAIT, None)
         if count <= 0:  # no datagram, or an earlier send failed
             return None
         lengths = self._lengths[:count].astype(np.int64)
-        buf, stop = tight(self._slots, self._starts[:count], lengths)
+        buf, stop = compact(self._slots, self._starts[:count], lengths)
         if lengths.max() > _PAGE:
             self._memory.madvise(mmap.MADV_DONTNEED)
-        sender, first = numbered(self._names[:count], self._name_sizes[:count])
+        sender, first = number_addresses(self._names[:count], self._name_sizes[:count])
         names = [self._names[i, : self._name_sizes[i]].tobytes() for i in first.tolist()]
-        return Heard(buf, stop - lengths, stop, self._arrivals(count), sender, tuple(map(self._address, names)))
+        return ReceivedBytes(buf, stop - lengths, stop, self._arrivals(count), sender, tuple(map(self._address, names)))
 
     def _arrivals(self, count: int) -> np.ndarray:
         """Return the arrival times, non-decreasing, (n,) [s since 1970]; now for datagrams without a time stamp."""
-        now, told = wall(), self._stamps[:count]
-        stamped = (self._stamp_sizes[:count] > 0) & (told[:, 1] == _STAMPED)
-        late = np.where(stamped, time.time() - told[:, 2] - told[:, 3] * 1e-9, 0.0)
-        found = np.maximum.accumulate(np.maximum(now - np.clip(late, 0.0, _LATEST_S), self._newest))
-        self._newest = float(found[-1])
-        return found
+        now, stamps = wall(), self._stamps[:count]
+        stamped = (self._stamp_sizes[:count] > 0) & (stamps[:, 1] == _STAMPED)
+        delay = np.where(stamped, time.time() - stamps[:, 2] - stamps[:, 3] * 1e-9, 0.0)
+        arrivals = np.maximum.accumulate(np.maximum(now - np.clip(delay, 0.0, _MAX_DELAY_S), self._newest))
+        self._newest = float(arrivals[-1])
+        return arrivals
 
     def _address(self, raw: bytes) -> Hashable:
-        if raw not in self._known:
-            if len(self._known) >= _MOST_KNOWN:
-                self._known.clear()
-            self._known[raw] = read_address(raw)
-        return self._known[raw]
+        if raw not in self._addresses:
+            if len(self._addresses) >= _MAX_ADDRESSES:
+                self._addresses.clear()
+            self._addresses[raw] = read_address(raw)
+        return self._addresses[raw]
 
 
 @nb.njit(cache=True, nogil=True)
-def numbered(names, sizes):
+def number_addresses(names, sizes):
     """Number distinct addresses: number of each address, (n,), and index of its first occurrence, (k,)."""
     number, first, k = np.empty(len(names), np.int64), np.empty(len(names), np.int64), 0
     for i in range(len(names)):
-        at = 0
-        while at < k and not _equal(names[first[at]], names[i], sizes[first[at]], sizes[i]):
-            at += 1
-        if at == k:
+        candidate = 0
+        while candidate < k and not _equal(names[first[candidate]], names[i], sizes[first[candidate]], sizes[i]):
+            candidate += 1
+        if candidate == k:
             first[k] = i
             k += 1
-        number[i] = at
+        number[i] = candidate
     return number, first[:k]
 
 

@@ -11,21 +11,21 @@ from typing import Any
 from fleet.contract import FleetState
 from fleet.telemetry.mavlink.steps import STEP_S
 from fleet.telemetry.recording.fleet_news import renumbered
-from fleet.telemetry.recording.ids import Ids
-from fleet.telemetry.recording.pace import Pace
+from fleet.telemetry.recording.ids import IdAllocator
+from fleet.telemetry.recording.pace import ReplayPace
 from fleet.telemetry.recording.recordings import Recording
-from fleet.telemetry.replay.offset_copies import Copies
+from fleet.telemetry.replay.offset_copies import OffsetCopies
 from gateway.links.link import POLL_S, QUEUE, Batch
-from gateway.settings.link_spec import Spec
+from gateway.settings.link_spec import LinkSpec
 
-LOOK_S = 3.0  # recorded time read ahead to find the aircraft [s]
-_MOST_LOOK = 100  # steps read ahead before the first message
+READ_AHEAD_S = 3.0  # recorded time read ahead to find the aircraft [s]
+_MAX_READ_AHEAD = 100  # steps read ahead before the first message
 _IN_FLIGHT = 4096  # messages between replay and publication, approximately
 
 _log = logging.getLogger(__name__)
 
 
-class Replay:
+class ReplayLink:
     """Recording replayed at a multiple of real time.
 
     Args:
@@ -36,15 +36,15 @@ class Replay:
         OSError: when it cannot be read.
     """
 
-    def __init__(self, spec: Spec, ids: Ids | None = None) -> None:
+    def __init__(self, spec: LinkSpec, ids: IdAllocator | None = None) -> None:
         self.spec = spec
         self.dropped = self.unsent = 0
-        self.greets: Sequence[Hashable] = ()
-        self.recording = Recording(spec.where, spec.offset)
-        self.pace = Pace(spec.speed)
-        self._ids = Ids() if ids is None else ids
-        self._copies = Copies(spec.copies)
-        self._known: dict[int, int] = {}  # UAV id by recorded id
+        self.known_peers: Sequence[Hashable] = ()
+        self.recording = Recording(spec.address, spec.offset)
+        self.pace = ReplayPace(spec.speed)
+        self._ids = IdAllocator() if ids is None else ids
+        self._copies = OffsetCopies(spec.copies)
+        self._uav_ids: dict[int, int] = {}  # UAV id by recorded id
         self._steps: Iterator[tuple[float, list[Any]]] | None = None
         self._thread: threading.Thread | None = None
 
@@ -63,11 +63,11 @@ class Replay:
         """Return the progress of reading, 0..1."""
         return self.recording.share
 
-    def words(self) -> str:
+    def progress_text(self) -> str:
         """Return the progress and speed of the replay."""
-        return self.pace.words() if self.pace.passed_s else "scanning"
+        return self.pace.progress_text() if self.pace.passed_s else "scanning"
 
-    def look(self, stop: threading.Event) -> None:
+    def read_ahead(self, stop: threading.Event) -> None:
         """Read ahead, so that all aircraft have an id before the first message is published.
 
         Raises:
@@ -77,35 +77,35 @@ class Replay:
         self.recording.source.stop = stop
         steps = self.recording.steps(self.spec.results)
         ahead: list[tuple[float, list[Any]]] = []
-        met: float | None = None
+        first_t: float | None = None
         try:
-            for now, news in steps:
-                ahead.append((now, news))
-                met = now if met is None and news else met
-                if len(ahead) >= _MOST_LOOK or (met is not None and now > met + LOOK_S):
+            for now, messages in steps:
+                ahead.append((now, messages))
+                first_t = now if first_t is None and messages else first_t
+                if len(ahead) >= _MAX_READ_AHEAD or (first_t is not None and now > first_t + READ_AHEAD_S):
                     break
         except ValueError:
             if not stop.is_set():
                 raise
-        self._meet([message for _, news in ahead for message in news])
+        self._assign_ids([message for _, news in ahead for message in news])
         self._steps = itertools.chain(ahead, steps)
 
-    def _meet(self, news: Sequence[Any]) -> None:
+    def _assign_ids(self, messages: Sequence[Any]) -> None:
         """Assign ids to new aircraft: first to the recorded ones, then to their copies, copy by copy."""
-        new = sorted({m.uav for m in news if not isinstance(m, FleetState)} - self._known.keys())
-        for uav in new:
-            self._known[uav] = self._ids.give((self, uav, 0), uav)
-            if self._known[uav] != uav:
-                _log.warning("%s: uav-%d is in use, replayed as uav-%d", self.name, uav, self._known[uav])
-        ids = [[self._ids.give((self, uav, copy), self._known[uav]) for uav in new]
+        new_uavs = sorted({m.uav for m in messages if not isinstance(m, FleetState)} - self._uav_ids.keys())
+        for uav in new_uavs:
+            self._uav_ids[uav] = self._ids.allocate((self, uav, 0), uav)
+            if self._uav_ids[uav] != uav:
+                _log.warning("%s: uav-%d is in use, replayed as uav-%d", self.name, uav, self._uav_ids[uav])
+        ids = [[self._ids.allocate((self, uav, copy), self._uav_ids[uav]) for uav in new_uavs]
                for copy in range(1, self.spec.copies)]  # fmt: skip
-        for k, uav in enumerate(new):
-            self._copies.name(self._known[uav], [row[k] for row in ids])
+        for k, uav in enumerate(new_uavs):
+            self._copies.set_ids(self._uav_ids[uav], [row[k] for row in ids])
 
     def start(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
         """Replay in a thread."""
         if self._steps is None:
-            self.look(stop)
+            self.read_ahead(stop)
         self._thread = threading.Thread(target=self._play, args=(number, out, stop), name=self.spec.text)
         self._thread.start()
 
@@ -122,26 +122,26 @@ class Replay:
 
     def _play_steps(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
         assert self._steps is not None
-        most = max(_IN_FLIGHT // self.spec.copies, 8)
+        max_queued = max(_IN_FLIGHT // self.spec.copies, 8)
         now = 0.0
-        for now, news in self._steps:
+        for now, messages in self._steps:
             if self.pace.wait(now, stop):
                 return
-            self._meet(news)
-            mine = self._named(news)
-            copied = self._copies.step(mine)
-            if mine or copied:
-                _put(out, Batch(number, news=mine, copies=copied), stop, most)
-        for k, copied in enumerate(self._copies.last(), start=1):
+            self._assign_ids(messages)
+            renumbered_batch = self._renumber(messages)
+            copied = self._copies.step(renumbered_batch)
+            if renumbered_batch or copied:
+                _put(out, Batch(number, messages=renumbered_batch, copies=copied), stop, max_queued)
+        for k, copied in enumerate(self._copies.remaining(), start=1):
             if self.pace.wait(now + k * STEP_S, stop):
                 return
-            _put(out, Batch(number, copies=copied), stop, most)
+            _put(out, Batch(number, copies=copied), stop, max_queued)
 
-    def _named(self, news: Sequence[Any]) -> list[Any]:
+    def _renumber(self, messages: Sequence[Any]) -> list[Any]:
         """Return the messages with the assigned UAV ids."""
-        if all(uav == known for uav, known in self._known.items()):
-            return list(news)
-        renamed = (renumbered(message, lambda uav: self._known.get(uav, uav)) for message in news)
+        if all(uav == assigned for uav, assigned in self._uav_ids.items()):
+            return list(messages)
+        renamed = (renumbered(message, lambda uav: self._uav_ids.get(uav, uav)) for message in messages)
         return [message for message in renamed if message is not None]
 
     def send(self, where: Hashable, data: bytes, messages: int = 1) -> None:
@@ -153,10 +153,10 @@ class Replay:
             self._thread.join()
 
 
-def _put(out: "queue.Queue[Batch]", batch: Batch, stop: threading.Event, most: int) -> None:
+def _put(out: "queue.Queue[Batch]", batch: Batch, stop: threading.Event, max_queued: int) -> None:
     """Queue a batch once fewer than `max_queued` are queued."""
     while not stop.is_set():
-        if out.qsize() >= most:
+        if out.qsize() >= max_queued:
             stop.wait(0.005)
             continue
         with contextlib.suppress(queue.Full):

@@ -4,10 +4,10 @@ import threading
 from collections import deque
 from collections.abc import Callable
 
-MOST = 65_536  # capacity in bytes; eleven seconds at 57,600 baud
+MAX_BYTES = 65_536  # capacity in bytes; eleven seconds at 57,600 baud
 
 
-class Outbox:
+class SendQueue:
     """Send queue of one stream.
 
     Args:
@@ -28,7 +28,7 @@ class Outbox:
             OSError: when the peer is disconnected.
         """
         with self._lock:
-            if self._closed or self._size + len(data) > MOST:
+            if self._closed or self._size + len(data) > MAX_BYTES:
                 return False
             self._waiting.append((data, messages))
             self._size += len(data)
@@ -47,14 +47,14 @@ class Outbox:
     def _flush(self) -> None:
         while self._waiting:
             data, messages = self._waiting[0]
-            taken = self._write(data)
-            self._size -= taken
-            if taken < len(data):
-                self._waiting[0] = data[taken:], messages
+            written = self._write(data)
+            self._size -= written
+            if written < len(data):
+                self._waiting[0] = data[written:], messages
                 return
             self._waiting.popleft()
 
-    def waits(self) -> bool:
+    def has_data(self) -> bool:
         """Return whether the queue has data."""
         return bool(self._waiting)
 

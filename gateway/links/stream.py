@@ -7,7 +7,7 @@ from typing import Any
 
 import serial
 
-from gateway.links.send_queue import Outbox
+from gateway.links.send_queue import SendQueue
 
 CHUNK = 65_536  # bytes read at once
 CONNECT_S = 3.0  # timeout of one attempt [s]
@@ -20,7 +20,7 @@ class Tcp:
         connected.setblocking(False)
         connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # commands are short and must not be delayed
         self._socket = connected
-        self.outbox = Outbox(self._write)
+        self.send_queue = SendQueue(self._write)
 
     def fileno(self) -> int:
         """Return the file descriptor."""
@@ -59,7 +59,7 @@ class Serial:
             self._line = serial.Serial(path, baud, timeout=0, write_timeout=0, exclusive=True)
         except (ValueError, termios.error) as error:  # a baud rate that the device does not support
             raise OSError(str(error)) from None
-        self.outbox = Outbox(self._write)
+        self.send_queue = SendQueue(self._write)
 
     def fileno(self) -> int:
         """Return the file descriptor."""
@@ -87,13 +87,13 @@ class Serial:
 Stream = Tcp | Serial
 
 
-def offer(stream: Stream | None, data: bytes, messages: int) -> int:
+def enqueue(stream: Stream | None, data: bytes, messages: int) -> int:
     """Queue complete messages on a stream, if it is open and has space; return the number not queued."""
     try:
-        taken = stream is not None and stream.outbox.put(data, messages)
+        queued = stream is not None and stream.send_queue.put(data, messages)
     except OSError:  # just closed: the thread of the stream counts the queued messages
         return 0
-    return 0 if taken else messages
+    return 0 if queued else messages
 
 
 def open_stream(kind: str, where: str, port: Any) -> Stream:

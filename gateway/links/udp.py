@@ -9,14 +9,14 @@ from collections.abc import Hashable, Sequence
 from typing import Any, cast
 
 from gateway.links.backoff import BackOff
-from gateway.links.link import POLL_S, Batch, Outlet
-from gateway.links.receive import MOST, receiver
-from gateway.settings.link_spec import Spec
+from gateway.links.link import POLL_S, Batch, BatchWriter
+from gateway.links.receive import MAX_DATAGRAMS, make_receiver
+from gateway.settings.link_spec import LinkSpec
 
 BUFFER = 1 << 26  # requested receive buffer: two seconds of 250 aircraft; memory is used only when filled [bytes]
-_FORCE = 33  # SO_RCVBUFFORCE: exceeds the system's limit, if permitted
-_LONGEST_NAP_S = 0.02
-_FILL = 4e8  # buffer use of a flood of 300,000 datagrams a second [bytes/s]
+_RCVBUFFORCE = 33  # SO_RCVBUFFORCE: exceeds the system's limit, if permitted
+_MAX_WAIT_S = 0.02
+_FLOOD_BYTES_S = 4e8  # buffer use of a flood of 300,000 datagrams a second [bytes/s]
 
 _log = logging.getLogger(__name__)
 
@@ -28,11 +28,11 @@ class Udp:
         OSError: when the listening port is in use.
     """
 
-    def __init__(self, spec: Spec) -> None:
+    def __init__(self, spec: LinkSpec) -> None:
         self.spec = spec
         self.dropped = self.unsent = 0
-        self.greets: Sequence[Hashable] = ()
-        self._socket = _listening(spec) if spec.kind == "udpin" else None
+        self.known_peers: Sequence[Hashable] = ()
+        self._socket = _open_listening(spec) if spec.kind == "udpin" else None
         self._thread: threading.Thread | None = None
 
     @property
@@ -42,35 +42,35 @@ class Udp:
 
     def start(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
         """Receive in a thread, which only time-stamps and queues datagrams."""
-        outlet = Outlet(number, out, self)
+        outlet = BatchWriter(number, out, self)
         self._thread = threading.Thread(target=self._run, args=(outlet, stop), name=self.spec.text)
         self._thread.start()
 
-    def _run(self, outlet: Outlet, stop: threading.Event) -> None:
+    def _run(self, outlet: BatchWriter, stop: threading.Event) -> None:
         back_off = BackOff()
         while self._socket is None and not stop.is_set():
             try:
-                self._socket, where = _calling(self.spec)
-                self.greets = (where,)
+                self._socket, where = _open_outgoing(self.spec)
+                self.known_peers = (where,)
             except OSError as error:  # no network yet, or an unresolved host name
                 _log.warning("link %s: %s; trying again", self.spec.text, error.strerror or error)
                 back_off.wait(stop)
         if self._socket is not None:
             self._receive(self._socket, outlet, stop)
 
-    def _receive(self, sock: socket.socket, outlet: Outlet, stop: threading.Event) -> None:
-        source = receiver(sock)
+    def _receive(self, sock: socket.socket, outlet: BatchWriter, stop: threading.Event) -> None:
+        source = make_receiver(sock)
         size = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-        nap = min(_LONGEST_NAP_S, size / _FILL)  # a batch of datagrams costs little more than one
+        wait_s = min(_MAX_WAIT_S, size / _FLOOD_BYTES_S)  # a batch of datagrams costs little more than one
         with selectors.DefaultSelector() as ready:
             ready.register(sock, selectors.EVENT_READ)
             while not stop.is_set():
                 if ready.select(POLL_S):
-                    heard = source.take()
-                    if heard is not None:
-                        outlet.put(heard)
-                    if heard is None or len(heard.start) < MOST:  # else there is more
-                        stop.wait(nap)
+                    received = source.receive()
+                    if received is not None:
+                        outlet.put(received)
+                    if received is None or len(received.start) < MAX_DATAGRAMS:  # else there is more
+                        stop.wait(wait_s)
 
     def send(self, where: Hashable, data: bytes, messages: int = 1) -> None:
         """Send one datagram; count its messages as unsent if the buffer is full or the peer unreachable."""
@@ -89,38 +89,38 @@ class Udp:
             self._socket.close()
 
 
-def _listening(spec: Spec) -> socket.socket:
-    family = socket.AF_INET6 if ":" in spec.where else socket.AF_INET
-    found = socket.socket(family, socket.SOCK_DGRAM)
-    _widen(found)
+def _open_listening(spec: LinkSpec) -> socket.socket:
+    family = socket.AF_INET6 if ":" in spec.address else socket.AF_INET
+    sock = socket.socket(family, socket.SOCK_DGRAM)
+    _set_buffer(sock)
     try:
-        found.bind((spec.where, spec.port))
+        sock.bind((spec.address, spec.port))
     except OSError as error:
-        found.close()
+        sock.close()
         reason = error.strerror or str(error)
         raise OSError(f"link {spec.text}: {reason}; stop the process on this port or name another") from None
-    return found
+    return sock
 
 
-def _calling(spec: Spec) -> tuple[socket.socket, Hashable]:
+def _open_outgoing(spec: LinkSpec) -> tuple[socket.socket, Hashable]:
     """Open a socket that sends first: connected to one peer, or unconnected for broadcasts."""
-    family, _, _, _, where = socket.getaddrinfo(spec.where, spec.port, type=socket.SOCK_DGRAM)[0]
-    found = socket.socket(family, socket.SOCK_DGRAM)
+    family, _, _, _, where = socket.getaddrinfo(spec.address, spec.port, type=socket.SOCK_DGRAM)[0]
+    sock = socket.socket(family, socket.SOCK_DGRAM)
     try:
-        _widen(found)
+        _set_buffer(sock)
         if spec.kind == "udpbcast":
-            found.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-            found.bind(("", 0))
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+            sock.bind(("", 0))
         else:
-            found.connect(where)
+            sock.connect(where)
     except OSError:
-        found.close()
+        sock.close()
         raise
-    return found, where
+    return sock, where
 
 
-def _widen(sock: socket.socket) -> None:
+def _set_buffer(sock: socket.socket) -> None:
     try:
-        sock.setsockopt(socket.SOL_SOCKET, _FORCE, BUFFER)
+        sock.setsockopt(socket.SOL_SOCKET, _RCVBUFFORCE, BUFFER)
     except OSError:  # not permitted
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)

@@ -6,17 +6,17 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from fleet.contract import Link
-from fleet.telemetry.mavlink.aircraft_link import Craft
+from fleet.telemetry.mavlink.aircraft_link import AircraftLink
 from gateway.onboard.cache import Cache
-from gateway.onboard.questions import Questions
-from gateway.onboard.rates import Share
+from gateway.onboard.questions import RequestScheduler
+from gateway.onboard.rates import RateShare
 
 # Other ground stations use 255: they must not receive our answers, and an aircraft must detect the loss of theirs.
 SYSTEM, COMPONENT = 254, dialect.MAV_COMP_ID_MISSIONPLANNER
 HEARTBEAT_S = 1.0
 
 
-class Onboard:
+class RequestSender:
     """Sender of heartbeats and requests on one link.
 
     Args:
@@ -25,14 +25,14 @@ class Onboard:
     """
 
     def __init__(self, budget: float = float("inf"), cache: Cache | None = None) -> None:
-        self.share = Share(budget)
+        self.share = RateShare(budget)
         self._cache = cache
         self._mav = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
-        self._questions: dict[int, Questions] = {}
-        self._beat = float("-inf")
+        self._schedulers: dict[int, RequestScheduler] = {}
+        self._heartbeat_t = float("-inf")
 
     def tick(
-        self, now: float, crafts: Iterable[Craft], greets: Sequence[Hashable] = ()
+        self, now: float, all_aircraft: Iterable[AircraftLink], known_peers: Sequence[Hashable] = ()
     ) -> list[tuple[Hashable, bytes]]:
         """Return the messages to send now: (peer, bytes).
 
@@ -41,19 +41,22 @@ class Onboard:
             all_aircraft: the aircraft of the link
             known_peers: peers that get a heartbeat before they send
         """
-        live = [craft for craft in crafts if craft.link is Link.LIVE and craft.source is not None]
+        live = [aircraft for aircraft in all_aircraft if aircraft.link is Link.LIVE and aircraft.source is not None]
         out: list[tuple[Hashable, bytes]] = []
-        if now - self._beat >= HEARTBEAT_S:
-            self._beat = now
+        if now - self._heartbeat_t >= HEARTBEAT_S:
+            self._heartbeat_t = now
             kind, none = dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID
             beat = dialect.MAVLink_heartbeat_message(kind, none, 0, 0, dialect.MAV_STATE_ACTIVE, 3)
-            out += [(source, self._pack(beat)) for source in dict.fromkeys([*greets, *(c.source for c in live)])]
-        share = self.share.weigh(live)
+            out += [
+                (source, self._pack(beat))
+                for source in dict.fromkeys([*known_peers, *(recipient.source for recipient in live)])
+            ]
+        share = self.share.update(live)
         for craft in live:
-            asked = self._questions.get(craft.system)
-            if asked is None or asked.craft is not craft:
-                asked = self._questions[craft.system] = Questions(craft, now, self._cache)
-            out += [(craft.source, self._pack(message)) for message in asked.ask(now, share)]
+            scheduler = self._schedulers.get(craft.system)
+            if scheduler is None or scheduler.aircraft is not craft:
+                scheduler = self._schedulers[craft.system] = RequestScheduler(craft, now, self._cache)
+            out += [(craft.source, self._pack(message)) for message in scheduler.requests(now, share)]
         return out
 
     def _pack(self, message: Any) -> bytes:

@@ -8,26 +8,26 @@ from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from fleet.telemetry.mavlink.microservices.params import HASH
+from fleet.telemetry.mavlink.microservices.params import HASH_NAME
 
 
-class Dialect(NamedTuple):
+class RequestDialect(NamedTuple):
     """Request protocol of one autopilot."""
 
     items_at_once: int = 1  # mission items requested at once
     probe: bool = False  # any item may be requested at any time, not only in order after the count
     hash: str = ""  # name of the parameter with the hash over all parameters
-    fickle: tuple[str, ...] = ()  # prefixes of parameters that the autopilot changes itself
+    volatile: tuple[str, ...] = ()  # prefixes of parameters that the autopilot changes itself
     streams: bool = False  # old versions support only groups of messages: REQUEST_DATA_STREAM
 
 
 DIALECTS = {
-    "ardupilot": Dialect(
-        5, True, fickle=("STAT_", "SYS_NUM_RESETS", "BARO", "GND_", "ARSPD", "COMPASS_"), streams=True
+    "ardupilot": RequestDialect(
+        5, True, volatile=("STAT_", "SYS_NUM_RESETS", "BARO", "GND_", "ARSPD", "COMPASS_"), streams=True
     ),
-    "px4": Dialect(hash=HASH),
+    "px4": RequestDialect(hash=HASH_NAME),
 }
-ANY = Dialect()
+ANY = RequestDialect()
 
 STREAMS = {
     "ATTITUDE": dialect.MAV_DATA_STREAM_EXTRA1,

@@ -8,19 +8,19 @@ from typing import Any
 
 import msgspec
 
-from fleet.bus.bus_protocol import Answers, Bus
-from fleet.bus.codec import Stamp, Wire, encode
-from fleet.contract import PER_UAV, Account, Alert, AlertKind, FleetState, History, Mission, Params, Status
-from fleet.telemetry.recording.fleet_news import RESULTS
-from gateway.publication.history import Keeper
-from gateway.publication.router_session import Way
+from fleet.bus.bus_protocol import Bus, Replies
+from fleet.bus.codec import EncodedMessage, Stamp, encode
+from fleet.contract import PER_UAV, Alert, AlertKind, FleetState, GatewayCounters, History, Mission, Params, Status
+from fleet.telemetry.recording.fleet_news import RESULT_TYPES
+from gateway.publication.history import HistoryStore
+from gateway.publication.router_session import RouterSession
 
-KEPT = (Status, Mission, Params, Alert)
-AGAIN = (Mission, Params)
+LATEST_KINDS = (Status, Mission, Params, Alert)
+REPEATED_KINDS = (Mission, Params)
 REPEAT_S = 10.0  # between repetitions of mission and parameters, for late subscribers [s]
 
 
-Told = tuple[Account | None, list[Status]]
+StatusSnapshot = tuple[GatewayCounters | None, list[Status]]
 
 
 class Publisher:
@@ -32,73 +32,79 @@ class Publisher:
     """
 
     def __init__(self, bus: Bus, results: bool = False) -> None:
-        self.way, self.history = Way(bus), Keeper()
+        self.session, self.history = RouterSession(bus), HistoryStore()
         self._bus = bus
         self._lock = threading.Lock()  # queries arrive on a thread of the bus
-        kept = tuple(dict.fromkeys(KEPT + RESULTS)) if results else KEPT
-        self._latest: dict[type, dict[Hashable, tuple[Any, Stamp | None]]] = {kind: {} for kind in kept}
-        self.told: Account | None = None  # the newest statistics
-        self._again: dict[tuple[type, int], Wire] = {}  # the latest mission and parameters, packed
-        self._repeated = 0.0
-        for kind in kept:
-            bus.answer(kind, partial(self._answers, kind))
-        bus.answer(Account, self._account_answer)
-        bus.answer(History, self.history.answer)
+        kinds = tuple(dict.fromkeys(LATEST_KINDS + RESULT_TYPES)) if results else LATEST_KINDS
+        self._latest: dict[type, dict[Hashable, tuple[Any, Stamp | None]]] = {kind: {} for kind in kinds}
+        self.newest_account: GatewayCounters | None = None  # the newest statistics
+        self._repeated_wires: dict[tuple[type, int], EncodedMessage] = {}  # the latest mission and parameters, packed
+        self._repeated_t = 0.0
+        for kind in kinds:
+            bus.declare_queryable(kind, partial(self._answer_latest, kind))
+        bus.declare_queryable(GatewayCounters, self._answer_account)
+        bus.declare_queryable(History, self.history.answer)
 
     def publish(self, messages: Iterable[Any]) -> None:
         """Put messages on the bus."""
         for message in messages:
             kind = type(message)
             stamp = None
-            if kind in RESULTS and getattr(message, "kind", None) is not AlertKind.SECOND_SENDER:
-                message, stamp = self._claimed(message)
+            if kind in RESULT_TYPES and getattr(message, "kind", None) is not AlertKind.SECOND_SENDER:
+                message, stamp = self._with_epoch(message)
             if kind in self._latest:
-                self._keep(kind, (getattr(message, "uav", 0), str(getattr(message, "kind", ""))), message, stamp)
-            wire = Wire(kind, message.uav if kind in PER_UAV else -1, encode(message), message.t)
+                self._store_latest(
+                    kind, (getattr(message, "uav", 0), str(getattr(message, "kind", ""))), message, stamp
+                )
+            wire = EncodedMessage(kind, message.uav if kind in PER_UAV else -1, encode(message), message.t)
             self._send([wire], stamp)
 
-    def put(self, wires: Sequence[Wire]) -> None:
+    def put(self, wires: Sequence[EncodedMessage]) -> None:
         """Put packed messages on the bus; they never contain results of workers."""
         for wire in wires:
             if wire.kind in self._latest:
-                self._keep(wire.kind, (wire.uav, ""), wire, None)
+                self._store_latest(wire.kind, (wire.uav, ""), wire, None)
         self._send(wires)
 
-    def account(self, account: Account) -> None:
+    def account(self, account: GatewayCounters) -> None:
         """Put the statistics on the bus."""
-        self.told = account
-        self.way.send([Wire(Account, -1, encode(account))])
+        self.newest_account = account
+        self.session.send([EncodedMessage(GatewayCounters, -1, encode(account))])
 
-    def newest(self) -> Told:
+    def snapshot(self) -> StatusSnapshot:
         """Return the newest statistics, and the newest status of every aircraft by id."""
-        return self.told, [s for s, _ in sorted(self._answers(Status, None, {}, b""), key=lambda pair: pair[0].uav)]
+        return self.newest_account, [
+            s for s, _ in sorted(self._answer_latest(Status, None, {}, b""), key=lambda pair: pair[0].uav)
+        ]
 
-    def repeat(self, mono: float) -> None:
+    def repeat(self, now: float) -> None:
         """Repeat missions and parameters when due; `now` is any monotonic clock [s]."""
-        came = self.way.look()
-        if mono - self._repeated < REPEAT_S and not came:
+        connected = self.session.poll()
+        if now - self._repeated_t < REPEAT_S and not connected:
             return
-        self._repeated = mono
-        self._send(list(self._again.values()))
+        self._repeated_t = now
+        self._send(list(self._repeated_wires.values()))
 
-    def forget(self, uavs: Collection[int]) -> None:
+    def remove(self, uavs: Collection[int]) -> None:
         """Remove aircraft; queries no longer return them."""
         with self._lock:
             for kind, latest in self._latest.items():
-                self._latest[kind] = {who: one for who, one in latest.items() if getattr(one[0], "uav", -1) not in uavs}
-        self._again = {who: wire for who, wire in self._again.items() if who[1] not in uavs}
-        self.history.forget(uavs)
+                self._latest[kind] = {
+                    key: entry for key, entry in latest.items() if getattr(entry[0], "uav", -1) not in uavs
+                }
+        self._repeated_wires = {who: wire for who, wire in self._repeated_wires.items() if who[1] not in uavs}
+        self.history.remove(uavs)
 
-    def _send(self, wires: Sequence[Wire], stamp: Stamp | None = None) -> None:
-        self._again.update({(wire.kind, wire.uav): wire for wire in wires if wire.kind in AGAIN})
-        self.history.keep(wires)
-        self.way.send(wires, stamp)
+    def _send(self, wires: Sequence[EncodedMessage], stamp: Stamp | None = None) -> None:
+        self._repeated_wires.update({(wire.kind, wire.uav): wire for wire in wires if wire.kind in REPEATED_KINDS})
+        self.history.add(wires)
+        self.session.send(wires, stamp)
 
-    def _keep(self, kind: type, who: Hashable, message: Any, stamp: Stamp | None) -> None:
+    def _store_latest(self, kind: type, key: Hashable, message: Any, stamp: Stamp | None) -> None:
         with self._lock:
-            self._latest[kind][who] = message, stamp
+            self._latest[kind][key] = message, stamp
 
-    def _claimed(self, message: Any) -> tuple[Any, Stamp]:
+    def _with_epoch(self, message: Any) -> tuple[Any, Stamp]:
         """Stamp a recorded result with a new epoch, which supersedes results of workers for the same aircraft."""
         epoch = time.time_ns() // 1_000_000
         if isinstance(message, FleetState):
@@ -106,13 +112,17 @@ class Publisher:
             message = msgspec.structs.replace(message, rows=rows)
         return message, Stamp(epoch, self._bus.writer)
 
-    def _answers(self, kind: type, uav: int | None, settings: dict[str, str], payload: bytes) -> Answers:
+    def _answer_latest(self, kind: type, uav: int | None, settings: dict[str, str], payload: bytes) -> Replies:
         del settings, payload
         with self._lock:
-            found = list(self._latest[kind].values())
-        told = [(one.message() if isinstance(one, Wire) else one, stamp) for one, stamp in found]
-        return [(one, stamp) for one, stamp in told if uav is None or getattr(one, "uav", uav) == uav]
+            entries = list(self._latest[kind].values())
+        answers = [(entry.message() if isinstance(entry, EncodedMessage) else entry, stamp) for entry, stamp in entries]
+        return [(one, stamp) for one, stamp in answers if uav is None or getattr(one, "uav", uav) == uav]
 
-    def _account_answer(self, uav: int | None, settings: dict[str, str], payload: bytes) -> Answers:
+    def _answer_account(self, uav: int | None, settings: dict[str, str], payload: bytes) -> Replies:
         del uav, settings, payload
-        return [] if self.told is None else [(msgspec.structs.replace(self.told, now=time.time()), None)]
+        return (
+            []
+            if self.newest_account is None
+            else [(msgspec.structs.replace(self.newest_account, wall_t=time.time()), None)]
+        )

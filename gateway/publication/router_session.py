@@ -6,14 +6,14 @@ from collections import deque
 from collections.abc import Callable, Sequence
 
 from fleet.bus.bus_protocol import Bus
-from fleet.bus.codec import Stamp, Wire
+from fleet.bus.codec import EncodedMessage, Stamp
 
 LEASE_S = 1.0  # time after which an unresponsive router counts as lost [s]
 
 _log = logging.getLogger(__name__)
 
 
-class Way:
+class RouterSession:
     """Send packed messages and count the published and the unsent ones.
 
     Args:
@@ -25,33 +25,33 @@ class Way:
         self._router = bus.router
         self.published = 0  # sent to a connected router
         self.unsent = 0  # no router was connected
-        self.unsure = 0  # of those published: within a lease before the router was lost
+        self.unconfirmed = 0  # of those published: within a lease before the router was lost
         self._bus, self._clock = bus, clock
         if not self._router:
             _log.warning("no router is connected yet: unsent messages are counted, everything else continues")
-        self._marks: deque[tuple[float, int]] = deque([(clock(), 0)])  # time, and messages published until then
+        self._published_at: deque[tuple[float, int]] = deque([(clock(), 0)])  # time, and messages published until then
 
     @property
-    def joined(self) -> bool:
+    def connected(self) -> bool:
         """Return whether a router was connected at the last poll."""
         return bool(self._router)
 
-    def look(self) -> bool:
+    def poll(self) -> bool:
         """Return whether a router has connected since the last poll; call it a few times a second."""
-        now, before = self._clock(), self._router
+        now, previous = self._clock(), self._router
         self._router = self._bus.router
-        if before and self._router != before:
-            self.unsure += self.published - self._marks[0][1]
+        if previous and self._router != previous:
+            self.unconfirmed += self.published - self._published_at[0][1]
             _log.warning("the router is disconnected: unsent messages are counted, everything else continues")
-        came = bool(self._router) and self._router != before
-        if came:
+        reconnected = bool(self._router) and self._router != previous
+        if reconnected:
             _log.warning("the router is connected; %d messages were unsent so far", self.unsent)
-        self._marks.append((now, self.published))
-        while len(self._marks) > 1 and self._marks[1][0] <= now - LEASE_S:
-            self._marks.popleft()
-        return came
+        self._published_at.append((now, self.published))
+        while len(self._published_at) > 1 and self._published_at[1][0] <= now - LEASE_S:
+            self._published_at.popleft()
+        return reconnected
 
-    def send(self, wires: Sequence[Wire], stamp: Stamp | None = None) -> None:
+    def send(self, wires: Sequence[EncodedMessage], stamp: Stamp | None = None) -> None:
         """Send messages, or count them as unsent without a router."""
         if not self._router:
             self.unsent += len(wires)

@@ -11,13 +11,13 @@ def read_size(text: str, option: str) -> int:
     Raises:
         ValueError: when it is not a size.
     """
-    found = re.fullmatch(r"(\d+(?:\.\d+)?)([kMGT]?)B?", text.strip())
-    if found is None or float(found[1]) <= 0:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([kMGT]?)B?", text.strip())
+    if match is None or float(match[1]) <= 0:
         raise ValueError(f"{option}: found {text!r}, expected a size such as 500M or 10G; correct it")
-    return round(float(found[1]) * _UNITS[found[2]])
+    return round(float(match[1]) * _UNITS[match[2]])
 
 
-def in_words(size: float) -> str:
+def format_size(size: float) -> str:
     """Format a size [bytes] with at most four digits."""
     for unit in ("", "k", "M", "G"):
         if size < 1000:

@@ -7,16 +7,16 @@ import time
 from pathlib import Path
 from typing import IO
 
-from gateway.record.size import in_words
+from gateway.record.size import format_size
 
-OURS = re.compile(r".+_\d{8}T\d{6}Z(-\d+)?\.tlog$")
-LONGEST_S = 3600.0  # longest duration of one file
-LARGEST, SMALLEST = 256 << 20, 64 << 10  # size limit of one file [bytes]
-PIECES = 4  # the size limit is at most this fraction of a link's share of the budget
-AGAIN_S = 2.0  # after a failure [s]
+FILE_PATTERN = re.compile(r".+_\d{8}T\d{6}Z(-\d+)?\.tlog$")
+MAX_FILE_S = 3600.0  # longest duration of one file
+MAX_FILE, MIN_FILE = 256 << 20, 64 << 10  # size limit of one file [bytes]
+PARTS = 4  # the size limit is at most this fraction of a link's share of the budget
+RETRY_S = 2.0  # after a failure [s]
 
 
-class Budget:
+class DiskBudget:
     """Disk budget of the recordings in a folder; the oldest recordings are deleted.
 
     Args:
@@ -26,8 +26,8 @@ class Budget:
         OSError: when the folder cannot be created or written to.
     """
 
-    def __init__(self, folder: Path, most: int) -> None:
-        self.folder, self.most = folder, most
+    def __init__(self, folder: Path, max_bytes: int) -> None:
+        self.folder, self.max_bytes = folder, max_bytes
         self.removed = 0  # files
         self._open: set[Path] = set()
         try:
@@ -39,7 +39,9 @@ class Budget:
         if not os.access(folder, os.W_OK | os.X_OK):
             raise OSError(f"--record: {str(folder)!r} is not writable; name another folder")
         self._sizes = {
-            path: path.stat().st_size for path in sorted(folder.iterdir(), key=_age) if OURS.match(path.name)
+            path: path.stat().st_size
+            for path in sorted(folder.iterdir(), key=_age_key)
+            if FILE_PATTERN.match(path.name)
         }
 
     @property
@@ -47,24 +49,24 @@ class Budget:
         """Return the size of the recordings [bytes]."""
         return sum(self._sizes.values())
 
-    def grow(self, path: Path, size: int) -> None:
+    def update_size(self, path: Path, size: int) -> None:
         """Update the size of an open file [bytes]; delete the oldest closed files beyond the budget."""
         self._sizes[path] = size
         self._open.add(path)
         for oldest in [path for path in self._sizes if path not in self._open]:
-            if self.used <= self.most:
+            if self.used <= self.max_bytes:
                 return
             del self._sizes[oldest]
             self.removed += 1
             with contextlib.suppress(OSError):  # deleted by another process
                 oldest.unlink()
 
-    def shut(self, path: Path) -> None:
+    def close_file(self, path: Path) -> None:
         """Mark a file as closed."""
         self._open.discard(path)
 
 
-class Tape(contextlib.AbstractContextManager):
+class TlogWriter(contextlib.AbstractContextManager):
     """Writer of the recording of one link; after a write error it counts lost bytes and later tries a new file.
 
     Args:
@@ -73,32 +75,32 @@ class Tape(contextlib.AbstractContextManager):
         links: number of links that share it
     """
 
-    def __init__(self, name: str, budget: Budget, links: int = 1) -> None:
+    def __init__(self, name: str, budget: DiskBudget, links: int = 1) -> None:
         self.written = 0  # bytes
         self.lost = 0  # bytes not written
-        self.trouble = ""  # error message while writing fails
+        self.fault = ""  # error message while writing fails
         self._slug = re.sub(r"[^\w.-]+", "-", name).strip("-")
         self._budget = budget
-        self._largest = max(SMALLEST, min(LARGEST, budget.most // (PIECES * links)))
+        self._max_file = max(MIN_FILE, min(MAX_FILE, budget.max_bytes // (PARTS * links)))
         self._file: IO[bytes] | None = None
         self._path = Path()
-        self._size, self._begun, self._again = 0, 0.0, float("-inf")
+        self._size, self._opened_t, self._retry_t = 0, 0.0, float("-inf")
 
     def write(self, records: bytes, now: float) -> int:
         """Write complete records and return the bytes lost; `now` is any monotonic clock [s]."""
         if not records:
             return 0
-        if self._file is None and now < self._again:
+        if self._file is None and now < self._retry_t:
             self.lost += len(records)
             return len(records)
         try:
-            self._turn(len(records), now)
+            self._rotate(len(records), now)
             self._put(records)
         except OSError as error:
             self._fail(error, now)
             self.lost += len(records)
             return len(records)
-        self.trouble = ""
+        self.fault = ""
         return 0
 
     def close(self) -> None:
@@ -106,35 +108,35 @@ class Tape(contextlib.AbstractContextManager):
         if self._file is not None:
             with contextlib.suppress(OSError):
                 self._file.close()
-        self._budget.shut(self._path)
+        self._budget.close_file(self._path)
         self._file = None
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _turn(self, more: int, now: float) -> None:
-        if self._file is not None and (self._size + more > self._largest or now - self._begun > LONGEST_S):
+    def _rotate(self, added: int, now: float) -> None:
+        if self._file is not None and (self._size + added > self._max_file or now - self._opened_t > MAX_FILE_S):
             self.close()
         if self._file is None:
             stem = f"{self._slug}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
             names = [f"{stem}.tlog", *(f"{stem}-{k}.tlog" for k in range(2, 1000))]
-            self._path = next(p for name in names if not (p := self._budget.folder / name).exists())
-            self._file, self._size, self._begun = self._path.open("xb", buffering=0), 0, now
+            self._path = next(candidate for name in names if not (candidate := self._budget.folder / name).exists())
+            self._file, self._size, self._opened_t = self._path.open("xb", buffering=0), 0, now
 
     def _put(self, records: bytes) -> None:
         assert self._file is not None
-        left = memoryview(records)
-        while left:
-            left = left[self._file.write(left) :]
+        remaining = memoryview(records)
+        while remaining:
+            remaining = remaining[self._file.write(remaining) :]
         self._size += len(records)
         self.written += len(records)
-        self._budget.grow(self._path, self._size)
+        self._budget.update_size(self._path, self._size)
 
     def _fail(self, error: OSError, now: float) -> None:
         """Truncate the file to its size before this write, delete it if empty, and pause writing."""
-        self.trouble = (
+        self.fault = (
             f"recording of {self._slug} stopped ({error.strerror or error}), the gateway continues; "
-            f"free space in {self._budget.folder} (recordings take {in_words(self._budget.used)})"
+            f"free space in {self._budget.folder} (recordings take {format_size(self._budget.used)})"
         )
         if self._file is not None:
             with contextlib.suppress(OSError):
@@ -142,8 +144,8 @@ class Tape(contextlib.AbstractContextManager):
                 if not self._size:
                     self._path.unlink()
         self.close()
-        self._again = now + AGAIN_S
+        self._retry_t = now + RETRY_S
 
 
-def _age(path: Path) -> tuple[float, str]:
+def _age_key(path: Path) -> tuple[float, str]:
     return path.stat().st_mtime, path.name

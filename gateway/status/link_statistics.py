@@ -7,49 +7,49 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fleet import SOURCES
-from fleet.contract import Account, LinkAccount
-from fleet.telemetry.mavlink.intake import Intake
-from fleet.telemetry.mavlink.parsing.received import Heard
-from gateway.links.link import Link
-from gateway.onboard.rates import Share
-from gateway.publication.router_session import Way
-from gateway.record.recorder import Recorder, Taped
+from fleet.contract import GatewayCounters, LinkCounters
+from fleet.telemetry.mavlink.intake import MavlinkReceiver
+from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
+from gateway.links.link import Endpoint
+from gateway.onboard.rates import RateShare
+from gateway.publication.router_session import RouterSession
+from gateway.record.recorder import LinkRecorder, RecordingCounters
 
-SMOOTH = 0.3  # weight of the newest second in a rate
-_SYSTEM_S_COUNT = (Path("/proc/net/udp"), Path("/proc/net/udp6"))
+SMOOTHING = 0.3  # weight of the newest second in a rate
+_PROC_FILES = (Path("/proc/net/udp"), Path("/proc/net/udp6"))
 
 
-class _Flow:
+class _LinkTraffic:
     """Traffic counters and rates of one link."""
 
     def __init__(self) -> None:
         self.datagrams = self.bytes_in = self.sent = self.bytes_out = 0
         self.bytes_s = self.messages_hz = 0.0
-        self._then = (float("-inf"), 0, 0)
+        self._previous = (float("-inf"), 0, 0)
 
     def measure(self, t: float, messages: int) -> None:
         """Update the rates at `t` [s since 1970]."""
-        before, bytes_in, heard = self._then
-        passed = t - before
-        self._then = (t, self.bytes_in, messages)
-        if 0 < passed < float("inf"):
-            self.bytes_s += SMOOTH * ((self.bytes_in - bytes_in) / passed - self.bytes_s)
-            self.messages_hz += SMOOTH * ((messages - heard) / passed - self.messages_hz)
+        previous_t, bytes_in, previous_messages = self._previous
+        elapsed = t - previous_t
+        self._previous = (t, self.bytes_in, messages)
+        if 0 < elapsed < float("inf"):
+            self.bytes_s += SMOOTHING * ((self.bytes_in - bytes_in) / elapsed - self.bytes_s)
+            self.messages_hz += SMOOTHING * ((messages - previous_messages) / elapsed - self.messages_hz)
 
 
-class Tally:
+class StatisticsCollector:
     """Counters of bytes received, before decoding, and of bytes sent."""
 
-    def __init__(self, links: Sequence[Link], recorder: Recorder | None = None) -> None:
+    def __init__(self, links: Sequence[Endpoint], recorder: LinkRecorder | None = None) -> None:
         self._links, self._recorder = links, recorder
-        self._flows = [_Flow() for _ in links]
+        self._flows = [_LinkTraffic() for _ in links]
         self._overruns: dict[int, int] = {}
 
-    def add(self, link: int, heard: Heard) -> None:
+    def add(self, link: int, received: ReceivedBytes) -> None:
         """Count received bytes of a link."""
         flow = self._flows[link]
-        flow.datagrams += len(heard.start)
-        flow.bytes_in += int((heard.stop - heard.start).sum())
+        flow.datagrams += len(received.start)
+        flow.bytes_in += int((received.stop - received.start).sum())
 
     def sent(self, link: int, size: int) -> None:
         """Count one datagram sent."""
@@ -58,47 +58,56 @@ class Tally:
         flow.bytes_out += size
 
     def account(
-        self, t: float, intakes: Sequence[Intake], players: set[int], way: Way, shares: Sequence[Share]
-    ) -> Account:
+        self,
+        t: float,
+        intakes: Sequence[MavlinkReceiver],
+        replayed: set[int],
+        session: RouterSession,
+        shares: Sequence[RateShare],
+    ) -> GatewayCounters:
         """Return the statistics message; `t` is fleet time [s since 1970], `replayed` the UAV ids of recordings."""
-        taped = self._recorder.account() if self._recorder is not None else [Taped() for _ in self._links]
+        recordings = (
+            self._recorder.counters() if self._recorder is not None else [RecordingCounters() for _ in self._links]
+        )
         self._overruns = overruns()
-        told = tuple(self._link(t, k, intakes[k], taped[k], share) for k, share in enumerate(shares))
+        accounts = tuple(self._link(t, k, intakes[k], recordings[k], share) for k, share in enumerate(shares))
         refused: Counter[str] = Counter()
-        uavs = set(players)
+        uavs = set(replayed)
         for intake in intakes:
-            refused.update(intake.refused)
-            uavs.update(craft.uav for craft in intake.crafts.values())
-        if dropped := sum(link.dropped for link in told):
+            refused.update(intake.rejected)
+            uavs.update(aircraft.uav for aircraft in intake.aircraft.values())
+        if dropped := sum(link.dropped for link in accounts):
             refused["dropped: decoding fell behind"] += dropped
-        if unsent := sum(link.unsent for link in told):
+        if unsent := sum(link.unsent for link in accounts):
             refused["not sent: no peer, or send queue full"] += unsent
-        return Account(
+        return GatewayCounters(
             t=t,
-            links=tuple(link.link for link in told),
+            links=tuple(link.link for link in accounts),
             uavs=tuple(sorted(uavs)),
-            datagrams=sum(link.datagrams for link in told),
-            bytes_in=sum(link.bytes_in for link in told),
-            messages=sum(link.messages for link in told),
-            bad_bytes=sum(link.bad_bytes for link in told),
-            bad_frames=sum(link.bad_frames for link in told),
+            datagrams=sum(link.datagrams for link in accounts),
+            bytes_in=sum(link.bytes_in for link in accounts),
+            messages=sum(link.messages for link in accounts),
+            bad_bytes=sum(link.bad_bytes for link in accounts),
+            bad_frames=sum(link.bad_frames for link in accounts),
             refused=dict(refused),
             sentence="" if uavs else "no aircraft received yet; send its telemetry to one of the links",
-            per_link=told,
-            published=way.published,
-            unsent=way.unsent,
-            unsure=way.unsure,
-            router=way.joined,
+            per_link=accounts,
+            published=session.published,
+            unsent=session.unsent,
+            unconfirmed=session.unconfirmed,
+            router=session.connected,
             removed=self._recorder.budget.removed if self._recorder is not None else 0,
-            now=time.time(),
+            wall_t=time.time(),
             machine=platform.node(),
             code=SOURCES,
         )
 
-    def _link(self, t: float, number: int, intake: Intake, taped: Taped, share: Share) -> LinkAccount:
+    def _link(
+        self, t: float, number: int, intake: MavlinkReceiver, recording: RecordingCounters, share: RateShare
+    ) -> LinkCounters:
         flow, link, counts = self._flows[number], self._links[number], intake.counters()
         flow.measure(t, counts["messages"])
-        return LinkAccount(
+        return LinkCounters(
             link=link.spec.text,
             datagrams=flow.datagrams,
             bytes_in=flow.bytes_in,
@@ -112,23 +121,23 @@ class Tally:
             unsent=link.unsent,
             bytes_s=round(flow.bytes_s, 1),
             messages_hz=round(flow.messages_hz, 1),
-            recorded=taped.recorded,
-            noise=taped.noise,
-            unrecorded=taped.lost + taped.dropped,
-            unwritten=taped.waiting,
-            share=share.now,
-            sentence="; ".join(filter(None, (taped.trouble, share.sentence, getattr(link, "damage", "")))),
+            recorded=recording.recorded,
+            noise=recording.noise,
+            unrecorded=recording.lost + recording.dropped,
+            unwritten=recording.waiting,
+            rate_fraction=share.value,
+            sentence="; ".join(filter(None, (recording.fault, share.sentence, getattr(link, "damage", "")))),
         )
 
 
-def overruns(counts: Sequence[Path] = _SYSTEM_S_COUNT) -> Counter[int]:
+def overruns(files: Sequence[Path] = _PROC_FILES) -> Counter[int]:
     """Return the datagrams dropped by the system at each UDP port because of a full buffer; empty if unknown."""
-    found: Counter[int] = Counter()
-    for path in counts:
+    dropped: Counter[int] = Counter()
+    for path in files:
         try:
             rows = [row.split() for row in path.read_text().splitlines()[1:]]
         except OSError:  # not Linux
             continue
         for row in rows:
-            found[int(row[1].rpartition(":")[2], 16)] += int(row[-1])
-    return found
+            dropped[int(row[1].rpartition(":")[2], 16)] += int(row[-1])
+    return dropped

@@ -20,11 +20,11 @@ import numpy as np
 from fleet.contract import Message, Prediction, Sample
 from fleet.frames import to_ned
 from fleet.simulator.flight.drive import to_tlog
-from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.flight.uav import SimulatedUav
 from fleet.telemetry.recording.recordings import replay_messages
 from tests.bad_radio import RADIOS, Radio, worsen
 from twin_worker.confidence.tube_and_horizon import axes_error, first_passage, path_length
-from twin_worker.evaluation.offline import run
+from twin_worker.evaluation.offline import run_offline
 from twin_worker.twin.step import Twin
 
 FROM_S = 60.0  # predictions count from here on: before, there is little to learn from [s]
@@ -86,7 +86,7 @@ def fly(messages: list[Message], truth: tuple[np.ndarray, np.ndarray], tally: Ta
     """Let a twin hear one flight, and score what it predicts from `since` on [s]."""
     shift = behind(positions(messages), truth)
     twins: dict[int, Twin] = {}
-    made = [r for r in run(messages, twins) if isinstance(r, Prediction)]
+    made = [r for r in run_offline(messages, twins) if isinstance(r, Prediction)]
     begin, end = truth[0][0] + since, truth[0][-1]
     told = [p for p in made if p.t - shift >= begin]
     tally.gap_s = max(tally.gap_s, *np.diff([p.t for p in told]), 0.0)
@@ -98,7 +98,7 @@ def fly(messages: list[Message], truth: tuple[np.ndarray, np.ndarray], tally: Ta
 
 
 def _score(p: Prediction, t: float, truth: tuple[np.ndarray, np.ndarray], tally: Tally) -> None:
-    ahead, path, tube = (a.numpy().astype(float) for a in (p.ahead, p.path, p.tube))
+    ahead, path, tube = (a.numpy().astype(float) for a in (p.ahead, p.path, p.prediction_region_half_axes))
     known = (ahead > 0) & (t + ahead <= truth[0][-1])
     flown = to_ned(p.ned_origin(), *(np.interp(t + ahead, truth[0], column) for column in truth[1].T))
     error = axes_error(path, flown)
@@ -122,7 +122,7 @@ def _score(p: Prediction, t: float, truth: tuple[np.ndarray, np.ndarray], tally:
 def flight(folder: Path, seed: int, seconds: float) -> Path:
     """Record one pretend flight without any loss."""
     path = folder / f"{seed}.tlog"
-    to_tlog(path, [PretendUav(0, seed, wind=4.0, turbulence=2)], seconds=seconds, loss=0.0, seed=seed)
+    to_tlog(path, [SimulatedUav(0, seed, wind=4.0, turbulence=2)], seconds=seconds, loss=0.0, seed=seed)
     return path
 
 

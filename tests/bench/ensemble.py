@@ -16,10 +16,10 @@ import numpy as np
 
 from fleet.airframes import GENERIC, load
 from fleet.autopilots import arduplane, laws
-from fleet.cli import guarded, parser_for
+from fleet.cli import make_parser, run_command
 from fleet.contract import Item
 from fleet.frames import Origin
-from fleet.mission import route
+from fleet.mission import unroll_route
 from fleet.physics import point_mass as H
 from fleet.physics.simulate import N_STATE, coupled_plant, simulate
 from twin_worker.identification.fixed_wing.derivatives_prior import prior
@@ -37,7 +37,7 @@ def controlled() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Give a controller at the start of a route with turns and climbs."""
     places = [(_HOME.lat_e7 + n, _HOME.lon_e7 + e, up) for n, e, up in _CORNERS]
     items = tuple(Item(seq=k, command=16, lat_e7=n, lon_e7=e, alt_m=up) for k, (n, e, up) in enumerate(places))
-    legs = route(items, seq=1, origin=_HOME, params={}).legs
+    legs = unroll_route(items, seq=1, origin=_HOME, params={}).legs
     par, _ = laws.parameters("arduplane", arduplane.DEFAULTS | {"AIRSPEED_CRUISE": _V, "AIRSPEED_MAX": 30.0}, 600.0)
     p, v = np.array([0.0, 0.0, -100.0]), np.array([_V, 0.0, 0.0])
     return laws.init(par, legs, 0, p, p, v, np.zeros(3), _V, 0.0, 0.5), par, legs  # type: ignore
@@ -45,11 +45,11 @@ def controlled() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def bundles(control: tuple[np.ndarray, np.ndarray, np.ndarray]) -> Callable[[], None]:
     """Give the flight of every aircraft's bundle."""
-    body, air, start = np.zeros(H.N_BODY), np.zeros(H.N_AIR), np.zeros(H.N_START)
+    body, air, start = np.zeros(H.N_PARAMETERS), np.zeros(H.N_AIR), np.zeros(H.N_START)
     body[[H.WN_PHI, H.ZETA_PHI, H.WN_THETA, H.ZETA_THETA]] = 3.0, 0.9, 3.0, 0.9
     body[[H.K_PSI, H.A_N, H.C_T, H.C_V, H.C_N, H.T_0, H.V_0]] = 1.0, 0.06, 4.0, -0.1, -0.2, 0.5, _V
     air[[H.SCALE, H.DRIFT, H.DRIFT_S, H.REST, H.REST_S]] = 1.0, 0.6, 60.0, 0.8, 7.0
-    start[2], start[H.V], start[H.THR] = -100.0, _V, 0.5
+    start[2], start[H.V], start[H.THROTTLE] = -100.0, _V, 0.5
     rows = [np.tile(row, (MEMBERS, 1)) for row in (body, air, start)]
     at, out = np.arange(0, SECONDS * 4 + 1, 4), np.empty((MEMBERS, SECONDS + 1, 3))
     rng = np.random.default_rng(1)
@@ -57,7 +57,7 @@ def bundles(control: tuple[np.ndarray, np.ndarray, np.ndarray]) -> Callable[[], 
     def fly() -> None:
         for _ in range(UAVS):
             chance = rng.standard_normal((MEMBERS, SECONDS + 1, 4))
-            H.bundle(control, *rows, chance, at, out)  # type: ignore
+            H.simulate_ensemble(control, *rows, chance, at, out)  # type: ignore
         assert np.isfinite(out).all()
 
     return fly
@@ -103,9 +103,9 @@ def _run(args: argparse.Namespace) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Time the ensembles of a fleet."""
-    parser = parser_for("python -m tests.bench.ensemble", "Time the ensembles of a fleet.", EXAMPLES)
+    parser = make_parser("python -m tests.bench.ensemble", "Time the ensembles of a fleet.", EXAMPLES)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the times to FILE")
-    return guarded("bench.ensemble", _run, parser.parse_args(argv))
+    return run_command("bench.ensemble", _run, parser.parse_args(argv))
 
 
 if __name__ == "__main__":

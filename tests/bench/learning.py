@@ -22,18 +22,18 @@ import numpy as np
 from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Message
 from fleet.telemetry.recording.recordings import replay_messages
-from twin_worker.evaluation.offline import run
+from twin_worker.evaluation.offline import run_offline
 from twin_worker.service.warm_up import warm_up
-from twin_worker.service.worker import Held, Worker
+from twin_worker.service.worker import OwnedTwin, Worker
 from twin_worker.twin import step as loop
 from twin_worker.twin.state.state import Twin
-from twin_worker.twin.steps.identify_step import learn
+from twin_worker.twin.steps.identify_step import identify_and_verify
 
 
 def begun(messages: list[Message]) -> Twin:
     """Let one twin hear the first part."""
     twins: dict[int, Twin] = {}
-    for _ in run(messages, twins):
+    for _ in run_offline(messages, twins):
         pass
     (twin,) = twins.values()
     return twin
@@ -41,25 +41,25 @@ def begun(messages: list[Message]) -> Twin:
 
 def measure(twin: Twin, rest: list[Message], uavs: int) -> dict[str, Any]:
     """Fly copies of a twin through the rest of its flight; give what their hops cost."""
-    worker = Worker(MemoryBus(), range(uavs), omega=twin.omega)
+    worker = Worker(MemoryBus(), range(uavs), omega=twin.config.omega)
     hops: list[float] = []
 
     def timed(one: Twin) -> list[Message]:
         start = time.process_time()
-        found = learn(one)
+        found = identify_and_verify(one)
         hops.append(time.process_time() - start)
         return found
 
     for uav in range(uavs):
         one = copy.deepcopy(twin)
-        one.uav = uav
-        worker._held[uav] = Held(one, epoch=1)
-    loop.learn = timed  # type: ignore[attr-defined]
+        one.config = msgspec.structs.replace(one.config, uav=uav)
+        worker._owned[uav] = OwnedTwin(one, epoch=1)
+    loop.identify_and_verify = timed  # type: ignore[attr-defined]
     began = time.process_time()
     for message in rest:
         for uav in range(uavs):
-            worker._hear(msgspec.structs.replace(message, uav=uav))
-        worker.turn()
+            worker._on_message(msgspec.structs.replace(message, uav=uav))
+        worker.sweep()
     flown = rest[-1].t - rest[0].t
     ms = 1e3 * np.array(hops)
     return {

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from pymavlink import mavutil
 
-from fleet.telemetry.recording.opening import Source
+from fleet.telemetry.recording.opening import RecordingFile
 from fleet.telemetry.recording.recordings import Recording
 from tests.bench.peak_memory import peak_mb, reset_peak
 
@@ -48,7 +48,7 @@ def best(read: Callable[[Path], int], path: Path, times: int) -> tuple[float, in
 
 def grown(path: Path, megabytes: int, folder: Path) -> Path:
     """Repeat a .tlog, each time later, until it has so many MB."""
-    data = bytearray(Source(path).open().read(1 << 30) or b"")
+    data = bytearray(RecordingFile(path).open().read(1 << 30) or b"")
     stamps = [stamp for batch in _stamps(path) for stamp in batch]
     out = folder / "grown.tlog"
     with out.open("wb") as file:
@@ -60,11 +60,11 @@ def grown(path: Path, megabytes: int, folder: Path) -> Path:
 
 
 def _stamps(path: Path) -> list[list[tuple[int, int]]]:
-    from fleet.telemetry.mavlink.parsing.decode import frames_of
+    from fleet.telemetry.mavlink.parsing.decode import find_frames
 
-    data = Source(path).open().read(1 << 30) or b""
+    data = RecordingFile(path).open().read(1 << 30) or b""
     buf = np.frombuffer(data, np.uint8)
-    at, times, _ = frames_of(buf, np.array([[0, len(buf), 0]]), np.zeros(4, np.int64), 8)
+    at, times, _ = find_frames(buf, np.array([[0, len(buf), 0]]), np.zeros(4, np.int64), 8)
     return [[(int(start) - 8, int(t)) for start, t in zip(at[:, 0], times, strict=True)]]
 
 
@@ -73,7 +73,7 @@ def plain(path: Path, folder: Path) -> Path:
     if path.suffix not in (".xz", ".gz", ".bz2"):
         return path
     out = folder / path.with_suffix("").name
-    out.write_bytes(Source(path).open().read(1 << 30) or b"")
+    out.write_bytes(RecordingFile(path).open().read(1 << 30) or b"")
     return out
 
 
@@ -97,8 +97,8 @@ def main() -> int:
                 "ratio": round(theirs / took, 2),
             }
             print(f"{path.name}: {messages} messages, {theirs / took:.1f} times as fast as pymavlink's own loop")
-        if args.grow:
-            big = grown(plain(args.file[0], Path(name)), args.grow, Path(name))
+        if args.update_size:
+            big = grown(plain(args.file[0], Path(name)), args.update_size, Path(name))
             before = reset_peak()
             took, _ = best(ours, big, 1)
             more = peak_mb() - before

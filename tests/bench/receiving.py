@@ -9,13 +9,13 @@ import socket
 import time
 from pathlib import Path
 
-from gateway.links.receive import Bulk, OneByOne
+from gateway.links.receive import BatchReceiver, SingleReceiver
 
 DATAGRAM = bytes(60)
 BURST = 200  # within what any system's buffer holds
 
 
-def measure(kind: type[Bulk] | type[OneByOne], bursts: int, senders: int) -> float:
+def measure(kind: type[BatchReceiver] | type[SingleReceiver], bursts: int, senders: int) -> float:
     """Give datagrams per CPU-second of taking alone, from so many senders."""
     far, *near = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(1 + senders))
     for sock in (far, *near):
@@ -25,7 +25,7 @@ def measure(kind: type[Bulk] | type[OneByOne], bursts: int, senders: int) -> flo
         for i in range(BURST):
             near[i % senders].sendto(DATAGRAM, far.getsockname())
         began = time.thread_time()
-        while (heard := reader.take()) is not None:
+        while (heard := reader.receive()) is not None:
             taken += len(heard.start) if burst else 0  # the first compiles
         spent += time.thread_time() - began if burst else 0.0
     for sock in (far, *near):
@@ -43,7 +43,7 @@ def main() -> None:
     found = {
         f"{kind.__name__}, {senders} senders": round(measure(kind, args.bursts, senders))
         for senders in (1, 50)
-        for kind in (Bulk, OneByOne)
+        for kind in (BatchReceiver, SingleReceiver)
     }
     print(json.dumps(found, indent=1))
     if args.json:

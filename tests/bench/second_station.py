@@ -20,7 +20,7 @@ from pathlib import Path
 
 from fleet.bus.bus_protocol import Bus
 from fleet.bus.session import connect, open_router
-from fleet.contract import Account, Item, Mission, Params
+from fleet.contract import GatewayCounters, Item, Mission, Params
 from fleet.process.children import Children
 
 PATIENCE_S = 600.0  # for each step [s]
@@ -81,7 +81,7 @@ def ours(bus: Bus, uav: int) -> tuple[Mission, Params]:
     """Wait until the gateway has mission and parameters of an aircraft."""
     done = threading.Event()
     for _ in range(round(PATIENCE_S)):
-        mission, params = bus.ask(Mission, uav), bus.ask(Params, uav)
+        mission, params = bus.get(Mission, uav), bus.get(Params, uav)
         if mission and params and mission[0][0].complete and params[0][0].complete:
             return mission[0][0], params[0][0]
         done.wait(1.0)
@@ -100,8 +100,8 @@ def measure(program: str) -> dict[str, object]:
             links = [f"--link=udpin:127.0.0.1:{air}", f"--forward=udpin:127.0.0.1:{ground}"]
             children.start("gateway", "gateway", "--router", where, *links)
             children.start("aircraft", "fleet.cli", "fly", "--uavs", "6", "--to", f"127.0.0.1:{air}", "--loss", "0")
-            accounts: list[Account] = []
-            bus.subscribe(Account, lambda account, _: accounts.append(account))
+            accounts: list[GatewayCounters] = []
+            bus.subscribe(GatewayCounters, lambda account, _: accounts.append(account))
             mission, params = ours(bus, 7)
             station = Station(program, ground, folder)
             try:

@@ -17,8 +17,8 @@ import numpy as np
 
 from fleet.physics.kernel import kernel
 
-_BOUND = 2.0  # standard deviations beyond which a pair is rejected: probability below 0.023 [-]
-_ENOUGH = 32  # draws without a hit after which the probability is taken as 0 [-]
+_CUTOFF_SIGMA = 2.0  # standard deviations beyond which a pair is rejected: probability below 0.023 [-]
+_PILOT_DRAWS = 32  # draws without a hit after which the probability is taken as 0 [-]
 
 
 class Separation(NamedTuple):
@@ -29,7 +29,7 @@ class Separation(NamedTuple):
 
 
 @kernel
-def _minimum(d0: float, d1: float, e0: float, e1: float) -> tuple[float, float]:
+def _closest_point(d0: float, d1: float, e0: float, e1: float) -> tuple[float, float]:
     """Return the minimum length of the vector (d, e) on the line from 0 to 1, and the position of the minimum."""
     x, y = d1 - d0, e1 - e0
     square = x * x + y * y
@@ -38,26 +38,26 @@ def _minimum(d0: float, d1: float, e0: float, e1: float) -> tuple[float, float]:
 
 
 @kernel
-def _meets(r0: np.ndarray, r1: np.ndarray, wide: float, high: float) -> bool:
+def _violates(r0: np.ndarray, r1: np.ndarray, horizontal: float, vertical: float) -> bool:
     """Return whether a relative position is inside both limits anywhere on the line from r0 to r1, NED (3,) [m]."""
     low, top = 0.0, 1.0
     fall = r1[2] - r0[2]
     if abs(fall) < 1e-9:
-        if abs(r0[2]) >= high:
+        if abs(r0[2]) >= vertical:
             return False
     else:
-        a, b = (-high - r0[2]) / fall, (high - r0[2]) / fall
+        a, b = (-vertical - r0[2]) / fall, (vertical - r0[2]) / fall
         low, top = max(min(a, b), 0.0), min(max(a, b), 1.0)
         if low >= top:
             return False
     x, y = r1[0] - r0[0], r1[1] - r0[1]
     n0, n1 = r0[0] + low * x, r0[0] + top * x
     e0, e1 = r0[1] + low * y, r0[1] + top * y
-    return _minimum(n0, n1, e0, e1)[0] < wide
+    return _closest_point(n0, n1, e0, e1)[0] < horizontal
 
 
 @kernel
-def _root(nn: float, ne: float, ee: float) -> tuple[float, float, float]:
+def _sqrt_covariance(nn: float, ne: float, ee: float) -> tuple[float, float, float]:
     """Return the symmetric square root of a 2 x 2 covariance."""
     s = sqrt(max(nn * ee - ne * ne, 0.0))
     t = sqrt(nn + ee + 2.0 * s)
@@ -90,35 +90,40 @@ def screen(
         out: filled, one row each: first and last step of the encounter (-1: none), instant of the closest approach of
             the mean paths [steps since 1970, with its fraction], its distance, its height [m]; (m, 5)
     """
-    wide, high = limits[0], limits[1]
+    horizontal, vertical = limits[0], limits[1]
     for j in range(len(others)):
-        b = others[j]
+        other = others[j]
         out[j, 0] = out[j, 1] = -1.0
-        start = max(first[own], first[b])
-        stop = min(first[own] + rows[own], first[b] + rows[b])
-        best = np.inf
+        start = max(first[own], first[other])
+        stop = min(first[own] + rows[own], first[other] + rows[other])
+        smallest = np.inf
         n0 = e0 = d0 = 0.0
         for k in range(start, stop):
-            i, l = k - first[own], k - first[b]
-            n1 = path[b, l, 0] * scale[j, 0] + shift[j, 0] - path[own, i, 0]
-            e1 = path[b, l, 1] * scale[j, 1] + shift[j, 1] - path[own, i, 1]
-            d1 = path[b, l, 2] * scale[j, 2] + shift[j, 2] - path[own, i, 2]
+            i, l = k - first[own], k - first[other]
+            n1 = path[other, l, 0] * scale[j, 0] + shift[j, 0] - path[own, i, 0]
+            e1 = path[other, l, 1] * scale[j, 1] + shift[j, 1] - path[own, i, 1]
+            d1 = path[other, l, 2] * scale[j, 2] + shift[j, 2] - path[own, i, 2]
             if k == start:
                 n0, e0, d0 = n1, e1, d1
-            near, s = _minimum(n0, n1, e0, e1)
-            above = 0.0 if d0 * d1 <= 0.0 else min(abs(d0), abs(d1))
-            apart = max(near / wide, abs(d0 + s * (d1 - d0)) / high)
-            if apart < best:
-                best = apart
+            distance, s = _closest_point(n0, n1, e0, e1)
+            height = 0.0 if d0 * d1 <= 0.0 else min(abs(d0), abs(d1))
+            ratio = max(distance / horizontal, abs(d0 + s * (d1 - d0)) / vertical)
+            if ratio < smallest:
+                smallest = ratio
                 out[j, 2] = k - 1 + s if k > start else float(k)
-                out[j, 3], out[j, 4] = near, abs(d0 + s * (d1 - d0))
-            nn = covariance[own, i, 0] + covariance[b, l, 0]
-            ne = covariance[own, i, 1] + covariance[b, l, 1]
-            ee = covariance[own, i, 2] + covariance[b, l, 2]
+                out[j, 3], out[j, 4] = distance, abs(d0 + s * (d1 - d0))
+            nn = covariance[own, i, 0] + covariance[other, l, 0]
+            ne = covariance[own, i, 1] + covariance[other, l, 1]
+            ee = covariance[own, i, 2] + covariance[other, l, 2]
             n, e = n0 + s * (n1 - n0), e0 + s * (e1 - e0)
-            spread = sqrt(max(nn * n * n + 2.0 * ne * n * e + ee * e * e, 0.0)) / near if near > 1e-3 else 0.0
-            up = sqrt(covariance[own, i, 3] + covariance[b, l, 3])
-            if near - wide < _BOUND * spread and above - high < _BOUND * up:
+            sigma_horizontal = (
+                sqrt(max(nn * n * n + 2.0 * ne * n * e + ee * e * e, 0.0)) / distance if distance > 1e-3 else 0.0
+            )
+            sigma_vertical = sqrt(covariance[own, i, 3] + covariance[other, l, 3])
+            if (
+                distance - horizontal < _CUTOFF_SIGMA * sigma_horizontal
+                and height - vertical < _CUTOFF_SIGMA * sigma_vertical
+            ):
                 if out[j, 0] < 0.0:
                     out[j, 0] = max(k - 1, start)
                 out[j, 1] = k
@@ -126,7 +131,9 @@ def screen(
 
 
 @kernel
-def chance(apart: np.ndarray, covariance: np.ndarray, draws: np.ndarray, limits: np.ndarray) -> float:
+def conflict_probability(
+    separation: np.ndarray, covariance: np.ndarray, draws: np.ndarray, limits: np.ndarray
+) -> float:
     """Compute the probability of a loss of separation.
 
     Args:
@@ -135,24 +142,24 @@ def chance(apart: np.ndarray, covariance: np.ndarray, draws: np.ndarray, limits:
         draws: normal errors, (k, 3) [-]
         limits: horizontal and vertical, (2,) [m]
     """
-    n = len(apart)
+    n = len(separation)
     root = np.empty((n, 4))
     for i in range(n):
-        root[i, 0], root[i, 1], root[i, 2] = _root(covariance[i, 0], covariance[i, 1], covariance[i, 2])
+        root[i, 0], root[i, 1], root[i, 2] = _sqrt_covariance(covariance[i, 0], covariance[i, 1], covariance[i, 2])
         root[i, 3] = sqrt(covariance[i, 3])
     r0, r1 = np.empty(3), np.empty(3)
     hits = 0
     for k in range(len(draws)):
-        if k == _ENOUGH and hits == 0:
+        if k == _PILOT_DRAWS and hits == 0:
             break
         z = draws[k]
         for i in range(n):
-            r1[0] = apart[i, 0] + root[i, 0] * z[0] + root[i, 1] * z[1]
-            r1[1] = apart[i, 1] + root[i, 1] * z[0] + root[i, 2] * z[1]
-            r1[2] = apart[i, 2] + root[i, 3] * z[2]
+            r1[0] = separation[i, 0] + root[i, 0] * z[0] + root[i, 1] * z[1]
+            r1[1] = separation[i, 1] + root[i, 1] * z[0] + root[i, 2] * z[1]
+            r1[2] = separation[i, 2] + root[i, 3] * z[2]
             if i == 0:
                 r0[:] = r1
-            if _meets(r0, r1, limits[0], limits[1]):
+            if _violates(r0, r1, limits[0], limits[1]):
                 hits += 1
                 break
             r0[:] = r1

@@ -21,18 +21,18 @@ from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.common import parameters
 from fleet.contract import AlertKind
 from fleet.frames import G, Origin, to_geodetic
-from twin_worker.alerts.hysteresis import Finding
+from twin_worker.alerts.hysteresis import HazardEstimate
 
 _LEGS = 12  # legs ahead that are checked
-_SLOWEST = 1.0  # minimum ground speed that counts as headway [m/s]
-_CHANGES = 0.55  # standard deviation of the change of wind within minutes [m/s]
-_SHARE = 0.05  # relative standard deviation of a limit [-]
-_FLAT = 15.0  # smaller height differences are not checked: they take little time [m]
-_OVER = "the mission is achievable"
+_MIN_GROUND_SPEED = 1.0  # minimum ground speed that counts as headway [m/s]
+_WIND_DRIFT = 0.55  # standard deviation of the change of wind within minutes [m/s]
+_LIMIT_SIGMA = 0.05  # relative standard deviation of a limit [-]
+_MIN_HEIGHT_STEP = 15.0  # smaller height differences are not checked: they take little time [m]
+_CLEAR_TEXT = "the mission is achievable"
 _CIRCLES = (m.LOITER_TURNS, m.LOITER_UNLIMITED, m.LOITER_TIME, m.LOITER_TO_ALT)
 
 
-class Ability(NamedTuple):
+class FlightLimits(NamedTuple):
     """Limits of a fixed wing from autopilot parameters; nan where they were not received."""
 
     Va: float  # cruise airspeed, true [m/s]
@@ -42,7 +42,7 @@ class Ability(NamedTuple):
     radius: float  # of circles without a radius of their own [m]
 
 
-class Now(NamedTuple):
+class MissionState(NamedTuple):
     """State of an aircraft on its mission.
 
     Attributes:
@@ -54,84 +54,93 @@ class Now(NamedTuple):
     """
 
     t: float
-    p: np.ndarray
+    position: np.ndarray
     origin: Origin
     wind: np.ndarray
-    way: m.Route
+    route: m.Route
 
 
-def ability(params: Mapping[str, float], altitude_m: float) -> Ability:
+def read_limits(params: Mapping[str, float], altitude_m: float) -> FlightLimits:
     """Read limits from ArduPlane or PX4 parameters, at a height above sea level [m]."""
     if "FW_AIRSPD_TRIM" in params:
         names = ("FW_AIRSPD_TRIM", "FW_T_CLMB_MAX", "FW_T_SINK_MAX", "FW_R_LIM", "NAV_LOITER_RAD")
         Va, climb, sink, bank, radius = (params.get(name, np.nan) for name in names)
-        return Ability(Va * parameters.eas2tas(altitude_m), climb, sink, radians(bank), abs(radius))
-    par, absent = arduplane.parameters(params, altitude_m)
-    at = (P.VA_CRUISE, P.CLIMB_MAX, P.SINK_MAX, P.ROLL_LIMIT, P.LOITER_RAD)
-    Va, climb, sink, bank, radius = (np.nan if P.NAMES[i] in absent else float(par[i]) for i in at)
-    return Ability(Va * parameters.eas2tas(altitude_m), climb, sink, bank, abs(radius))
+        return FlightLimits(Va * parameters.eas2tas(altitude_m), climb, sink, radians(bank), abs(radius))
+    values, absent = arduplane.parameters(params, altitude_m)
+    indices = (P.VA_CRUISE, P.CLIMB_MAX, P.SINK_MAX, P.ROLL_LIMIT, P.LOITER_RAD)
+    Va, climb, sink, bank, radius = (np.nan if P.NAMES[i] in absent else float(values[i]) for i in indices)
+    return FlightLimits(Va * parameters.eas2tas(altitude_m), climb, sink, bank, abs(radius))
 
 
-def achievable(now: Now, able: Ability) -> Finding:
+def feasibility_hazard(state: MissionState, limits: FlightLimits) -> HazardEstimate:
     """Check the legs ahead and return the least feasible one; the check ends at a leg of unknown airspeed.
 
     Without a wind estimate no leg is checked.
     """
-    if not np.isfinite(now.wind).all():
-        return Finding(AlertKind.NOT_ACHIEVABLE, 0.0, "", _OVER)
-    at, from_p = now.t, now.way.start if np.isfinite(now.way.start).all() else now.p
+    if not np.isfinite(state.wind).all():
+        return HazardEstimate(AlertKind.NOT_ACHIEVABLE, 0.0, "", _CLEAR_TEXT)
+    t, start = state.t, state.route.start if np.isfinite(state.route.start).all() else state.position
     worst: tuple[float, str, np.ndarray, float] | None = None
-    for leg in now.way.legs[:_LEGS]:
-        to = leg[m.P_N : m.P_D + 1]
-        Va = leg[m.VA_C] * parameters.eas2tas(now.origin.alt_mm * 1e-3 - to[2]) if leg[m.VA_C] > 0 else able.Va
+    for leg in state.route.legs[:_LEGS]:
+        end = leg[m.P_N : m.P_D + 1]
+        Va = leg[m.VA_C] * parameters.eas2tas(state.origin.alt_mm * 1e-3 - end[2]) if leg[m.VA_C] > 0 else limits.Va
         if not isfinite(Va):
             break
-        speed, (p, why) = _worst(leg, from_p, Va, able, now.wind)
-        if p > (worst[0] if worst is not None else 0.0):
-            worst = p, why, leg, at
-        at += float(np.hypot(*(to - from_p)[:2])) / max(speed, _SLOWEST)
-        from_p = to
+        speed, (probability, reason) = _assess_leg(leg, start, Va, limits, state.wind)
+        if probability > (worst[0] if worst is not None else 0.0):
+            worst = probability, reason, leg, t
+        t += float(np.hypot(*(end - start)[:2])) / max(speed, _MIN_GROUND_SPEED)
+        start = end
     if worst is None:
-        return Finding(AlertKind.NOT_ACHIEVABLE, 0.0, "", _OVER)
-    p, why, leg, at = worst
-    place = Origin(*map(int, to_geodetic(now.origin, leg[m.P_N : m.P_D + 1])))
+        return HazardEstimate(AlertKind.NOT_ACHIEVABLE, 0.0, "", _CLEAR_TEXT)
+    probability, reason, leg, t = worst
+    position = Origin(*map(int, to_geodetic(state.origin, leg[m.P_N : m.P_D + 1])))
     item = f"mission item {int(leg[m.SEQ])}" if leg[m.SEQ] >= 0 else "the return to launch"
-    return Finding(AlertKind.NOT_ACHIEVABLE, p, f"{item} is not achievable: {why}", _OVER, -1, at, place)
+    return HazardEstimate(
+        AlertKind.NOT_ACHIEVABLE, probability, f"{item} is not achievable: {reason}", _CLEAR_TEXT, -1, t, position
+    )
 
 
-def _worst(
-    leg: np.ndarray, from_p: np.ndarray, Va: float, able: Ability, wind: np.ndarray
+def _assess_leg(
+    leg: np.ndarray, start: np.ndarray, Va: float, limits: FlightLimits, wind: np.ndarray
 ) -> tuple[float, tuple[float, str]]:
     """Return the ground speed on a leg [m/s], and the greatest probability of infeasibility with its reason."""
-    way, length = leg[m.P_N : m.P_D + 1] - from_p, hypot(*(leg[m.P_N : m.P_D] - from_p[:2]))
-    unit = way[:2] / length if length > 1.0 else np.array([1.0, 0.0])
+    vector, length = leg[m.P_N : m.P_D + 1] - start, hypot(*(leg[m.P_N : m.P_D] - start[:2]))
+    unit = vector[:2] / length if length > 1.0 else np.array([1.0, 0.0])
     along, cross = float(wind[:2] @ unit), float(wind[1] * unit[0] - wind[0] * unit[1])
     speed = sqrt(max(Va * Va - cross * cross, 0.0)) + along
-    sigma = hypot(wind[2], _CHANGES)
+    sigma = hypot(wind[2], _WIND_DRIFT)
     checks = []
     if length > 1.0:
-        left = min(speed, Va - abs(cross))
-        why = f"wind of {hypot(*wind[:2]):.0f} m/s leaves no headway at {Va:.0f} m/s of airspeed; raise the airspeed"
-        checks.append((_p(_SLOWEST - left, sigma), why))
-        if abs(way[2]) > _FLAT:
-            checks += _steep(leg, -float(way[2]) / length * max(speed, 0.0), able, sigma / max(speed, _SLOWEST))
-    radius = abs(leg[m.RADIUS]) or able.radius
-    if int(leg[m.KIND]) in _CIRCLES and isfinite(able.bank + radius) and radius > 0 and able.bank > 0:
-        needed, most = Va * Va / (G * radius), tan(min(able.bank, 1.5))
-        why = f"a circle of {radius:.0f} m at {Va:.0f} m/s needs {np.degrees(np.arctan(needed)):.0f} deg of bank, "
-        checks.append((_p(needed / most - 1, _SHARE), why + f"the limit is {np.degrees(able.bank):.0f}; widen it"))
+        headway = min(speed, Va - abs(cross))
+        reason = f"wind of {hypot(*wind[:2]):.0f} m/s leaves no headway at {Va:.0f} m/s of airspeed; raise the airspeed"
+        checks.append((_probability(_MIN_GROUND_SPEED - headway, sigma), reason))
+        if abs(vector[2]) > _MIN_HEIGHT_STEP:
+            checks += _assess_slope(
+                leg, -float(vector[2]) / length * max(speed, 0.0), limits, sigma / max(speed, _MIN_GROUND_SPEED)
+            )
+    radius = abs(leg[m.RADIUS]) or limits.radius
+    if int(leg[m.KIND]) in _CIRCLES and isfinite(limits.bank + radius) and radius > 0 and limits.bank > 0:
+        required, allowed = Va * Va / (G * radius), tan(min(limits.bank, 1.5))
+        reason = f"a circle of {radius:.0f} m at {Va:.0f} m/s needs {np.degrees(np.arctan(required)):.0f} deg of bank, "
+        checks.append(
+            (
+                _probability(required / allowed - 1, _LIMIT_SIGMA),
+                reason + f"the limit is {np.degrees(limits.bank):.0f}; widen it",
+            )
+        )
     return speed, max(checks, default=(0.0, ""))
 
 
-def _steep(leg: np.ndarray, rate: float, able: Ability, share: float) -> list[tuple[float, str]]:
+def _assess_slope(leg: np.ndarray, rate: float, limits: FlightLimits, sigma: float) -> list[tuple[float, str]]:
     """Check the climb rate [m/s] that a leg requires; legs to a landing are not checked."""
-    kind, most = int(leg[m.KIND]), able.climb if rate > 0 else able.sink
-    if kind not in (m.WAYPOINT, m.LOITER_TURNS, m.LOITER_TIME) or not (isfinite(most) and most > 0):
+    kind, allowed = int(leg[m.KIND]), limits.climb if rate > 0 else limits.sink
+    if kind not in (m.WAYPOINT, m.LOITER_TURNS, m.LOITER_TIME) or not (isfinite(allowed) and allowed > 0):
         return []
-    word = "climb" if rate > 0 else "descent"
-    why = f"it requires a {word} of {abs(rate):.1f} m/s, the limit is {most:.1f}; make the leg longer"
-    return [(_p(abs(rate) / most - 1, hypot(_SHARE, share)), why)]
+    direction = "climb" if rate > 0 else "descent"
+    reason = f"it requires a {direction} of {abs(rate):.1f} m/s, the limit is {allowed:.1f}; make the leg longer"
+    return [(_probability(abs(rate) / allowed - 1, hypot(_LIMIT_SIGMA, sigma)), reason)]
 
 
-def _p(excess: float, sigma: float) -> float:
+def _probability(excess: float, sigma: float) -> float:
     return float(ndtr(excess / sigma))

@@ -26,19 +26,19 @@ from scipy.stats import norm, qmc
 from fleet.contract import Prediction
 from fleet.frames import Origin, to_geodetic
 from twin_worker.confidence.tube_and_horizon import track_frame
-from twin_worker.numerics.interpolation import straight
+from twin_worker.numerics.interpolation import interpolate_rows
 
 STEP = 2.0  # grid in fleet time, the same for all: instants k STEP [s since 1970]
-LONGEST_S = 180.0  # longest look-ahead used [s]
+MAX_AHEAD_S = 180.0  # longest look-ahead used [s]
 DRAWS = norm.ppf(qmc.Sobol(3, scramble=True, seed=5).random(128))  # quasi-random normal errors, (128, 3) [-]
-_MOST = 1e6  # positions farther from their origin are invalid [m]
-_LEAST = 0.1  # minimum standard deviation [m]
+_MAX_DISTANCE = 1e6  # positions farther from their origin are invalid [m]
+_MIN_SIGMA = 0.1  # minimum standard deviation [m]
 
 
-class Forecast(NamedTuple):
+class GaussianForecast(NamedTuple):
     """A validated prediction on the common grid."""
 
-    made: Prediction
+    prediction: Prediction
     first: int  # instant of the first row, in steps since 1970
     path: np.ndarray  # mean position, NED from the prediction's origin, (n, 3) [m]
     along: np.ndarray  # direction of the path, horizontal unit vector, (n, 2)
@@ -52,7 +52,7 @@ class Forecast(NamedTuple):
     def covariance(self) -> np.ndarray:
         """Return nn, ne, ee of the horizontal covariance and the vertical variance, (n, 4) [m2]."""
         out = np.empty((len(self.path), 4))
-        _turned(self.along, self.sigma, out)
+        _ned_covariance(self.along, self.sigma, out)
         return out
 
     def draws(self, until: float = np.inf) -> np.ndarray:
@@ -63,13 +63,13 @@ class Forecast(NamedTuple):
         error = [e[..., 0] * c - e[..., 1] * s, e[..., 0] * s + e[..., 1] * c, e[..., 2]]
         return self.path[:k] + np.stack(error, axis=-1)
 
-    def place(self, k: int) -> Origin:
+    def position(self, k: int) -> Origin:
         """Return the mean position at row `k`."""
-        return Origin(*map(int, to_geodetic(self.made.ned_origin(), self.path[k])))
+        return Origin(*map(int, to_geodetic(self.prediction.ned_origin(), self.path[k])))
 
 
 @lru_cache(maxsize=64)
-def axis_z(quantile: float, alone: float = 0.0) -> float:
+def axis_z(quantile: float, axis_quantile: float = 0.0) -> float:
     """Return the half-axis of a tube of coverage `quantile`, in standard deviations of one axis.
 
     Args:
@@ -77,30 +77,35 @@ def axis_z(quantile: float, alone: float = 0.0) -> float:
         axis_quantile: coverage of each half-axis; a value out of range, such as 0, means independent axes
     """
     independent = quantile ** (1 / 3)
-    return float(norm.ppf((1 + (alone if quantile <= alone < independent else independent)) / 2))
+    return float(norm.ppf((1 + (axis_quantile if quantile <= axis_quantile < independent else independent)) / 2))
 
 
-def forecast(made: Prediction) -> Forecast | None:
+def to_gaussian(prediction: Prediction) -> GaussianForecast | None:
     """Validate a prediction and interpolate it on the common grid; None if it is invalid or too short."""
     try:
-        ahead, path, tube = (array.numpy().astype(float) for array in (made.ahead, made.path, made.tube))
+        ahead, path, tube = (
+            array.numpy().astype(float)
+            for array in (prediction.ahead, prediction.path, prediction.prediction_region_half_axes)
+        )
     except ValueError:
         return None
-    if not _sound(made, ahead, path, tube):
+    if not _is_valid(prediction, ahead, path, tube):
         return None
-    t = made.t + ahead
-    first, last = ceil(t[0] / STEP), floor(min(t[-1], t[0] + LONGEST_S) / STEP)
+    t = prediction.t + ahead
+    first, last = ceil(t[0] / STEP), floor(min(t[-1], t[0] + MAX_AHEAD_S) / STEP)
     if last < first:
         return None
-    at = STEP * np.arange(first, last + 1)
-    mean = straight(at, t, path)
-    sigma = np.maximum(straight(at, t, tube) / axis_z(made.quantile, made.axis_quantile), _LEAST)
-    along = track_frame(mean, at - at[0]) if len(at) > 1 else np.array([[1.0, 0.0]])
-    return Forecast(made, first, mean, along, sigma)
+    grid = STEP * np.arange(first, last + 1)
+    mean = interpolate_rows(grid, t, path)
+    sigma = np.maximum(
+        interpolate_rows(grid, t, tube) / axis_z(prediction.quantile, prediction.axis_quantile), _MIN_SIGMA
+    )
+    along = track_frame(mean, grid - grid[0]) if len(grid) > 1 else np.array([[1.0, 0.0]])
+    return GaussianForecast(prediction, first, mean, along, sigma)
 
 
 @nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]
-def _turned(along: np.ndarray, sigma: np.ndarray, out: np.ndarray) -> None:
+def _ned_covariance(along: np.ndarray, sigma: np.ndarray, out: np.ndarray) -> None:
     """Compute the NED covariance of every row into `out`, (n, 4)."""
     for k in range(len(out)):
         c, s = along[k, 0], along[k, 1]
@@ -109,17 +114,17 @@ def _turned(along: np.ndarray, sigma: np.ndarray, out: np.ndarray) -> None:
         out[k, 3] = sigma[k, 2] ** 2
 
 
-def _sound(made: Prediction, ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> bool:
+def _is_valid(prediction: Prediction, ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> bool:
     """Return whether times rise, shapes agree, numbers are finite and the origin is a valid position."""
     n = len(ahead) if ahead.ndim == 1 else 0
     if n < 1 or path.shape != (n, 3) or tube.shape != (n, 3):
         return False
-    lat, lon, alt = made.origin
+    lat, lon, alt = prediction.origin
     return bool(
-        0 < made.t < 4e9
-        and 0 < made.quantile < 1
-        and isfinite(made.quantile)
-        and _credible(ahead, path, tube)
+        0 < prediction.t < 4e9
+        and 0 < prediction.quantile < 1
+        and isfinite(prediction.quantile)
+        and _is_plausible(ahead, path, tube)
         and abs(lat) < 8.9e8
         and abs(lon) <= 1.8e9
         and abs(alt) <= 1e8
@@ -127,12 +132,12 @@ def _sound(made: Prediction, ahead: np.ndarray, path: np.ndarray, tube: np.ndarr
 
 
 @nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]
-def _credible(ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> bool:
+def _is_plausible(ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> bool:
     """Return whether times are finite and rise, and positions and half-axes are within bounds; false for nan."""
     for k in range(len(ahead)):
         if not np.isfinite(ahead[k]) or (k and not ahead[k] > ahead[k - 1]):
             return False
         for i in range(3):
-            if not (abs(path[k, i]) < _MOST and 0.0 <= tube[k, i] < _MOST):
+            if not (abs(path[k, i]) < _MAX_DISTANCE and 0.0 <= tube[k, i] < _MAX_DISTANCE):
                 return False
     return True

@@ -13,65 +13,77 @@ import numpy as np
 
 from fleet.contract import AlertKind
 from fleet.frames import Origin, to_ned
-from twin_worker.alerts.gaussian_forecast import Forecast
-from twin_worker.alerts.hysteresis import Finding
+from twin_worker.alerts.gaussian_forecast import GaussianForecast
+from twin_worker.alerts.hysteresis import HazardEstimate
 
 _CEILING, _CIRCLE, _POLYGON, _FLOOR = 1, 2, 4, 8  # FENCE_TYPE
-_OVER = "no geofence breach predicted"
+_CLEAR_TEXT = "no geofence breach predicted"
 
 
-class Fence(NamedTuple):
+class GeofenceLimits(NamedTuple):
     """Geofence limits around home; infinite where there is none."""
 
     radius: float = np.inf  # horizontal [m]
     ceiling: float = np.inf  # height above home [m]
     floor: float = -np.inf  # height above home [m]
-    unseen: str = ""  # part of the fence that is not monitored
+    unmonitored: str = ""  # part of the fence that is not monitored
 
-    def limits(self) -> bool:
+    def any_limit(self) -> bool:
         """Return whether there is any limit."""
         return bool(np.isfinite(self[:3]).any())
 
 
-def fence(params: Mapping[str, float]) -> Fence:
+def read_geofence(params: Mapping[str, float]) -> GeofenceLimits:
     """Read the active geofence from autopilot parameters; without one all limits are infinite."""
     if "GF_MAX_HOR_DIST" in params or "GF_MAX_VER_DIST" in params:
-        wide, high = (_positive(params.get(name)) for name in ("GF_MAX_HOR_DIST", "GF_MAX_VER_DIST"))
-        return Fence(wide, high)
+        max_horizontal, max_vertical = (
+            _distance_limit(params.get(name)) for name in ("GF_MAX_HOR_DIST", "GF_MAX_VER_DIST")
+        )
+        return GeofenceLimits(max_horizontal, max_vertical)
     if not (params.get("FENCE_ENABLE", 0.0) > 0 or params.get("FENCE_AUTOENABLE", 0.0) > 0):
-        return Fence()
-    told = params.get("FENCE_TYPE", np.nan)
-    kinds = int(told) if isfinite(told) and 0 <= told < 256 else _CEILING | _CIRCLE | _FLOOR
+        return GeofenceLimits()
+    fence_type = params.get("FENCE_TYPE", np.nan)
+    kinds = int(fence_type) if isfinite(fence_type) and 0 <= fence_type < 256 else _CEILING | _CIRCLE | _FLOOR
     low = params.get("FENCE_ALT_MIN", np.nan)
     points = params.get("FENCE_TOTAL", 0.0)
-    return Fence(
-        _positive(params.get("FENCE_RADIUS")) if kinds & _CIRCLE else np.inf,
-        _positive(params.get("FENCE_ALT_MAX")) if kinds & _CEILING else np.inf,
+    return GeofenceLimits(
+        _distance_limit(params.get("FENCE_RADIUS")) if kinds & _CIRCLE else np.inf,
+        _distance_limit(params.get("FENCE_ALT_MAX")) if kinds & _CEILING else np.inf,
         low if kinds & _FLOOR and isfinite(low) else -np.inf,
         f"its polygon of {points:.0f} points was not received" if kinds & _POLYGON and points > 0 else "",
     )
 
 
-def _positive(value: float | None) -> float:
+def _distance_limit(value: float | None) -> float:
     """Return a distance limit; infinite if it is absent, not positive or not finite."""
     return value if value is not None and isfinite(value) and value > 0 else np.inf
 
 
-def leaves(flight: Forecast, limit: Fence, home: Origin, until: float = np.inf) -> Finding:
+def geofence_hazard(
+    flight: GaussianForecast, limits: GeofenceLimits, home: Origin, until: float = np.inf
+) -> HazardEstimate:
     """Compute the probability of a geofence breach around `home`, up to an instant [s since 1970]."""
-    centre = to_ned(flight.made.ned_origin(), *(np.array([x]) for x in home))[0]
-    place = flight.draws(until) - centre
-    away, height = np.hypot(place[..., 0], place[..., 1]), -place[..., 2]
-    out: np.ndarray = np.stack([away > limit.radius, height > limit.ceiling, height < limit.floor])
-    ever: np.ndarray = np.any(out, axis=0)  # (draws, instants)
-    hit: np.ndarray = np.any(ever, axis=1)
-    p = float(hit.mean())
-    if not p:
-        return Finding(AlertKind.GEOFENCE, 0.0, "", _OVER)
-    k = int(np.sort(ever[hit].argmax(axis=1))[hit.sum() // 2])
-    which = int(out[:, :, k].sum(axis=1).argmax())
-    name = f"{('circle', 'ceiling', 'floor')[which]} of {limit[which]:.0f} m"
-    at = float(flight.t[k])
-    when = f"in {at - flight.made.t:.0f} s" if k else "now"
-    said = f"{p:.0%} chance that it leaves the geofence, {name} about home, {when}"
-    return Finding(AlertKind.GEOFENCE, p, "; ".join(filter(None, (said, limit.unseen))), _OVER, -1, at, flight.place(k))
+    centre = to_ned(flight.prediction.ned_origin(), *(np.array([x]) for x in home))[0]
+    relative = flight.draws(until) - centre
+    distance, height = np.hypot(relative[..., 0], relative[..., 1]), -relative[..., 2]
+    breaches: np.ndarray = np.stack([distance > limits.radius, height > limits.ceiling, height < limits.floor])
+    breached: np.ndarray = np.any(breaches, axis=0)  # (draws, instants)
+    breaching: np.ndarray = np.any(breached, axis=1)
+    probability = float(breaching.mean())
+    if not probability:
+        return HazardEstimate(AlertKind.GEOFENCE, 0.0, "", _CLEAR_TEXT)
+    k = int(np.sort(breached[breaching].argmax(axis=1))[breaching.sum() // 2])
+    index = int(breaches[:, :, k].sum(axis=1).argmax())
+    name = f"{('circle', 'ceiling', 'floor')[index]} of {limits[index]:.0f} m"
+    breach_t = float(flight.t[k])
+    when = f"in {breach_t - flight.prediction.t:.0f} s" if k else "now"
+    message = f"{probability:.0%} chance that it leaves the geofence, {name} about home, {when}"
+    return HazardEstimate(
+        AlertKind.GEOFENCE,
+        probability,
+        "; ".join(filter(None, (message, limits.unmonitored))),
+        _CLEAR_TEXT,
+        -1,
+        breach_t,
+        flight.position(k),
+    )

@@ -5,20 +5,23 @@ from scipy.special import ndtr
 
 from fleet.contract import AlertKind
 from fleet.frames import Origin
-from twin_worker.alerts.gaussian_forecast import Forecast
-from twin_worker.alerts.hysteresis import Finding
+from twin_worker.alerts.gaussian_forecast import GaussianForecast
+from twin_worker.alerts.hysteresis import HazardEstimate
 
-WINGS_M, ROTORS_M = 30.0, 5.0  # minimum height above home outside landings, fixed wings and multirotors [m]
-_SLIGHT = 0.02  # below this probability no alert text is composed [-]
-_OVER = "no descent below the minimum height predicted"
+MIN_HEIGHT_WINGS_M, MIN_HEIGHT_ROTORS_M = (
+    30.0,
+    5.0,
+)  # minimum height above home outside landings, fixed wings and multirotors [m]
+_MIN_PROBABILITY = 0.02  # below this probability no alert text is composed [-]
+_CLEAR_TEXT = "no descent below the minimum height predicted"
 
 
-def above(flight: Forecast, home: Origin) -> np.ndarray:
+def height_above_home(flight: GaussianForecast, home: Origin) -> np.ndarray:
     """Return the mean height above home, (n,) [m]."""
-    return (flight.made.origin[2] - home.alt_mm) * 1e-3 - flight.path[:, 2]
+    return (flight.prediction.origin[2] - home.alt_mm) * 1e-3 - flight.path[:, 2]
 
 
-def sinks(flight: Forecast, home: Origin, margin: float, until: float = np.inf) -> Finding:
+def ground_hazard(flight: GaussianForecast, home: Origin, margin: float, until: float = np.inf) -> HazardEstimate:
     """Compute the probability of descending below a height above home [m], up to an instant [s since 1970].
 
     The vertical error is one draw for the whole flight, so the worst instant determines the probability:
@@ -26,17 +29,17 @@ def sinks(flight: Forecast, home: Origin, margin: float, until: float = np.inf) 
         p = max over t of Phi((margin - height(t)) / sigma(t))
     """
     k = max(int(np.searchsorted(flight.t, until, side="right")), 1)
-    height, sigma = above(flight, home)[:k], flight.sigma[:k, 2]
+    height, sigma = height_above_home(flight, home)[:k], flight.sigma[:k, 2]
     z = (margin - height) / sigma
-    p = float(ndtr(z.max()))
-    if p < _SLIGHT:
-        return Finding(AlertKind.GROUND, p, "", _OVER)
+    probability = float(ndtr(z.max()))
+    if probability < _MIN_PROBABILITY:
+        return HazardEstimate(AlertKind.GROUND, probability, "", _CLEAR_TEXT)
     first = int(
         np.flatnonzero(z >= min(z.max(), 0.0))[0]
     )  # where the mean goes below the margin, else the lowest point
-    at = float(flight.t[first])
-    danger = (
-        f"{p:.0%} chance that it sinks below {margin:.0f} m above home (terrain unknown) in "
-        f"{max(at - flight.made.t, 0.0):.0f} s; lowest {height.min():.0f} m"
+    t = float(flight.t[first])
+    message = (
+        f"{probability:.0%} chance that it sinks below {margin:.0f} m above home (terrain unknown) in "
+        f"{max(t - flight.prediction.t, 0.0):.0f} s; lowest {height.min():.0f} m"
     )
-    return Finding(AlertKind.GROUND, p, danger, _OVER, -1, at, flight.place(first))
+    return HazardEstimate(AlertKind.GROUND, probability, message, _CLEAR_TEXT, -1, t, flight.position(first))

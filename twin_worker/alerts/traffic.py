@@ -6,99 +6,114 @@ from math import inf, isfinite
 import numpy as np
 
 from fleet.contract import Alert, AlertKind, Message, Prediction
-from twin_worker.alerts.conflict_probability import Separation, chance, screen
-from twin_worker.alerts.gaussian_forecast import DRAWS, STEP, Forecast
-from twin_worker.alerts.hysteresis import Finding, Ledger
-from twin_worker.alerts.traffic_picture import Board
+from twin_worker.alerts.conflict_probability import Separation, conflict_probability, screen
+from twin_worker.alerts.gaussian_forecast import DRAWS, STEP, GaussianForecast
+from twin_worker.alerts.hysteresis import AlertState, HazardEstimate
+from twin_worker.alerts.traffic_picture import TrafficPicture
 
-_EVERY_S = 1.0  # between assessments of one aircraft's pairs [s]
+_PERIOD_S = 1.0  # between assessments of one aircraft's pairs [s]
 _STALE_S = 10.0  # maximum age of a prediction [s]
-_SLIGHT = 0.02  # lower probabilities are ignored [-]
-_KEPT = "no conflict with uav-{} predicted"
+_MIN_PROBABILITY = 0.02  # lower probabilities are ignored [-]
+_CLEAR_TEXT = "no conflict with uav-{} predicted"
 
 
 @dataclass
-class Traffic:
+class TrafficMonitor:
     """Predictions of all aircraft, and conflicts of the owned aircraft."""
 
     separation: Separation = field(default_factory=Separation)
-    board: Board = field(default_factory=Board)
-    _ledgers: dict[int, Ledger] = field(default_factory=dict)
-    _judged: dict[int, float] = field(default_factory=dict)  # time of the last assessment, by UAV [s since 1970]
+    picture: TrafficPicture = field(default_factory=TrafficPicture)
+    _states: dict[int, AlertState] = field(default_factory=dict)
+    _assessed_t: dict[int, float] = field(default_factory=dict)  # time of the last assessment, by UAV [s since 1970]
 
-    def hear(self, made: Prediction) -> None:
+    def receive(self, prediction: Prediction) -> None:
         """Store the newest prediction of any aircraft."""
-        self.board.hear(made)
+        self.picture.receive(prediction)
 
-    def after(self, uav: int, now: float, results: list[Message]) -> list[Message]:
+    def process_results(self, uav: int, now: float, results: list[Message]) -> list[Message]:
         """Process the results of an owned twin at data time `now`; return them and the conflict alerts that follow."""
         for result in results:
             if isinstance(result, Prediction):
-                self.hear(result)
-        return [*results, *self.judge(uav, now)]
+                self.receive(result)
+        return [*results, *self.assess(uav, now)]
 
-    def judge(self, uav: int, now: float) -> list[Alert]:
+    def assess(self, uav: int, now: float) -> list[Alert]:
         """Assess one owned aircraft against all with a higher id, at most once a second of data time `now`."""
-        last = self._judged.get(uav, -inf)
-        if last <= now < last + _EVERY_S or not isfinite(now):
+        previous = self._assessed_t.get(uav, -inf)
+        if previous <= now < previous + _PERIOD_S or not isfinite(now):
             return []
-        self._judged[uav] = now
-        ledger = self._ledgers.setdefault(uav, Ledger())
-        found = {finding.other: finding for finding in self._meetings(uav, now)}
-        for other in ledger.watched(AlertKind.CONFLICT):
-            found.setdefault(other, Finding(AlertKind.CONFLICT, 0.0, "", _KEPT.format(other), other))
-        return [alert for finding in found.values() for alert in ledger.judge(uav, now, finding)]
+        self._assessed_t[uav] = now
+        state = self._states.setdefault(uav, AlertState())
+        hazards = {hazard.other: hazard for hazard in self._conflicts(uav, now)}
+        for other in state.tracked_uavs(AlertKind.CONFLICT):
+            hazards.setdefault(other, HazardEstimate(AlertKind.CONFLICT, 0.0, "", _CLEAR_TEXT.format(other), other))
+        return [alert for finding in hazards.values() for alert in state.update(uav, now, finding)]
 
-    def take(self, uav: int, conflicts: Ledger) -> None:
+    def acquire(self, uav: int, conflicts: AlertState) -> None:
         """Take over the alert state of a newly owned aircraft from another worker."""
-        self._ledgers[uav] = conflicts
+        self._states[uav] = conflicts
 
-    def show(self, uav: int) -> Ledger:
+    def state_of(self, uav: int) -> AlertState:
         """Return the alert state of an aircraft."""
-        return self._ledgers.get(uav) or Ledger()
+        return self._states.get(uav) or AlertState()
 
-    def forget(self, uav: int) -> None:
+    def release(self, uav: int) -> None:
         """Delete the alert state of an aircraft that is no longer owned."""
-        self._judged.pop(uav, None)
-        self._ledgers.pop(uav, None)
+        self._assessed_t.pop(uav, None)
+        self._states.pop(uav, None)
 
     def active(self, uav: int) -> list[Alert]:
         """Return the active conflict alerts of one owned aircraft."""
-        return self._ledgers[uav].active if uav in self._ledgers else []
+        return self._states[uav].active if uav in self._states else []
 
-    def _meetings(self, uav: int, now: float) -> list[Finding]:
-        self.board.settle()
-        held = self.board.of(uav)
-        if held is None or abs(held[1].made.t - now) > _STALE_S:
+    def _conflicts(self, uav: int, now: float) -> list[HazardEstimate]:
+        self.picture.update_slots()
+        occupied = self.picture.slot_of(uav)
+        if occupied is None or abs(occupied[1].prediction.t - now) > _STALE_S:
             return []
-        board, (slot, own) = self.board, held
-        others = board.others(slot, now, _STALE_S)
+        picture, (slot, forecast) = self.picture, occupied
+        others = picture.others(slot, now, _STALE_S)
         if not len(others):
             return []
-        scale, shift = board.into(slot, others)
-        met = np.empty((len(others), 5))
+        scale, shift = picture.frame_transform(slot, others)
+        encounters = np.empty((len(others), 5))
         limits = np.array(self.separation, float)
-        screen(slot, others, board.first, board.rows, board.path, board.covariance, scale, shift, limits, met)
-        findings = []
-        for j in np.flatnonzero(met[:, 0] >= 0):
-            p = self._chance(slot, int(others[j]), (scale[j], shift[j]), met[j])
-            if p >= _SLIGHT:
-                findings.append(self._finding(own, int(board.uav[others[j]]), p, met[j]))
-        return findings
-
-    def _chance(self, own: int, other: int, frame: tuple[np.ndarray, np.ndarray], met: np.ndarray) -> float:
-        board, steps = self.board, np.arange(int(met[0]), int(met[1]) + 1)
-        i, k = steps - board.first[own], steps - board.first[other]
-        apart = board.path[other, k] * frame[0] + frame[1] - board.path[own, i]
-        covariance = board.covariance[own, i] + board.covariance[other, k]
-        return float(chance(apart, covariance, DRAWS, np.array(self.separation, float)))
-
-    def _finding(self, own: Forecast, other: int, p: float, met: np.ndarray) -> Finding:
-        at, wide, high = float(met[2]) * STEP, float(met[3]), float(met[4])
-        limit = self.separation
-        danger = (
-            f"{p:.0%} chance that it comes within {limit.horizontal:.0f} m and {limit.vertical:.0f} m of height of "
-            f"uav-{other} in {max(at - own.made.t, 0.0):.0f} s; mean paths come within {wide:.0f} m and {high:.0f} m"
+        screen(
+            slot,
+            others,
+            picture.first,
+            picture.rows,
+            picture.path,
+            picture.covariance,
+            scale,
+            shift,
+            limits,
+            encounters,
         )
-        place = own.place(int(np.clip(round(met[2]) - own.first, 0, len(own.path) - 1)))
-        return Finding(AlertKind.CONFLICT, p, danger, _KEPT.format(other), other, at, place)
+        hazards = []
+        for j in np.flatnonzero(encounters[:, 0] >= 0):
+            probability = self._probability(slot, int(others[j]), (scale[j], shift[j]), encounters[j])
+            if probability >= _MIN_PROBABILITY:
+                hazards.append(self._hazard(forecast, int(picture.uav[others[j]]), probability, encounters[j]))
+        return hazards
+
+    def _probability(self, own: int, other: int, frame: tuple[np.ndarray, np.ndarray], encounter: np.ndarray) -> float:
+        picture, steps = self.picture, np.arange(int(encounter[0]), int(encounter[1]) + 1)
+        i, k = steps - picture.first[own], steps - picture.first[other]
+        separation = picture.path[other, k] * frame[0] + frame[1] - picture.path[own, i]
+        covariance = picture.covariance[own, i] + picture.covariance[other, k]
+        return float(conflict_probability(separation, covariance, DRAWS, np.array(self.separation, float)))
+
+    def _hazard(
+        self, forecast: GaussianForecast, other: int, probability: float, encounter: np.ndarray
+    ) -> HazardEstimate:
+        t, horizontal, vertical = float(encounter[2]) * STEP, float(encounter[3]), float(encounter[4])
+        limit = self.separation
+        message = (
+            f"{probability:.0%} chance that it comes within {limit.horizontal:.0f} m and {limit.vertical:.0f} "
+            "m of height of "
+            f"uav-{other} in {max(t - forecast.prediction.t, 0.0):.0f} s; mean paths come within "
+            f"{horizontal:.0f} m and {vertical:.0f} m"
+        )
+        position = forecast.position(int(np.clip(round(encounter[2]) - forecast.first, 0, len(forecast.path) - 1)))
+        return HazardEstimate(AlertKind.CONFLICT, probability, message, _CLEAR_TEXT.format(other), other, t, position)

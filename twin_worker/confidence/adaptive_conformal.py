@@ -16,67 +16,69 @@ from dataclasses import dataclass, field
 import numba as nb
 import numpy as np
 
-from twin_worker.confidence.calibration_table import ATOMS, COLUMN, KNOTS, Table
-from twin_worker.confidence.horizon_risk import critical
-from twin_worker.confidence.prediction_log import EVERY_S, Ledger
+from twin_worker.confidence.calibration_table import ATOMS, COLUMN, KNOTS, CalibrationTable
+from twin_worker.confidence.horizon_risk import critical_factor
+from twin_worker.confidence.prediction_log import EVERY_S, PredictionLog
 from twin_worker.confidence.weighted_quantile import censored_quantile, weighted_quantile
-from twin_worker.numerics.prediction_errors import AHEAD, QUANTILE
+from twin_worker.numerics.prediction_errors import AHEAD, NOMINAL_COVERAGE
 
-_TABLE = 10.0  # independent predictions that the table counts as [-]
-_FADES_S = 400.0  # time constant of the weight of a score [s]
-_SHARE = np.minimum(1.0, EVERY_S / (0.5 * KNOTS))  # weight of a score; scores of overlapping predictions correlate [-]
-_SHARE_HORIZON = EVERY_S / 30.0  # weight of a first passage [-]
+_TABLE_WEIGHT = 10.0  # independent predictions that the table counts as [-]
+_DECAY_S = 400.0  # time constant of the weight of a score [s]
+_WEIGHT = np.minimum(1.0, EVERY_S / (0.5 * KNOTS))  # weight of a score; scores of overlapping predictions correlate [-]
+_HORIZON_WEIGHT = EVERY_S / 30.0  # weight of a first passage [-]
 _TUBE_STEP, _HORIZON_STEP = 0.05, 0.02  # of the level, per independent miss [-]
-_LEAST_LEVEL, _MOST_LEVEL = 0.5, 0.99
+_MIN_LEVEL, _MAX_LEVEL = 0.5, 0.99
 _COLUMN_OF = np.full(len(AHEAD), -1)
 _COLUMN_OF[COLUMN] = np.arange(len(KNOTS))
-_LEAST_FACTOR, _MOST_FACTOR = 0.1, 20.0
+_MIN_FACTOR, _MAX_FACTOR = 0.1, 20.0
 _exact = nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath: results equal numpy's
 
 
 @dataclass
-class Levels:
+class AdaptiveLevels:
     """Present quantile levels of one group: of the tube at each knot, and of the horizon."""
 
-    tube: np.ndarray = field(default_factory=lambda: np.full(len(KNOTS), QUANTILE))
-    horizon: float = QUANTILE
+    tube: np.ndarray = field(default_factory=lambda: np.full(len(KNOTS), NOMINAL_COVERAGE))
+    horizon: float = NOMINAL_COVERAGE
 
-    def learn(self, ledger: Ledger, r: np.ndarray, j: np.ndarray, mine: np.ndarray) -> None:
+    def update(self, log: PredictionLog, rows: np.ndarray, columns: np.ndarray, in_group: np.ndarray) -> None:
         """Update the levels with new scores: rows and columns of the log, and which rows are of this group, bool."""
-        _learn_tube(self.tube, ledger.score, r, j, mine)
-        held, failed = _settle_claims(ledger.claimed, ledger.followed, ledger.horizon, ledger.passed, mine)
-        moved = failed * QUANTILE - held * (1.0 - QUANTILE)
+        _update_tube_levels(self.tube, log.score, rows, columns, in_group)
+        met, missed = _close_horizons(log.horizon_pending, log.followed, log.horizon, log.exceeded, in_group)
+        step = missed * NOMINAL_COVERAGE - met * (1.0 - NOMINAL_COVERAGE)
         # never below NOMINAL_COVERAGE: easy minutes, which meet any horizon, must not offset difficult ones
-        self.horizon = min(max(self.horizon + _HORIZON_STEP * moved, QUANTILE), _MOST_LEVEL)
+        self.horizon = min(max(self.horizon + _HORIZON_STEP * step, NOMINAL_COVERAGE), _MAX_LEVEL)
 
 
 @_exact
-def _learn_tube(level: np.ndarray, score: np.ndarray, r: np.ndarray, j: np.ndarray, mine: np.ndarray) -> None:
+def _update_tube_levels(
+    level: np.ndarray, score: np.ndarray, rows: np.ndarray, columns: np.ndarray, in_group: np.ndarray
+) -> None:
     """Update the levels at the knots, (13,), with new scores of this group."""
-    for k in range(len(r)):
-        knot, value = _COLUMN_OF[j[k]], score[r[k], j[k]]
-        if mine[r[k]] and knot >= 0 and np.isfinite(value):
-            level[knot] += _TUBE_STEP * _SHARE[knot] * ((1.0 if value > 1.0 else 0.0) - (1.0 - QUANTILE))
+    for k in range(len(rows)):
+        knot, value = _COLUMN_OF[columns[k]], score[rows[k], columns[k]]
+        if in_group[rows[k]] and knot >= 0 and np.isfinite(value):
+            level[knot] += _TUBE_STEP * _WEIGHT[knot] * ((1.0 if value > 1.0 else 0.0) - (1.0 - NOMINAL_COVERAGE))
     for knot in range(len(level)):
-        level[knot] = min(max(level[knot], _LEAST_LEVEL), _MOST_LEVEL)
+        level[knot] = min(max(level[knot], _MIN_LEVEL), _MAX_LEVEL)
 
 
 @_exact
-def _settle_claims(
-    claimed: np.ndarray, followed: np.ndarray, horizon: np.ndarray, passed: np.ndarray, mine: np.ndarray
+def _close_horizons(
+    pending: np.ndarray, followed: np.ndarray, horizon: np.ndarray, exceeded: np.ndarray, in_group: np.ndarray
 ) -> tuple[int, int]:
     """Count the horizons of this group that were met and missed since the last call, and close them."""
-    held = failed = 0
-    for r in range(len(claimed)):
-        if mine[r] and claimed[r]:
-            holds = followed[r] >= horizon[r]
-            held, failed = held + holds, failed + (passed[r] and not holds)
-            claimed[r] = not (holds or passed[r])
-    return held, failed
+    met = missed = 0
+    for row in range(len(pending)):
+        if in_group[row] and pending[row]:
+            is_met = followed[row] >= horizon[row]
+            met, missed = met + is_met, missed + (exceeded[row] and not is_met)
+            pending[row] = not (is_met or exceeded[row])
+    return met, missed
 
 
 @dataclass(frozen=True)
-class Factors:
+class ScaleFactors:
     """Present scale factors of one group.
 
     Attributes:
@@ -88,7 +90,7 @@ class Factors:
 
     tube: np.ndarray
     horizon: float
-    own: int
+    own_count: int
     bounded: bool = False
 
     def at(self, ahead: np.ndarray) -> np.ndarray:
@@ -96,33 +98,33 @@ class Factors:
         return np.interp(ahead, KNOTS, self.tube)
 
 
-def factors(ledger: Ledger, group: str, table: Table, levels: Levels) -> Factors:
+def scale_factors(log: PredictionLog, group: str, table: CalibrationTable, levels: AdaptiveLevels) -> ScaleFactors:
     """Compute scale factors from the table and the scores of the aircraft's own predictions of this group."""
-    rows = np.flatnonzero(ledger.group == group)
-    scores = ledger.score[np.ix_(rows, COLUMN)] * ledger.factor[rows]
-    age = ledger.until - ledger.t0[rows]
-    weight = np.exp(-np.clip(age, 0.0, None) / _FADES_S)[:, None] * np.where(np.isfinite(scores), _SHARE, 0.0)
+    rows = np.flatnonzero(log.group == group)
+    scores = log.score[np.ix_(rows, COLUMN)] * log.factor[rows]
+    age = log.evaluated_until - log.t0[rows]
+    weight = np.exp(-np.clip(age, 0.0, None) / _DECAY_S)[:, None] * np.where(np.isfinite(scores), _WEIGHT, 0.0)
     level = np.array([levels.tube.mean()])
-    pooled = _join(table.scores, scores.reshape(1, -1), weight.reshape(1, -1) / len(KNOTS), level)[0]
-    tube = _join(table.scores * pooled, scores.T, weight.T, levels.tube)
-    horizon = _horizon(ledger, rows, table.risks * pooled, levels.horizon)
-    own = int((weight > 0).any(axis=1).sum())
-    bounded = bool((levels.tube >= _MOST_LEVEL).any() or (tube >= _MOST_FACTOR).any())
-    return Factors(np.clip(tube, _LEAST_FACTOR, _MOST_FACTOR), horizon, own, bounded)
+    pooled = _joint_quantiles(table.scores, scores.reshape(1, -1), weight.reshape(1, -1) / len(KNOTS), level)[0]
+    tube = _joint_quantiles(table.scores * pooled, scores.T, weight.T, levels.tube)
+    horizon = _horizon_factor(log, rows, table.risks * pooled, levels.horizon)
+    own_count = int((weight > 0).any(axis=1).sum())
+    bounded = bool((levels.tube >= _MAX_LEVEL).any() or (tube >= _MAX_FACTOR).any())
+    return ScaleFactors(np.clip(tube, _MIN_FACTOR, _MAX_FACTOR), horizon, own_count, bounded)
 
 
-def _join(atoms: np.ndarray, scores: np.ndarray, weight: np.ndarray, level: np.ndarray) -> np.ndarray:
+def _joint_quantiles(atoms: np.ndarray, scores: np.ndarray, weight: np.ndarray, level: np.ndarray) -> np.ndarray:
     """Return the quantiles of each row of scores (r, n) joined with a table's atoms (20,)."""
     r = len(scores)
     x = np.hstack([np.broadcast_to(atoms, (r, ATOMS)), scores])
-    return weighted_quantile(x, np.hstack([np.full((r, ATOMS), _TABLE / ATOMS), weight]), level)
+    return weighted_quantile(x, np.hstack([np.full((r, ATOMS), _TABLE_WEIGHT / ATOMS), weight]), level)
 
 
-def _horizon(ledger: Ledger, rows: np.ndarray, risks: np.ndarray, level: float) -> float:
+def _horizon_factor(log: PredictionLog, rows: np.ndarray, risks: np.ndarray, level: float) -> float:
     """Return the factor at which a share `level` of first passages lies beyond the horizon."""
-    followed, passed = ledger.followed[rows], ledger.passed[rows]
-    x = critical(ledger.ratio[rows], followed)
-    age = np.clip(ledger.until - ledger.t0[rows], 0.0, None)
-    weight = np.where((followed > 0) | passed, _SHARE_HORIZON * np.exp(-age / _FADES_S), 0.0)
-    x, exact = np.append(risks, x), np.append(np.ones(ATOMS, bool), passed)
-    return censored_quantile(x, np.append(np.full(ATOMS, _TABLE / ATOMS), weight), exact, level)
+    followed, exceeded = log.followed[rows], log.exceeded[rows]
+    x = critical_factor(log.ratio[rows], followed)
+    age = np.clip(log.evaluated_until - log.t0[rows], 0.0, None)
+    weight = np.where((followed > 0) | exceeded, _HORIZON_WEIGHT * np.exp(-age / _DECAY_S), 0.0)
+    x, exact = np.append(risks, x), np.append(np.ones(ATOMS, bool), exceeded)
+    return censored_quantile(x, np.append(np.full(ATOMS, _TABLE_WEIGHT / ATOMS), weight), exact, level)

@@ -10,15 +10,15 @@ from functools import cached_property, lru_cache
 import numpy as np
 from scipy.special import erfinv
 
-from twin_worker.numerics.interpolation import straight
-from twin_worker.numerics.prediction_errors import AHEAD, QUANTILE
+from twin_worker.numerics.interpolation import interpolate_rows
+from twin_worker.numerics.prediction_errors import AHEAD, NOMINAL_COVERAGE
 
 KNOTS = np.array([1.0, 2, 3, 5, 8, 12, 18, 27, 40, 60, 80, 120, 180])  # look-aheads of the table rows [s]
 COLUMN = np.searchsorted(AHEAD, KNOTS)  # of each in AHEAD
 ATOMS = 20  # quantiles that represent a distribution, at the midpoints of equal shares
 LEVELS = (np.arange(ATOMS) + 0.5) / ATOMS
-INDEPENDENT = QUANTILE ** (1 / 3)  # coverage of each axis where errors of the axes are independent [-]
-_LAW = {  # default spread along, cross, vertical: base [m], growth [m/s^power], power
+INDEPENDENT = NOMINAL_COVERAGE ** (1 / 3)  # coverage of each axis where errors of the axes are independent [-]
+_GROWTH_LAW = {  # default spread along, cross, vertical: base [m], growth [m/s^power], power
     "dynamics": ((0.3, 0.3, 0.3), (0.4, 0.15, 0.15), 1.2),
     "hybrid": ((0.3, 0.3, 0.3), (0.4, 0.15, 0.15), 1.2),
     "both": ((0.3, 0.3, 0.3), (0.4, 0.15, 0.15), 1.2),
@@ -27,12 +27,12 @@ _LAW = {  # default spread along, cross, vertical: base [m], growth [m/s^power],
     "greybox": ((0.5, 0.4, 0.4), (0.5, 0.3, 0.2), 1.3),
     "imm": ((1.0, 1.0, 0.5), (1.6, 1.6, 0.5), 1.4),
 }
-_SOON_S = 10.0  # the forecast revision is not informative below about this look-ahead [s]
-_MOST_M = 1e6  # larger spreads are invalid [m]
+_LAG_TIME_S = 10.0  # the forecast revision is not informative below about this look-ahead [s]
+_MAX_SPREAD_M = 1e6  # larger spreads are invalid [m]
 
 
 @dataclass(frozen=True)
-class Table:
+class CalibrationTable:
     """Calibration of one group, fitted to past flights.
 
     Attributes:
@@ -60,32 +60,32 @@ class Table:
     held_out: dict[str, float] = field(default_factory=dict)
     alone: float = INDEPENDENT
 
-    def sigma(self, doubt: "Doubt", ahead: np.ndarray) -> np.ndarray:
+    def sigma(self, features: "UncertaintyFeatures", ahead: np.ndarray) -> np.ndarray:
         """Return the expected error standard deviation, extrapolated beyond the last knot, (..., n, 3) [m]."""
         scale, lag, floor, _ = self._curves(ahead)
-        return np.sqrt((scale * doubt.spread) ** 2 + (lag * doubt.revision) ** 2 + floor**2)
+        return np.sqrt((scale * features.spread) ** 2 + (lag * features.revision) ** 2 + floor**2)
 
-    def half_axes(self, doubt: "Doubt", ahead: np.ndarray) -> np.ndarray:
+    def half_axes(self, features: "UncertaintyFeatures", ahead: np.ndarray) -> np.ndarray:
         """Return the half-axes of coverage `NOMINAL_COVERAGE` at each look-ahead, (..., n, 3) [m]."""
-        return self._curves(ahead)[3] * self.sigma(doubt, ahead)
+        return self._curves(ahead)[3] * self.sigma(features, ahead)
 
     def _curves(self, ahead: np.ndarray) -> np.ndarray:
         """Return scale, lag, floor and factor by look-ahead, (4, n, 3)."""
         n = len(ahead)
-        return self._usual[:, :n] if np.array_equal(ahead, AHEAD[:n]) else self._drawn(ahead)
+        return self._on_grid[:, :n] if np.array_equal(ahead, AHEAD[:n]) else self._interpolated(ahead)
 
     @cached_property
-    def _usual(self) -> np.ndarray:
-        return self._drawn(AHEAD)
+    def _on_grid(self) -> np.ndarray:
+        return self._interpolated(AHEAD)
 
-    def _drawn(self, ahead: np.ndarray) -> np.ndarray:
+    def _interpolated(self, ahead: np.ndarray) -> np.ndarray:
         out = np.array([at_look_aheads(ahead, rows) for rows in (self.scale, self.lag, self.floor, self.factor)])
         out[2] *= np.maximum(ahead / KNOTS[-1], 1.0)[:, None]
         return out
 
 
 @dataclass(frozen=True)
-class Doubt:
+class UncertaintyFeatures:
     """Features of a prediction that predict its error.
 
     Attributes:
@@ -99,32 +99,34 @@ class Doubt:
 
 def at_look_aheads(ahead: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Interpolate table rows by knot and axis, (13, 3), at look-aheads, (n, 3)."""
-    return straight(ahead, KNOTS, rows)
+    return interpolate_rows(ahead, KNOTS, rows)
 
 
-def law_of_growth(method: str, ahead: np.ndarray) -> np.ndarray:
+def error_growth(method: str, ahead: np.ndarray) -> np.ndarray:
     """Return the default spread of a method without an ensemble, (n, 3) [m]; not calibrated."""
-    base, growth, power = _LAW.get(method, _LAW["greybox"])
+    base, growth, power = _GROWTH_LAW.get(method, _GROWTH_LAW["greybox"])
     return np.hypot(base, np.outer(np.maximum(ahead, 0.0) ** power, growth))
 
 
-def doubt_of(spread: np.ndarray | None, revision: np.ndarray | None, method: str, ahead: np.ndarray) -> Doubt:
+def uncertainty_features(
+    spread: np.ndarray | None, revision: np.ndarray | None, method: str, ahead: np.ndarray
+) -> UncertaintyFeatures:
     """Return the features of a prediction, with `error_growth` where the spread is absent or invalid."""
-    whole = _filled(spread, law_of_growth(method, ahead))
-    return Doubt(whole, _filled(revision, whole))
+    complete = _fill_invalid(spread, error_growth(method, ahead))
+    return UncertaintyFeatures(complete, _fill_invalid(revision, complete))
 
 
-def _filled(values: np.ndarray | None, otherwise: np.ndarray) -> np.ndarray:
+def _fill_invalid(values: np.ndarray | None, default: np.ndarray) -> np.ndarray:
     if values is None:
-        return otherwise
-    return np.where(np.isfinite(values) & (values >= 0) & (values < _MOST_M), values, otherwise)
+        return default
+    return np.where(np.isfinite(values) & (values >= 0) & (values < _MAX_SPREAD_M), values, default)
 
 
 @lru_cache(maxsize=32)
-def untaught(method: str) -> Table:
+def default_table(method: str) -> CalibrationTable:
     """Return the table of a method without calibration flights: never narrower than `error_growth`."""
-    law = law_of_growth(method, KNOTS)
+    law = error_growth(method, KNOTS)
     shape = np.sqrt(2.0) * erfinv(np.cbrt(LEVELS))  # the largest of three normal errors
-    shape = shape / np.interp(QUANTILE, LEVELS, shape)
-    lag = np.tile((KNOTS / (KNOTS + _SOON_S))[:, None], 3)
-    return Table(method, 0, 0, np.ones_like(law), lag, law, np.full_like(law, 2.0), shape, shape)
+    shape = shape / np.interp(NOMINAL_COVERAGE, LEVELS, shape)
+    lag = np.tile((KNOTS / (KNOTS + _LAG_TIME_S))[:, None], 3)
+    return CalibrationTable(method, 0, 0, np.ones_like(law), lag, law, np.full_like(law, 2.0), shape, shape)

@@ -6,73 +6,73 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from twin_worker.numerics.prediction_errors import AHEAD, LIMIT
+from twin_worker.numerics.prediction_errors import AHEAD, ERROR_LIMIT
 
 _GAP_S = 2.5  # positions farther apart than this are a telemetry gap [s]
 _exact = nb.njit(cache=True, error_model="numpy", nogil=True)  # no fastmath: as numpy does it
 
 
-class Said(NamedTuple):
+class PredictionColumns(NamedTuple):
     """Arrays of `PredictionLog` that describe the predictions, one row each."""
 
     t0: np.ndarray
     size: np.ndarray
     path: np.ndarray
-    along: np.ndarray
+    direction: np.ndarray
     tube: np.ndarray
-    least: np.ndarray
+    min_length: np.ndarray
 
 
-class Known(NamedTuple):
+class ScoringState(NamedTuple):
     """Arrays of `PredictionLog` that describe the scores so far, changed in place."""
 
     score: np.ndarray
-    next: np.ndarray
+    next_column: np.ndarray
     live: np.ndarray
     followed: np.ndarray
-    passed: np.ndarray
-    watched: np.ndarray
-    begun: np.ndarray
-    before: np.ndarray
+    exceeded: np.ndarray
+    uncensored: np.ndarray
+    start_length: np.ndarray
+    last_error: np.ndarray
 
 
 @_exact
-def _before(at: float, t: np.ndarray) -> int:
+def _row_before(instant: float, t: np.ndarray) -> int:
     """Return the row before an instant, at least the first, at most the last but one."""
-    k: int = np.searchsorted(t, at)  # type: ignore[assignment]
+    k: int = np.searchsorted(t, instant)  # type: ignore[assignment]
     return max(min(k, len(t) - 1) - 1, 0)
 
 
 @_exact
-def _between(at: float, t0: float, t1: float, x0: float, x1: float) -> float:
+def _interpolate(instant: float, t0: float, t1: float, x0: float, x1: float) -> float:
     """Interpolate between two rows as `numpy.interp` does."""
-    if at <= t0:
+    if instant <= t0:
         return x0
-    return (x1 - x0) / (t1 - t0) * (at - t0) + x0 if at < t1 else x1
+    return (x1 - x0) / (t1 - t0) * (instant - t0) + x0 if instant < t1 else x1
 
 
 @_exact
-def _run(at: float, odometer: np.ndarray) -> float:
+def _length_until(instant: float, odometer: np.ndarray) -> float:
     """Return the path length flown until an instant [m]."""
-    k = _before(at, odometer[:, 0])
+    k = _row_before(instant, odometer[:, 0])
     (t0, x0), (t1, x1) = odometer[k], odometer[min(k + 1, len(odometer) - 1)]
-    return _between(at, t0, t1, x0, x1)
+    return _interpolate(instant, t0, t1, x0, x1)
 
 
 @_exact
-def _watch(r: int, j: int, relative: float, known: Known) -> None:
+def _update_passage(row: int, column: int, relative_error: float, state: ScoringState) -> None:
     """Update the first passage of an uncensored prediction at one look-ahead."""
-    before, last = known.before[r], AHEAD[max(j - 1, 0)]
-    known.followed[r] = AHEAD[j]
-    if relative > LIMIT:
-        share = (LIMIT - before) / max(relative - before, 1e-9) if j > 0 else 0.0
-        known.followed[r] = last + min(max(share, 0.0), 1.0) * (AHEAD[j] - last)
-        known.passed[r], known.watched[r] = True, False
-    known.before[r] = relative
+    last_error, last_ahead = state.last_error[row], AHEAD[max(column - 1, 0)]
+    state.followed[row] = AHEAD[column]
+    if relative_error > ERROR_LIMIT:
+        fraction = (ERROR_LIMIT - last_error) / max(relative_error - last_error, 1e-9) if column > 0 else 0.0
+        state.followed[row] = last_ahead + min(max(fraction, 0.0), 1.0) * (AHEAD[column] - last_ahead)
+        state.exceeded[row], state.uncensored[row] = True, False
+    state.last_error[row] = relative_error
 
 
 @_exact
-def answer_each(said: Said, known: Known, happened: tuple, answered: np.ndarray) -> int:
+def evaluate_all(predictions: PredictionColumns, state: ScoringState, flight: tuple, evaluated: np.ndarray) -> int:
     """Score the look-aheads that have been flown, of every open prediction.
 
     Args:
@@ -82,41 +82,46 @@ def answer_each(said: Said, known: Known, happened: tuple, answered: np.ndarray)
     Returns:
         how many
     """
-    t, flown, odometer = happened
+    t, positions, odometer = flight
     n, until, error, axes = 0, t[-1], np.empty(3), np.empty(3)
-    for r in range(len(said.t0)):
-        if not known.live[r]:
+    for row in range(len(predictions.t0)):
+        if not state.live[row]:
             continue
-        for j in range(known.next[r], said.size[r]):
-            at = said.t0[r] + AHEAD[j]
-            if not at <= until:
+        for column in range(state.next_column[row], predictions.size[row]):
+            instant = predictions.t0[row] + AHEAD[column]
+            if not instant <= until:
                 break
-            answered[n, 0], answered[n, 1] = r, j
+            evaluated[n, 0], evaluated[n, 1] = row, column
             n += 1
-            known.next[r] = j + 1
-            if known.begun[r] != known.begun[r]:
-                known.begun[r] = _run(said.t0[r], odometer)
-            k = _before(at, t)
-            if not (t[k + 1] - t[k] <= _GAP_S and at >= t[0] - 1e-6):
-                known.watched[r] = False
+            state.next_column[row] = column + 1
+            if state.start_length[row] != state.start_length[row]:
+                state.start_length[row] = _length_until(predictions.t0[row], odometer)
+            k = _row_before(instant, t)
+            if not (t[k + 1] - t[k] <= _GAP_S and instant >= t[0] - 1e-6):
+                state.uncensored[row] = False
                 continue
             for i in range(3):
-                error[i] = _between(at, t[k], t[k + 1], flown[k, i], flown[k + 1, i]) - said.path[r, j, i]
-            c, s = said.along[r, j, 0], said.along[r, j, 1]
+                error[i] = (
+                    _interpolate(instant, t[k], t[k + 1], positions[k, i], positions[k + 1, i])
+                    - predictions.path[row, column, i]
+                )
+            c, s = predictions.direction[row, column, 0], predictions.direction[row, column, 1]
             axes[0], axes[1], axes[2] = error[0] * c + error[1] * s, error[1] * c - error[0] * s, error[2]
-            most = 0.0
+            max_ratio = 0.0
             for i in range(3):
-                most = max(most, abs(axes[i]) / said.tube[r, j, i])
-            known.score[r, j] = most
-            if known.watched[r]:
-                length = max(_run(at, odometer) - known.begun[r], said.least[r])
-                _watch(r, j, sqrt(error[0] ** 2 + error[1] ** 2 + error[2] ** 2) / length, known)
-        known.live[r] = known.next[r] < said.size[r]
+                max_ratio = max(max_ratio, abs(axes[i]) / predictions.tube[row, column, i])
+            state.score[row, column] = max_ratio
+            if state.uncensored[row]:
+                length = max(_length_until(instant, odometer) - state.start_length[row], predictions.min_length[row])
+                _update_passage(row, column, sqrt(error[0] ** 2 + error[1] ** 2 + error[2] ** 2) / length, state)
+        state.live[row] = state.next_column[row] < predictions.size[row]
     return n
 
 
 @_exact
-def run_on(at: np.ndarray, points: np.ndarray, begin: np.ndarray, before: float, out: np.ndarray) -> None:
+def accumulate_length(
+    t: np.ndarray, points: np.ndarray, start: np.ndarray, start_length: float, out: np.ndarray
+) -> None:
     """Compute the path length flown until each time, (n, 2) [s since 1970, m].
 
     Args:
@@ -125,9 +130,9 @@ def run_on(at: np.ndarray, points: np.ndarray, begin: np.ndarray, before: float,
         start_length: path length flown until there [m]
         out: times and path lengths, filled in
     """
-    run, north, east, down = 0.0, begin[0], begin[1], begin[2]
-    for k in range(len(at)):
+    length, north, east, down = 0.0, start[0], start[1], start[2]
+    for k in range(len(t)):
         n, e, d = points[k, 0] - north, points[k, 1] - east, points[k, 2] - down
-        run += sqrt(n * n + e * e + d * d)
-        out[k, 0], out[k, 1] = at[k], before + run
+        length += sqrt(n * n + e * e + d * d)
+        out[k, 0], out[k, 1] = t[k], start_length + length
         north, east, down = points[k, 0], points[k, 1], points[k, 2]

@@ -9,19 +9,19 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from twin_worker.confidence.calibration_table import ATOMS, KNOTS, Table, untaught
-from twin_worker.confidence.groups import wider
-from twin_worker.numerics.prediction_errors import QUANTILE
+from twin_worker.confidence.calibration_table import ATOMS, KNOTS, CalibrationTable, default_table
+from twin_worker.confidence.groups import group_chain
+from twin_worker.numerics.prediction_errors import NOMINAL_COVERAGE
 
 FORMAT = 1
-GUESSED = "not calibrated"  # begins the sentence of a prediction without a calibrated table
-_HERE = Path(__file__).parent
+UNCALIBRATED = "not calibrated"  # begins the sentence of a prediction without a calibrated table
+_FOLDER = Path(__file__).parent
 _INNERMOST = re.compile(r"\[[^\[\]{}]*\]")  # innermost lists: one per line
-_ALONE = 0.94  # default of `CalibrationTable.alone`; measured: 0.96 to 30 s, 0.94 to 60 s, 0.91 to 120 s
-_MOST = 1e6  # larger numbers are invalid
+_DEFAULT_ALONE = 0.94  # default of `CalibrationTable.alone`; measured: 0.96 to 30 s, 0.94 to 60 s, 0.91 to 120 s
+_MAX_VALUE = 1e6  # larger numbers are invalid
 
 
-class Source(msgspec.Struct, frozen=True):
+class TableSource(msgspec.Struct, frozen=True):
     """One file of predictions that tables were fitted on."""
 
     file: str
@@ -29,7 +29,7 @@ class Source(msgspec.Struct, frozen=True):
     flights: tuple[str, ...]
 
 
-class Row(msgspec.Struct, frozen=True):
+class TableRecord(msgspec.Struct, frozen=True):
     """One table as stored; scale, lag, floor and factor by axis, then knot."""
 
     group: str
@@ -42,103 +42,108 @@ class Row(msgspec.Struct, frozen=True):
     scores: list[float]
     risks: list[float]
     held_out: dict[str, float] = {}
-    alone: float = _ALONE
+    alone: float = _DEFAULT_ALONE
 
 
-class Sheet(msgspec.Struct, frozen=True):
+class TableFile(msgspec.Struct, frozen=True):
     """A file of tables."""
 
     format: int
     made: str
     command: str
-    sources: tuple[Source, ...]
+    sources: tuple[TableSource, ...]
     knots_s: list[float]
-    tables: tuple[Row, ...]
+    tables: tuple[TableRecord, ...]
 
 
 @dataclass(frozen=True)
-class Tables:
+class TableSet:
     """All tables by group, and the errors of the files."""
 
-    by_group: dict[str, Table]
+    by_group: dict[str, CalibrationTable]
     sentence: str = ""
 
-    def choose(self, group: str) -> tuple[Table, str]:
+    def choose(self, group: str) -> tuple[CalibrationTable, str]:
         """Return the narrowest table for a group, and a description of it."""
         method = group.partition("/")[0]
-        for name in wider(group):
+        for name in group_chain(group):
             if (table := self.by_group.get(name)) is not None:
-                own = "" if name == group else f", none for {group}"
-                return table, f"calibrated on {table.starts} predictions of {table.flights} flights ({name}{own})"
-        said = f"{GUESSED}: no table for {group}, the default for {method} is used"
-        return untaught(method), " ".join(filter(None, (said, self.sentence)))
+                fallback = "" if name == group else f", none for {group}"
+                return table, f"calibrated on {table.starts} predictions of {table.flights} flights ({name}{fallback})"
+        description = f"{UNCALIBRATED}: no table for {group}, the default for {method} is used"
+        return default_table(method), " ".join(filter(None, (description, self.sentence)))
 
 
-def read_tables(path: Path) -> Tables:
+def read_tables(path: Path) -> TableSet:
     """Read a file of tables.
 
     Raises:
         ValueError: when it is invalid; the message names the remedy.
     """
     try:
-        sheet = msgspec.json.decode(path.read_bytes(), type=Sheet)
+        content = msgspec.json.decode(path.read_bytes(), type=TableFile)
     except (OSError, msgspec.DecodeError) as error:
         raise ValueError(f"calibration {path.name}: found no tables ({error}); fit it again") from None
-    if sheet.format != FORMAT or sheet.knots_s != KNOTS.tolist():
-        raise ValueError(f"calibration {path.name}: found format {sheet.format}, expected {FORMAT}; fit it again")
-    return Tables({row.group: _table(path.name, row) for row in sheet.tables})
+    if content.format != FORMAT or content.knots_s != KNOTS.tolist():
+        raise ValueError(f"calibration {path.name}: found format {content.format}, expected {FORMAT}; fit it again")
+    return TableSet({row.group: _table_from_record(path.name, row) for row in content.tables})
 
 
-def _table(file: str, row: Row) -> Table:
+def _table_from_record(file: str, record: TableRecord) -> CalibrationTable:
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("scale", "lag", "floor", "factor"), (3, 13))
     shapes |= dict.fromkeys(("scores", "risks"), (ATOMS,))
     arrays = {}
     for name, shape in shapes.items():
         try:
-            arrays[name] = np.array(getattr(row, name), float)
+            arrays[name] = np.array(getattr(record, name), float)
         except ValueError:
             arrays[name] = np.empty(0)
-        found = arrays[name]
-        if found.shape != shape or not ((found >= 0) & (found < _MOST)).all():
+        array = arrays[name]
+        if array.shape != shape or not ((array >= 0) & (array < _MAX_VALUE)).all():
             raise ValueError(
-                f"calibration {file}: found {name} of {row.group} of shape {found.shape}, "
+                f"calibration {file}: found {name} of {record.group} of shape {array.shape}, "
                 f"expected {shape}, finite, not negative; fit it again"
             )
     if not ((arrays["factor"] > 0).all() and (arrays["scores"] > 0).all() and (arrays["floor"] > 0).all()):
-        raise ValueError(f"calibration {file}: found a zero width for {row.group}, expected more; fit it again")
-    if not QUANTILE <= row.alone < 1.0:
+        raise ValueError(f"calibration {file}: found a zero width for {record.group}, expected more; fit it again")
+    if not NOMINAL_COVERAGE <= record.alone < 1.0:
         raise ValueError(
-            f"calibration {file}: found alone {row.alone} of {row.group}, expected {QUANTILE} to 1; fit it again"
+            f"calibration {file}: found alone {record.alone} of {record.group}, expected {NOMINAL_COVERAGE} "
+            "to 1; fit it again"
         )
     by_knot = {name: arrays.pop(name).T for name in ("scale", "lag", "floor", "factor")}
-    return Table(row.group, row.starts, row.flights, **by_knot, **arrays, held_out=row.held_out, alone=row.alone)
+    return CalibrationTable(
+        record.group, record.starts, record.flights, **by_knot, **arrays, held_out=record.held_out, alone=record.alone
+    )
 
 
 @lru_cache(maxsize=8)
-def load(folder: Path = _HERE) -> Tables:
+def load(folder: Path = _FOLDER) -> TableSet:
     """Read every file of tables in a folder; later names override, invalid files are skipped and reported."""
-    found: dict[str, Table] = {}
-    said = []
+    tables: dict[str, CalibrationTable] = {}
+    errors = []
     for path in sorted(folder.glob("*.json")):
         try:
-            found.update(read_tables(path).by_group)
+            tables.update(read_tables(path).by_group)
         except ValueError as error:
-            said.append(str(error))
-    return Tables(found, " ".join(said))
+            errors.append(str(error))
+    return TableSet(tables, " ".join(errors))
 
 
-def write(path: Path, tables: Sequence[Table], sources: Sequence[Source], made: str, command: str) -> None:
+def write(
+    path: Path, tables: Sequence[CalibrationTable], sources: Sequence[TableSource], date: str, command: str
+) -> None:
     """Write tables with their sources."""
-    sheet = Sheet(FORMAT, made, command, tuple(sources), KNOTS.tolist(), tuple(map(_row, tables)))
-    text = msgspec.json.format(msgspec.json.encode(sheet), indent=1).decode()
-    path.write_text(_INNERMOST.sub(lambda found: " ".join(found[0].split()), text) + "\n")
+    content = TableFile(FORMAT, date, command, tuple(sources), KNOTS.tolist(), tuple(map(_record_from_table, tables)))
+    text = msgspec.json.format(msgspec.json.encode(content), indent=1).decode()
+    path.write_text(_INNERMOST.sub(lambda match: " ".join(match[0].split()), text) + "\n")
 
 
-def _row(table: Table) -> Row:
+def _record_from_table(table: CalibrationTable) -> TableRecord:
     parts = table.scale.T, table.lag.T, table.floor.T, table.factor.T, table.scores, table.risks
-    scale, lag, floor, factor, scores, risks = map(_short, parts)
-    measured = {name: round(value, 4) for name, value in table.held_out.items() if np.isfinite(value)}
-    return Row(
+    scale, lag, floor, factor, scores, risks = map(_four_digits, parts)
+    held_out = {name: round(value, 4) for name, value in table.held_out.items() if np.isfinite(value)}
+    return TableRecord(
         table.group,
         table.starts,
         table.flights,
@@ -148,10 +153,10 @@ def _row(table: Table) -> Row:
         factor,
         scores,
         risks,
-        measured,
+        held_out,
         round(table.alone, 4),
     )
 
 
-def _short(values: np.ndarray) -> list:
+def _four_digits(values: np.ndarray) -> list:
     return np.vectorize(lambda x: float(f"{x:.4g}"))(values).tolist()

@@ -12,17 +12,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from twin_worker.confidence.adaptive_conformal import Factors, Levels, factors
-from twin_worker.confidence.calibration_table import INDEPENDENT, Table, doubt_of
-from twin_worker.confidence.horizon_risk import growth
-from twin_worker.confidence.lagged_ensemble import Earlier
-from twin_worker.confidence.prediction_log import EVERY_S, Ledger
-from twin_worker.confidence.table_files import Tables, load
+from twin_worker.confidence.adaptive_conformal import AdaptiveLevels, ScaleFactors, scale_factors
+from twin_worker.confidence.calibration_table import INDEPENDENT, CalibrationTable, uncertainty_features
+from twin_worker.confidence.horizon_risk import running_max_error_ratio
+from twin_worker.confidence.lagged_ensemble import LaggedForecasts
+from twin_worker.confidence.prediction_log import EVERY_S, PredictionLog
+from twin_worker.confidence.table_files import TableSet, load
 from twin_worker.confidence.weighted_quantile import median_passage
 from twin_worker.numerics.prediction_errors import (
     AHEAD,
-    LIMIT,
-    QUANTILE,
+    ERROR_LIMIT,
+    NOMINAL_COVERAGE,
     axes_error,
     first_passage,
     path_length,
@@ -31,28 +31,28 @@ from twin_worker.numerics.prediction_errors import (
 
 __all__ = [
     "AHEAD",
+    "ERROR_LIMIT",
     "EVERY_S",
-    "LIMIT",
-    "QUANTILE",
-    "Made",
-    "Record",
-    "Trust",
+    "NOMINAL_COVERAGE",
+    "Confidence",
+    "ConfidenceTracker",
+    "PointForecast",
     "axes_error",
     "first_passage",
     "path_length",
     "track_frame",
 ]
 _GROUPS = 8  # groups whose levels are stored
-_ENDED = 60  # passages stored per method
-_RENEWED_EVERY_S = (
+_PASSAGES = 60  # passages stored per method
+_EXTRAPOLATED_EVERY_S = (
     5.38  # between extrapolated rollouts that are scored: no multiple of usual periods, so all ages occur [s]
 )
-_RENEWED_ROWS, _RENEWED_S = 48, 60.0  # extrapolated rollouts stored, longest look-ahead that is scored [s]
-_RIPE_S = 60.0  # younger predictions would bias the median: early failures are observed first [s]
+_EXTRAPOLATED_ROWS, _EXTRAPOLATED_S = 48, 60.0  # extrapolated rollouts stored, longest look-ahead that is scored [s]
+_MIN_FOLLOWUP_S = 60.0  # younger predictions would bias the median: early failures are observed first [s]
 
 
 @dataclass(frozen=True)
-class Made:
+class PointForecast:
     """A prediction without prediction region and horizon.
 
     Attributes:
@@ -74,7 +74,7 @@ class Made:
 
 
 @dataclass(frozen=True)
-class Trust:
+class Confidence:
     """Prediction region and confidence horizon of a prediction.
 
     Attributes:
@@ -93,71 +93,73 @@ class Trust:
     sentence: str
     factor: np.ndarray
     ratio: np.ndarray
-    alone: float = INDEPENDENT
+    axis_quantile: float = INDEPENDENT
 
 
 @dataclass
-class Record:
+class ConfidenceTracker:
     """Past predictions of one aircraft and their scores."""
 
-    tables: Tables = field(default_factory=load)
+    tables: TableSet = field(default_factory=load)
     passages: dict[str, deque[tuple[float, bool]]] = field(default_factory=dict)  # ended: time to 10 % [s], censored
     scored: dict[str, int] = field(default_factory=dict)  # predictions ended so far, by method
-    latest: tuple[Made, Trust] | None = None
-    _ledger: Ledger = field(default_factory=Ledger)
-    _earlier: Earlier = field(default_factory=Earlier)
-    _levels: dict[str, Levels] = field(default_factory=dict)
-    _joined: tuple[tuple[str, float], Factors] | None = None
-    _renewed: Ledger | None = None  # extrapolated rollouts; None before the first
-    _renewed_due: float = -np.inf  # earliest time of the next one [s since 1970]
+    latest: tuple[PointForecast, Confidence] | None = None
+    _log: PredictionLog = field(default_factory=PredictionLog)
+    _lagged: LaggedForecasts = field(default_factory=LaggedForecasts)
+    _levels: dict[str, AdaptiveLevels] = field(default_factory=dict)
+    _cached_factors: tuple[tuple[str, float], ScaleFactors] | None = None
+    _extrapolated: PredictionLog | None = None  # extrapolated rollouts; None before the first
+    _extrapolated_due: float = -np.inf  # earliest time of the next one [s since 1970]
 
-    def trust(self, made: Made) -> Trust:
+    def confidence_of(self, forecast: PointForecast) -> Confidence:
         """Compute the tube of a prediction and the horizon up to which it stays within 10 %."""
-        table, said = self.tables.choose(made.group)
-        now = self._factors(made.group, table)
-        revision = self._earlier.revised(made.t, made.ahead, made.path)
-        half_axes = table.half_axes(doubt_of(made.spread, revision, made.method, made.ahead), made.ahead)
-        length = path_length(made.path, made.speed, made.speed * float(made.ahead[0]))
-        ratio = growth(half_axes, length)
-        horizon, open_end = first_passage(now.horizon * ratio, made.ahead)
-        own = f", adapted to {now.own} own predictions" if now.own else ""
-        own += "; adaptation is at its bound: coverage may be below the target" if now.bounded else ""
-        tube = now.at(made.ahead)[:, None] * half_axes
-        return Trust(tube, horizon, open_end, said + own, now.tube, ratio, table.alone)
+        table, description = self.tables.choose(forecast.group)
+        scale = self._factors(forecast.group, table)
+        revision = self._lagged.revision(forecast.t, forecast.ahead, forecast.path)
+        half_axes = table.half_axes(
+            uncertainty_features(forecast.spread, revision, forecast.method, forecast.ahead), forecast.ahead
+        )
+        length = path_length(forecast.path, forecast.speed, forecast.speed * float(forecast.ahead[0]))
+        ratio = running_max_error_ratio(half_axes, length)
+        horizon, horizon_open = first_passage(scale.horizon * ratio, forecast.ahead)
+        adaptation = f", adapted to {scale.own_count} own predictions" if scale.own_count else ""
+        adaptation += "; adaptation is at its bound: coverage may be below the target" if scale.bounded else ""
+        tube = scale.at(forecast.ahead)[:, None] * half_axes
+        return Confidence(tube, horizon, horizon_open, description + adaptation, scale.tube, ratio, table.alone)
 
-    def _factors(self, group: str, table: Table) -> Factors:
+    def _factors(self, group: str, table: CalibrationTable) -> ScaleFactors:
         """Return the scale factors, recomputed after every prediction that was added."""
-        key = group, self._ledger.newest
-        if self._joined is None or self._joined[0] != key:
-            levels = self._levels.get(group) or Levels()
-            self._joined = key, factors(self._ledger, group, table, levels)
-        return self._joined[1]
+        cache_key = group, self._log.newest_t
+        if self._cached_factors is None or self._cached_factors[0] != cache_key:
+            levels = self._levels.get(group) or AdaptiveLevels()
+            self._cached_factors = cache_key, scale_factors(self._log, group, table, levels)
+        return self._cached_factors[1]
 
-    def keep(self, made: Made, trust: Trust) -> None:
+    def add(self, forecast: PointForecast, confidence: Confidence) -> None:
         """Store a prediction for scoring, at most one every few seconds.
 
         Raises:
             ValueError: when its look-aheads are not the first n of `AHEAD`; resample it.
         """
-        self.latest = made, trust
-        n = len(made.ahead)
-        if not np.array_equal(made.ahead, AHEAD[:n]):
+        self.latest = forecast, confidence
+        n = len(forecast.ahead)
+        if not np.array_equal(forecast.ahead, AHEAD[:n]):
             raise ValueError(
-                f"prediction: found {n} look-aheads up to {made.ahead[-1]:g} s, expected the first {n} of AHEAD; "
+                f"prediction: found {n} look-aheads up to {forecast.ahead[-1]:g} s, expected the first {n} of AHEAD; "
                 "resample it"
             )
-        if made.t < self._ledger.newest:  # the clock was set back: earlier predictions cannot be scored
-            self.forget()
-            self._ledger, self._renewed = Ledger(), None
-        if made.t - self._ledger.newest < EVERY_S or n < 2:
+        if forecast.t < self._log.newest_t:  # the clock was set back: earlier predictions cannot be scored
+            self.censor_open()
+            self._log, self._extrapolated = PredictionLog(), None
+        if forecast.t - self._log.newest_t < EVERY_S or n < 2:
             return
-        self._earlier.add(made.t, made.ahead, made.path)
-        book = self._ledger
-        r = book.add(made.t, made.method, made.group, made.path, made.speed)
-        book.tube[r, :n], book.factor[r], book.horizon[r] = trust.tube, trust.factor, trust.horizon_s
-        book.ratio[r], book.ratio[r, :n] = trust.ratio[-1], trust.ratio
+        self._lagged.add(forecast.t, forecast.ahead, forecast.path)
+        log = self._log
+        row = log.add(forecast.t, forecast.method, forecast.group, forecast.path, forecast.speed)
+        log.tube[row, :n], log.factor[row], log.horizon[row] = confidence.tube, confidence.factor, confidence.horizon_s
+        log.ratio[row], log.ratio[row, :n] = confidence.ratio[-1], confidence.ratio
 
-    def keep_renewed(self, t: float, method: str, path: np.ndarray, tube: np.ndarray) -> None:
+    def add_extrapolated(self, t: float, method: str, path: np.ndarray, tube: np.ndarray) -> None:
         """Store an extrapolated rollout for scoring, at most one every few seconds; it does not affect adaptation.
 
         Args:
@@ -165,30 +167,33 @@ class Record:
             method: as in `Prediction`
             path, tube: NED positions and half-axes over the first n of `AHEAD`, (n, 3) [m]
         """
-        if self._renewed is None or t < self._renewed.newest:
-            self._renewed, self._renewed_due = Ledger(_RENEWED_ROWS, int(AHEAD.searchsorted(_RENEWED_S)) + 1), t
-        book = self._renewed
-        n = min(len(path), book.score.shape[1])
-        if t < self._renewed_due or n < 2:
+        if self._extrapolated is None or t < self._extrapolated.newest_t:
+            self._extrapolated, self._extrapolated_due = (
+                PredictionLog(_EXTRAPOLATED_ROWS, int(AHEAD.searchsorted(_EXTRAPOLATED_S)) + 1),
+                t,
+            )
+        log = self._extrapolated
+        n = min(len(path), log.score.shape[1])
+        if t < self._extrapolated_due or n < 2:
             return
-        self._renewed_due = max(self._renewed_due, t - _RENEWED_EVERY_S) + _RENEWED_EVERY_S
-        r = book.add(t, method, "", path[:n], 0.0)
-        book.tube[r, :n] = tube[:n]
+        self._extrapolated_due = max(self._extrapolated_due, t - _EXTRAPOLATED_EVERY_S) + _EXTRAPOLATED_EVERY_S
+        row = log.add(t, method, "", path[:n], 0.0)
+        log.tube[row, :n] = tube[:n]
 
-    def forget(self, *, moved: bool = False) -> None:
+    def censor_open(self, *, frame_changed: bool = False) -> None:
         """Censor every open prediction: an event (mode, mission, clock) has invalidated them.
 
         Args:
             frame_changed: the origin of the local frame has changed
         """
-        self._enter(self._ledger.end())
-        for book in filter(None, (self._ledger, self._renewed)):
-            book.end()
-            if moved:
-                book.restart()
-        self._earlier.clear()
+        self._record_passages(self._log.censor_open())
+        for log in filter(None, (self._log, self._extrapolated)):
+            log.censor_open()
+            if frame_changed:
+                log.reset_odometer()
+        self._lagged.clear()
 
-    def answer(self, t: np.ndarray, flown: np.ndarray) -> int:
+    def evaluate(self, t: np.ndarray, positions: np.ndarray) -> int:
         """Score every look-ahead that has been flown.
 
         Args:
@@ -199,50 +204,50 @@ class Record:
         """
         if len(t) < 2:
             return 0
-        live = self._ledger.live.copy()
-        r, j = self._ledger.answer(t, flown)
-        if self._renewed is not None:
-            self._renewed.answer(t, flown)
-        for group in set(self._ledger.group[r].tolist()):
+        live = self._log.live.copy()
+        rows, columns = self._log.evaluate(t, positions)
+        if self._extrapolated is not None:
+            self._extrapolated.evaluate(t, positions)
+        for group in set(self._log.group[rows].tolist()):
             if group not in self._levels and len(self._levels) >= _GROUPS:
                 del self._levels[next(iter(self._levels))]
-            self._levels.setdefault(group, Levels()).learn(self._ledger, r, j, self._ledger.group == group)
-        ended = np.flatnonzero(live & ~self._ledger.live)
-        self._enter(ended)
+            self._levels.setdefault(group, AdaptiveLevels()).update(self._log, rows, columns, self._log.group == group)
+        ended = np.flatnonzero(live & ~self._log.live)
+        self._record_passages(ended)
         return len(ended)
 
-    def _enter(self, rows: np.ndarray) -> None:
+    def _record_passages(self, rows: np.ndarray) -> None:
         """Store the first passages of predictions that have ended."""
-        for r in rows:
-            method = self._ledger.method[r]
+        for row in rows:
+            method = self._log.method[row]
             self.scored[method] = self.scored.get(method, 0) + 1
-            passage = float(self._ledger.followed[r]), not self._ledger.passed[r]
-            self.passages.setdefault(method, deque(maxlen=_ENDED)).append(passage)
+            passage = float(self._log.followed[row]), not self._log.exceeded[row]
+            self.passages.setdefault(method, deque(maxlen=_PASSAGES)).append(passage)
 
     @property
-    def answered(self) -> float:
+    def evaluated_until(self) -> float:
         """Return the time up to which predictions have been scored [s since 1970]."""
-        return self._ledger.until
+        return self._log.evaluated_until
 
     @property
-    def waits(self) -> bool:
+    def has_open(self) -> bool:
         """Return whether any prediction is not yet fully scored."""
-        return bool(self._ledger.live.any()) or (self._renewed is not None and bool(self._renewed.live.any()))
+        return bool(self._log.live.any()) or (self._extrapolated is not None and bool(self._extrapolated.live.any()))
 
     @property
-    def waiting(self) -> tuple[float, ...]:
+    def open_start_times(self) -> tuple[float, ...]:
         """Return the start times of the predictions that are not yet fully scored [s since 1970]."""
-        return tuple(self._ledger.t0[self._ledger.live].tolist())
+        return tuple(self._log.t0[self._log.live].tolist())
 
     @property
-    def held(self) -> tuple[float, int]:
+    def coverage(self) -> tuple[float, int]:
         """Return the empirical coverage (nan before any score) and the number of predictions behind it."""
-        return self._ledger.coverage
+        return self._log.coverage
 
     @property
-    def coverage_renewed(self) -> tuple[float | None, int]:
+    def extrapolated_coverage(self) -> tuple[float | None, int]:
         """Return the empirical coverage of extrapolated rollouts (None before any score) and their number."""
-        share, n = self._renewed.coverage if self._renewed is not None else (0.0, 0)
+        share, n = self._extrapolated.coverage if self._extrapolated is not None else (0.0, 0)
         return (share if n else None), n
 
     def t10(self, method: str) -> tuple[float | None, float | None, int]:
@@ -251,10 +256,10 @@ class Record:
         Open predictions count as censored at their present age. Where fewer than half have passed, the median is the
         longest time that any prediction was followed.
         """
-        book = self._ledger
-        ripe = book.live & (book.method == method) & (book.t0 <= book.until - _RIPE_S)
-        found = [*self.passages.get(method, ())]
-        found += [(float(book.followed[r]), not book.passed[r]) for r in np.flatnonzero(ripe)]
-        if not found:
+        log = self._log
+        mature = log.live & (log.method == method) & (log.t0 <= log.evaluated_until - _MIN_FOLLOWUP_S)
+        passages = [*self.passages.get(method, ())]
+        passages += [(float(log.followed[r]), not log.exceeded[r]) for r in np.flatnonzero(mature)]
+        if not passages:
             return None, None, 0
-        return median_passage(found), float(np.mean([censored for _, censored in found])), len(found)
+        return median_passage(passages), float(np.mean([censored for _, censored in passages])), len(passages)

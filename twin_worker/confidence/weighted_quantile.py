@@ -21,17 +21,17 @@ def weighted_quantile(x: np.ndarray, weight: np.ndarray, level: np.ndarray) -> n
     order = np.argsort(np.where(weight > 0, x, np.inf), axis=1)
     x, weight = np.take_along_axis(x, order, 1), np.take_along_axis(weight, order, 1)
     total = np.cumsum(weight, axis=1)
-    place = (total - 0.5 * weight) / total[:, -1:]
+    position = (total - 0.5 * weight) / total[:, -1:]
     n = np.maximum((weight > 0).sum(axis=1), 1)  # values of zero weight are sorted last
-    right = np.clip((place < level[:, None]).sum(axis=1), 1, np.maximum(n - 1, 1))
+    right = np.clip((position < level[:, None]).sum(axis=1), 1, np.maximum(n - 1, 1))
     left, row = np.minimum(right - 1, n - 1), np.arange(len(x))
     right = np.minimum(right, n - 1)
-    gap = np.maximum(place[row, right] - place[row, left], 1e-12)
-    share = np.clip((level - place[row, left]) / gap, 0.0, 1.0)
+    gap = np.maximum(position[row, right] - position[row, left], 1e-12)
+    share = np.clip((level - position[row, left]) / gap, 0.0, 1.0)
     return x[row, left] + share * (x[row, right] - x[row, left])
 
 
-def masses(x: np.ndarray, weight: np.ndarray, exact: np.ndarray) -> np.ndarray:
+def kaplan_meier_masses(x: np.ndarray, weight: np.ndarray, exact: np.ndarray) -> np.ndarray:
     """Return the probability mass of each exact value; the others are upper bounds (left-censored).
 
     Kaplan-Meier estimator from above: the weight of a bound is distributed over the values below it.
@@ -44,27 +44,29 @@ def masses(x: np.ndarray, weight: np.ndarray, exact: np.ndarray) -> np.ndarray:
         masses, 0 for bounds, (n,); if their sum is below one, the rest lies below every value
     """
     order = np.lexsort((~exact, -x))  # descending, a value before a bound of the same size
-    w, d = weight[order], exact[order]
-    at_risk = np.cumsum(w[::-1])[::-1]
-    stays = 1.0 - np.divide(w * d, at_risk, out=np.zeros(len(w)), where=at_risk > 0)
-    left = np.cumprod(stays)
+    sorted_weight, sorted_exact = weight[order], exact[order]
+    at_risk = np.cumsum(sorted_weight[::-1])[::-1]
+    survival_step = 1.0 - np.divide(
+        sorted_weight * sorted_exact, at_risk, out=np.zeros(len(sorted_weight)), where=at_risk > 0
+    )
+    remaining = np.cumprod(survival_step)
     out = np.empty(len(x))
-    out[order] = np.concatenate([[1.0], left[:-1]]) - left
+    out[order] = np.concatenate([[1.0], remaining[:-1]]) - remaining
     return out
 
 
 def censored_quantile(x: np.ndarray, weight: np.ndarray, exact: np.ndarray, level: float) -> float:
     """Return a quantile of left-censored values; 0 where the quantile lies below every value."""
-    mass = masses(x, weight, exact)
-    nothing = max(1.0 - float(mass.sum()), 0.0)
-    x, mass = np.append(x, 0.0), np.append(mass, nothing)
+    mass = kaplan_meier_masses(x, weight, exact)
+    rest = max(1.0 - float(mass.sum()), 0.0)
+    x, mass = np.append(x, 0.0), np.append(mass, rest)
     return float(weighted_quantile(x[None], mass[None], np.array([level]))[0])
 
 
 Passages = Sequence[tuple[float, bool]]  # first passage of 10 % or censoring time [s], whether it is censored
 
 
-def _survival(passages: Passages) -> tuple[np.ndarray, np.ndarray]:
+def survival_curve(passages: Passages) -> tuple[np.ndarray, np.ndarray]:
     """Return times, rising, and the share still within 10 % after each of them."""
     times, censored = (np.array(column) for column in zip(*passages, strict=True))
     order = np.lexsort((censored, times))
@@ -76,13 +78,13 @@ def survival(passages: Passages, t: float) -> float:
     """Return the share of predictions still within 10 % at `t` [s]; nan without predictions."""
     if not passages:
         return float("nan")
-    times, share = _survival(passages)
-    before = int(np.searchsorted(times, t))
-    return float(share[before - 1]) if before else 1.0
+    times, share = survival_curve(passages)
+    index = int(np.searchsorted(times, t))
+    return float(share[index - 1]) if index else 1.0
 
 
 def median_passage(passages: Passages) -> float:
     """Return the time at which half have exceeded 10 % [s]; the longest follow-up time where fewer did."""
-    times, share = _survival(passages)
+    times, share = survival_curve(passages)
     half = np.flatnonzero(share <= 0.5)
     return float(times[half[0]] if len(half) else times[-1])

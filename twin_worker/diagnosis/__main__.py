@@ -4,63 +4,63 @@ import argparse
 import sys
 from pathlib import Path
 
-from fleet.cli import guarded, parser_for
-from fleet.commands.offline.diagnose import EXAMPLES, arguments, check
+from fleet.cli import make_parser, run_command
+from fleet.commands.offline.diagnose import EXAMPLES, arguments, check_arguments
 from twin_worker.diagnosis.baseline import hidden
 from twin_worker.diagnosis.baseline.own_past import OwnPast
-from twin_worker.diagnosis.inference.report import Outcome, Report
-from twin_worker.diagnosis.learn import card_of, learn, say
+from twin_worker.diagnosis.inference.report import Report, ReportOutcome
+from twin_worker.diagnosis.learn import calibrate_recordings, card_or_unknown, log_progress
 from twin_worker.diagnosis.model.baseline import Baseline
 from twin_worker.diagnosis.output import keep, written
-from twin_worker.diagnosis.share import Against, shared
+from twin_worker.diagnosis.share import Reference, diagnose_all
 
 
 def _run(args: argparse.Namespace) -> int:
-    check(args)
+    check_arguments(args)
     args.conceal = tuple(filter(None, args.conceal.split(",")))
     hidden.check(args.conceal)
-    against = _against(args)
+    reference = _reference_of(args)
     reports: list[Report] = []
-    refused = 0
-    for found, why in shared(args.file, against, args.jobs, say, args.conceal):
-        for report in found:
+    n_refused = 0
+    for file_reports, refusal in diagnose_all(args.file, reference, args.jobs, log_progress, args.conceal):
+        for report in file_reports:
             print(f"{report.flight}: {report.sentence}", flush=True)
-        reports += found
-        if why:
-            refused += 1
-            say(why)
+        reports += file_reports
+        if refusal:
+            n_refused += 1
+            log_progress(refusal)
     if args.json:
         written.write(reports, args.json)
     if args.report:
-        _page(reports, against, args.report)
-    return 2 if refused and not reports else 1 if refused else 0
+        _page(reports, reference, args.report)
+    return 2 if n_refused and not reports else 1 if n_refused else 0
 
 
-def _against(args: argparse.Namespace) -> Against:
+def _reference_of(args: argparse.Namespace) -> Reference:
     """Return the reference of the diagnosis: a model, a calibration, or the past of each flight."""
     if args.model:
         return keep.load(args.model)[0]
-    card = card_of(args.airframe)
-    return learn(args.against, card) if args.against else OwnPast(args.against_own_past, card)
+    card = card_or_unknown(args.airframe)
+    return calibrate_recordings(args.against, card) if args.against else OwnPast(args.against_own_past, card)
 
 
-def _page(reports: list[Report], against: Against, folder: Path) -> None:
+def _page(reports: list[Report], reference: Reference, folder: Path) -> None:
     """Write figures and pages; with a common simulation, also a model file corrected by the named effects."""
     from twin_worker.diagnosis.output.figures import stems
     from twin_worker.diagnosis.output.page import write
 
     folder.mkdir(exist_ok=True)
     for report, stem in zip(reports, stems([report.flight for report in reports]), strict=True):
-        if report.outcome is Outcome.NAMED and isinstance(against, Baseline):
-            keep.save(folder / f"{stem}.model.json", against, report.findings)
-    say(f"wrote {write(reports, folder)}")
+        if report.outcome is ReportOutcome.NAMED and isinstance(reference, Baseline):
+            keep.save(folder / f"{stem}.model.json", reference, report.findings)
+    log_progress(f"wrote {write(reports, folder)}")
 
 
 def main(argv: list[str] | None = None) -> int:
     """Diagnose the recordings named on the command line."""
-    parser = parser_for("python -m twin_worker.diagnosis", "Diagnose flights against a simulation.", EXAMPLES)
+    parser = make_parser("python -m twin_worker.diagnosis", "Diagnose flights against a simulation.", EXAMPLES)
     arguments(parser)
-    return guarded("diagnose", _run, parser.parse_args(argv))
+    return run_command("diagnose", _run, parser.parse_args(argv))
 
 
 if __name__ == "__main__":

@@ -6,63 +6,63 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from fleet.cli import guarded, parser_for
+from fleet.cli import make_parser, run_command
 from fleet.commands.offline.calibrate import EXAMPLES, arguments
-from fleet.process.logs import tell
+from fleet.process.logs import report_progress
 from twin_worker.diagnosis.baseline.calibrate import calibrate
-from twin_worker.diagnosis.baseline.past import before, calibrate_past
-from twin_worker.diagnosis.data.card import UNKNOWN, Card, read
-from twin_worker.diagnosis.data.flight import Flight, read_flights
-from twin_worker.diagnosis.inference.diagnose import uncovered
+from twin_worker.diagnosis.baseline.past import calibrate_past, part_before
+from twin_worker.diagnosis.data.card import UNKNOWN, AircraftCard, read_card
+from twin_worker.diagnosis.data.flight import FlightData, read_flights
+from twin_worker.diagnosis.inference.diagnose import uncovered_axes
 from twin_worker.diagnosis.model.baseline import Baseline
 from twin_worker.diagnosis.output.keep import save
 
 
-def say(word: str) -> None:
+def log_progress(message: str) -> None:
     """Log a progress message."""
-    tell("diagnose", word)
+    report_progress("diagnose", message)
 
 
-def card_of(path: Path | None) -> Card:
+def card_or_unknown(path: Path | None) -> AircraftCard:
     """Read the aircraft card, or return `UNKNOWN` with a log message."""
     if path is not None:
-        return read(path)
-    say("no airframe card: assuming unit mass and geometry; masses and coefficients are relative, not in kg")
+        return read_card(path)
+    log_progress("no airframe card: assuming unit mass and geometry; masses and coefficients are relative, not in kg")
     return UNKNOWN
 
 
-def flights_of(files: Sequence[Path], card: Card) -> list[Flight]:
+def read_all_flights(files: Sequence[Path], card: AircraftCard) -> list[FlightData]:
     """Read the flights of all recordings.
 
     Raises:
         ValueError: if a recording has no usable flight.
         OSError: if a file cannot be read.
     """
-    found = []
+    flights = []
     for path in files:
-        say(f"reading {path.name}")
-        found += read_flights(path, card)
-    return found
+        log_progress(f"reading {path.name}")
+        flights += read_flights(path, card)
+    return flights
 
 
-def learn(files: Sequence[Path], card: Card, until: float | None = None) -> Baseline:
+def calibrate_recordings(files: Sequence[Path], card: AircraftCard, until: float | None = None) -> Baseline:
     """Calibrate on recordings, or on the part of each before `until` [s, on its own clock]."""
-    flights = flights_of(files, card)
+    flights = read_all_flights(files, card)
     if until is None:
-        base = calibrate(flights, card, say)
+        base = calibrate(flights, card, log_progress)
     elif len(flights) == 1:
-        base = calibrate_past(flights[0], until, card, say)
+        base = calibrate_past(flights[0], until, card, log_progress)
     else:
-        base = calibrate([before(flight, until) for flight in flights], card, say)
-    for sentence in uncovered(base):
-        say(sentence)
+        base = calibrate([part_before(flight, until) for flight in flights], card, log_progress)
+    for limitation in uncovered_axes(base):
+        log_progress(limitation)
     return base
 
 
 def _run(args: argparse.Namespace) -> int:
     if not args.out.absolute().parent.is_dir():
         raise ValueError(f"--out: found no folder {str(args.out.parent)!r}, expected one; make it first")
-    base = learn(args.file, card_of(args.airframe), args.until)
+    base = calibrate_recordings(args.file, card_or_unknown(args.airframe), args.until)
     save(args.out, base)
     explained = ", ".join(f"{name} {x:.0%}" for name, x in base.r2.items())
     print(f"{args.out.name}: calibrated on {len(base.flights)} flights; variance explained: {explained}")
@@ -73,9 +73,11 @@ def _run(args: argparse.Namespace) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Calibrate on the recordings named on the command line."""
-    parser = parser_for("python -m twin_worker.diagnosis.learn", "Calibrate a simulation on nominal flights.", EXAMPLES)
+    parser = make_parser(
+        "python -m twin_worker.diagnosis.learn", "Calibrate a simulation on nominal flights.", EXAMPLES
+    )
     arguments(parser)
-    return guarded("calibrate", _run, parser.parse_args(argv))
+    return run_command("calibrate", _run, parser.parse_args(argv))
 
 
 if __name__ == "__main__":

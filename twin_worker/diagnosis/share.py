@@ -5,21 +5,25 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from twin_worker.diagnosis.baseline.hidden import concealed, deaf
+from twin_worker.diagnosis.baseline.hidden import conceal_channels, exclude_concealed
 from twin_worker.diagnosis.baseline.own_past import OwnPast
-from twin_worker.diagnosis.data.flight import Flight, read_flights
+from twin_worker.diagnosis.data.flight import FlightData, read_flights
 from twin_worker.diagnosis.inference.diagnose import diagnose
 from twin_worker.diagnosis.inference.report import Report
 from twin_worker.diagnosis.model.baseline import Baseline
 
-Say = Callable[[str], None]
-Against = Baseline | OwnPast
-Told = tuple[list[Report], str]  # reports of one task, and the error message or an empty string
+ReportProgress = Callable[[str], None]
+Reference = Baseline | OwnPast
+TaskResult = tuple[list[Report], str]  # reports of one task, and the error message or an empty string
 
 
-def shared(
-    tasks: Sequence[Path | Flight], against: Against, jobs: int, say: Say, conceal: Sequence[str] = ()
-) -> Iterator[Told]:
+def diagnose_all(
+    tasks: Sequence[Path | FlightData],
+    reference: Reference,
+    jobs: int,
+    progress: ReportProgress,
+    conceal: Sequence[str] = (),
+) -> Iterator[TaskResult]:
     """Diagnose every recording or flight, in order; an error in one does not affect the others.
 
     Args:
@@ -30,36 +34,40 @@ def shared(
         conceal: channels to conceal, of `hidden.NAMES`
     """
     if jobs == 1:
-        yield from (_told(task, against, say, conceal) for task in tasks)
+        yield from (_diagnose_task(task, reference, progress, conceal) for task in tasks)
         return
-    with multiprocessing.get_context("spawn").Pool(jobs, _begin, (against, conceal)) as pool:
+    with multiprocessing.get_context("spawn").Pool(jobs, _init_worker, (reference, conceal)) as pool:
         yield from pool.imap(_task, tasks)
 
 
-_against: Against
+_reference: Reference
 _conceal: Sequence[str]
 
 
-def _begin(against: Against, conceal: Sequence[str]) -> None:
+def _init_worker(reference: Reference, conceal: Sequence[str]) -> None:
     """Initialise a pool process; only the parent handles Ctrl-C."""
-    global _against, _conceal
-    _against, _conceal = against, conceal
+    global _reference, _conceal
+    _reference, _conceal = reference, conceal
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _task(task: Path | Flight) -> Told:
-    return _told(task, _against, lambda word: None, _conceal)
+def _task(task: Path | FlightData) -> TaskResult:
+    return _diagnose_task(task, _reference, lambda message: None, _conceal)
 
 
-def _told(task: Path | Flight, against: Against, say: Say, conceal: Sequence[str]) -> Told:
+def _diagnose_task(
+    task: Path | FlightData, reference: Reference, progress: ReportProgress, conceal: Sequence[str]
+) -> TaskResult:
     reports: list[Report] = []
     try:
-        for flight in [task] if isinstance(task, Flight) else read_flights(task, against.card):
-            say(f"{flight.name}: {flight.seconds:.0f} s of flight")
-            if isinstance(against, OwnPast):
-                reports.append(against.diagnose(flight, say, conceal))
+        for flight in [task] if isinstance(task, FlightData) else read_flights(task, reference.card):
+            progress(f"{flight.name}: {flight.seconds:.0f} s of flight")
+            if isinstance(reference, OwnPast):
+                reports.append(reference.diagnose(flight, progress, conceal))
             else:
-                reports.append(diagnose(concealed(flight, conceal, flight), deaf(against, conceal), say))
+                reports.append(
+                    diagnose(conceal_channels(flight, conceal, flight), exclude_concealed(reference, conceal), progress)
+                )
     except (ValueError, OSError) as error:
         return reports, str(error)
     return reports, ""

@@ -7,22 +7,24 @@ from math import atan2, cos, exp, hypot, inf, isfinite, sin, sqrt
 import numpy as np
 
 from fleet.physics.kernel import kernel
-from twin_worker.telemetry.history import History
+from twin_worker.telemetry.history import TelemetryHistory
 
 DRIFT, DRIFT_S = 0.6, 60.0  # slow change of the wind: standard deviation, correlation time [m/s, s]
 GUST, GUST_S = 0.8, 7.0  # turbulence along the flight: the same two numbers
-_WANDER = 0.01  # random walk of the mean [m/s per sqrt(s)]
+_RANDOM_WALK = 0.01  # random walk of the mean [m/s per sqrt(s)]
 _SIGMA = 1.0  # sideslip and sensors in one ground-velocity component [m/s]
 _GATE = 25.0  # normalised innovation squared (NIS) from which a row is rejected
-_SURPRISE_S = 60.0  # time constant of the mean NIS [s]
-_CALM, _ROUGH = 0.05, 10.0  # bounds of the mean NIS [-]
-_FASTEST = 1e3  # larger airspeeds and ground speeds are noise [m/s]
-_STRONGEST = 150.0  # a larger wind is invalid: the filter restarts [m/s]
-_START = np.array([0.03, 0.03, 6.0, 6.0, DRIFT, DRIFT, GUST, GUST])
+_NIS_AVERAGE_S = 60.0  # time constant of the mean NIS [s]
+_MIN_NIS, _MAX_NIS = 0.05, 10.0  # bounds of the mean NIS [-]
+_MAX_SPEED = 1e3  # larger airspeeds and ground speeds are noise [m/s]
+_MAX_WIND = 150.0  # a larger wind is invalid: the filter restarts [m/s]
+_INITIAL_SIGMA = np.array([0.03, 0.03, 6.0, 6.0, DRIFT, DRIFT, GUST, GUST])
 
 
 @kernel
-def _take(x: np.ndarray, P: np.ndarray, dt: float, c: float, s: float, north: float, east: float, gate: float) -> float:
+def _predict_and_correct(
+    x: np.ndarray, P: np.ndarray, dt: float, c: float, s: float, north: float, east: float, gate: float
+) -> float:
     """Predict state and covariance by dt and correct them with one ground velocity that passes the gate.
 
     Args:
@@ -35,17 +37,17 @@ def _take(x: np.ndarray, P: np.ndarray, dt: float, c: float, s: float, north: fl
         the normalised innovation squared (NIS)
     Source: Bar-Shalom 2001, 5.2.4 (Joseph form).
     """
-    keep, H, HP, y = np.ones(8), np.zeros((2, 8)), np.zeros((2, 8)), np.empty(2)
+    decay, H, HP, y = np.ones(8), np.zeros((2, 8)), np.zeros((2, 8)), np.empty(2)
     for i in range(2):
-        keep[4 + i], keep[6 + i] = exp(-dt / DRIFT_S), exp(-dt / GUST_S)
+        decay[4 + i], decay[6 + i] = exp(-dt / DRIFT_S), exp(-dt / GUST_S)
         H[i, 2 + i] = H[i, 4 + i] = H[i, 6 + i] = 1.0
     H[0, 0], H[0, 1], H[1, 0], H[1, 1] = c, -s, s, c
     y[0], y[1] = north, east
     for i in range(8):
-        x[i] *= keep[i]
+        x[i] *= decay[i]
         for j in range(8):
-            P[i, j] *= keep[i] * keep[j]
-        walk = 1e-8 if i < 2 else _WANDER**2 * dt if i < 4 else _START[i] ** 2 * (1.0 - keep[i] ** 2)
+            P[i, j] *= decay[i] * decay[j]
+        walk = 1e-8 if i < 2 else _RANDOM_WALK**2 * dt if i < 4 else _INITIAL_SIGMA[i] ** 2 * (1.0 - decay[i] ** 2)
         P[i, i] += walk
     for k in range(2):
         for i in range(8):
@@ -58,18 +60,20 @@ def _take(x: np.ndarray, P: np.ndarray, dt: float, c: float, s: float, north: fl
     S00, S11 = S00 + _SIGMA**2, S11 + _SIGMA**2
     det = S00 * S11 - S01 * S01
     a, b = (S11 * y[0] - S01 * y[1]) / det, (S00 * y[1] - S01 * y[0]) / det
-    surprise = y[0] * a + y[1] * b
-    if surprise < gate:
+    nis = y[0] * a + y[1] * b
+    if nis < gate:
         _correct(x, P, H, HP, np.array((a, b)), np.array((S11 / det, -S01 / det, S00 / det)))
-    return surprise
+    return nis
 
 
 @kernel
-def _correct(x: np.ndarray, P: np.ndarray, H: np.ndarray, HP: np.ndarray, pull: np.ndarray, inv: np.ndarray) -> None:
+def _correct(
+    x: np.ndarray, P: np.ndarray, H: np.ndarray, HP: np.ndarray, weighted: np.ndarray, S_inv: np.ndarray
+) -> None:
     K, A, AP = np.empty((8, 2)), np.eye(8), np.zeros((8, 8))
     for i in range(8):
-        x[i] += HP[0, i] * pull[0] + HP[1, i] * pull[1]
-        K[i, 0], K[i, 1] = HP[0, i] * inv[0] + HP[1, i] * inv[1], HP[0, i] * inv[1] + HP[1, i] * inv[2]
+        x[i] += HP[0, i] * weighted[0] + HP[1, i] * weighted[1]
+        K[i, 0], K[i, 1] = HP[0, i] * S_inv[0] + HP[1, i] * S_inv[1], HP[0, i] * S_inv[1] + HP[1, i] * S_inv[2]
         for j in range(8):
             A[i, j] -= K[i, 0] * H[0, j] + K[i, 1] * H[1, j]
     for i in range(8):
@@ -99,35 +103,35 @@ class WindFilter:
         """Update with one row: ground velocity NED (3,) [m/s], reported airspeed [m/s], heading [rad]."""
         dt = min(t - self.t, 5.0) if isfinite(self.t) else 0.2
         north, east, down = map(float, ground)
-        if dt <= 0 or not 3.0 <= Va < _FASTEST or not hypot(north, east, down) < _FASTEST:
+        if dt <= 0 or not 3.0 <= Va < _MAX_SPEED or not hypot(north, east, down) < _MAX_SPEED:
             return
         self.t = t
         level = Va * sqrt(max(1 - (down / Va) ** 2, 0.25))
-        self._rows += 1
-        gate = inf if self._rows < 50 else _GATE
+        self._row_count += 1
+        gate = inf if self._row_count < 50 else _GATE
         along, across = level * cos(psi), level * sin(psi)
-        surprise = _take(self.x, self.P, dt, along, across, north, east, gate)  # type: ignore[call-arg]
-        self._surprise += dt / _SURPRISE_S * (min(surprise, _GATE) / 2 - self._surprise)
-        if not self._believable():
+        nis = _predict_and_correct(self.x, self.P, dt, along, across, north, east, gate)  # type: ignore[call-arg]
+        self._mean_nis += dt / _NIS_AVERAGE_S * (min(nis, _GATE) / 2 - self._mean_nis)
+        if not self._is_plausible():
             self._reset()
 
-    def _believable(self) -> bool:
+    def _is_plausible(self) -> bool:
         """Return whether the wind estimate is plausible; false for nan."""
-        return hypot(self.x[2] + self.x[4], self.x[3] + self.x[5]) < _STRONGEST and bool(np.isfinite(self.P).all())
+        return hypot(self.x[2] + self.x[4], self.x[3] + self.x[5]) < _MAX_WIND and bool(np.isfinite(self.P).all())
 
     def _reset(self) -> None:
         """Reset the estimate to zero wind; the time stays."""
-        self.x, self.P = np.array([1.0, *np.zeros(7)]), np.diag(_START**2)
-        self._rows, self._surprise = 0, 1.0
+        self.x, self.P = np.array([1.0, *np.zeros(7)]), np.diag(_INITIAL_SIGMA**2)
+        self._row_count, self._mean_nis = 0, 1.0
 
-    def blow(self, t: float, wind: np.ndarray) -> None:
+    def reset_wind(self, t: float, wind: np.ndarray) -> None:
         """Set the wind at time `t` [s since 1970], NED, (3,) [m/s]; ignore an implausible wind."""
-        if not hypot(*wind[:2]) < _STRONGEST:
+        if not hypot(*wind[:2]) < _MAX_WIND:
             return
         self.t = t
         self.x[2:6] = *wind[:2], 0.0, 0.0  # mean; zero drift
 
-    def jump(self, wind: np.ndarray, scale: float, doubt: float) -> None:
+    def inflate_after_step(self, wind: np.ndarray, scale: float, relative_sigma: float) -> None:
         """Apply a step of wind and airspeed scale and inflate the covariance by `relative_sigma` of the step.
 
         Args:
@@ -137,12 +141,12 @@ class WindFilter:
 
         An implausible step is ignored.
         """
-        if not (hypot(*wind[:2]) < _STRONGEST and 0.0 < scale < inf):
+        if not (hypot(*wind[:2]) < _MAX_WIND and 0.0 < scale < inf):
             return
         x, P = self.x, self.P
         x[2:4] += wind[:2]
-        P[[2, 3], [2, 3]] += (doubt * wind[:2]) ** 2
-        P[[0, 1], [0, 1]] += (doubt * (scale - 1.0) * x[:2]) ** 2
+        P[[2, 3], [2, 3]] += (relative_sigma * wind[:2]) ** 2
+        P[[0, 1], [0, 1]] += (relative_sigma * (scale - 1.0) * x[:2]) ** 2
         x[:2] *= scale
 
     @property
@@ -157,9 +161,9 @@ class WindFilter:
         return np.array([x[2] + x[4], x[3] + x[5], 0.0])
 
     @property
-    def roughness(self) -> float:
+    def innovation_ratio(self) -> float:
         """Return the root of the mean NIS of the last minute: measured over assumed innovation [-]."""
-        return sqrt(min(max(self._surprise, _CALM), _ROUGH))
+        return sqrt(min(max(self._mean_nis, _MIN_NIS), _MAX_NIS))
 
     @property
     def scale(self) -> float:
@@ -175,15 +179,17 @@ class WindFilter:
     def sigma(self) -> float:
         """Return the standard deviation of the larger component of the wind without gusts [m/s]."""
         P = self.P
-        both = P[2:4, 2:4] + P[2:4, 4:6] + P[4:6, 2:4] + P[4:6, 4:6]
-        return sqrt(max(both[0, 0], both[1, 1]))
+        total = P[2:4, 2:4] + P[2:4, 4:6] + P[4:6, 2:4] + P[4:6, 4:6]
+        return sqrt(max(total[0, 0], total[1, 1]))
 
 
-_EVERY_S = 0.199  # interval of the rows used [s]
+_ROW_INTERVAL_S = 0.199  # interval of the rows used [s]
 _STALE_S = 0.5  # older airspeed and heading are not combined with a velocity [s]
 
 
-def blow(wind: WindFilter, history: History, last: float, since: float, until: float = inf) -> float:
+def update_from_history(
+    wind_filter: WindFilter, history: TelemetryHistory, last_t: float, since: float, until: float = inf
+) -> float:
     """Update the filter with five ground velocities a second; return the time of the newest [s since 1970].
 
     Args:
@@ -192,17 +198,17 @@ def blow(wind: WindFilter, history: History, last: float, since: float, until: f
         last_t: time of the newest row used so far [s since 1970]
         since, until: rows before and after are skipped [s since 1970]
     """
-    times, v = history.look("velocity", since)
-    air_times, air = history.look("air", since - 1.0)
-    att_times, attitude = history.look("attitude", since - 1.0)
+    times, velocity = history.rows_since("velocity", since)
+    air_times, air = history.rows_since("air", since - 1.0)
+    att_times, attitude = history.rows_since("attitude", since - 1.0)
     t_air, t_att = air_times.tolist(), att_times.tolist()  # bisect on a short list is faster than on an array
     if not (t_air and t_att):
-        return last
-    for t, ground in zip(times.tolist(), v.tolist(), strict=True):
-        if t - last < _EVERY_S or t >= until:
+        return last_t
+    for t, ground in zip(times.tolist(), velocity.tolist(), strict=True):
+        if t - last_t < _ROW_INTERVAL_S or t >= until:
             continue
         i, j = bisect_left(t_air, t) - 1, bisect_left(t_att, t) - 1
         if i >= 0 and j >= 0 and t - t_air[i] < _STALE_S and t - t_att[j] < _STALE_S:
-            last = t
-            wind.update(t, ground, float(air[i, 0]), float(attitude[j, 2]))
-    return last
+            last_t = t
+            wind_filter.update(t, ground, float(air[i, 0]), float(attitude[j, 2]))
+    return last_t

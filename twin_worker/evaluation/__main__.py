@@ -8,75 +8,75 @@ from typing import Any
 
 from rich.console import Console
 
-from fleet.cli import guarded, parser_for
-from fleet.commands.offline.assess import EXAMPLES, arguments, check, chosen
-from fleet.process.logs import tell
-from twin_worker.evaluation.drive import Plan
-from twin_worker.evaluation.scoring.case import Case
-from twin_worker.evaluation.scoring.summary import summary
-from twin_worker.evaluation.share import Found, assess
+from fleet.cli import make_parser, run_command
+from fleet.commands.offline.assess import EXAMPLES, arguments, baseline_methods, check_arguments
+from fleet.process.logs import report_progress
+from twin_worker.evaluation.drive import EvaluationPlan
+from twin_worker.evaluation.scoring.case import EvaluationCase
+from twin_worker.evaluation.scoring.summary import summarise
+from twin_worker.evaluation.share import Evaluation, assess_recordings
 from twin_worker.evaluation.table import table
 
-_WIDE = 150  # columns of the table where the output is not a terminal
+_PLAIN_WIDTH = 150  # columns of the table where the output is not a terminal
 
 
-def _say(line: str) -> None:
-    tell("assess", line)
+def _report(line: str) -> None:
+    report_progress("assess", line)
 
 
 def _run(args: argparse.Namespace) -> int:
-    check(args)
-    _say("compiling the twin's physics, once")
+    check_arguments(args)
+    _report("compiling the twin's physics, once")
     from twin_worker.service.warm_up import warm_up  # numba is slow to import: report first
 
     warm_up()
-    plan = Plan(args.every, args.method, chosen(args.methods), args.without_params)
-    found = assess(args.file, plan, jobs=args.jobs, offset=args.offset, say=_say)
-    told = summary(found.cases) | {"run": _about(args, plan, found)}
+    plan = EvaluationPlan(args.every, args.method, baseline_methods(args.methods), args.without_params)
+    evaluation = assess_recordings(args.file, plan, jobs=args.jobs, offset=args.offset, report=_report)
+    results = summarise(evaluation.cases) | {"run": _run_summary(args, plan, evaluation)}
     console = Console()
-    console.width = console.width if console.is_terminal else _WIDE
-    console.print(table(told))
-    for sentence in found.sentences:
-        _say(sentence)
+    console.width = console.width if console.is_terminal else _PLAIN_WIDTH
+    console.print(table(results))
+    for sentence in evaluation.sentences:
+        _report(sentence)
     if args.json:
-        args.json.write_text(json.dumps(told, indent=1) + "\n")
+        args.json.write_text(json.dumps(results, indent=1) + "\n")
     if args.out:
-        _draw(args.out, found.cases)
-    return 0 if any(not case.apart for case in found.cases) else 1
+        _write_outputs(args.out, evaluation.cases)
+    return 0 if any(not case.exclusion for case in evaluation.cases) else 1
 
 
-def _about(args: argparse.Namespace, plan: Plan, found: Found) -> dict[str, Any]:
+def _run_summary(args: argparse.Namespace, plan: EvaluationPlan, evaluation: Evaluation) -> dict[str, Any]:
     return {
         "files": [str(path) for path in args.file],
         "every_s": plan.every_s,
         "method": args.method,
         "methods": list(plan.methods),
         "without_params": plan.without_params,
-        "counted": sum(not case.apart for case in found.cases),
-        "apart": sum(bool(case.apart) for case in found.cases),
-        "silent": found.silent,
+        "counted": sum(not case.exclusion for case in evaluation.cases),
+        "apart": sum(bool(case.exclusion) for case in evaluation.cases),
+        "silent": evaluation.missed,
     }
 
 
-def _draw(folder: Path, cases: list[Case]) -> None:
+def _write_outputs(folder: Path, cases: list[EvaluationCase]) -> None:
     from twin_worker.evaluation.figures import draw
-    from twin_worker.evaluation.keep import keep
+    from twin_worker.evaluation.keep import write_predictions
 
     folder.mkdir(parents=True, exist_ok=True)
-    counted = [case for case in cases if not case.apart]
-    made = draw(folder, counted)
-    for name, its in (("predictions", counted), ("predictions_apart", [case for case in cases if case.apart])):
-        if its:
-            keep(folder / f"{name}.npz", its)
-            made.append(folder / f"{name}.npz")
-    _say(f"wrote {', '.join(path.name for path in made) or 'nothing: every start is excluded'} in {folder}")
+    counted = [case for case in cases if not case.exclusion]
+    written = draw(folder, counted)
+    for name, selected in (("predictions", counted), ("predictions_apart", [case for case in cases if case.exclusion])):
+        if selected:
+            write_predictions(folder / f"{name}.npz", selected)
+            written.append(folder / f"{name}.npz")
+    _report(f"wrote {', '.join(path.name for path in written) or 'nothing: every start is excluded'} in {folder}")
 
 
 def main(argv: list[str] | None = None) -> int:
     """Assess the recordings named on the command line."""
-    parser = parser_for("python -m twin_worker.evaluation", "Score the twins' predictions on recordings.", EXAMPLES)
+    parser = make_parser("python -m twin_worker.evaluation", "Score the twins' predictions on recordings.", EXAMPLES)
     arguments(parser)
-    return guarded("assess", _run, parser.parse_args(argv))
+    return run_command("assess", _run, parser.parse_args(argv))
 
 
 if __name__ == "__main__":

@@ -7,22 +7,22 @@ import numpy as np
 
 from fleet.contract import Message, Params, Prediction, Status
 from twin_worker.confidence.tube_and_horizon import AHEAD
-from twin_worker.evaluation.baselines.methods import BASELINES, Now
-from twin_worker.evaluation.scoring.case import OURS, Asked, Case, Told
-from twin_worker.evaluation.scoring.log import Log
-from twin_worker.evaluation.scoring.truth import FIRST_S, WHOLE_S, answer
+from twin_worker.evaluation.baselines.methods import BASELINES, BaselineInput
+from twin_worker.evaluation.scoring.case import OURS, EvaluationCase, EvaluationStart, MethodForecast
+from twin_worker.evaluation.scoring.log import ReferenceFlight
+from twin_worker.evaluation.scoring.truth import MIN_EVENT_FREE_S, MIN_FIRST_S, resolve_start
 from twin_worker.identification.fixed_wing.plant import DYNAMICS, PAPER
-from twin_worker.twin.state.state import AUTO, hear
-from twin_worker.twin.state.vehicle_class import seen
-from twin_worker.twin.step import Twin, advance, silence
+from twin_worker.twin.state.state import AUTO, ingest
+from twin_worker.twin.state.vehicle_class import recent_track
+from twin_worker.twin.step import Twin, advance, silent_step_times
 
-STAND_IN = "imm"  # fallback of a method that cannot predict
-_LOOK_BACK_S = 62.0  # telemetry available to the baselines [s]
-_SAME_S = 0.01  # predictions whose starts differ by more are different [s]
+FALLBACK = "imm"  # fallback of a method that cannot predict
+_HISTORY_S = 62.0  # telemetry available to the baselines [s]
+_TIME_TOLERANCE_S = 0.01  # predictions whose starts differ by more are different [s]
 
 
 @dataclass(frozen=True)
-class Plan:
+class EvaluationPlan:
     """Settings of an evaluation.
 
     Attributes:
@@ -39,7 +39,7 @@ class Plan:
 
 
 @dataclass
-class Examined:
+class EvaluatedUav:
     """One aircraft under evaluation.
 
     Attributes:
@@ -55,16 +55,16 @@ class Examined:
 
     flight: str
     twin: Twin
-    paper: Twin | None
-    log: Log = field(default_factory=Log)
-    asked: list[Asked] = field(default_factory=list)
+    paper_twin: Twin | None
+    reference: ReferenceFlight = field(default_factory=ReferenceFlight)
+    starts: list[EvaluationStart] = field(default_factory=list)
     slot: int = -1
-    answered: bool = True
-    silent: int = 0
+    predicted: bool = True
+    missed: int = 0
 
 
 @dataclass
-class Drive:
+class RecordingDriver:
     """Evaluation of the aircraft of one recording.
 
     Attributes:
@@ -75,145 +75,151 @@ class Drive:
     """
 
     name: str
-    plan: Plan
-    mine: Callable[[int], bool] = lambda _: True
-    examined: dict[int, Examined | None] = field(default_factory=dict)
+    plan: EvaluationPlan
+    is_selected: Callable[[int], bool] = lambda _: True
+    uavs: dict[int, EvaluatedUav | None] = field(default_factory=dict)
 
-    def run(self, messages: Iterable[Message]) -> Iterator[Case]:
+    def run(self, messages: Iterable[Message]) -> Iterator[EvaluationCase]:
         """Replay messages through the twins in the order they were received; yield every resolved start."""
         for message in messages:
-            one = self._whose(message.uav)
-            if one is None:
+            evaluated = self._evaluated(message.uav)
+            if evaluated is None:
                 continue
-            if _clock_jumps(one, message):
-                yield from _answers(one)
-                one.log, one.slot = Log(), -1
-            one.log.hear(message)
+            if _clock_jumps(evaluated, message):
+                yield from _resolve_starts(evaluated)
+                evaluated.reference, evaluated.slot = ReferenceFlight(), -1
+            evaluated.reference.add(message)
             if not (self.plan.without_params and isinstance(message, Params)):
-                _advance(one, message, self.plan)
-        for one in self.examined.values():
-            if one is not None:
-                yield from _answers(one)
+                _advance(evaluated, message, self.plan)
+        for evaluated in self.uavs.values():
+            if evaluated is not None:
+                yield from _resolve_starts(evaluated)
 
     @property
-    def silent(self) -> int:
+    def missed(self) -> int:
         """Return the number of intervals without any prediction."""
-        return sum(one.silent for one in self.examined.values() if one is not None)
+        return sum(evaluated.missed for evaluated in self.uavs.values() if evaluated is not None)
 
-    def _whose(self, uav: int) -> Examined | None:
-        if uav not in self.examined:
-            paper = Twin(uav, method=PAPER) if PAPER in self.plan.methods else None
-            one = Examined(f"{self.name}:uav-{uav}", Twin(uav, method=self.plan.method), paper)
-            self.examined[uav] = one if self.mine(len(self.examined)) else None
-        return self.examined[uav]
+    def _evaluated(self, uav: int) -> EvaluatedUav | None:
+        if uav not in self.uavs:
+            paper_twin = Twin.of(uav, method=PAPER) if PAPER in self.plan.methods else None
+            evaluated = EvaluatedUav(f"{self.name}:uav-{uav}", Twin.of(uav, method=self.plan.method), paper_twin)
+            self.uavs[uav] = evaluated if self.is_selected(len(self.uavs)) else None
+        return self.uavs[uav]
 
 
-def _clock_jumps(one: Examined, message: Message) -> bool:
-    before = one.twin.status
+def _clock_jumps(evaluated: EvaluatedUav, message: Message) -> bool:
+    before = evaluated.twin.onboard.status
     if not isinstance(message, Status) or before is None:
         return False
-    now, then = ((status.clock_jumps, status.clock_advance_s) for status in (message, before))
-    return now != then
+    now, earlier = ((status.clock_jumps, status.clock_advance_s) for status in (message, before))
+    return now != earlier
 
 
-def _answers(one: Examined) -> Iterator[Case]:
+def _resolve_starts(evaluated: EvaluatedUav) -> Iterator[EvaluationCase]:
     """Yield every start so far, compared with the actual flight."""
-    yield from (answer(one.log, asked) for asked in one.asked)
-    one.asked.clear()
+    yield from (resolve_start(evaluated.reference, start) for start in evaluated.starts)
+    evaluated.starts.clear()
 
 
-def _advance(one: Examined, message: Message, plan: Plan) -> None:
+def _advance(evaluated: EvaluatedUav, message: Message, plan: EvaluationPlan) -> None:
     """Advance the twin by one message and record its predictions, with no later data available to any method."""
-    for at in silence(one.twin, message):
-        _ask(one, advance(one.twin, (), at), plan)
-    if one.paper is not None:
-        hear(one.paper, message)
-    _ask(one, advance(one.twin, (message,)), plan)
+    for t in silent_step_times(evaluated.twin, message):
+        _record_results(evaluated, advance(evaluated.twin, (), t), plan)
+    if evaluated.paper_twin is not None:
+        ingest(evaluated.paper_twin, message)
+    _record_results(evaluated, advance(evaluated.twin, (message,)), plan)
 
 
-def _ask(one: Examined, results: Iterable[Message], plan: Plan) -> None:
+def _record_results(evaluated: EvaluatedUav, results: Iterable[Message], plan: EvaluationPlan) -> None:
     """Record a start at the first prediction of every interval of `every_s`."""
-    made = [result for result in results if isinstance(result, Prediction)]
-    at = made[-1].t if made else one.twin.data_t
-    if not np.isfinite([at, one.log.begun]).all():
+    predictions = [result for result in results if isinstance(result, Prediction)]
+    t = predictions[-1].t if predictions else evaluated.twin.telemetry.data_t
+    if not np.isfinite([t, evaluated.reference.first_t]).all():
         return
-    slot = int((at - one.log.begun) // plan.every_s)
-    if slot > one.slot:
-        late = one.slot * plan.every_s >= FIRST_S
-        one.silent += late and not one.answered and not one.twin.why_no_route()
-        one.slot, one.answered = slot, False
-    if made and not one.answered:
-        one.answered = True
-        _start(one, made[-1], plan)
+    slot = int((t - evaluated.reference.first_t) // plan.every_s)
+    if slot > evaluated.slot:
+        late = evaluated.slot * plan.every_s >= MIN_FIRST_S
+        evaluated.missed += late and not evaluated.predicted and not evaluated.twin.no_route_reason()
+        evaluated.slot, evaluated.predicted = slot, False
+    if predictions and not evaluated.predicted:
+        evaluated.predicted = True
+        _record_start(evaluated, predictions[-1], plan)
 
 
-def _start(one: Examined, made: Prediction, plan: Plan) -> None:
-    twin = one.twin
-    flown = seen(twin, _LOOK_BACK_S)
-    if flown is None or twin.origin is None:
+def _record_start(evaluated: EvaluatedUav, prediction: Prediction, plan: EvaluationPlan) -> None:
+    twin = evaluated.twin
+    track = recent_track(twin, _HISTORY_S)
+    if track is None or twin.telemetry.origin is None:
         return
-    flown = flown.whole()
+    track = track.unbroken_tail()
     ahead = AHEAD
-    now = Now(twin, flown, ahead + (made.t - flown.t[-1]))
-    told = {OURS: _told(made, ahead, made.t)}
+    inputs = BaselineInput(twin, track, ahead + (prediction.t - track.t[-1]))
+    forecasts = {OURS: _resampled_forecast(prediction, ahead, prediction.t)}
     for name in plan.methods:
-        path = _paper(one, made, ahead) if name == PAPER else _path(name, now, told[OURS])
+        path = (
+            _paper_forecast(evaluated, prediction, ahead)
+            if name == PAPER
+            else _baseline_forecast(name, inputs, forecasts[OURS])
+        )
         if path is None:
-            fallback = BASELINES[STAND_IN](now)
-            path = None if fallback is None else Told(fallback, STAND_IN)
+            fallback = BASELINES[FALLBACK](inputs)
+            path = None if fallback is None else MethodForecast(fallback, FALLBACK)
         if path is not None:
-            told[name] = path
-    group, spread = _kept(twin, made, ahead)
-    one.asked.append(
-        Asked(
-            flight=one.flight,
-            uav=twin.uav,
-            t=made.t,
-            first_s=made.t - one.log.begun,
+            forecasts[name] = path
+    group, spread = _group_and_spread(twin, prediction, ahead)
+    evaluated.starts.append(
+        EvaluationStart(
+            flight=evaluated.flight,
+            uav=twin.config.uav,
+            t=prediction.t,
+            first_s=prediction.t - evaluated.reference.first_t,
             ahead=ahead,
-            origin=twin.origin,
-            speed=float(np.linalg.norm(flown.v[-1])),
-            follows=twin.why_no_route(),
+            origin=twin.telemetry.origin,
+            speed=float(np.linalg.norm(track.v[-1])),
+            no_route_reason=twin.no_route_reason(),
             group=group,
-            told=told,
+            forecasts=forecasts,
             spread=spread,
         )
     )
 
 
-def _path(name: str, now: Now, ours: Told) -> Told | None:
+def _baseline_forecast(name: str, inputs: BaselineInput, ours: MethodForecast) -> MethodForecast | None:
     """Return the forecast of one baseline; `dynamics` reuses ours where ours is `dynamics`."""
-    if name == DYNAMICS and ours.made_by == DYNAMICS:
-        return Told(ours.path, DYNAMICS)
-    path = BASELINES[name](now)
-    near = now.ahead <= WHOLE_S
-    return None if path is None or not np.isfinite(path[near]).all() else Told(path, name)
+    if name == DYNAMICS and ours.source == DYNAMICS:
+        return MethodForecast(ours.path, DYNAMICS)
+    path = BASELINES[name](inputs)
+    required = inputs.ahead <= MIN_EVENT_FREE_S
+    return None if path is None or not np.isfinite(path[required]).all() else MethodForecast(path, name)
 
 
-def _told(made: Prediction, ahead: np.ndarray, t: float) -> Told:
+def _resampled_forecast(prediction: Prediction, ahead: np.ndarray, t: float) -> MethodForecast:
     """Resample a prediction to look-aheads from `t`, which is within one step of its own time."""
-    own = made.t + made.ahead.numpy().astype(float)
+    prediction_t = prediction.t + prediction.ahead.numpy().astype(float)
     path, tube = (
-        np.column_stack([np.interp(t + ahead, own, column, right=np.nan) for column in rows.numpy().astype(float).T])
-        for rows in (made.path, made.tube)
+        np.column_stack(
+            [np.interp(t + ahead, prediction_t, column, right=np.nan) for column in rows.numpy().astype(float).T]
+        )
+        for rows in (prediction.path, prediction.prediction_region_half_axes)
     )
-    return Told(path, made.method, tube, made.horizon_s)
+    return MethodForecast(path, prediction.method, tube, prediction.horizon_s)
 
 
-def _paper(one: Examined, made: Prediction, ahead: np.ndarray) -> Told | None:
+def _paper_forecast(evaluated: EvaluatedUav, prediction: Prediction, ahead: np.ndarray) -> MethodForecast | None:
     """Step the paper's twin once and return its forecast by the paper's method; None without one."""
-    assert one.paper is not None
-    results = advance(one.paper, (), one.twin.turned_t)
-    found = [r for r in results if isinstance(r, Prediction) and r.method == PAPER]
-    return _told(found[-1], ahead, made.t) if found else None
+    assert evaluated.paper_twin is not None
+    results = advance(evaluated.paper_twin, (), evaluated.twin.telemetry.last_step_t)
+    predictions = [result for result in results if isinstance(result, Prediction) and result.method == PAPER]
+    return _resampled_forecast(predictions[-1], ahead, prediction.t) if predictions else None
 
 
-def _kept(twin: Twin, made: Prediction, ahead: np.ndarray) -> tuple[str, np.ndarray]:
+def _group_and_spread(twin: Twin, prediction: Prediction, ahead: np.ndarray) -> tuple[str, np.ndarray]:
     """Return the calibration group of a prediction and its ensemble spread, (k, 3) [m] or nan."""
-    latest = twin.record.latest
+    latest = twin.confidence.tracker.latest
     spread = np.full((len(ahead), 3), np.nan)
-    if latest is None or abs(latest[0].t + latest[0].ahead[0] - made.t) > _SAME_S:
-        return made.method, spread
+    if latest is None or abs(latest[0].t + latest[0].ahead[0] - prediction.t) > _TIME_TOLERANCE_S:
+        return prediction.method, spread
     if latest[0].spread is not None:
         spread[: len(latest[0].spread)] = latest[0].spread
     return latest[0].group, spread

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.special import ndtri
 
 from fleet.frames import to_geodetic
-from twin_worker.evaluation.scoring.case import OURS, Case
-from twin_worker.numerics.prediction_errors import QUANTILE, path_length, track_frame
+from twin_worker.evaluation.scoring.case import OURS, EvaluationCase
+from twin_worker.numerics.prediction_errors import NOMINAL_COVERAGE, path_length, track_frame
 
 KEYS = {
     "t0": "start, (s,) [s since 1970]",
@@ -33,43 +33,43 @@ KEYS = {
 }
 
 
-def keep(path: Path, cases: Sequence[Case]) -> None:
+def write_predictions(path: Path, cases: Sequence[EvaluationCase]) -> None:
     """Write our predictions and the flown positions; keys and units: `KEYS`."""
     rows = [_row(case) for case in cases]
     arrays = {name: np.array([row[name] for row in rows]) for name in KEYS if name != "ahead"}
-    np.savez_compressed(path, ahead=cases[0].asked.ahead, **arrays)  # type: ignore[arg-type]
+    np.savez_compressed(path, ahead=cases[0].start.ahead, **arrays)  # type: ignore[arg-type]
 
 
-def _row(case: Case) -> dict[str, object]:
-    asked, told = case.asked, case.asked.told[OURS]
-    place, far = np.full(told.path.shape, np.nan), np.isfinite(told.path).all(axis=1)
-    place[far] = to_geodetic(asked.origin, told.path[far]) * np.array([1e-7, 1e-7, 1e-3])
-    assert told.tube is not None
+def _row(case: EvaluationCase) -> dict[str, object]:
+    start, forecast = case.start, case.start.forecasts[OURS]
+    geodetic, valid = np.full(forecast.path.shape, np.nan), np.isfinite(forecast.path).all(axis=1)
+    geodetic[valid] = to_geodetic(start.origin, forecast.path[valid]) * np.array([1e-7, 1e-7, 1e-3])
+    assert forecast.tube is not None
     return {
-        "t0": asked.t,
-        "t": asked.t + asked.ahead,
-        "latitude": place[:, 0],
-        "longitude": place[:, 1],
-        "altitude": place[:, 2],
-        "covariance": covariance(told.path, told.tube).astype(np.float32),
-        "horizon": told.horizon_s,
-        "flight": asked.flight,
-        "uav": asked.uav,
-        "apart": case.apart,
-        "path": told.path,
-        "tube": told.tube,
-        "spread": asked.spread,
-        "flown": case.flown,
+        "t0": start.t,
+        "t": start.t + start.ahead,
+        "latitude": geodetic[:, 0],
+        "longitude": geodetic[:, 1],
+        "altitude": geodetic[:, 2],
+        "covariance": covariance(forecast.path, forecast.tube).astype(np.float32),
+        "horizon": forecast.horizon_s,
+        "flight": start.flight,
+        "uav": start.uav,
+        "apart": case.exclusion,
+        "path": forecast.path,
+        "tube": forecast.tube,
+        "spread": start.spread,
+        "flown": case.positions,
         "length": case.length,
-        "predicted_length": path_length(told.path, asked.speed),
-        "group": asked.group,
-        "method": told.made_by,
+        "predicted_length": path_length(forecast.path, start.speed),
+        "group": start.group,
+        "method": forecast.source,
     }
 
 
 def covariance(path: np.ndarray, tube: np.ndarray) -> np.ndarray:
     """Return the NED covariance of independent normal errors with the coverage of the tube, (k, 3, 3) [m2]."""
-    sigma = tube / ndtri(0.5 + 0.5 * QUANTILE ** (1 / 3))
+    sigma = tube / ndtri(0.5 + 0.5 * NOMINAL_COVERAGE ** (1 / 3))
     along = track_frame(path)
     axes = np.zeros((len(path), 3, 3))
     axes[:, :2, 0] = along

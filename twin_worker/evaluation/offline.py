@@ -3,11 +3,13 @@
 from collections.abc import Iterable, Iterator
 
 from fleet.contract import Message
-from twin_worker.alerts.traffic import Traffic
+from twin_worker.alerts.traffic import TrafficMonitor
 from twin_worker.twin.step import Twin, advance
 
 
-def run(messages: Iterable[Message], twins: dict[int, Twin], traffic: Traffic | None = None) -> Iterator[Message]:
+def run_offline(
+    messages: Iterable[Message], twins: dict[int, Twin], traffic: TrafficMonitor | None = None
+) -> Iterator[Message]:
     """Drive twins with recorded messages; every new UAV gets a twin.
 
     Args:
@@ -17,10 +19,10 @@ def run(messages: Iterable[Message], twins: dict[int, Twin], traffic: Traffic | 
     Yields:
         Model, Prediction and Alert messages
     """
-    traffic = traffic or Traffic()
+    traffic = traffic or TrafficMonitor()
     for message in messages:
         twin = twins.get(message.uav)
         if twin is None:
-            twin = twins[message.uav] = Twin(message.uav)
+            twin = twins[message.uav] = Twin.of(message.uav)
         results = advance(twin, (message,))
-        yield from traffic.after(twin.uav, twin.turned_t, results)
+        yield from traffic.process_results(twin.config.uav, twin.telemetry.last_step_t, results)

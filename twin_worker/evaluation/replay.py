@@ -13,17 +13,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fleet.cli import guarded, parser_for
+from fleet.cli import make_parser, run_command
 from fleet.contract import Message, Model, Outcome, Prediction
-from fleet.process.logs import tell
+from fleet.process.logs import report_progress
 from fleet.telemetry.recording.recordings import replay_messages
-from twin_worker.alerts.traffic import Traffic
+from twin_worker.alerts.traffic import TrafficMonitor
 from twin_worker.confidence.weighted_quantile import survival
-from twin_worker.evaluation.offline import run
+from twin_worker.evaluation.offline import run_offline
 from twin_worker.twin.step import Twin
 
 WITHIN_S = (10, 30, 60, 120)
-_SAY_EVERY_S = 60.0  # recorded time between two lines of progress [s]
+_REPORT_EVERY_S = 60.0  # recorded time between two lines of progress [s]
 
 EXAMPLES = """
   python -m twin_worker.evaluation.replay flight.tlog
@@ -32,7 +32,7 @@ EXAMPLES = """
 
 
 @dataclass
-class Tally:
+class ReplaySummary:
     """Summary of one UAV over a recording."""
 
     methods: Counter[str] = field(default_factory=Counter)
@@ -40,7 +40,7 @@ class Tally:
     verdict: str = ""
     sentence: str = ""
     passages: dict[str, list[tuple[float, bool]]] = field(default_factory=dict)  # by method: time to 10 % [s], censored
-    seen: dict[str, int] = field(default_factory=dict)  # predictions scored so far, by method
+    scored: dict[str, int] = field(default_factory=dict)  # predictions scored so far, by method
 
 
 def replay(messages: Iterable[Message], progress: str = "") -> dict[str, dict[str, Any]]:
@@ -51,94 +51,95 @@ def replay(messages: Iterable[Message], progress: str = "") -> dict[str, dict[st
         progress: name under which progress is reported on stderr; empty: no progress
     """
     twins: dict[int, Twin] = {}
-    traffic = Traffic()
-    tallies: dict[int, Tally] = {}
-    begun: dict[int, float] = {}
-    said = 0.0
+    traffic = TrafficMonitor()
+    summaries: dict[int, ReplaySummary] = {}
+    first_t: dict[int, float] = {}
+    reported_s = 0.0
     for message in messages:
-        start = begun.setdefault(message.uav, message.t)
-        if progress and message.t - start >= said + _SAY_EVERY_S:
-            said = message.t - start
-            tell(progress, f"{said:.0f} s of flight, {len(begun)} UAVs")
-        tally = tallies.setdefault(message.uav, Tally())
-        for result in run((message,), twins, traffic):
-            _take(tally, result, start)
-        _collect(tally, twins[message.uav])
+        start = first_t.setdefault(message.uav, message.t)
+        if progress and message.t - start >= reported_s + _REPORT_EVERY_S:
+            reported_s = message.t - start
+            report_progress(progress, f"{reported_s:.0f} s of flight, {len(first_t)} UAVs")
+        uav_summary = summaries.setdefault(message.uav, ReplaySummary())
+        for result in run_offline((message,), twins, traffic):
+            _add_result(uav_summary, result, start)
+        _collect_passages(uav_summary, twins[message.uav])
     for uav, twin in twins.items():
-        twin.record.forget()  # the recording is over: open predictions are censored
-        _collect(tallies[uav], twin)
-    return {str(uav): _row(twins[uav], tallies[uav], begun[uav]) for uav in sorted(twins)}
+        twin.confidence.tracker.censor_open()  # the recording is over: open predictions are censored
+        _collect_passages(summaries[uav], twin)
+    return {str(uav): _row(twins[uav], summaries[uav], first_t[uav]) for uav in sorted(twins)}
 
 
-def _take(tally: Tally, result: Message, start: float) -> None:
+def _add_result(summary: ReplaySummary, result: Message, start: float) -> None:
     if isinstance(result, Prediction):
-        tally.methods[result.method] += 1
-        tally.sentence = result.sentence
+        summary.methods[result.method] += 1
+        summary.sentence = result.sentence
     elif isinstance(result, Model):
-        tally.verdict = result.verdict.sentence
-        if result.verdict.outcome is Outcome.VERIFIED and tally.verified_s is None:
-            tally.verified_s = result.t - start
+        summary.verdict = result.verdict.sentence
+        if result.verdict.outcome is Outcome.VERIFIED and summary.verified_s is None:
+            summary.verified_s = result.t - start
 
 
-def _collect(tally: Tally, twin: Twin) -> None:
+def _collect_passages(summary: ReplaySummary, twin: Twin) -> None:
     """Collect every scored passage: the tracker stores only the latest."""
-    for method, n in twin.record.scored.items():
-        new = n - tally.seen.get(method, 0)
-        if new:
-            latest = list(twin.record.passages[method])[-new:]
-            tally.passages.setdefault(method, []).extend(latest)
-            tally.seen[method] = n
+    for method, n in twin.confidence.tracker.scored.items():
+        new_count = n - summary.scored.get(method, 0)
+        if new_count:
+            latest = list(twin.confidence.tracker.passages[method])[-new_count:]
+            summary.passages.setdefault(method, []).extend(latest)
+            summary.scored[method] = n
 
 
-def _row(twin: Twin, tally: Tally, start: float) -> dict[str, Any]:
+def _row(twin: Twin, summary: ReplaySummary, start: float) -> dict[str, Any]:
     return {
         "vehicle": twin.vehicle,
-        "seconds": round(float(max(twin.history.newest - start, 0.0)), 1),
-        "methods": dict(tally.methods),
-        "first_verified_s": None if tally.verified_s is None else round(tally.verified_s, 1),
-        "scored": {method: len(found) for method, found in tally.passages.items()},
+        "seconds": round(float(max(twin.telemetry.history.newest - start, 0.0)), 1),
+        "methods": dict(summary.methods),
+        "first_verified_s": None if summary.verified_s is None else round(summary.verified_s, 1),
+        "scored": {method: len(passages) for method, passages in summary.passages.items()},
         "within_10_percent": {
-            method: {str(s): round(survival(found, s), 3) for s in WITHIN_S} for method, found in tally.passages.items()
+            method: {str(s): round(survival(passages, s), 3) for s in WITHIN_S}
+            for method, passages in summary.passages.items()
         },
-        "verdict": twin.verdict.sentence or tally.verdict,
-        "prediction": tally.sentence,
+        "verdict": twin.identification.verdict.sentence or summary.verdict,
+        "prediction": summary.sentence,
     }
 
 
-def text(uav: str, row: dict[str, Any]) -> str:
+def format_row(uav: str, row: dict[str, Any]) -> str:
     """Format one UAV's row as lines of text."""
     methods = ", ".join(f"{n} {method}" for method, n in row["methods"].items()) or "none"
     verified = "never" if row["first_verified_s"] is None else f"after {row['first_verified_s']:.0f} s"
     lines = [f"uav-{uav}: {row['vehicle']}, {row['seconds']:.0f} s; predictions: {methods}; verified {verified}"]
     for method, shares in row["within_10_percent"].items():
-        known = ", ".join(f"{share:.0%} at {s} s" for s, share in shares.items())
-        lines.append(f"  {method}: within 10 %: {known} (of {row['scored'][method]} scored)")
+        shares_text = ", ".join(f"{share:.0%} at {s} s" for s, share in shares.items())
+        lines.append(f"  {method}: within 10 %: {shares_text} (of {row['scored'][method]} scored)")
     lines += [f"  {name}: {row[name]}" for name in ("verdict", "prediction") if row[name]]
     return "\n".join(lines)
 
 
 def _run(args: argparse.Namespace) -> int:
-    found = {}
+    rows_by_file = {}
     for path in args.files:
         rows = replay(replay_messages(path, args.offset), path.name)
-        found[str(path)] = rows
+        rows_by_file[str(path)] = rows
         print(f"{path.name}: {len(rows)} UAVs")
         for uav, row in rows.items():
-            print(text(uav, row), flush=True)
+            print(format_row(uav, row), flush=True)
     if args.json:
-        args.json.write_text(json.dumps(found, indent=2) + "\n")
+        args.json.write_text(json.dumps(rows_by_file, indent=2) + "\n")
     return 0
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line: replay recordings through the twins."""
-    parser = parser_for(
+    parser = make_parser(
         "python -m twin_worker.evaluation.replay", "Run recordings through the twins offline.", EXAMPLES
     )
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="recording, e.g. flight.tlog.xz")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the same rows to FILE")
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + offset (0)")
-    return guarded("twin_worker.evaluation.replay", _run, parser.parse_args(argv))
+    return run_command("twin_worker.evaluation.replay", _run, parser.parse_args(argv))
 
 
 if __name__ == "__main__":

@@ -11,12 +11,14 @@ from typing import Any
 
 from rich.console import Console
 
-from fleet.report.progress import shown
+from fleet.report.progress import show_progress
 from fleet.telemetry.recording.recordings import Recording
-from twin_worker.evaluation.drive import Drive, Plan
-from twin_worker.evaluation.scoring.case import Case
+from twin_worker.evaluation.drive import EvaluationPlan, RecordingDriver
+from twin_worker.evaluation.scoring.case import EvaluationCase
 
-Task = tuple[Sequence[Path], Plan, int, tuple[int, int]]  # files, plan, offset, number of this process of how many
+Task = tuple[
+    Sequence[Path], EvaluationPlan, int, tuple[int, int]
+]  # files, plan, offset, number of this process of how many
 
 
 @dataclass
@@ -25,20 +27,20 @@ class Progress:
 
     name: str
     shares: Any  # progress of each process, 0..1
-    at: slice = field(default_factory=lambda: slice(None))
+    processes: slice = field(default_factory=lambda: slice(None))
 
     @property
     def share(self) -> float:
         """Return the progress of the slowest process, 0..1."""
-        return float(min(self.shares[self.at]))
+        return float(min(self.shares[self.processes]))
 
-    def words(self) -> str:
+    def progress_text(self) -> str:
         """Return the activity."""
         return "assessed" if self.share >= 1.0 else "assessing"
 
 
 @dataclass(frozen=True)
-class Found:
+class Evaluation:
     """Result of an evaluation.
 
     Attributes:
@@ -47,12 +49,14 @@ class Found:
         sentences: warnings of the readers
     """
 
-    cases: list[Case]
-    silent: int
+    cases: list[EvaluationCase]
+    missed: int
     sentences: list[str]
 
 
-def assess(files: Sequence[Path], plan: Plan, *, jobs: int = 1, offset: int = 0, say: Any = print) -> Found:
+def assess_recordings(
+    files: Sequence[Path], plan: EvaluationPlan, *, jobs: int = 1, offset: int = 0, report: Any = print
+) -> Evaluation:
     """Evaluate the twins on recordings.
 
     Args:
@@ -66,62 +70,62 @@ def assess(files: Sequence[Path], plan: Plan, *, jobs: int = 1, offset: int = 0,
     """
     context = multiprocessing.get_context("spawn")
     shares = context.Array("d", len(files) * jobs)
-    bars = [Progress(path.name, shares, slice(k * jobs, (k + 1) * jobs)) for k, path in enumerate(files)]
+    recordings = [Progress(path.name, shares, slice(k * jobs, (k + 1) * jobs)) for k, path in enumerate(files)]
     tasks: list[Task] = [(files, plan, offset, (k, jobs)) for k in range(jobs)]
-    with shown(bars, say, Console(stderr=True), leave=False):
+    with show_progress(recordings, report, Console(stderr=True), leave=False):
         if jobs == 1:
-            parts = [_part(tasks[0], shares)]
+            evaluations = [_evaluate_share(tasks[0], shares)]
         else:
-            with context.Pool(jobs, _begin, (shares,)) as pool:
-                parts = pool.map(_task, tasks, chunksize=1)
-    order = {name: k for k, name in enumerate(names(files))}
-    found = [case for part in parts for case in part.cases]
-    cases = sorted(found, key=lambda case: (order[case.asked.flight.rpartition(":")[0]], case.asked.uav))
-    return Found(cases, sum(part.silent for part in parts), parts[0].sentences)
+            with context.Pool(jobs, _init_process, (shares,)) as pool:
+                evaluations = pool.map(_task, tasks, chunksize=1)
+    order = {name: k for k, name in enumerate(recording_names(files))}
+    unsorted_cases = [case for evaluation in evaluations for case in evaluation.cases]
+    cases = sorted(unsorted_cases, key=lambda case: (order[case.start.flight.rpartition(":")[0]], case.start.uav))
+    return Evaluation(cases, sum(part.missed for part in evaluations), evaluations[0].sentences)
 
 
 _shares: Any = None
 
 
-def _begin(shares: Any) -> None:
+def _init_process(shares: Any) -> None:
     """Initialise a process of the pool; it ignores Ctrl-C, which the parent handles."""
     global _shares
     _shares = shares
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _task(task: Task) -> Found:
-    return _part(task, _shares)
+def _task(task: Task) -> Evaluation:
+    return _evaluate_share(task, _shares)
 
 
-def _part(task: Task, shares: Any) -> Found:
+def _evaluate_share(task: Task, shares: Any) -> Evaluation:
     """Evaluate this process's share of the aircraft, numbered in order of appearance."""
-    files, plan, offset, mine = task
-    k, jobs = mine
-    cases: list[Case] = []
-    silent, sentences, before = 0, [], 0
-    for number, (path, name) in enumerate(zip(files, names(files), strict=True)):
+    files, plan, offset, share = task
+    k, jobs = share
+    cases: list[EvaluationCase] = []
+    missed, sentences, uav_count = 0, [], 0
+    for number, (path, name) in enumerate(zip(files, recording_names(files), strict=True)):
         recording = Recording(path, offset)
-        drive = Drive(name, plan, partial(_is_mine, before, mine))
+        drive = RecordingDriver(name, plan, partial(_is_in_share, uav_count, share))
         cases += drive.run(_messages(recording, shares, number * jobs + k))
         shares[number * jobs + k] = 1.0
-        before += len(drive.examined)
-        silent += drive.silent
+        uav_count += len(drive.uavs)
+        missed += drive.missed
         sentences += recording.skipped
-    return Found(cases, silent, sentences)
+    return Evaluation(cases, missed, sentences)
 
 
-def _is_mine(before: int, mine: tuple[int, int], number: int) -> bool:
-    return (before + number) % mine[1] == mine[0]
+def _is_in_share(before: int, share: tuple[int, int], number: int) -> bool:
+    return (before + number) % share[1] == share[0]
 
 
-def names(files: Sequence[Path]) -> list[str]:
+def recording_names(files: Sequence[Path]) -> list[str]:
     """Return the names of recordings: the file name, or the path where file names are equal."""
-    often = Counter(path.name for path in set(files))
-    return [path.name if often[path.name] == 1 else str(path) for path in files]
+    counts = Counter(path.name for path in set(files))
+    return [path.name if counts[path.name] == 1 else str(path) for path in files]
 
 
-def _messages(recording: Recording, shares: Any, at: int) -> Iterator[Any]:
-    for _, news in recording.steps():
-        shares[at] = min(recording.share, 0.999)
-        yield from news
+def _messages(recording: Recording, shares: Any, slot: int) -> Iterator[Any]:
+    for _, messages in recording.steps():
+        shares[slot] = min(recording.share, 0.999)
+        yield from messages

@@ -6,10 +6,10 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from fleet.report.report_text import plain
+from fleet.report.report_text import printable
 from twin_worker.evaluation.scoring.case import OURS
 from twin_worker.evaluation.scoring.compare import BEATEN, WORSE
-from twin_worker.evaluation.scoring.truth import FIRST_S
+from twin_worker.evaluation.scoring.truth import MIN_FIRST_S
 
 _LABELS = {
     "cv": "constant velocity",
@@ -23,38 +23,40 @@ _LABELS = {
 }
 _ERRORS = ("5", "16", "30", "60")
 _STYLES = {BEATEN: "green", WORSE: "red"}
-_NOTHING = f"no prediction, and no mission flown after the first {FIRST_S:.0f} s"
-_ASIDE = ("compare", "apart", "run")
+_NO_STARTS = f"no prediction, and no mission flown after the first {MIN_FIRST_S:.0f} s"
+_OTHER_KEYS = ("compare", "apart", "run")
 
 
-def table(found: dict[str, Any]) -> RenderableType:
+def table(results: dict[str, Any]) -> RenderableType:
     """Format methods, tubes, phases, comparison and excluded starts."""
-    names = [name for name in (*_LABELS, *found) if name in found and name not in _ASIDE]
+    names = [name for name in (*_LABELS, *results) if name in results and name not in _OTHER_KEYS]
     names = list(dict.fromkeys(names))
     parts: list[RenderableType] = []
     if names:
-        parts += [_methods(found, names), Text(""), _trust(found, names), Text("")]
-        parts += [_phases(found[OURS]["phases"]), Text("")]
-        if found["compare"]:
-            parts += [_compare(found["compare"]), Text("")]
-    return Group(*parts, *(Text(plain(line)) for line in notes(found, names)))
+        parts += [_methods(results, names), Text(""), _region_table(results, names), Text("")]
+        parts += [_phases(results[OURS]["phases"]), Text("")]
+        if results["compare"]:
+            parts += [_compare(results["compare"]), Text("")]
+    return Group(*parts, *(Text(printable(line)) for line in notes(results, names)))
 
 
-def _methods(found: dict[str, Any], names: list[str]) -> Table:
-    first = found[names[0]]
-    title = f"{first['starts']} starts of {first['flights']} flights; t10: time within 10 % of the path flown (M1)"
+def _methods(results: dict[str, Any], names: list[str]) -> Table:
+    first_row = results[names[0]]
+    title = (
+        f"{first_row['starts']} starts of {first_row['flights']} flights; t10: time within 10 % of the path flown (M1)"
+    )
     out = _table(title, "method", "t10 quartile / median [s]", "t5 [s]", "within 60 s", "M2 [s]")
     for s in _ERRORS:
         _column(out, f"p50 {s} s [m]")
     _column(out, "p90 60 s [m]")
     for name in names:
-        row = found[name]
-        held = "–" if row["survive_60"] is None else f"{row['survive_60']:.0%}"
+        row = results[name]
+        survival = "–" if row["survive_60"] is None else f"{row['survive_60']:.0%}"
         out.add_row(
             _LABELS.get(name, name),
             f"{_time(row, 'm1_t10_lq_s')} / {_time(row, 'm1_t10_median_s')}",
             _time(row, "m1_t5_lq_s"),
-            held,
+            survival,
             _time(row, "m2_t10_lq_s"),
             *(_number(row["p50_m"].get(s)) for s in _ERRORS),
             _number(row["p90_m"].get("60")),
@@ -63,17 +65,17 @@ def _methods(found: dict[str, Any], names: list[str]) -> Table:
     return out
 
 
-def _trust(found: dict[str, Any], names: list[str]) -> Table:
-    look = list(found[names[0]]["coverage"])
+def _region_table(results: dict[str, Any], names: list[str]) -> Table:
+    look_aheads = list(results[names[0]]["coverage"])
     out = _table("tube: share inside (worst flight), half-axes along / cross / vertical [m]", "look-ahead")
-    its = [name for name in names if any(value is not None for value in found[name]["coverage"].values())]
-    for name in its:
+    with_region = [name for name in names if any(value is not None for value in results[name]["coverage"].values())]
+    for name in with_region:
         _column(out, _LABELS.get(name, name))
-    for s in look:
-        out.add_row(f"{s} s", *(_inside(found[name], s) for name in its))
-    out.add_row("horizon hit rate", *(_share(found[name]["horizon_hit_rate"]) for name in its))
-    out.add_row("horizon rank correlation", *(_number(found[name]["horizon_rank_corr"], 2) for name in its))
-    out.add_row("horizon median [s]", *(_number(found[name]["horizon_median_s"]) for name in its))
+    for s in look_aheads:
+        out.add_row(f"{s} s", *(_inside(results[name], s) for name in with_region))
+    out.add_row("horizon hit rate", *(_share(results[name]["horizon_hit_rate"]) for name in with_region))
+    out.add_row("horizon rank correlation", *(_number(results[name]["horizon_rank_corr"], 2) for name in with_region))
+    out.add_row("horizon median [s]", *(_number(results[name]["horizon_median_s"]) for name in with_region))
     return out
 
 
@@ -108,31 +110,32 @@ def _difference(row: dict[str, Any] | None) -> Text:
     return Text(f"{row['difference']:+.1f}{span} {row['verdict']}", style=_STYLES.get(row["verdict"], ""))
 
 
-def notes(found: dict[str, Any], names: list[str]) -> list[str]:
+def notes(results: dict[str, Any], names: list[str]) -> list[str]:
     """Return notes on fallback predictions and excluded starts."""
-    lines = [] if names else [_why_none(found)]
+    lines = [] if names else [_no_start_reason(results)]
     for name in names:
-        made = found[name]["made_by"]
-        others = {by: n for by, n in made.items() if by != name}
+        counts = results[name]["made_by"]
+        others = {source: n for source, n in counts.items() if source != name}
         if others:
-            said = ", ".join(f"{n} by {by}" for by, n in others.items())
-            lines.append(f"{_LABELS.get(name, name)}: of {found[name]['starts']} predictions {said}")
-    for why, row in found["apart"].items():
+            counts_text = ", ".join(f"{n} by {by}" for by, n in others.items())
+            lines.append(f"{_LABELS.get(name, name)}: of {results[name]['starts']} predictions {counts_text}")
+    for reason, row in results["apart"].items():
         lines.append(
-            f"excluded: {row['starts']} starts, {why}; ours within 10 % for {_number(row['m1_t10_lq_s'])} s (quartile)"
+            f"excluded: {row['starts']} starts, {reason}; ours within 10 % for {_number(row['m1_t10_lq_s'])} "
+            "s (quartile)"
         )
     return lines
 
 
-def _why_none(found: dict[str, Any]) -> str:
+def _no_start_reason(results: dict[str, Any]) -> str:
     """Return the reasons why there are no figures, from the keys `apart` and `run` of the JSON."""
-    run, apart = found.get("run", {}), sum(row["starts"] for row in found["apart"].values())
-    reasons = [f"{apart} are excluded, see below"] if apart else []
+    run, excluded = results.get("run", {}), sum(row["starts"] for row in results["apart"].values())
+    reasons = [f"{excluded} are excluded, see below"] if excluded else []
     if counted := run.get("counted", 0):
         reasons.append(f"{counted} lack a prediction of some method")
-    if silent := run.get("silent", 0):
-        reasons.append(f"{silent} on a mission have no prediction")
-    return f"no start is included: {'; '.join(reasons) or _NOTHING}"
+    if missed := run.get("silent", 0):
+        reasons.append(f"{missed} on a mission have no prediction")
+    return f"no start is included: {'; '.join(reasons) or _NO_STARTS}"
 
 
 def _table(title: str, *columns: str) -> Table:

@@ -13,46 +13,54 @@ import numpy as np
 from fleet.contract import Outcome
 from fleet.physics.wrench import NAMES, WIND, L, M, N, X, Y, Z, terms
 from fleet.window import Window
-from twin_worker.estimation.wind_filter import WindFilter, blow
-from twin_worker.identification.fixed_wing.derivatives_model import Coupled
-from twin_worker.identification.fixed_wing.point_mass_with_effects import Added
-from twin_worker.identification.fixed_wing.point_mass_with_effects import extended as extended_hybrid
-from twin_worker.mismatch.effect_increments import Push
-from twin_worker.numerics.ridge_regression import ridge
-from twin_worker.prediction.closed_loop import Flown, set_out
-from twin_worker.telemetry.resample import Grid
-from twin_worker.twin.state.checkpoint import Extension, Mark, before
-from twin_worker.twin.state.state import Believed, Twin
-from twin_worker.twin.steps.rollouts import paths
+from twin_worker.estimation.wind_filter import WindFilter, update_from_history
+from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
+from twin_worker.identification.fixed_wing.point_mass_with_effects import EffectIncrements
+from twin_worker.identification.fixed_wing.point_mass_with_effects import with_effects as extended_hybrid
+from twin_worker.mismatch.effect_increments import EffectOutputs
+from twin_worker.numerics.ridge_regression import solve_ridge
+from twin_worker.prediction.closed_loop import Rollout, synchronise_controller
+from twin_worker.telemetry.resample import Resampler
+from twin_worker.twin.state.checkpoint import ActiveEffects, Checkpoint, latest_before
+from twin_worker.twin.state.models import VerifiedModel
+from twin_worker.twin.state.state import Twin
+from twin_worker.twin.steps.rollouts import method_paths
 
-_EARLIER_S = 2.0  # a checkpoint nearer to the onset can contain the effect already [s]
-_FLOWN_S = (20.0, 15.0, 10.0)  # newest flight simulated with both models, from several starts [s]
-_CLEARLY = 0.95  # the adapted model is used if its error is below this share of the present error [-]
-_DOUBT = 0.3  # relative uncertainty of an effect's increments: diagnosis and baseline are not exact [-]
+_CHECKPOINT_MARGIN_S = 2.0  # a checkpoint nearer to the onset can contain the effect already [s]
+_HINDCAST_S = (20.0, 15.0, 10.0)  # newest flight simulated with both models, from several starts [s]
+_MAX_ERROR_RATIO = 0.95  # the adapted model is used if its error is below this share of the present error [-]
+_EFFECT_UNCERTAINTY = 0.3  # relative uncertainty of an effect's increments: diagnosis and baseline are not exact [-]
 _RIDGE = 0.02  # regularisation of an increment towards zero, as a share of its term's length
-_HOLDS_S = 60.0  # assumed data span of the adapted model; its weight fades as that of earlier data does [s]
-_ROWS = ((0, X, Z), (2, Z, M), (4, M, Y), (1, Y, L), (3, L, N), (5, N, WIND))  # row of the wrench, its derivatives
-_COLUMNS = {0: "da", 1: "de", 2: "dr", 3: "dt"}  # derivatives of each input
+_PRIOR_SPAN_S = 60.0  # assumed data span of the adapted model; its weight fades as that of earlier data does [s]
+_WRENCH_TERMS = (
+    (0, X, Z),
+    (2, Z, M),
+    (4, M, Y),
+    (1, Y, L),
+    (3, L, N),
+    (5, N, WIND),
+)  # row of the wrench, its derivatives
+_INPUT_LETTERS = {0: "da", 1: "de", 2: "dr", 3: "dt"}  # derivatives of each input
 
 
 @dataclass(frozen=True)
-class Tried:
+class AdaptationResult:
     """Result of an adaptation: whether the adapted model is used, and the mean position errors compared [m]."""
 
     used: bool
-    present: float
-    extended: float
+    present_error: float
+    adapted_error: float
 
     @property
-    def said(self) -> str:
+    def message(self) -> str:
         """Describe the result."""
-        if not np.isfinite(self.extended):
+        if not np.isfinite(self.adapted_error):
             return "not used for predictions: there is no flight to compare the models on"
-        missed = f"{self.extended:.1f} m against {self.present:.1f} m over the last {_FLOWN_S[0]:.0f} s"
-        return f"predictions use it ({missed})" if self.used else f"the identified model is used unchanged ({missed})"
+        errors = f"{self.adapted_error:.1f} m against {self.present_error:.1f} m over the last {_HINDCAST_S[0]:.0f} s"
+        return f"predictions use it ({errors})" if self.used else f"the identified model is used unchanged ({errors})"
 
 
-def extend(twin: Twin, push: Push, names: str) -> Tried:
+def adapt_models(twin: Twin, outputs: EffectOutputs, names: str) -> AdaptationResult:
     """Add diagnosed effects to the models of a twin if this lowers the error over the newest flight.
 
     Args:
@@ -60,119 +68,136 @@ def extend(twin: Twin, push: Push, names: str) -> Tried:
         outputs: of the effects
         names: of the effects
     """
-    mark = before(twin.marks, push.onset - _EARLIER_S)
-    if mark is None:
-        return Tried(False, np.nan, np.nan)
-    other = _begun_anew(twin, push, mark)
-    misses = np.array([(_miss(twin, s), _miss(other, s)) for s in _FLOWN_S if twin.history.newest - s > push.onset])
-    misses = misses[np.isfinite(misses).all(axis=1)] if len(misses) else np.full((1, 2), np.nan)
-    if not len(misses):
-        return Tried(False, np.nan, np.nan)
-    present, extended = misses.mean(axis=0).tolist()
-    if not extended < _CLEARLY * present:
-        return Tried(False, present, extended)
-    for name in ("wind", "wind_t", "plant", "last", "pool", "hybrid", "near_hybrid", "in_force", "learn_from"):
-        setattr(twin, name, getattr(other, name))
-    twin.near, twin.predict_t, twin.spread_t, twin.put_off, twin.told_t = None, -np.inf, -np.inf, None, -np.inf
-    twin.grid.clear()
-    twin.extended = Extension(names, push.onset)
-    return Tried(True, present, extended)
+    checkpoint = latest_before(twin.models.checkpoints, outputs.onset - _CHECKPOINT_MARGIN_S)
+    if checkpoint is None:
+        return AdaptationResult(False, np.nan, np.nan)
+    adapted = _adapted_copy(twin, outputs, checkpoint)
+    errors = np.array(
+        [
+            (_hindcast_error(twin, s), _hindcast_error(adapted, s))
+            for s in _HINDCAST_S
+            if twin.telemetry.history.newest - s > outputs.onset
+        ]
+    )
+    errors = errors[np.isfinite(errors).all(axis=1)] if len(errors) else np.full((1, 2), np.nan)
+    if not len(errors):
+        return AdaptationResult(False, np.nan, np.nan)
+    present_error, adapted_error = errors.mean(axis=0).tolist()
+    if not adapted_error < _MAX_ERROR_RATIO * present_error:
+        return AdaptationResult(False, present_error, adapted_error)
+    twin.environment.set_wind(adapted.environment.wind, adapted.environment.wind_t)
+    twin.models.adopt(adapted.models, ActiveEffects(names, outputs.onset))
+    twin.identification.restart(outputs.onset, adapted.identification.prior_model)
+    twin.prediction.expire()
+    twin.telemetry.resampler.clear()
+    return AdaptationResult(True, present_error, adapted_error)
 
 
-def _begun_anew(twin: Twin, push: Push, mark: Mark) -> Twin:
+def _adapted_copy(twin: Twin, outputs: EffectOutputs, checkpoint: Checkpoint) -> Twin:
     """Return a copy of the twin that contains the effects, restarted from `checkpoint` at the onset."""
-    other = copy(twin)
-    other.contest, other.grid = copy(twin.contest), Grid()
-    other.learn_from = push.onset
-    other.wind, other.wind_t = wind_since(twin, push, mark)
-    window = other.window(_HOLDS_S)
+    adapted = msgspec.structs.replace(
+        twin,
+        telemetry=msgspec.structs.replace(twin.telemetry, resampler=Resampler()),
+        environment=copy(twin.environment),
+        identification=copy(twin.identification),
+        models=copy(twin.models),
+        prediction=msgspec.structs.replace(twin.prediction, selector=copy(twin.prediction.selector)),
+    )
+    adapted.environment.set_wind(*wind_with_effects(twin, outputs, checkpoint))
+    window = adapted.window(_PRIOR_SPAN_S)
     assert window is not None
-    since = window.part(min(int(np.searchsorted(window.t, push.onset)), len(window) - 2), len(window))
-    if mark.plant is not None and twin.in_force is not None:
-        other.plant = other.last = plant = extended_plant(mark.plant, push, window)
-        verdict = msgspec.structs.replace(twin.in_force, outcome=Outcome.VERIFIED)
-        other.in_force = verdict
-        other.pool = [Believed(plant, verdict, float(window.t[-1]), np.nan)]
-    if mark.hybrid is not None:
-        air = np.column_stack([_at(push.t, window, c) for c in range(3)])
-        faulty = (push.moved != push.command).any(axis=0)
-        added = Added(
-            push.wrench[:, :3], air, _at(push.t, window, 6), push.moved[:, 3], (bool(faulty[0]), bool(faulty[1]))
+    after_onset = window.part(min(int(np.searchsorted(window.t, outputs.onset)), len(window) - 2), len(window))
+    if checkpoint.derivatives_model is not None and twin.models.active_verdict is not None:
+        plant = adapted_derivatives(checkpoint.derivatives_model, outputs, window)
+        verdict = msgspec.structs.replace(twin.models.active_verdict, outcome=Outcome.VERIFIED)
+        adapted.identification.store_prior(plant)
+        adapted.models.activate(VerifiedModel(plant, verdict, float(window.t[-1]), np.nan))
+    if checkpoint.point_mass is not None:
+        air = np.column_stack([_interpolated(outputs.t, window, c) for c in range(3)])
+        faulty = (outputs.actual != outputs.command).any(axis=0)
+        added = EffectIncrements(
+            outputs.wrench[:, :3],
+            air,
+            _interpolated(outputs.t, window, 6),
+            outputs.actual[:, 3],
+            (bool(faulty[0]), bool(faulty[1])),
         )
-        other.hybrid = extended_hybrid(mark.hybrid, since, twin.history, other.wind.scale, added)
-        other.near_hybrid = other.hybrid
-    return other
+        point_mass = extended_hybrid(
+            checkpoint.point_mass, after_onset, twin.telemetry.history, adapted.environment.wind.scale, added
+        )
+        adapted.models.store_point_mass(point_mass, verified=True)
+    return adapted
 
 
-def wind_since(twin: Twin, push: Push, mark: Mark) -> tuple[WindFilter, float]:
+def wind_with_effects(twin: Twin, outputs: EffectOutputs, checkpoint: Checkpoint) -> tuple[WindFilter, float]:
     """Return the wind filter rerun with the effects from their onset on, and the time of its newest row."""
-    wind = deepcopy(mark.wind)
-    last = blow(wind, twin.history, mark.t, mark.t, push.onset)
-    wind.jump(push.wind, 1.0 / push.scale, _DOUBT)
-    return wind, blow(wind, twin.history, last, push.onset)
+    wind = deepcopy(checkpoint.wind_filter)
+    last_t = update_from_history(wind, twin.telemetry.history, checkpoint.t, checkpoint.t, outputs.onset)
+    wind.inflate_after_step(outputs.wind, 1.0 / outputs.airspeed_scale, _EFFECT_UNCERTAINTY)
+    return wind, update_from_history(wind, twin.telemetry.history, last_t, outputs.onset)
 
 
-def extended_plant(plant: Coupled, push: Push, window: Window) -> Coupled:
+def adapted_derivatives(plant: DerivativesModel, outputs: EffectOutputs, window: Window) -> DerivativesModel:
     """Return the model with the effects: derivatives by input scaled for servo faults, increments added.
 
     Increments are regressed on the terms of the wrench over the recent flight: their slopes about the present trim.
     """
-    par, added = _through_servos(plant.par, push), np.zeros(len(NAMES))
-    flown = np.column_stack([_at(push.t, window, c) for c in range(6)])
-    A = np.empty((len(flown), WIND))
-    for row, x, delta in zip(A, flown, push.moved, strict=True):
-        terms(x[0], x[1], x[2], x[3:6], delta, plant.at, row)
-    for which, first, end in _ROWS:
-        added[first:end] = ridge(A[:, first:end], push.wrench[:, which], _RIDGE)
-    added[WIND:] = push.wind[:2]
-    changed = par + added - plant.par
-    covariance = plant.covariance + np.diag((_DOUBT * changed) ** 2)
-    nothing = np.zeros_like(plant.information)
+    par, added = _apply_servo_faults(plant.par, outputs), np.zeros(len(NAMES))
+    states = np.column_stack([_interpolated(outputs.t, window, c) for c in range(6)])
+    A = np.empty((len(states), WIND))
+    for row, x, delta in zip(A, states, outputs.actual, strict=True):
+        terms(x[0], x[1], x[2], x[3:6], delta, plant.trim_velocity, row)
+    for wrench_row, first, end in _WRENCH_TERMS:
+        added[first:end] = solve_ridge(A[:, first:end], outputs.wrench[:, wrench_row], _RIDGE)
+    added[WIND:] = outputs.wind[:2]
+    change = par + added - plant.par
+    covariance = plant.covariance + np.diag((_EFFECT_UNCERTAINTY * change) ** 2)
+    no_information = np.zeros_like(plant.fisher_information)
     return replace(
         plant,
         par=par + added,
-        mean=par + added,
-        precision=np.linalg.inv(covariance),
-        information=nothing,
-        t0=push.onset,
-        t1=push.onset + _HOLDS_S,
+        prior_mean=par + added,
+        prior_precision=np.linalg.inv(covariance),
+        fisher_information=no_information,
+        t0=outputs.onset,
+        t1=outputs.onset + _PRIOR_SPAN_S,
     )
 
 
-def _through_servos(par: np.ndarray, push: Push) -> np.ndarray:
+def _apply_servo_faults(par: np.ndarray, outputs: EffectOutputs) -> np.ndarray:
     """Return the derivatives by commands, for faulty servos with  delta = g delta_c + o."""
     out = par.copy()
-    for column, letters in _COLUMNS.items():
-        u, moved = push.command[:, column], push.moved[:, column]
-        if np.array_equal(u, moved):
+    for column, letters in _INPUT_LETTERS.items():
+        u, actual = outputs.command[:, column], outputs.actual[:, column]
+        if np.array_equal(u, actual):
             continue
-        g, o = np.polyfit(u, moved, 1) if np.ptp(u) > 1e-3 else (1.0, float((moved - u).mean()))
+        g, o = np.polyfit(u, actual, 1) if np.ptp(u) > 1e-3 else (1.0, float((actual - u).mean()))
         for axis in "XYZLMN":
             if (name := f"{axis}_{letters}") in NAMES:
-                by = NAMES.index(name)
-                out[NAMES.index(f"{axis}_0")] += o * par[by]
-                out[by] = g * par[by]
+                index = NAMES.index(name)
+                out[NAMES.index(f"{axis}_0")] += o * par[index]
+                out[index] = g * par[index]
     return out
 
 
-def _at(t: np.ndarray, window: Window, column: int) -> np.ndarray:
+def _interpolated(t: np.ndarray, window: Window, column: int) -> np.ndarray:
     return np.interp(t, window.t, window.x[:, column])
 
 
-def _miss(twin: Twin, seconds: float) -> float:
+def _hindcast_error(twin: Twin, seconds: float) -> float:
     """Return the mean position error of the active method over the newest seconds [m]; inf outside the envelope."""
     window = twin.window(62.0 + seconds)
-    if window is None or twin.why_no_route() or not window.ok[-round(seconds / window.dt) :].all():
+    if window is None or twin.no_route_reason() or not window.ok[-round(seconds / window.dt) :].all():
         return np.nan
     start = len(window) - 1 - round(seconds / window.dt)
-    now = twin.situation(window.part(0, start + 1))
-    begin = set_out(now)
-    if isinstance(begin, Flown):
+    situation = twin.situation(window.part(0, start + 1))
+    initial = synchronise_controller(situation)
+    if isinstance(initial, Rollout):
         return np.nan
     ahead = np.arange(0.0, seconds + 1e-9)
-    found, _ = paths(twin, (now, begin), ahead, False)
-    if not found:
+    by_method, _ = method_paths(twin, (situation, initial), ahead, False)
+    if not by_method:
         return np.inf
-    path = found[twin.contest.best(tuple(found))]
+    path = by_method[twin.prediction.selector.best(tuple(by_method))]
     rows = start + np.rint(ahead / window.dt).astype(int)
     return float(np.linalg.norm(path - window.p[rows], axis=1).mean())

@@ -8,36 +8,36 @@ from functools import partial
 from types import MappingProxyType
 from typing import Protocol, TypeVar
 
-from fleet.contract import Found, Mismatch
+from fleet.contract import DiagnosisOutcome, Mismatch
 from twin_worker.diagnosis.data.card import UNKNOWN
 from twin_worker.diagnosis.model.baseline import Baseline
-from twin_worker.mismatch.adapt_models import extend
-from twin_worker.mismatch.job import Answer, Job
-from twin_worker.mismatch.messages import judged
-from twin_worker.mismatch.scheduler import Watch
+from twin_worker.mismatch.adapt_models import adapt_models
+from twin_worker.mismatch.job import DiagnosisJob, DiagnosisResult
+from twin_worker.mismatch.messages import with_adaptation
+from twin_worker.mismatch.scheduler import DiagnosisState
 from twin_worker.twin.state.state import Twin
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
-ALL = -1  # in place of a UAV id
-Held = tuple[Twin, AbstractContextManager]  # a twin and its lock
+ALL_UAVS = -1  # in place of a UAV id
+LockedTwin = tuple[Twin, AbstractContextManager]  # a twin and its lock
 
 
-class Hand(Protocol):
+class Executor(Protocol):
     """Executes diagnosis jobs, one at a time."""
 
     @property
     def free(self) -> bool:
         """Return whether a job can be submitted now."""
 
-    def give(self, job: Job) -> None:
+    def submit(self, job: DiagnosisJob) -> None:
         """Start a job."""
 
-    def answer(self) -> Answer | None:
+    def poll(self) -> DiagnosisResult | None:
         """Return a finished result; None if there is none."""
 
 
-class Live:
+class Coordinator:
     """Mismatch diagnosis of the aircraft that a worker owns.
 
     Args:
@@ -46,86 +46,89 @@ class Live:
         adapt: adapt the prediction models to diagnosed effects
     """
 
-    def __init__(self, hand: Hand, bases: Mapping[int, Baseline] = MappingProxyType({}), *, adapt: bool = True) -> None:
-        self._hand, self._bases, self._adapt = hand, bases, adapt
-        self.watches: dict[int, Watch] = {}
-        self._waiting: Answer | None = None  # its aircraft's lock is in use
+    def __init__(
+        self, executor: Executor, baselines: Mapping[int, Baseline] = MappingProxyType({}), *, adapt: bool = True
+    ) -> None:
+        self._executor, self._baselines, self._adapt = executor, baselines, adapt
+        self.states: dict[int, DiagnosisState] = {}
+        self._deferred: DiagnosisResult | None = None  # its aircraft's lock is in use
 
-    def watch(self, uav: int) -> Watch:
+    def state(self, uav: int) -> DiagnosisState:
         """Return the diagnosis state of one aircraft."""
-        if uav not in self.watches:
-            base = self._bases.get(uav, self._bases.get(ALL))
-            self.watches[uav] = Watch(UNKNOWN if base is None else base.card, base)
-        return self.watches[uav]
+        if uav not in self.states:
+            baseline = self._baselines.get(uav, self._baselines.get(ALL_UAVS))
+            self.states[uav] = DiagnosisState(UNKNOWN if baseline is None else baseline.card, baseline)
+        return self.states[uav]
 
-    def turn(self, held: Sequence[Held]) -> Iterator[Mismatch]:
+    def run_once(self, owned: Sequence[LockedTwin]) -> Iterator[Mismatch]:
         """Process a finished result, and submit the most urgent job if the executor is free.
 
         An internal error affects only its own aircraft: it is reported and logged, and the aircraft is suspended.
         """
-        twins = {twin.uav: (twin, lock) for twin, lock in held}
-        if (answer := self._waiting or self._hand.answer()) is not None:
-            self._waiting = answer if _locked(twins.get(answer.uav)) else None
-            if self._waiting is not None:  # identification holds the lock; do not block the telemetry of the others
+        twins = {twin.config.uav: (twin, lock) for twin, lock in owned}
+        if (result := self._deferred or self._executor.poll()) is not None:
+            self._deferred = result if _locked(twins.get(result.uav)) else None
+            if self._deferred is not None:  # identification holds the lock; do not block the telemetry of the others
                 return
-            uav, t = answer.uav, answer.end
-            yield from self._isolated(uav, t, lambda: self._take(answer, twins)) or ()
-        if not self._hand.free:
+            uav, t = result.uav, result.end
+            yield from self._run_isolated(uav, t, lambda: self._handle_result(result, twins)) or ()
+        if not self._executor.free:
             return
         due = []
-        for twin, _ in held:
-            urgent = self._isolated(twin.uav, twin.history.newest, partial(self._urgency, twin))
-            if urgent is not None:
-                due.append((urgent, twin))
+        for twin, _ in owned:
+            urgency = self._run_isolated(twin.config.uav, twin.telemetry.history.newest, partial(self._urgency, twin))
+            if urgency is not None:
+                due.append((urgency, twin))
         if due:
-            twin = max(due, key=lambda one: one[0])[1]
-            job = self._isolated(twin.uav, twin.history.newest, lambda: self.watch(twin.uav).job(twin))
+            twin = max(due, key=lambda entry: entry[0])[1]
+            uav, newest = twin.config.uav, twin.telemetry.history.newest
+            job = self._run_isolated(uav, newest, lambda: self.state(uav).create_job(twin))
             if job is not None:
-                self._hand.give(job)
+                self._executor.submit(job)
 
-    def failed(self, uavs: Iterable[int]) -> list[str]:
+    def defects(self, uavs: Iterable[int]) -> list[str]:
         """Return the newest internal errors in the diagnoses of these aircraft."""
-        return [self.watches[uav].failed for uav in uavs if uav in self.watches and self.watches[uav].failed]
+        return [self.states[uav].defect for uav in uavs if uav in self.states and self.states[uav].defect]
 
     def _urgency(self, twin: Twin) -> float | None:
-        return self.watch(twin.uav).wants(twin)
+        return self.state(twin.config.uav).urgency(twin)
 
-    def _isolated(self, uav: int, t: float, do: Callable[[], T]) -> T | None:
+    def _run_isolated(self, uav: int, t: float, action: Callable[[], T]) -> T | None:
         """Run an action for one aircraft at data time `t`; return None after an internal error."""
         try:
-            return do()
+            return action()
         except Exception as error:
-            watch = self.watch(uav)
-            watch.give_up(uav, t, f"{type(error).__name__}: {error}")
-            _log.exception("%s", watch.failed)
+            state = self.state(uav)
+            state.suspend(uav, t, f"{type(error).__name__}: {error}")
+            _log.exception("%s", state.defect)
             return None
 
-    def _take(self, answer: Answer, held: dict[int, Held]) -> list[Mismatch]:
-        watch = self.watch(answer.uav)
-        told = watch.take(answer)
-        if answer.failed:
-            _log.error("%s", "\n".join(filter(None, (watch.failed, answer.details))))
-        if told is None or answer.uav not in held:
+    def _handle_result(self, result: DiagnosisResult, owned: dict[int, LockedTwin]) -> list[Mismatch]:
+        state = self.state(result.uav)
+        mismatch = state.handle_result(result)
+        if result.defect:
+            _log.error("%s", "\n".join(filter(None, (state.defect, result.details))))
+        if mismatch is None or result.uav not in owned:
             return []
-        twin, lock = held[answer.uav]
+        twin, lock = owned[result.uav]
         if self._adapt:
             with lock:
-                told = watch.told = _adapted(twin, told, answer)
-        return [told]
+                mismatch = state.published = _adapt_twin(twin, mismatch, result)
+        return [mismatch]
 
 
-def _locked(held: Held | None) -> bool:
-    return held is not None and isinstance(held[1], LockType) and held[1].locked()
+def _locked(locked_twin: LockedTwin | None) -> bool:
+    return locked_twin is not None and isinstance(locked_twin[1], LockType) and locked_twin[1].locked()
 
 
-def _adapted(twin: Twin, told: Mismatch, answer: Answer) -> Mismatch:
+def _adapt_twin(twin: Twin, mismatch: Mismatch, result: DiagnosisResult) -> Mismatch:
     """Adapt the models of a twin to the diagnosed effects, once; a cleared mismatch removes only the label."""
-    if told.outcome is Found.NONE:
-        twin.extended = None
-    if told.outcome is not Found.NAMED or answer.pushes is None:
-        return told
-    names = " and ".join(one.name for one in told.causes)
-    if twin.extended is not None and twin.extended.names == names:
-        return judged(told, "predictions use it", used=True)
-    tried = extend(twin, answer.pushes, names)
-    return judged(told, tried.said, used=tried.used)
+    if mismatch.outcome is DiagnosisOutcome.NONE:
+        twin.models.set_effect(None)
+    if mismatch.outcome is not DiagnosisOutcome.NAMED or result.effect_outputs is None:
+        return mismatch
+    names = " and ".join(cause.name for cause in mismatch.causes)
+    if twin.models.active_effect is not None and twin.models.active_effect.names == names:
+        return with_adaptation(mismatch, "predictions use it", used=True)
+    adaptation = adapt_models(twin, result.effect_outputs, names)
+    return with_adaptation(mismatch, adaptation.message, used=adaptation.used)

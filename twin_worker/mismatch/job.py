@@ -6,29 +6,29 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleet.contract import COLUMNS
-from twin_worker.diagnosis.baseline.own_past import later
-from twin_worker.diagnosis.baseline.past import BEFORE_S, calibrate_past, since
-from twin_worker.diagnosis.data.card import Card
-from twin_worker.diagnosis.data.flight import Flight, lay
+from twin_worker.diagnosis.baseline.own_past import only_new_findings
+from twin_worker.diagnosis.baseline.past import CONTEXT_S, calibrate_past, part_after
+from twin_worker.diagnosis.data.card import AircraftCard
+from twin_worker.diagnosis.data.flight import FlightData, resample_flight
 from twin_worker.diagnosis.data.smooth import STEP_S
 from twin_worker.diagnosis.inference.diagnose import diagnose
-from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
+from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 from twin_worker.diagnosis.inference.report import Report
 from twin_worker.diagnosis.model.baseline import Baseline
-from twin_worker.diagnosis.model.residual import Case
+from twin_worker.diagnosis.model.residual import ModelledFlight
 from twin_worker.diagnosis.model.weather import own_weather
-from twin_worker.mismatch.effect_increments import Push, pushes
-from twin_worker.telemetry.history import History
+from twin_worker.mismatch.effect_increments import EffectOutputs, effect_outputs
+from twin_worker.telemetry.history import TelemetryHistory
 
-NEWEST_S = 20.0  # newest flight whose residuals are monitored [s]
-GREW = 1.5  # mean square of the recent residuals over the earlier ones that triggers a diagnosis [-]
-_LEAST_ROWS = 50  # of both parts, one row every 0.2 s
+RECENT_S = 20.0  # newest flight whose residuals are monitored [s]
+MIN_GROWTH = 1.5  # mean square of the recent residuals over the earlier ones that triggers a diagnosis [-]
+_MIN_ROWS = 50  # of both parts, one row every 0.2 s
 
-Rows = dict[str, tuple[np.ndarray, np.ndarray]]
+TelemetryRows = dict[str, tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
-class Job:
+class DiagnosisJob:
     """Recent flight of one aircraft.
 
     Attributes:
@@ -42,16 +42,16 @@ class Job:
     """
 
     uav: int
-    rows: Rows
+    rows: TelemetryRows
     params: dict[str, float]
-    card: Card
-    base: Baseline | None
-    until: float = 0.0
-    whole: bool = False
+    card: AircraftCard
+    baseline: Baseline | None
+    past_end: float = 0.0
+    full: bool = False
 
 
 @dataclass(frozen=True)
-class Answer:
+class DiagnosisResult:
     """Result of one diagnosis job.
 
     Attributes:
@@ -69,74 +69,74 @@ class Answer:
     uav: int
     begin: float
     end: float
-    grew: float = float("nan")
+    residual_growth: float = float("nan")
     report: Report | None = None
-    pushes: Push | None = None
-    refused: str = ""
-    failed: str = ""
+    effect_outputs: EffectOutputs | None = None
+    refusal: str = ""
+    defect: str = ""
     details: str = ""
     cpu_s: float = 0.0
 
 
-def rows_of(history: History, start: float, past: Rows | None = None) -> Rows:
+def telemetry_rows(history: TelemetryHistory, start: float, past: TelemetryRows | None = None) -> TelemetryRows:
     """Copy the telemetry for a diagnosis from `start` on [s since 1970], appended to the stored past."""
     out = {}
     for kind in COLUMNS:
         t, x = history.rows(kind, start)
         if past is not None and len(past[kind][0]):
-            old, before = past[kind]
-            new = t > old[-1]
-            t, x = np.concatenate([old, t[new]]), np.concatenate([before, x[new]])
+            past_t, past_x = past[kind]
+            new = t > past_t[-1]
+            t, x = np.concatenate([past_t, t[new]]), np.concatenate([past_x, x[new]])
         out[kind] = t, x
     return out
 
 
-def failed(job: Job, why: str, *, cpu_s: float = 0.0, details: str = "") -> Answer:
+def failed_result(job: DiagnosisJob, reason: str, *, cpu_s: float = 0.0, details: str = "") -> DiagnosisResult:
     """Return the result of a job that ended with an internal error."""
-    return replace(_unanswered(job), failed=why, cpu_s=cpu_s, details=details)
+    return replace(_empty_result(job), defect=reason, cpu_s=cpu_s, details=details)
 
 
-def _unanswered(job: Job) -> Answer:
+def _empty_result(job: DiagnosisJob) -> DiagnosisResult:
     t = job.rows["attitude"][0]
-    return Answer(job.uav, float(t[0]) if len(t) else 0.0, float(t[-1]) if len(t) else 0.0)
+    return DiagnosisResult(job.uav, float(t[0]) if len(t) else 0.0, float(t[-1]) if len(t) else 0.0)
 
 
-def work(job: Job) -> Answer:
+def run_job(job: DiagnosisJob) -> DiagnosisResult:
     """Check the recent residuals and diagnose if they grew; a `ValueError` becomes a refusal."""
-    begun = time.process_time()
-    found = _unanswered(job)
+    started = time.process_time()
+    result = _empty_result(job)
     try:
-        found = _work(job, found)
+        result = _run(job, result)
     except (ValueError, np.linalg.LinAlgError) as error:
-        found = replace(found, refused=str(error))
-    return replace(found, cpu_s=time.process_time() - begun)
+        result = replace(result, refusal=str(error))
+    return replace(result, cpu_s=time.process_time() - started)
 
 
-def _work(job: Job, found: Answer) -> Answer:
-    history = History(keep_s=np.inf)
+def _run(job: DiagnosisJob, result: DiagnosisResult) -> DiagnosisResult:
+    history = TelemetryHistory(keep_s=np.inf)
     for kind, (t, x) in job.rows.items():
-        history.put(kind, t, x)
-    flight = lay(f"uav-{job.uav}", history, job.params, job.card)
-    base, until = job.base, job.until - flight.zero
-    if base is None:
-        base = calibrate_past(flight, until, job.card)
-        flight = since(flight, until - BEFORE_S)
-    found = replace(found, begin=flight.zero, grew=growth(flight, base))
-    if not (job.whole or found.grew > GREW):
-        return found
-    report = diagnose(flight, base)
-    if job.base is None:
-        report = later(report, None, until)  # the newest seconds can be a climb: no permanent loss yet
-    return replace(found, report=report, pushes=pushes(flight, base, report))
+        history.replace_rows(kind, t, x)
+    flight = resample_flight(f"uav-{job.uav}", history, job.params, job.card)
+    baseline, past_end = job.baseline, job.past_end - flight.t_start
+    if baseline is None:
+        baseline = calibrate_past(flight, past_end, job.card)
+        flight = part_after(flight, past_end - CONTEXT_S)
+    result = replace(result, begin=flight.t_start, residual_growth=residual_growth(flight, baseline))
+    if not (job.full or result.residual_growth > MIN_GROWTH):
+        return result
+    report = diagnose(flight, baseline)
+    if job.baseline is None:
+        report = only_new_findings(report, None, past_end)  # the newest seconds can be a climb: no permanent loss yet
+    return replace(result, report=report, effect_outputs=effect_outputs(flight, baseline, report))
 
 
-def growth(flight: Flight, base: Baseline) -> float:
+def residual_growth(flight: FlightData, baseline: Baseline) -> float:
     """Return the mean square of the recent residuals over the earlier ones, of the channel with the largest growth."""
-    case = Case(flight, base)
-    sight = Sight(case, own_weather(case))
-    late = case.t > case.t[-1] - NEWEST_S
-    now, before = sight.part(late), sight.part(~late)
-    if min(now.ok.sum(), before.ok.sum()) < min(_LEAST_ROWS, 0.5 * NEWEST_S / STEP_S):
+    flight_model = ModelledFlight(flight, baseline)
+    whitened = WhitenedResiduals(flight_model, own_weather(flight_model))
+    is_recent = flight_model.t > flight_model.t[-1] - RECENT_S
+    recent, earlier = whitened.part(is_recent), whitened.part(~is_recent)
+    if min(recent.ok.sum(), earlier.ok.sum()) < min(_MIN_ROWS, 0.5 * RECENT_S / STEP_S):
         return float("nan")
-    size = [((x.e + x.Jn @ sight.xn)[x.ok] ** 2).mean(axis=0) for x in (now, before)]
-    return float((size[0] / np.maximum(size[1], base.usual * 0.5)).max())
+    mean_square = [((part.e + part.Jn @ whitened.xn)[part.ok] ** 2).mean(axis=0) for part in (recent, earlier)]
+    return float((mean_square[0] / np.maximum(mean_square[1], baseline.usual * 0.5)).max())

@@ -16,18 +16,18 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 
-from twin_worker.mismatch.job import Answer, Job, failed, work
+from twin_worker.mismatch.job import DiagnosisJob, DiagnosisResult, failed_result, run_job
 
-SHARE = 0.2  # average share of one core [-]
+CPU_SHARE = 0.2  # average share of one core [-]
 LIMIT_CPU_S = 180.0  # CPU time of one job, including compilation [s]
 LIMIT_S = 900.0  # wall time of one job; longer only if it waits indefinitely [s]
-_NICE = 15  # increment of the nice value
-_PATIENCE_S = 1.0  # wait for the end of process and thread [s]
-_ENDING_S = 30.0  # wait for a process to exit after it closed its pipe; it runs at low priority [s]
-Work = Callable[[Job], Answer]
+_NICE_INCREMENT = 15  # increment of the nice value
+_JOIN_TIMEOUT_S = 1.0  # wait for the end of process and thread [s]
+_EXIT_TIMEOUT_S = 30.0  # wait for a process to exit after it closed its pipe; it runs at low priority [s]
+JobFunction = Callable[[DiagnosisJob], DiagnosisResult]
 
 
-class Background:
+class DiagnosisProcess:
     """A process that executes one diagnosis job at a time.
 
     Args:
@@ -38,14 +38,18 @@ class Background:
     """
 
     def __init__(
-        self, share: float = SHARE, work: Work = work, limit_cpu_s: float = LIMIT_CPU_S, limit_s: float = LIMIT_S
+        self,
+        share: float = CPU_SHARE,
+        function: JobFunction = run_job,
+        limit_cpu_s: float = LIMIT_CPU_S,
+        limit_s: float = LIMIT_S,
     ) -> None:
-        self._share, self._work, self._limit_cpu_s, self._limit_s = share, work, limit_cpu_s, limit_s
+        self._share, self._function, self._limit_cpu_s, self._limit_s = share, function, limit_cpu_s, limit_s
         self._process: SpawnProcess | None = None
         self._pipe: Connection | None = None
         self._thread: threading.Thread | None = None  # of the running job
-        self._answer: Answer | None = None
-        self._busy = self._closed = self._late = False
+        self._result: DiagnosisResult | None = None
+        self._busy = self._closed = self._timed_out = False
         self._free_at = 0.0  # monotonic [s]
         self._lock = threading.Lock()  # protects start and end of the process
 
@@ -54,51 +58,51 @@ class Background:
         """Return whether a job can be submitted now."""
         return not self._busy and not self._closed and time.monotonic() >= self._free_at
 
-    def give(self, job: Job) -> None:
+    def submit(self, job: DiagnosisJob) -> None:
         """Start a job; `poll` returns its result."""
-        self._busy, self._answer = True, None
+        self._busy, self._result = True, None
         self._thread = threading.Thread(target=self._exchange, args=(job,), daemon=True, name="diagnosis")
         self._thread.start()
 
-    def answer(self) -> Answer | None:
+    def poll(self) -> DiagnosisResult | None:
         """Return a finished result; None if there is none."""
-        found = self._answer
-        if found is not None:
-            self._free_at = time.monotonic() + found.cpu_s * (1.0 / self._share - 1.0)
-            self._answer, self._busy = None, False
-        return found
+        result = self._result
+        if result is not None:
+            self._free_at = time.monotonic() + result.cpu_s * (1.0 / self._share - 1.0)
+            self._result, self._busy = None, False
+        return result
 
     def close(self) -> None:
         """End the process and discard its running job."""
         self._closed = True
-        self._end()
+        self._stop_process()
         if self._thread is not None:
-            self._thread.join(_PATIENCE_S)
+            self._thread.join(_JOIN_TIMEOUT_S)
 
-    def _exchange(self, job: Job) -> None:
+    def _exchange(self, job: DiagnosisJob) -> None:
         """Send a job and receive its result; store a failed result if there is none."""
-        begun, self._late = time.monotonic(), False
-        guard = threading.Timer(self._limit_s, self._too_late)
+        started, self._timed_out = time.monotonic(), False
+        guard = threading.Timer(self._limit_s, self._kill_on_timeout)
         guard.daemon = True
         guard.start()
-        why = ""
+        reason = ""
         try:
-            pipe = self._started()
+            pipe = self._open_pipe()
             pipe.send(job)
-            found: Answer = pipe.recv()
+            result: DiagnosisResult = pipe.recv()
         except (EOFError, OSError):
-            why = self._why(self._end())
+            reason = self._exit_reason(self._stop_process())
         except Exception as error:  # data that cannot be pickled affect this job only
-            self._end()
-            why = f"{type(error).__name__}: {error}"
+            self._stop_process()
+            reason = f"{type(error).__name__}: {error}"
         finally:
             guard.cancel()
-        if why:
-            took = min(time.monotonic() - begun, self._limit_cpu_s)
-            found = failed(job, why, cpu_s=took)
-        self._answer = found
+        if reason:
+            cpu_s = min(time.monotonic() - started, self._limit_cpu_s)
+            result = failed_result(job, reason, cpu_s=cpu_s)
+        self._result = result
 
-    def _started(self) -> Connection:
+    def _open_pipe(self) -> Connection:
         """Return the pipe to a running process; start one if needed.
 
         Raises:
@@ -109,21 +113,21 @@ class Background:
                 raise OSError("diagnosis process: found it closed, expected open; create another one")
             if self._process is None or not self._process.is_alive() or self._pipe is None:
                 spawn = multiprocessing.get_context("spawn")
-                self._pipe, theirs = spawn.Pipe()
-                given = theirs, self._work, self._limit_cpu_s
-                self._process = spawn.Process(target=_serve, args=given, daemon=True, name="diagnosis")
+                self._pipe, child_pipe = spawn.Pipe()
+                arguments = child_pipe, self._function, self._limit_cpu_s
+                self._process = spawn.Process(target=_serve, args=arguments, daemon=True, name="diagnosis")
                 self._process.start()
-                theirs.close()
+                child_pipe.close()
             return self._pipe
 
-    def _too_late(self) -> None:
+    def _kill_on_timeout(self) -> None:
         """Kill a process that exceeds the wall time; the reader then sees the end of its pipe."""
-        self._late = True
+        self._timed_out = True
         process = self._process
         if process is not None:
             process.kill()
 
-    def _end(self) -> int | None:
+    def _stop_process(self) -> int | None:
         """End the process and return its exit code; None if there was none."""
         with self._lock:
             process, pipe = self._process, self._pipe
@@ -131,17 +135,17 @@ class Background:
         if process is None or pipe is None:
             return None
         if not self._closed:
-            process.join(_ENDING_S)  # a process about to exit reports its own exit code
+            process.join(_EXIT_TIMEOUT_S)  # a process about to exit reports its own exit code
         if process.is_alive():
             process.kill()
-            process.join(_PATIENCE_S)
+            process.join(_JOIN_TIMEOUT_S)
         if self._thread is None or self._thread is threading.current_thread() or not self._thread.is_alive():
             pipe.close()  # otherwise the thread still reads the pipe until its end
         return process.exitcode
 
-    def _why(self, code: int | None) -> str:
+    def _exit_reason(self, code: int | None) -> str:
         """Describe why there is no result."""
-        if self._late:
+        if self._timed_out:
             return f"found no result after {self._limit_s:.0f} s"
         if code is not None and code == -getattr(signal, "SIGXCPU", 0):
             return f"found no result after {self._limit_cpu_s:.0f} s of CPU time"
@@ -150,22 +154,22 @@ class Background:
         return "its process could not be started" if code is None else f"its process ended with exit code {code}"
 
 
-def _serve(pipe: Connection, work: Work, limit_cpu_s: float) -> None:
+def _serve(pipe: Connection, function: JobFunction, limit_cpu_s: float) -> None:
     """Execute jobs until the pipe closes, as it does when the parent ends; the parent handles Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with contextlib.suppress(OSError):
-        os.nice(_NICE)
+        os.nice(_NICE_INCREMENT)
     with contextlib.suppress(EOFError, OSError):
         while True:
             job = pipe.recv()
-            begun = time.process_time()
-            _limit_cpu(begun + limit_cpu_s)
+            started = time.process_time()
+            _limit_cpu(started + limit_cpu_s)
             try:
-                found = work(job)
+                result = function(job)
             except Exception as error:  # an error in one job must not stop the others
-                why, cpu_s = f"{type(error).__name__}: {error}", time.process_time() - begun
-                found = failed(job, why, cpu_s=cpu_s, details=traceback.format_exc())
-            pipe.send(found)
+                reason, cpu_s = f"{type(error).__name__}: {error}", time.process_time() - started
+                result = failed_result(job, reason, cpu_s=cpu_s, details=traceback.format_exc())
+            pipe.send(result)
 
 
 def _limit_cpu(seconds: float) -> None:
@@ -173,6 +177,6 @@ def _limit_cpu(seconds: float) -> None:
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource  # not on Windows, where only the wall time limits a job
 
-        for what, soft in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_CPU, int(seconds) + 1)):
-            hard = resource.getrlimit(what)[1]
-            resource.setrlimit(what, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard))
+        for limit, soft in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_CPU, int(seconds) + 1)):
+            hard = resource.getrlimit(limit)[1]
+            resource.setrlimit(limit, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard))

@@ -4,30 +4,30 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet.contract import Found, Mismatch, Outcome
-from twin_worker.diagnosis.data.card import UNKNOWN, Card
-from twin_worker.diagnosis.inference.report import Outcome as Result
+from fleet.contract import DiagnosisOutcome, Mismatch, Outcome
+from twin_worker.diagnosis.data.card import UNKNOWN, AircraftCard
 from twin_worker.diagnosis.inference.report import Report
+from twin_worker.diagnosis.inference.report import ReportOutcome as Result
 from twin_worker.diagnosis.model.baseline import Baseline
-from twin_worker.mismatch.job import Answer, Job, Rows, rows_of
-from twin_worker.mismatch.messages import message, since, unconfirmed
+from twin_worker.mismatch.job import DiagnosisJob, DiagnosisResult, TelemetryRows, telemetry_rows
+from twin_worker.mismatch.messages import mark_unconfirmed, mismatch_message, shift_times
 from twin_worker.twin.state.state import ROUTE_MODES, Twin
-from twin_worker.twin.state.vehicle_class import WINGS
+from twin_worker.twin.state.vehicle_class import WINGED
 
-PAST_S = 105.0  # own past used as the comparison model [s]
-SEEN_S = 120.0  # flight used for a diagnosis [s]
-LOOK_S, WHOLE_S = 8.0, 25.0  # between residual checks, and between full diagnoses [s]
-LEAST_S = 45.0  # flight before the first comparison with a model [s]
-_AGAIN_S = 5.0  # before a finding is checked again for confirmation [s]
+BASELINE_S = 105.0  # own past used as the comparison model [s]
+FLIGHT_S = 120.0  # flight used for a diagnosis [s]
+CHECK_PERIOD_S, DIAGNOSIS_PERIOD_S = 8.0, 25.0  # between residual checks, and between full diagnoses [s]
+MIN_FLIGHT_S = 45.0  # flight before the first comparison with a model [s]
+_CONFIRM_AFTER_S = 5.0  # before a finding is checked again for confirmation [s]
 _RETRY_S = 30.0  # after a refusal [s]
-_OFF_S, _OFF_MOST_S = 60.0, 3600.0  # after an internal error, doubled each time; upper limit [s]
-_SAME_S = 20.0  # findings of one effect with onsets further apart count as different [s]
-_GONE = 2  # consecutive diagnoses without a finding that clear a mismatch
-_SOUND = (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST, Outcome.STARVED)
+_SUSPEND_S, _MAX_SUSPEND_S = 60.0, 3600.0  # after an internal error, doubled each time; upper limit [s]
+_SAME_ONSET_S = 20.0  # findings of one effect with onsets further apart count as different [s]
+_CLEAR_COUNT = 2  # consecutive diagnoses without a finding that clear a mismatch
+_VALID_OUTCOMES = (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST, Outcome.INSUFFICIENT_DATA)
 
 
 @dataclass
-class Watch:
+class DiagnosisState:
     """Diagnosis state of one aircraft.
 
     Attributes:
@@ -40,114 +40,143 @@ class Watch:
         failures: consecutive diagnoses that ended with an internal error
     """
 
-    card: Card = UNKNOWN
-    base: Baseline | None = None
-    past: Rows | None = None
-    told: Mismatch | None = None
-    why: str = ""
-    failed: str = ""
+    card: AircraftCard = UNKNOWN
+    baseline: Baseline | None = None
+    past: TelemetryRows | None = None
+    published: Mismatch | None = None
+    reason: str = ""
+    defect: str = ""
     failures: int = 0
-    begun: float = float("nan")  # first telemetry [s since 1970]
+    first_t: float = float("nan")  # first telemetry [s since 1970]
     past_t: float = float("-inf")  # end of the own past [s since 1970]
     next_t: float = float("-inf")  # earliest next check [s since 1970]
-    off_until: float = float("-inf")  # end of the suspension after an internal error [s since 1970]
-    whole_t: float = float("-inf")  # end of the newest flight diagnosed
-    last: Report | None = None  # newest diagnosis; start of its flight below
+    suspended_until: float = float("-inf")  # end of the suspension after an internal error [s since 1970]
+    diagnosed_t: float = float("-inf")  # end of the newest flight diagnosed
+    last_report: Report | None = None  # newest diagnosis; start of its flight below
     last_begin: float = 0.0
-    none: int = 0
+    clear_count: int = 0
 
-    def wants(self, twin: Twin) -> float | None:
+    def urgency(self, twin: Twin) -> float | None:
         """Return the urgency of a diagnosis; None if it is not due."""
-        newest = twin.history.newest
-        if newest < self.next_t - _RETRY_S - WHOLE_S:  # the clock jumped back
-            self.__init__(self.card, self.base)  # type: ignore[misc]
-        if self.begun != self.begun and np.isfinite(newest):
-            self.begun = float(min(twin.history.rows("attitude")[0], default=newest))
+        newest = twin.telemetry.history.newest
+        if newest < self.next_t - _RETRY_S - DIAGNOSIS_PERIOD_S:  # the clock jumped back
+            self.__init__(self.card, self.baseline)  # type: ignore[misc]
+        if self.first_t != self.first_t and np.isfinite(newest):
+            self.first_t = float(min(twin.telemetry.history.rows("attitude")[0], default=newest))
         if (
-            newest < max(self.next_t, self.off_until)
-            or twin.lost
-            or twin.ground.landed
-            or twin.vehicle not in WINGS
-            or twin.origin is None
+            newest < max(self.next_t, self.suspended_until)
+            or twin.telemetry.link_lost
+            or twin.environment.flight_phase.landed
+            or twin.vehicle not in WINGED
+            or twin.telemetry.origin is None
         ):
             return None
-        if self.base is None and self.past is None:
-            if self._steady_s(twin) < PAST_S:
-                self.next_t = newest + LOOK_S
+        if self.baseline is None and self.past is None:
+            if self._mission_flight_s(twin) < BASELINE_S:
+                self.next_t = newest + CHECK_PERIOD_S
                 return None
-            self.past = rows_of(twin.history, newest - PAST_S)
+            self.past = telemetry_rows(twin.telemetry.history, newest - BASELINE_S)
             self.past_t = newest
-        if newest < (self.begun + LEAST_S if self.base is not None else self.past_t + LOOK_S):
+        if newest < (self.first_t + MIN_FLIGHT_S if self.baseline is not None else self.past_t + CHECK_PERIOD_S):
             return None
-        return 2.0 * (not self._sound(twin)) + 4.0 * self._to_confirm + (newest - self.whole_t) / WHOLE_S
-
-    def job(self, twin: Twin) -> Job:
-        """Return the job that is due."""
-        newest = twin.history.newest
-        self.next_t = newest + LOOK_S
-        whole = newest - self.whole_t >= WHOLE_S or not self._sound(twin) or self._to_confirm
-        rows = rows_of(twin.history, newest - SEEN_S, self.past)
-        return Job(twin.uav, rows, dict(twin.received), self.card, self.base, self.past_t, whole)
-
-    @property
-    def _to_confirm(self) -> bool:
-        return self.told is not None and self.told.outcome in (Found.SUSPECTED, Found.UNKNOWN)
-
-    def take(self, answer: Answer) -> Mismatch | None:
-        """Handle a result; return the mismatch to publish, None if nothing changed."""
-        if answer.failed:
-            self.give_up(answer.uav, answer.end, answer.failed)
-            return None
-        self.why, self.failed, self.failures = answer.refused, "", 0
-        if answer.refused:
-            self.next_t = answer.end + _RETRY_S
-            return None
-        if answer.report is None:
-            return None
-        self.whole_t = answer.end
-        report = answer.report
-        told = message(answer.uav, since(report, answer.begin - self.begun), answer.begin, answer.end)
-        if told.outcome in (Found.NAMED, Found.UNKNOWN) and not self._confirmed(report, answer.begin):
-            self.next_t = answer.end + _AGAIN_S
-            told = unconfirmed(told)
-        self.last, self.last_begin = report, answer.begin
-        held = self.told is not None and self.told.outcome in (Found.NAMED, Found.UNKNOWN)
-        self.none = self.none + 1 if told.outcome in (Found.NONE, Found.SUSPECTED) else 0
-        if held and 0 < self.none < _GONE:
-            return None  # a single diagnosis without the finding does not clear it
-        self.told = told
-        return told
-
-    def give_up(self, uav: int, t: float, why: str) -> None:
-        """Suspend the diagnosis after an internal error at data time `t`, longer each time."""
-        again_s = min(_OFF_S * 2.0**self.failures, _OFF_MOST_S)
-        self.failures, self.off_until = self.failures + 1, t + again_s
-        self.failed = (
-            f"uav-{uav}: diagnosis failed with an internal error ({why}); retried in {again_s:.0f} s, report it"
+        return (
+            2.0 * (not self._model_valid(twin))
+            + 4.0 * self._needs_confirmation
+            + (newest - self.diagnosed_t) / DIAGNOSIS_PERIOD_S
         )
 
-    def _confirmed(self, report: Report, begin: float) -> bool:
+    def create_job(self, twin: Twin) -> DiagnosisJob:
+        """Return the job that is due."""
+        newest = twin.telemetry.history.newest
+        self.next_t = newest + CHECK_PERIOD_S
+        full = (
+            newest - self.diagnosed_t >= DIAGNOSIS_PERIOD_S or not self._model_valid(twin) or self._needs_confirmation
+        )
+        rows = telemetry_rows(twin.telemetry.history, newest - FLIGHT_S, self.past)
+        return DiagnosisJob(
+            twin.config.uav, rows, dict(twin.received_params), self.card, self.baseline, self.past_t, full
+        )
+
+    @property
+    def _needs_confirmation(self) -> bool:
+        return self.published is not None and self.published.outcome in (
+            DiagnosisOutcome.SUSPECTED,
+            DiagnosisOutcome.UNKNOWN,
+        )
+
+    def handle_result(self, result: DiagnosisResult) -> Mismatch | None:
+        """Handle a result; return the mismatch to publish, None if nothing changed."""
+        if result.defect:
+            self.suspend(result.uav, result.end, result.defect)
+            return None
+        self.reason, self.defect, self.failures = result.refusal, "", 0
+        if result.refusal:
+            self.next_t = result.end + _RETRY_S
+            return None
+        if result.report is None:
+            return None
+        self.diagnosed_t = result.end
+        report = result.report
+        mismatch = mismatch_message(
+            result.uav, shift_times(report, result.begin - self.first_t), result.begin, result.end
+        )
+        if mismatch.outcome in (DiagnosisOutcome.NAMED, DiagnosisOutcome.UNKNOWN) and not self._is_confirmed(
+            report, result.begin
+        ):
+            self.next_t = result.end + _CONFIRM_AFTER_S
+            mismatch = mark_unconfirmed(mismatch)
+        self.last_report, self.last_begin = report, result.begin
+        confirmed_before = self.published is not None and self.published.outcome in (
+            DiagnosisOutcome.NAMED,
+            DiagnosisOutcome.UNKNOWN,
+        )
+        self.clear_count = (
+            self.clear_count + 1 if mismatch.outcome in (DiagnosisOutcome.NONE, DiagnosisOutcome.SUSPECTED) else 0
+        )
+        if confirmed_before and 0 < self.clear_count < _CLEAR_COUNT:
+            return None  # a single diagnosis without the finding does not clear it
+        self.published = mismatch
+        return mismatch
+
+    def suspend(self, uav: int, t: float, reason: str) -> None:
+        """Suspend the diagnosis after an internal error at data time `t`, longer each time."""
+        pause_s = min(_SUSPEND_S * 2.0**self.failures, _MAX_SUSPEND_S)
+        self.failures, self.suspended_until = self.failures + 1, t + pause_s
+        self.defect = (
+            f"uav-{uav}: diagnosis failed with an internal error ({reason}); retried in {pause_s:.0f} s, report it"
+        )
+
+    def _is_confirmed(self, report: Report, begin: float) -> bool:
         """Return whether the previous diagnosis agrees with this report."""
-        if self.last is None:
+        if self.last_report is None:
             return False
         if report.outcome is Result.UNKNOWN:
-            return self.last.outcome is not Result.NONE
-        names = {name for one in self.last.findings for name in (one.guess.effect.name, *one.rivals)}
-        onsets = [self.last_begin + one.segments[0][0] for one in self.last.findings]
+            return self.last_report.outcome is not Result.NONE
+        names = {
+            name for finding in self.last_report.findings for name in (finding.hypothesis.effect.name, *finding.rivals)
+        }
+        onsets = [self.last_begin + one.segments[0][0] for one in self.last_report.findings]
         return any(
-            one.guess.effect.name in names
-            and any(abs(begin + one.segments[0][0] - onset) < _SAME_S for onset in onsets)
+            one.hypothesis.effect.name in names
+            and any(abs(begin + one.segments[0][0] - onset) < _SAME_ONSET_S for onset in onsets)
             for one in report.findings
         )
 
     @staticmethod
-    def _sound(twin: Twin) -> bool:
-        return twin.plant is None or twin.verdict.outcome in _SOUND
+    def _model_valid(twin: Twin) -> bool:
+        return twin.models.active_model is None or twin.identification.verdict.outcome in _VALID_OUTCOMES
 
     @staticmethod
-    def _steady_s(twin: Twin) -> float:
+    def _mission_flight_s(twin: Twin) -> float:
         """Return the uninterrupted flight time on the mission [s]."""
-        if twin.status is None or twin.status.mode not in ROUTE_MODES:
+        if twin.onboard.status is None or twin.onboard.status.mode not in ROUTE_MODES:
             return 0.0
-        t = twin.history.rows("attitude", max(twin.since, twin.back_t, twin.history.newest - PAST_S - 5.0))[0]
+        t = twin.telemetry.history.rows(
+            "attitude",
+            max(
+                twin.onboard.plan_changed_t,
+                twin.telemetry.link_restored_t,
+                twin.telemetry.history.newest - BASELINE_S - 5.0,
+            ),
+        )[0]
         return float(t[-1] - t[0]) if len(t) else 0.0

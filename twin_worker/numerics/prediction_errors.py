@@ -9,52 +9,52 @@ import numba as nb
 import numpy as np
 
 AHEAD = np.concatenate([np.arange(0.0, 61.0), np.arange(64.0, 181.0, 4.0)])  # look-ahead of every prediction, (91,) [s]
-LIMIT = 0.10  # relative error that ends the confidence horizon [-]
-QUANTILE = 0.9  # nominal coverage of tube and horizon [-]
+ERROR_LIMIT = 0.10  # relative error that ends the confidence horizon [-]
+NOMINAL_COVERAGE = 0.9  # nominal coverage of tube and horizon [-]
 _FLOOR_S = 2.0  # minimum path length, in seconds of ground speed [s]
 
 
 def track_frame(path: np.ndarray, ahead: np.ndarray = AHEAD) -> np.ndarray:
     """Return the horizontal unit vector along paths (..., n, 3), (..., n, 2); north where the path is stationary."""
     out = np.empty((*path.shape[:-1], 2))
-    each = np.ascontiguousarray(path, float).reshape(-1, *path.shape[-2:])
-    _frame_each(each, np.ascontiguousarray(ahead, float), out.reshape(-1, path.shape[-2], 2))
+    paths = np.ascontiguousarray(path, float).reshape(-1, *path.shape[-2:])
+    _fill_track_frames(paths, np.ascontiguousarray(ahead, float), out.reshape(-1, path.shape[-2], 2))
     return out
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath
-def _frame_each(path: np.ndarray, t: np.ndarray, out: np.ndarray) -> None:
+def _fill_track_frames(path: np.ndarray, t: np.ndarray, out: np.ndarray) -> None:
     """Compute the unit vectors of each path into `out`, (m, n, 2): slope over uneven times, second order inside."""
     n = path.shape[1]
     for i in range(len(path)):
         for k in range(n):
             first, last = max(k - 1, 0), min(k, n - 2)
             east, north = 0.0, 0.0
-            before = (t[k + 1] - t[k]) / (t[k + 1] - t[k - 1]) if 0 < k < n - 1 else 1.0  # nearer side
+            weight_before = (t[k + 1] - t[k]) / (t[k + 1] - t[k - 1]) if 0 < k < n - 1 else 1.0  # nearer side
             for j in range(first, last + 1):
-                share, step = (before if j == first else 1.0 - before), t[j + 1] - t[j]
-                north += share * ((path[i, j + 1, 0] - path[i, j, 0]) / step)
-                east += share * ((path[i, j + 1, 1] - path[i, j, 1]) / step)
+                weight, step = (weight_before if j == first else 1.0 - weight_before), t[j + 1] - t[j]
+                north += weight * ((path[i, j + 1, 0] - path[i, j, 0]) / step)
+                east += weight * ((path[i, j + 1, 1] - path[i, j, 1]) / step)
             length = sqrt(north * north + east * east)
-            still = length <= 1e-6  # false for nan
-            out[i, k, 0], out[i, k, 1] = (1.0, 0.0) if still else (north / length, east / length)
+            stationary = length <= 1e-6  # false for nan
+            out[i, k, 0], out[i, k, 1] = (1.0, 0.0) if stationary else (north / length, east / length)
 
 
-def along_cross_down(along: np.ndarray, error: np.ndarray) -> np.ndarray:
+def along_cross_down(tangent: np.ndarray, error: np.ndarray) -> np.ndarray:
     """Convert NED errors (..., 3) to along, cross, vertical, by the unit vector along the path, (..., 2) [m]."""
-    ahead = error[..., 0] * along[..., 0] + error[..., 1] * along[..., 1]
-    across = error[..., 1] * along[..., 0] - error[..., 0] * along[..., 1]
-    return np.stack([ahead, across, error[..., 2]], axis=-1)
+    along_error = error[..., 0] * tangent[..., 0] + error[..., 1] * tangent[..., 1]
+    cross_error = error[..., 1] * tangent[..., 0] - error[..., 0] * tangent[..., 1]
+    return np.stack([along_error, cross_error, error[..., 2]], axis=-1)
 
 
-def axes_error(path: np.ndarray, flown: np.ndarray, ahead: np.ndarray = AHEAD) -> np.ndarray:
+def axes_error(path: np.ndarray, actual: np.ndarray, ahead: np.ndarray = AHEAD) -> np.ndarray:
     """Split errors of paths (..., n, 3) into along, cross, vertical and distance, (..., n, 4) [m]."""
-    error = flown - path
+    error = actual - path
     parts = along_cross_down(track_frame(path, ahead), error)
     return np.abs(np.concatenate([parts, np.linalg.norm(error, axis=-1, keepdims=True)], axis=-1))
 
 
-def path_length(path: np.ndarray, speed: float, before: float = 0.0) -> np.ndarray:
+def path_length(path: np.ndarray, speed: float, length_before: float = 0.0) -> np.ndarray:
     """Return the cumulative path length, at least two seconds of ground speed, (n,) [m].
 
     Args:
@@ -62,11 +62,11 @@ def path_length(path: np.ndarray, speed: float, before: float = 0.0) -> np.ndarr
         speed: over ground at the start [m/s]
         length_before: length flown before the first position [m]
     """
-    flown = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-    return np.maximum(before + flown, least_length(speed))
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    return np.maximum(length_before + length, min_path_length(speed))
 
 
-def least_length(speed: float) -> float:
+def min_path_length(speed: float) -> float:
     """Return the minimum path length: two seconds of ground speed, at least a metre [m]."""
     return max(_FLOOR_S * speed, 1.0)
 
@@ -76,13 +76,13 @@ def first_passage(relative: np.ndarray, ahead: np.ndarray = AHEAD) -> tuple[floa
 
     A censored flight never exceeds 10 %; its time is that of the last finite value before the first non-finite one.
     """
-    broken = np.flatnonzero(~np.isfinite(relative))
-    n = int(broken[0]) if len(broken) else len(relative)
-    over = np.flatnonzero(relative[:n] > LIMIT)
-    if not len(over):
+    not_finite = np.flatnonzero(~np.isfinite(relative))
+    n = int(not_finite[0]) if len(not_finite) else len(relative)
+    exceeded = np.flatnonzero(relative[:n] > ERROR_LIMIT)
+    if not len(exceeded):
         return float(ahead[max(n - 1, 0)]), True
-    k = int(over[0])
+    k = int(exceeded[0])
     if k == 0:
         return 0.0, False
-    share = (LIMIT - relative[k - 1]) / (relative[k] - relative[k - 1])
-    return float(ahead[k - 1] + share * (ahead[k] - ahead[k - 1])), False
+    fraction = (ERROR_LIMIT - relative[k - 1]) / (relative[k] - relative[k - 1])
+    return float(ahead[k - 1] + fraction * (ahead[k] - ahead[k - 1])), False

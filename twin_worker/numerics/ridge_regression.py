@@ -3,7 +3,7 @@
 import numpy as np
 
 
-def ridge(A: np.ndarray, y: np.ndarray, pull: float | np.ndarray) -> np.ndarray:
+def solve_ridge(A: np.ndarray, y: np.ndarray, penalty: float | np.ndarray) -> np.ndarray:
     """Return x of  min |y - A x|^2 + sum (penalty_k |a_k| x_k)^2, a_k the k-th column, (k,).
 
     Args:
@@ -14,6 +14,6 @@ def ridge(A: np.ndarray, y: np.ndarray, pull: float | np.ndarray) -> np.ndarray:
     """
     length = np.linalg.norm(A, axis=0) + 1e-12
     k = A.shape[1]
-    rows, told = np.vstack([A / length, np.diag(np.full(k, pull))]), np.concatenate([y, np.zeros(k)])
-    found: np.ndarray = np.linalg.lstsq(rows, told, rcond=None)[0] / length
-    return found
+    rows, targets = np.vstack([A / length, np.diag(np.full(k, penalty))]), np.concatenate([y, np.zeros(k)])
+    solution: np.ndarray = np.linalg.lstsq(rows, targets, rcond=None)[0] / length
+    return solution

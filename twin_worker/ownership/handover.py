@@ -10,39 +10,43 @@ from fleet.airframes import Airframe
 from fleet.airframes.airframe import ServoMap
 from fleet.contract import Message, Mismatch
 from fleet.frames import Origin
-from twin_worker.alerts.hysteresis import Ledger, Open
-from twin_worker.confidence.adaptive_conformal import Factors, Levels
-from twin_worker.confidence.lagged_ensemble import Earlier
-from twin_worker.confidence.prediction_log import Ledger as Book
-from twin_worker.confidence.table_files import Tables
+from twin_worker.alerts.hysteresis import AlertState, PendingAlert
+from twin_worker.confidence.adaptive_conformal import AdaptiveLevels, ScaleFactors
+from twin_worker.confidence.lagged_ensemble import LaggedForecasts
+from twin_worker.confidence.prediction_log import PredictionLog
+from twin_worker.confidence.table_files import TableSet
 from twin_worker.confidence.table_files import load as load_tables
-from twin_worker.confidence.tube_and_horizon import Made, Record, Trust
+from twin_worker.confidence.tube_and_horizon import Confidence, ConfidenceTracker, PointForecast
 from twin_worker.estimation.wind_filter import WindFilter
-from twin_worker.identification.fixed_wing.derivatives_model import Coupled
-from twin_worker.identification.fixed_wing.energy_balance import Ridge
-from twin_worker.identification.fixed_wing.point_mass_model import Hybrid
-from twin_worker.identification.linear.linear_model import Axis
-from twin_worker.ownership.typed_serialization import Known, Special, pack, unpack
-from twin_worker.prediction.autopilot_identification import Learnt
-from twin_worker.prediction.autopilot_parameters import Control
-from twin_worker.prediction.kinematic import Grey
-from twin_worker.prediction.method_selection import Contest
-from twin_worker.prediction.multirotor.rollout import Rotor
-from twin_worker.telemetry.arrival_delay import Delay
-from twin_worker.telemetry.history import History
-from twin_worker.telemetry.resample import Grid
-from twin_worker.telemetry.row_buffer import Kept
-from twin_worker.twin.state.budget import Quota
-from twin_worker.twin.state.checkpoint import Extension, Mark
-from twin_worker.twin.state.events import Note
-from twin_worker.twin.state.flight_phase import Ground
-from twin_worker.twin.state.schedule import Pace
-from twin_worker.twin.state.state import Believed, Twin
-from twin_worker.validation.forecast_shrinkage import Earned
+from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
+from twin_worker.identification.fixed_wing.energy_balance import RegressionResult
+from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel
+from twin_worker.identification.linear.linear_model import AxisModel
+from twin_worker.ownership.typed_serialization import ClassCodec, ClassRegistry, deserialise, serialise
+from twin_worker.prediction.autopilot_identification import AutopilotEstimate
+from twin_worker.prediction.autopilot_parameters import ControllerTwin
+from twin_worker.prediction.kinematic import KinematicModel
+from twin_worker.prediction.method_selection import MethodSelector
+from twin_worker.prediction.multirotor.rollout import MultirotorModel
+from twin_worker.telemetry.arrival_delay import ArrivalDelay
+from twin_worker.telemetry.history import TelemetryHistory
+from twin_worker.telemetry.resample import Resampler
+from twin_worker.telemetry.row_buffer import RowBuffer
+from twin_worker.twin.state.budget import ComputeBudget
+from twin_worker.twin.state.checkpoint import ActiveEffects, Checkpoint
+from twin_worker.twin.state.events import FlightEvent
+from twin_worker.twin.state.flight_phase import FlightPhase
+from twin_worker.twin.state.inputs import Environment, OnboardState, Telemetry
+from twin_worker.twin.state.models import Identification, ModelBank, VerifiedModel
+from twin_worker.twin.state.outputs import AlertingState, ConfidenceState, PredictionState
+from twin_worker.twin.state.schedule import Schedule
+from twin_worker.twin.state.state import Twin, TwinConfig
+from twin_worker.twin.state.timer import Timer
+from twin_worker.validation.forecast_shrinkage import Shrinkage
 
 
 @dataclass
-class Load:
+class Snapshot:
     """Data of one aircraft in a handover.
 
     Attributes:
@@ -54,55 +58,107 @@ class Load:
 
     twin: Twin
     inbox: list[Message] = field(default_factory=list)
-    conflicts: Ledger = field(default_factory=Ledger)
+    traffic_alerts: AlertState = field(default_factory=AlertState)
     mismatch: Mismatch | None = None
 
 
-def _spline(parts: tuple[np.ndarray, np.ndarray]) -> CubicSpline:
+def _build_spline(parts: tuple[np.ndarray, np.ndarray]) -> CubicSpline:
     x, coefficients = parts
     if coefficients.ndim != 3 or coefficients.shape[:2] != (4, len(x) - 1):
         raise TypeError(f"a spline of {coefficients.shape} over {len(x)}")
     return CubicSpline.construct_fast(coefficients, x, extrapolate=True, axis=0)
 
 
-def _kept(parts: tuple[np.ndarray, np.ndarray]) -> Kept:
+def _build_rows(parts: tuple[np.ndarray, np.ndarray]) -> RowBuffer:
     t, x = parts
     if t.ndim != 1 or x.ndim != 2 or len(t) != len(x) or {t.dtype, x.dtype} != {np.dtype(float)}:
         raise TypeError(f"rows of {x.shape} at {t.shape}")
-    return Kept(t, x)
+    return RowBuffer(t, x)
 
 
-_WIRE = (c.Status, c.Mission, c.Params, c.Sample, c.Model, c.Prediction, c.Mismatch, c.Alert, c.Verdict, c.Item)
-_NAMED = (c.State, c.Event, c.AlertKind, Origin)
-_OURS = (
-    *(Load, Twin, History, Grid, WindFilter, Record, Ledger, Open, Rotor, Grey, Learnt, Contest, Earned, Mark),
-    *(Coupled, Axis, Hybrid, Ridge, Believed, Extension, Ground, Note, Control, Earlier, Book, Levels, Factors),
-    *(Made, Trust, Airframe, ServoMap, Pace, Delay),
+_MESSAGE_TYPES = (
+    c.Status,
+    c.Mission,
+    c.Params,
+    c.Sample,
+    c.Model,
+    c.Prediction,
+    c.Mismatch,
+    c.Alert,
+    c.Verdict,
+    c.Item,
 )
-CARRIED: Known = {
-    **{one.__name__: one for one in (*_WIRE, *_NAMED, *_OURS) if one is not Book},
-    "Book": Book,
-    "Kept": (Kept, Special(Kept.whole, _kept)),
-    "CubicSpline": (CubicSpline, Special(lambda one: (one.x, one.c), _spline)),
-    "Quota": (Quota, Special(lambda _: None, lambda _: None)),  # the new driver has its own
-    "Tables": (Tables, Special(lambda _: None, lambda _: load_tables())),  # installed with every worker
+_VALUE_TYPES = (c.TwinState, c.Event, c.AlertKind, Origin)
+_STATE_TYPES = (
+    *(
+        Snapshot,
+        Twin,
+        TwinConfig,
+        Telemetry,
+        OnboardState,
+        Environment,
+        Identification,
+        ModelBank,
+        PredictionState,
+        ConfidenceState,
+        AlertingState,
+        Timer,
+        TelemetryHistory,
+        Resampler,
+        WindFilter,
+        ConfidenceTracker,
+        AlertState,
+        PendingAlert,
+        MultirotorModel,
+        KinematicModel,
+        AutopilotEstimate,
+        MethodSelector,
+        Shrinkage,
+        Checkpoint,
+    ),
+    *(
+        DerivativesModel,
+        AxisModel,
+        PointMassModel,
+        RegressionResult,
+        VerifiedModel,
+        ActiveEffects,
+        FlightPhase,
+        FlightEvent,
+        ControllerTwin,
+        LaggedForecasts,
+        PredictionLog,
+        AdaptiveLevels,
+        ScaleFactors,
+    ),
+    *(PointForecast, Confidence, Airframe, ServoMap, Schedule, ArrivalDelay),
+)
+REGISTRY: ClassRegistry = {
+    **{one.__name__: one for one in (*_MESSAGE_TYPES, *_VALUE_TYPES, *_STATE_TYPES)},
+    "RowBuffer": (RowBuffer, ClassCodec(RowBuffer.rows, _build_rows)),
+    "CubicSpline": (CubicSpline, ClassCodec(lambda one: (one.x, one.c), _build_spline)),
+    "ComputeBudget": (ComputeBudget, ClassCodec(lambda _: None, lambda _: None)),  # the new driver has its own
+    "TableSet": (TableSet, ClassCodec(lambda _: None, lambda _: load_tables())),  # installed with every worker
 }
 
 
-def packed(load: Load) -> bytes:
+def encode_snapshot(snapshot: Snapshot) -> bytes:
     """Encode a snapshot."""
-    return pack(load, CARRIED)
+    return serialise(snapshot, REGISTRY)
 
 
-def unpacked(data: bytes, uav: int) -> Load:
+def decode_snapshot(data: bytes, uav: int) -> Snapshot:
     """Decode a snapshot.
 
     Raises:
         ValueError: when the bytes are not a twin of this aircraft; start it from published data instead.
     """
-    load = unpack(data, CARRIED)
-    if not isinstance(load, Load) or not isinstance(load.twin, Twin) or load.twin.uav != uav:
+    snapshot = deserialise(data, REGISTRY)
+    if not isinstance(snapshot, Snapshot) or not isinstance(snapshot.twin, Twin) or snapshot.twin.config.uav != uav:
         raise ValueError(f"uav-{uav}: found another object, expected its twin; it starts without a snapshot")
-    if not isinstance(load.twin.history, History) or not load.twin.history.sound():
+    if (
+        not isinstance(snapshot.twin.telemetry.history, TelemetryHistory)
+        or not snapshot.twin.telemetry.history.is_consistent()
+    ):
         raise ValueError(f"uav-{uav}: found other telemetry columns, expected ours; it starts without a snapshot")
-    return load
+    return snapshot

@@ -9,52 +9,54 @@ from struct import unpack_from
 import numpy as np
 
 from fleet.contract import COLUMNS, DTYPES, Array, Rows, Sample
-from fleet.physics.kernel import bare, kernel
+from fleet.physics.kernel import kernel, no_alloc_kernel
 
-PLAIN, WORD, BYTES, LIST, MAP, BAD = range(6)  # msgpack kinds
-DTYPE, DIMENSIONS, LONG, WIDE, AT, SIZE = range(6)  # of one array: two sizes, offset, byte count
-_LEAST, _MOST = 40, 1 << 31  # minimum bytes of the rows of one kind; maximum number of rows
+SCALAR, TEXT, BYTES, LIST, MAP, INVALID = range(6)  # msgpack kinds
+DTYPE, DIMENSIONS, LENGTH, WIDTH, OFFSET, SIZE = range(6)  # of one array: two sizes, offset, byte count
+_MIN_ENTRY_BYTES, _MAX_ROWS = 40, 1 << 31  # minimum bytes of the rows of one kind; maximum number of rows
 _DOUBLE = 0xCB
-_PARTS = (tuple(COLUMNS), ("uav", "t", "samples"), ("t", "x"), ("dtype", "shape", "data"), DTYPES)
-TOP, ROWS, ARRAY, DTYPE_NAMES = np.cumsum([len(names) for names in _PARTS])[:-1].tolist()  # start of each group
+_NAME_GROUPS = (tuple(COLUMNS), ("uav", "t", "samples"), ("t", "x"), ("dtype", "shape", "data"), DTYPES)
+TOP_KEYS, ROW_KEYS, ARRAY_KEYS, DTYPE_NAMES = np.cumsum([len(names) for names in _NAME_GROUPS])[
+    :-1
+].tolist()  # start of each group
 _F8 = DTYPES.index("<f8")
 
 
-def _names() -> np.ndarray:
+def _name_table() -> np.ndarray:
     """Return all names as rows of bytes, (n, longest + 1) u1, with the length first."""
-    names = [name.encode() for part in _PARTS for name in part]
+    names = [name.encode() for group in _NAME_GROUPS for name in group]
     out = np.zeros((len(names), 1 + max(map(len, names))), np.uint8)
     for row, name in zip(out, names, strict=True):
         row[0], row[1 : 1 + len(name)] = len(name), list(name)
     return out
 
 
-def _heads() -> np.ndarray:
+def _header_table() -> np.ndarray:
     """Return for each first byte from 0xC0 on: kind, bytes of the next number, whether it is a count."""
-    out = np.full((64, 3), (PLAIN, 0, 0), np.int64)
-    out[0x01] = out[0x07:0x0A] = (BAD, 0, 0)  # unused byte; extension types
-    out[0x14:0x19] = (BAD, 0, 0)
-    for first, what, sizes, counts in (
+    out = np.full((64, 3), (SCALAR, 0, 0), np.int64)
+    out[0x01] = out[0x07:0x0A] = (INVALID, 0, 0)  # unused byte; extension types
+    out[0x14:0x19] = (INVALID, 0, 0)
+    for first, kind, sizes, counted in (
         (0x04, BYTES, (1, 2, 4), 1),
-        (0x0A, PLAIN, (4, 8), 0),
-        (0x0C, PLAIN, (1, 2, 4, 8), 1),
-        (0x10, PLAIN, (1, 2, 4, 8), 0),
-        (0x19, WORD, (1, 2, 4), 1),
+        (0x0A, SCALAR, (4, 8), 0),
+        (0x0C, SCALAR, (1, 2, 4, 8), 1),
+        (0x10, SCALAR, (1, 2, 4, 8), 0),
+        (0x19, TEXT, (1, 2, 4), 1),
         (0x1C, LIST, (2, 4), 1),
         (0x1E, MAP, (2, 4), 1),
     ):
         for k, size in enumerate(sizes):
-            out[first + k] = (what, size, counts)
+            out[first + k] = (kind, size, counted)
     return out
 
 
-_NAMES, _HEADS = _names(), _heads()
+_NAMES, _HEADS = _name_table(), _header_table()
 _WIDTHS = np.array([len(columns) for columns in COLUMNS.values()])
 _SIZES = np.array([np.dtype(name).itemsize for name in DTYPES])
 
 
-@bare
-def number(b: np.ndarray, i: int, n: int) -> int:
+@no_alloc_kernel
+def read_uint(b: np.ndarray, i: int, n: int) -> int:
     """Read an unsigned big-endian integer of n bytes."""
     out = 0
     for k in range(n):
@@ -62,49 +64,49 @@ def number(b: np.ndarray, i: int, n: int) -> int:
     return out
 
 
-@bare
-def head(b: np.ndarray, i: int) -> tuple[int, int, int]:
+@no_alloc_kernel
+def read_header(b: np.ndarray, i: int) -> tuple[int, int, int]:
     """Read the header at i; return kind, its size (bytes, items or pairs) or integer value, and the next index."""
     if i < 0 or i >= len(b) - 9:  # a number has at most nine bytes
-        return BAD, 0, i
+        return INVALID, 0, i
     c = int(b[i])
     i += 1
     if c <= 0x7F:
-        return PLAIN, c, i
+        return SCALAR, c, i
     if c <= 0x8F:
         return MAP, c & 0x0F, i
     if c <= 0x9F:
         return LIST, c & 0x0F, i
     if c <= 0xBF:
-        return WORD, c & 0x1F, i
+        return TEXT, c & 0x1F, i
     k = _HEADS[c - 0xC0, 0]
     n = _HEADS[c - 0xC0, 1]
-    return k, number(b, i, n) if _HEADS[c - 0xC0, 2] else -1, i + n
+    return k, read_uint(b, i, n) if _HEADS[c - 0xC0, 2] else -1, i + n
 
 
-@bare
-def leap(b: np.ndarray, i: int) -> int:
+@no_alloc_kernel
+def skip_value(b: np.ndarray, i: int) -> int:
     """Return the index after the value at i; negative if it is invalid."""
-    left = 1
-    while left > 0:
-        kind, n, i = head(b, i)
-        if kind == BAD or (kind != PLAIN and n > len(b)):
+    remaining = 1
+    while remaining > 0:
+        kind, n, i = read_header(b, i)
+        if kind == INVALID or (kind != SCALAR and n > len(b)):
             return -1
-        left -= 1
-        if kind in (WORD, BYTES):
+        remaining -= 1
+        if kind in (TEXT, BYTES):
             i += n
         elif kind == LIST:
-            left += n
+            remaining += n
         elif kind == MAP:
-            left += 2 * n
+            remaining += 2 * n
     return i
 
 
-@bare
-def named(b: np.ndarray, i: int, first: int, last: int) -> tuple[int, int]:
+@no_alloc_kernel
+def read_key(b: np.ndarray, i: int, first: int, last: int) -> tuple[int, int]:
     """Read a key; return its index among the names first to last or -1, and the next index, negative if invalid."""
-    kind, n, i = head(b, i)
-    if kind != WORD or i + n > len(b):
+    kind, n, i = read_header(b, i)
+    if kind != TEXT or i + n > len(b):
         return -1, -1
     for k in range(first, last):
         if n == _NAMES[k, 0]:
@@ -116,83 +118,89 @@ def named(b: np.ndarray, i: int, first: int, last: int) -> tuple[int, int]:
     return -1, i + n
 
 
-@bare
-def array(b: np.ndarray, i: int, got: np.ndarray, row: int) -> int:
+@no_alloc_kernel
+def read_array(b: np.ndarray, i: int, layout: np.ndarray, row: int) -> int:
     """Read an array header into a row of `layout`, (2, 6); return the next index, negative if invalid."""
-    got[row, DTYPE], got[row, DIMENSIONS], got[row, SIZE] = -1, 0, -1
-    kind, pairs, i = head(b, i)
+    layout[row, DTYPE], layout[row, DIMENSIONS], layout[row, SIZE] = -1, 0, -1
+    kind, pairs, i = read_header(b, i)
     if kind != MAP:
         return -1
     for _ in range(pairs):
-        key, begin = named(b, i, ARRAY, DTYPE_NAMES)
-        kind, n, i = head(b, begin)
-        if key == 0 and kind == WORD:
-            got[row, DTYPE], i = named(b, begin, DTYPE_NAMES, len(_NAMES))
+        key, start = read_key(b, i, ARRAY_KEYS, DTYPE_NAMES)
+        kind, n, i = read_header(b, start)
+        if key == 0 and kind == TEXT:
+            layout[row, DTYPE], i = read_key(b, start, DTYPE_NAMES, len(_NAMES))
         elif key == 1 and kind == LIST and n <= 2:
-            got[row, DIMENSIONS] = n
+            layout[row, DIMENSIONS] = n
             for k in range(n):
-                kind, got[row, LONG + k], i = head(b, i)
-                if kind != PLAIN:
+                kind, layout[row, LENGTH + k], i = read_header(b, i)
+                if kind != SCALAR:
                     return -1
         elif key == 2 and kind == BYTES and i + n <= len(b):
-            got[row, AT], got[row, SIZE] = i, n
+            layout[row, OFFSET], layout[row, SIZE] = i, n
             i += n
         else:
-            i = leap(b, begin)
+            i = skip_value(b, start)
         if i < 0:
             return -1
     return i
 
 
-@bare
-def rows_at(b: np.ndarray, i: int, got: np.ndarray) -> int:
+@no_alloc_kernel
+def read_rows(b: np.ndarray, i: int, layout: np.ndarray) -> int:
     """Read the rows of one kind: array `t` into layout[0] and `x` into layout[1]; return the next index."""
-    got[0, SIZE] = got[1, SIZE] = -1
-    kind, pairs, after = head(b, i)
-    if kind == PLAIN:
+    layout[0, SIZE] = layout[1, SIZE] = -1
+    kind, pairs, after = read_header(b, i)
+    if kind == SCALAR:
         return after
     if kind != MAP:
         return -1
     i = after
     for _ in range(pairs):
-        key, i = named(b, i, ROWS, ARRAY)
-        i = array(b, i, got, key) if key >= 0 else leap(b, i)
+        key, i = read_key(b, i, ROW_KEYS, ARRAY_KEYS)
+        i = read_array(b, i, layout, key) if key >= 0 else skip_value(b, i)
         if i < 0:
             return -1
     return i
 
 
-@bare
-def whole(got: np.ndarray, kind: int) -> bool:
+@no_alloc_kernel
+def is_consistent(layout: np.ndarray, kind: int) -> bool:
     """Return whether the shapes of the rows match their byte counts."""
-    n, dtype = got[0, LONG], got[1, DTYPE]
-    if got[0, SIZE] < 0 or got[1, SIZE] < 0 or got[0, DIMENSIONS] != 1 or got[1, DIMENSIONS] != 2 or dtype < 0:
+    n, dtype = layout[0, LENGTH], layout[1, DTYPE]
+    if (
+        layout[0, SIZE] < 0
+        or layout[1, SIZE] < 0
+        or layout[0, DIMENSIONS] != 1
+        or layout[1, DIMENSIONS] != 2
+        or dtype < 0
+    ):
         return False
-    if got[0, DTYPE] != _F8 or not 0 < n < _MOST or got[1, LONG] != n or got[1, WIDE] != _WIDTHS[kind]:
+    if layout[0, DTYPE] != _F8 or not 0 < n < _MAX_ROWS or layout[1, LENGTH] != n or layout[1, WIDTH] != _WIDTHS[kind]:
         return False
-    return got[0, SIZE] == 8 * n and got[1, SIZE] == n * _WIDTHS[kind] * _SIZES[dtype]
+    return layout[0, SIZE] == 8 * n and layout[1, SIZE] == n * _WIDTHS[kind] * _SIZES[dtype]
 
 
-@bare
-def sample(b: np.ndarray, i: int, got: np.ndarray, found: np.ndarray, n: int) -> tuple[int, int]:
+@no_alloc_kernel
+def scan_sample(b: np.ndarray, i: int, layout: np.ndarray, entries: np.ndarray, n: int) -> tuple[int, int]:
     """Find the rows in one sample; return the number of entries and the next index."""
-    what, pairs, i = head(b, i)
-    if what != MAP:
+    tag, pairs, i = read_header(b, i)
+    if tag != MAP:
         return n, -1
     for _ in range(pairs):
-        kind, i = named(b, i, 0, TOP)
-        i = rows_at(b, i, got) if kind >= 0 else leap(b, i)
-        if i < 0 or n >= len(found):
+        kind, i = read_key(b, i, 0, TOP_KEYS)
+        i = read_rows(b, i, layout) if kind >= 0 else skip_value(b, i)
+        if i < 0 or n >= len(entries):
             return n, -1
-        if kind >= 0 and whole(got, kind):
-            found[n, 0], found[n, 1], found[n, 2] = kind, got[0, LONG], got[0, AT]
-            found[n, 3], found[n, 4], found[n, 5] = got[1, AT], got[1, SIZE], got[1, DTYPE]
+        if kind >= 0 and is_consistent(layout, kind):
+            entries[n, 0], entries[n, 1], entries[n, 2] = kind, layout[0, LENGTH], layout[0, OFFSET]
+            entries[n, 3], entries[n, 4], entries[n, 5] = layout[1, OFFSET], layout[1, SIZE], layout[1, DTYPE]
             n += 1
     return n, i
 
 
-@bare
-def scan(b: np.ndarray, got: np.ndarray, found: np.ndarray) -> tuple[int, int, int]:
+@no_alloc_kernel
+def scan(b: np.ndarray, layout: np.ndarray, entries: np.ndarray) -> tuple[int, int, int]:
     """Find all rows; return the number of entries (negative: invalid), the UAV id, and the offset of the time.
 
     Args:
@@ -201,58 +209,62 @@ def scan(b: np.ndarray, got: np.ndarray, found: np.ndarray) -> tuple[int, int, i
         entries: output, one row an entry: kind, row count, offsets of times and values, bytes of the values, dtype
     """
     uav, t, n = -1, -1, 0
-    what, pairs, i = head(b, 0)
-    if what != MAP:
+    tag, pairs, i = read_header(b, 0)
+    if tag != MAP:
         return -1, uav, t
     for _ in range(pairs):
-        key, begin = named(b, i, TOP, ROWS)
-        what, items, i = head(b, begin)
-        if key == 2 and what == LIST:
+        key, start = read_key(b, i, TOP_KEYS, ROW_KEYS)
+        tag, items, i = read_header(b, start)
+        if key == 2 and tag == LIST:
             for _ in range(items):
-                n, i = sample(b, i, got, found, n)
+                n, i = scan_sample(b, i, layout, entries, n)
                 if i < 0:
                     return -1, uav, t
             continue
-        if key == 0 and what == PLAIN:
+        if key == 0 and tag == SCALAR:
             uav = items
-        elif key == 1 and what == PLAIN and b[begin] == _DOUBLE:
-            t = begin + 1
-        i = leap(b, begin)
+        elif key == 1 and tag == SCALAR and b[start] == _DOUBLE:
+            t = start + 1
+        i = skip_value(b, start)
         if i < 0:
             return -1, uav, t
     return n, uav, t
 
 
 @kernel
-def put_together(b: np.ndarray, at: np.ndarray, size: np.ndarray, out: np.ndarray) -> None:
+def concatenate(b: np.ndarray, offset: np.ndarray, size: np.ndarray, out: np.ndarray) -> None:
     """Concatenate byte ranges."""
     k = 0
-    for j in range(len(at)):
-        out[k : k + size[j]] = b[at[j] : at[j] + size[j]]
+    for j in range(len(offset)):
+        out[k : k + size[j]] = b[offset[j] : offset[j] + size[j]]
         k += size[j]
 
 
-def read(payload: bytes) -> Sample | None:
+def decode_history(payload: bytes) -> Sample | None:
     """Decode a `History` into one sample with all its rows; rows with another dtype than the newest are skipped.
 
     Returns:
         None if it is invalid or empty.
     """
     b = np.frombuffer(payload + bytes(9), np.uint8)
-    found = np.empty((len(b) // _LEAST + 1, 6), np.int64)
-    n, uav, at = scan(b, np.empty((2, 6), np.int64), found)  # type: ignore[call-arg]
-    if n <= 0 or uav < 0 or at < 0:
+    entries = np.empty((len(b) // _MIN_ENTRY_BYTES + 1, 6), np.int64)
+    n, uav, t_offset = scan(b, np.empty((2, 6), np.int64), entries)  # type: ignore[call-arg]
+    if n <= 0 or uav < 0 or t_offset < 0:
         return None
-    kinds = {name: _rows(b, mine) for k, name in enumerate(COLUMNS) if len(mine := found[:n][found[:n, 0] == k])}
-    return Sample(uav=uav, t=unpack_from(">d", payload, at)[0], **kinds)
+    kinds = {
+        name: _join_rows(b, kind_entries)
+        for k, name in enumerate(COLUMNS)
+        if len(kind_entries := entries[:n][entries[:n, 0] == k])
+    }
+    return Sample(uav=uav, t=unpack_from(">d", payload, t_offset)[0], **kinds)
 
 
-def _rows(b: np.ndarray, found: np.ndarray) -> Rows:
+def _join_rows(b: np.ndarray, entries: np.ndarray) -> Rows:
     """Join the entries that have the newest entry's dtype."""
-    kind, dtype = found[-1, 0], found[-1, 5]
-    rows, t_at, x_at, x_size = np.ascontiguousarray(found[found[:, 5] == dtype, 1:5].T)  # contiguous if single
+    kind, dtype = entries[-1, 0], entries[-1, 5]
+    rows, t_at, x_at, x_size = np.ascontiguousarray(entries[entries[:, 5] == dtype, 1:5].T)  # contiguous if single
     n = int(rows.sum())
     t, x = np.empty(8 * n, np.uint8), np.empty(int(x_size.sum()), np.uint8)
-    put_together(b, t_at, 8 * rows, t)  # type: ignore[call-arg]
-    put_together(b, x_at, x_size, x)  # type: ignore[call-arg]
+    concatenate(b, t_at, 8 * rows, t)  # type: ignore[call-arg]
+    concatenate(b, x_at, x_size, x)  # type: ignore[call-arg]
     return Rows(t=Array("<f8", (n,), t.tobytes()), x=Array(DTYPES[dtype], (n, int(_WIDTHS[kind])), x.tobytes()))

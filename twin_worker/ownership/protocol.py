@@ -23,59 +23,61 @@ import msgspec
 
 from fleet import SOURCES
 from fleet.bus.bus_protocol import Bus
-from fleet.bus.codec import EPOCH_AHEAD_MS, Stamp, timely
-from fleet.bus.presence import Present, read
-from fleet.contract import Claim, Handover, Wanted
-from twin_worker.ownership.protocol_state import Claims, Rank
+from fleet.bus.codec import MAX_EPOCH_AHEAD_MS, Stamp, is_plausible_epoch
+from fleet.bus.presence import WorkerToken, parse_token
+from fleet.contract import Claim, Handover, HandoverRequest
+from twin_worker.ownership.protocol_state import FencingToken, OwnershipState
 
 _log = logging.getLogger(__name__)
-_TURN_S = 0.1  # between steps without an event [s]
-_SETTLE_S = 0.03  # waits for the rest of a burst of tokens [s]
-_ANNOUNCE_S = 0.25  # several times in `SILENT_S` [s]
-_ASK_S = 0.5  # for the claims of all workers; a frozen worker does not answer [s]
-_HAND_S = 3.0  # maximum gap between snapshots from an owner, which publishes meanwhile [s]
-_COPIES_S = 20.0  # for all snapshots requested from one worker at once [s]
-_COPY_S = 1.4  # for one snapshot; below half of the handover timeout, so that two lost ones do not end the handover [s]
-_LEAVE_S = 5.0  # for the other workers to acquire everything at shutdown [s]
-_MEND_S = 1.0  # between checks for incomplete acquisitions [s]
-_MOST_AHEAD = 100  # maximum number of workers with a clock warning
+_STEP_PERIOD_S = 0.1  # between steps without an event [s]
+_BURST_S = 0.03  # waits for the rest of a burst of tokens [s]
+_ANNOUNCE_PERIOD_S = 0.25  # several times in `SILENT_S` [s]
+_CLAIM_TIMEOUT_S = 0.5  # for the claims of all workers; a frozen worker does not answer [s]
+_HANDOVER_TIMEOUT_S = 3.0  # maximum gap between snapshots from an owner, which publishes meanwhile [s]
+_BATCH_TIMEOUT_S = 20.0  # for all snapshots requested from one worker at once [s]
+_SNAPSHOT_TIMEOUT_S = (
+    1.4  # for one snapshot; below half of the handover timeout, so that two lost ones do not end the handover [s]
+)
+_LEAVE_TIMEOUT_S = 5.0  # for the other workers to acquire everything at shutdown [s]
+_REPAIR_PERIOD_S = 1.0  # between checks for incomplete acquisitions [s]
+_MAX_CLOCK_WARNINGS = 100  # maximum number of workers with a clock warning
 
 
-class Keeper(Protocol):
+class TwinStore(Protocol):
     """Stores the twins of the owned aircraft."""
 
     def expect(self, uavs: Iterable[int]) -> None:
         """Queue messages of these aircraft before their twins arrive."""
 
-    def adopt(self, uav: int, epoch: int, twin: Handover | None) -> None:
+    def acquire(self, uav: int, epoch: int, twin: Handover | None) -> None:
         """Acquire one aircraft, with a snapshot of its twin or without."""
 
-    def recall(self, uavs: list[int]) -> None:
+    def rehydrate(self, uavs: list[int]) -> None:
         """Query the past telemetry of aircraft acquired without a snapshot."""
 
-    def renew(self, uav: int, epoch: int) -> None:
+    def set_epoch(self, uav: int, epoch: int) -> None:
         """Publish under another epoch from now on."""
 
-    def drop(self, uavs: Iterable[int]) -> None:
+    def release(self, uavs: Iterable[int]) -> None:
         """Release these aircraft."""
 
-    def copied(self, uav: int, epoch: int) -> Handover | None:
+    def snapshot(self, uav: int, epoch: int) -> Handover | None:
         """Return a snapshot of one twin; None if it is not available now."""
 
     @property
-    def kept(self) -> dict[int, bool]:
+    def ready_by_uav(self) -> dict[int, bool]:
         """Return for each owned or expected aircraft whether its twin is ready."""
 
     @property
-    def quiet(self) -> frozenset[int]:
+    def not_publishing(self) -> frozenset[int]:
         """Return the aircraft acquired by snapshot that this worker does not publish yet."""
 
     @property
-    def bare(self) -> tuple[int, ...]:
+    def without_history(self) -> tuple[int, ...]:
         """Return the aircraft without past telemetry."""
 
 
-class Claiming:
+class OwnershipProtocol:
     """One worker's side of the ownership protocol.
 
     Args:
@@ -84,101 +86,101 @@ class Claiming:
         store: of its twins
     """
 
-    def __init__(self, bus: Bus, ids: range, keeper: Keeper) -> None:
-        self.me = f"{bus.writer:016x}"
-        self.claims = Claims(self.me, ids)
+    def __init__(self, bus: Bus, ids: range, store: TwinStore) -> None:
+        self.worker_id = f"{bus.writer:016x}"
+        self.state = OwnershipState(self.worker_id, ids)
         self.threaded = False  # true: `run` steps; false: callbacks step
-        self._bus, self._keeper = bus, keeper
+        self._bus, self._store = bus, store
         self._lock = threading.RLock()
-        self._news = threading.Event()
-        self._said = float("-inf")
-        self._told: tuple[object, ...] = ()  # last announced claim
-        self._asked_for: dict[int, float] = {}  # start of the wait for a snapshot, by UAV id [s, monotonic]
-        self._asking: dict[str, threading.Thread] = {}  # by worker
-        self._recalling: list[threading.Thread] = []
-        self._stranger = False  # a worker without a known token announces; tokens can arrive out of order
-        self._mended = float("-inf")
-        self._ahead: set[str] = set()  # workers whose epochs were rejected
+        self._wakeup = threading.Event()
+        self._announced_t = float("-inf")
+        self._announced: tuple[object, ...] = ()  # last announced claim
+        self._requested: dict[int, float] = {}  # start of the wait for a snapshot, by UAV id [s, monotonic]
+        self._request_threads: dict[str, threading.Thread] = {}  # by worker
+        self._query_threads: list[threading.Thread] = []
+        self._unknown_peer = False  # a worker without a known token announces; tokens can arrive out of order
+        self._repaired_t = float("-inf")
+        self._clock_warned: set[str] = set()  # workers whose epochs were rejected
 
     # --- from any thread ---------------------------------------------------------------------------------------------
 
     def join(self) -> None:
         """Declare this worker's liveliness token, and subscribe to tokens, claims and handover queries."""
-        self._bus.attend(self._token)
-        self._bus.subscribe(Claim, lambda claim, stamp: self._claim(claim))
-        self._bus.answer(Claim, lambda *_: [(self.claim(asked=True), None)])
-        self._bus.answer(Handover, lambda uav, asked, payload: self._asked(payload))
-        self._bus.present(Present(self.me, self.claims.ids, _wall_ms()).token)
-        self.turn()
+        self._bus.watch_liveliness(self._on_token)
+        self._bus.subscribe(Claim, lambda claim, stamp: self._on_claim(claim))
+        self._bus.declare_queryable(Claim, lambda *_: [(self.claim(with_highest=True), None)])
+        self._bus.declare_queryable(Handover, lambda uav, params, payload: self._on_handover_query(payload))
+        self._bus.declare_liveliness(WorkerToken(self.worker_id, self.state.ids, _wall_ms()).token)
+        self.step()
 
-    def hear_of(self, uav: int) -> None:
+    def on_aircraft(self, uav: int) -> None:
         """Register an aircraft; if it has no owner, the assigned worker acquires it."""
-        claims = self.claims
-        claims.hears = True
-        if uav in claims.ids and uav not in claims.known:
-            claims.known.add(uav)
-            self._news.set()
+        state = self.state
+        state.receiving = True
+        if uav in state.ids and uav not in state.known:
+            state.known.add(uav)
+            self._wakeup.set()
             if not self.threaded:
-                self.turn()
+                self.step()
 
     def may_write(self) -> bool:
         """Return whether this worker may publish results."""
-        return not self.threaded or self.claims.may_write(time.monotonic())
+        return not self.threaded or self.state.may_write(time.monotonic())
 
-    def overheard(self, uav: int, stamp: Stamp | None) -> None:
+    def observe_stamp(self, uav: int, stamp: Stamp | None) -> None:
         """Record the publisher of an aircraft's result."""
-        if stamp is not None and timely(stamp.epoch):
+        if stamp is not None and is_plausible_epoch(stamp.epoch):
             with self._lock:
-                self.claims.note(uav, Rank(stamp.epoch, f"{stamp.writer:016x}"))
+                self.state.record(uav, FencingToken(stamp.epoch, f"{stamp.writer:016x}"))
 
-    def claim(self, *, asked: bool = False) -> Claim:
+    def claim(self, *, with_highest: bool = False) -> Claim:
         """Return this worker's claim; `with_highest` adds the highest known claims of others."""
         with self._lock:
-            seen = ((uav, *rank) for uav, rank in self.claims.seen.items()) if asked else ()
-            quiet = self._keeper.quiet
-            held = tuple((uav, epoch) for uav, epoch in self.claims.held.items() if uav not in quiet)
+            highest = ((uav, *rank) for uav, rank in self.state.highest.items()) if with_highest else ()
+            not_publishing = self._store.not_publishing
+            owned = tuple((uav, epoch) for uav, epoch in self.state.owned.items() if uav not in not_publishing)
             return Claim(
                 t=time.time(),
-                worker=self.me,
-                held=held,
-                bare=self._keeper.bare,
-                leaving=self.claims.leaving,
+                worker=self.worker_id,
+                owned=owned,
+                without_history=self._store.without_history,
+                leaving=self.state.leaving,
                 machine=platform.node(),
                 code=SOURCES,
-                seen=tuple(seen),
+                highest_claims=tuple(highest),
             )
 
-    def _token(self, name: str, lives: bool) -> None:
-        told = read(name)
-        if told is None or (lives and not self._timely(told.worker, told.born)):
+    def _on_token(self, name: str, live: bool) -> None:
+        presence = parse_token(name)
+        if presence is None or (live and not self._is_timely(presence.worker, presence.started_ms)):
             return
         with self._lock:
-            if lives:
-                self.claims.appeared(*told)
+            if live:
+                self.state.on_join(*presence)
             else:
-                self.claims.vanished(told.worker, told.born)
-        self._news.set()
+                self.state.on_leave(presence.worker, presence.started_ms)
+        self._wakeup.set()
 
-    def _claim(self, claim: Claim) -> None:
-        if claim.worker == self.me:
+    def _on_claim(self, claim: Claim) -> None:
+        if claim.worker == self.worker_id:
             return
         with self._lock:
-            self._stranger |= claim.worker not in self.claims.peers and not claim.leaving
-            held = {uav: epoch for uav, epoch in claim.held if self._timely(claim.worker, epoch)}
-            lost = self.claims.heard(claim.worker, held, claim.leaving)
-            for uav, epoch, worker in claim.seen:
-                if timely(epoch):
-                    self.claims.note(uav, Rank(epoch, worker))
-            self._keeper.drop(lost)
+            self._unknown_peer |= claim.worker not in self.state.peers and not claim.leaving
+            claimed = {uav: epoch for uav, epoch in claim.owned if self._is_timely(claim.worker, epoch)}
+            lost = self.state.on_claim(claim.worker, claimed, claim.leaving)
+            for uav, epoch, worker in claim.highest_claims:
+                if is_plausible_epoch(epoch):
+                    self.state.record(uav, FencingToken(epoch, worker))
+            self._store.release(lost)
         if lost:
             _log.info("%d aircraft released: worker %s has the higher claim", len(lost), claim.worker)
 
-    def _asked(self, payload: bytes) -> Iterator[tuple[Handover, None]]:
+    def _on_handover_query(self, payload: bytes) -> Iterator[tuple[Handover, None]]:
         """Yield snapshots of owned aircraft, one by one; the requester acquires them and announces it."""
-        for uav in _wanted(payload).uavs if payload else ():
+        for uav in _decode_wanted(payload).uavs if payload else ():
             with self._lock:
-                epoch = self.claims.held.get(uav)
-            if epoch is not None and (twin := self._keeper.copied(uav, epoch)) is not None:
+                epoch = self.state.owned.get(uav)
+            if epoch is not None and (twin := self._store.snapshot(uav, epoch)) is not None:
                 yield twin, None
 
     # --- one thread --------------------------------------------------------------------------------------------------
@@ -186,185 +188,185 @@ class Claiming:
     def run(self, stop: threading.Event) -> None:
         """Step until `stop` is set."""
         while not stop.is_set():
-            if self._news.wait(_TURN_S):
+            if self._wakeup.wait(_STEP_PERIOD_S):
                 self.tick()
-                stop.wait(_SETTLE_S)
-            self._news.clear()
+                stop.wait(_BURST_S)
+            self._wakeup.clear()
             try:
-                self.turn()
+                self.step()
             except ConnectionError:  # the session is closed: shutdown
                 return
             except Exception:  # an error must not stop the protocol
                 _log.exception("ownership step failed; report it")
 
-    def turn(self) -> None:
+    def step(self) -> None:
         """Run whatever is due."""
         if not self.tick():
             return
-        self._set_right()
-        if self.claims.unsure:
+        self._replace_future_epochs()
+        if self.state.unsynchronised:
             self._synchronise()
         with self._lock:
-            plan = self.claims.plan(time.monotonic())
-        self._take(plan.take)
-        if plan.sure:  # a short unsynchronised phase, as on a busy machine, does not restart the timeouts
-            self._take(self._ask(plan.ask))
-            self._mend()
-        if self._news_to_tell() or time.monotonic() - self._said >= _ANNOUNCE_S:
+            plan = self.state.plan(time.monotonic())
+        self._acquire(plan.acquire)
+        if plan.valid:  # a short unsynchronised phase, as on a busy machine, does not restart the timeouts
+            self._acquire(self._request_handovers(plan.request))
+            self._repair()
+        if self._claim_changed() or time.monotonic() - self._announced_t >= _ANNOUNCE_PERIOD_S:
             self._announce()
 
     def leave(self) -> None:
         """Hand all aircraft over to the other workers, within a few seconds."""
         with self._lock:
-            self.claims.leaving = True
-        until, waited = time.monotonic() + _LEAVE_S, threading.Event()
-        while self.tick() and self._heirs() and time.monotonic() < until:
+            self.state.leaving = True
+        until, pause = time.monotonic() + _LEAVE_TIMEOUT_S, threading.Event()
+        while self.tick() and self._has_successors() and time.monotonic() < until:
             self._announce()
-            waited.wait(_TURN_S)
+            pause.wait(_STEP_PERIOD_S)
 
-    def _heirs(self) -> bool:
+    def _has_successors(self) -> bool:
         """Return whether another worker can acquire an aircraft still owned here."""
         with self._lock:
-            others = self.claims.heirs().values()
-            return any(uav in ids for uav in self.claims.held for ids in others)
+            others = self.state.successors().values()
+            return any(uav in ids for uav in self.state.owned for ids in others)
 
     def tick(self) -> bool:
         """Update the clock and the router state; return whether the router is connected."""
-        in_sight = bool(self._bus.router)
+        connected = bool(self._bus.router)
         with self._lock:
-            self.claims.tick(time.monotonic(), in_sight)
-        return in_sight
+            self.state.tick(time.monotonic(), connected)
+        return connected
 
     def _synchronise(self) -> None:
         """Query all claims and resynchronise; aircraft claimed by others meanwhile are claimed again or released."""
-        for claim, _ in self._bus.ask(Claim, timeout_s=_ASK_S):
-            self._claim(claim)
+        for claim, _ in self._bus.get(Claim, timeout_s=_CLAIM_TIMEOUT_S):
+            self._on_claim(claim)
         if not self.tick():
             return
         with self._lock:
-            before = dict(self.claims.held)
-            self.claims.synced(_wall_ms())
-            renewed = {uav: epoch for uav, epoch in self.claims.held.items() if before[uav] != epoch}
+            previous = dict(self.state.owned)
+            self.state.resynchronise(_wall_ms())
+            renewed = {uav: epoch for uav, epoch in self.state.owned.items() if previous[uav] != epoch}
         for uav, epoch in renewed.items():
-            self._keeper.renew(uav, epoch)
+            self._store.set_epoch(uav, epoch)
 
-    def _set_right(self) -> None:
+    def _replace_future_epochs(self) -> None:
         """Claim aircraft again whose epochs are ahead of this clock after it was set back."""
         with self._lock:
-            renewed = self.claims.timely(_wall_ms() + EPOCH_AHEAD_MS, _wall_ms())
+            renewed = self.state.drop_future_epochs(_wall_ms() + MAX_EPOCH_AHEAD_MS, _wall_ms())
         for uav, epoch in renewed.items():
-            self._keeper.renew(uav, epoch)
+            self._store.set_epoch(uav, epoch)
 
-    def _timely(self, worker: str, epoch: int) -> bool:
+    def _is_timely(self, worker: str, epoch: int) -> bool:
         """Return whether a worker's epoch is within the limit; warn once if it is far ahead of this clock."""
-        if timely(epoch):
+        if is_plausible_epoch(epoch):
             return True
-        if worker not in self._ahead and len(self._ahead) < _MOST_AHEAD:
-            self._ahead.add(worker)
-            found = f"claims over {EPOCH_AHEAD_MS // 60_000} minutes ahead of this clock"
-            _log.warning("worker %s: found %s, expected synchronised clocks; set its clock", worker, found)
+        if worker not in self._clock_warned and len(self._clock_warned) < _MAX_CLOCK_WARNINGS:
+            self._clock_warned.add(worker)
+            problem = f"claims over {MAX_EPOCH_AHEAD_MS // 60_000} minutes ahead of this clock"
+            _log.warning("worker %s: found %s, expected synchronised clocks; set its clock", worker, problem)
         return False
 
-    def _ask(self, wanted: dict[str, list[int]]) -> list[int]:
+    def _request_handovers(self, wanted: dict[str, list[int]]) -> list[int]:
         """Request snapshots from all owners at once; return the aircraft whose owner does not respond in time."""
-        now, uavs = time.monotonic(), {uav for mine in wanted.values() for uav in mine}
+        now, uavs = time.monotonic(), {uav for batch in wanted.values() for uav in batch}
         with self._lock:
-            self._asked_for = {uav: self._asked_for.get(uav, now) for uav in uavs}
+            self._requested = {uav: self._requested.get(uav, now) for uav in uavs}
         for worker, mine in wanted.items():
             if not self.threaded:
-                self._copy(worker, mine)
-            elif worker not in self._asking or not self._asking[worker].is_alive():
-                self._asking[worker] = self._begin(self._copy, worker, mine)
+                self._fetch_snapshots(worker, mine)
+            elif worker not in self._request_threads or not self._request_threads[worker].is_alive():
+                self._request_threads[worker] = self._start_thread(self._fetch_snapshots, worker, mine)
         with self._lock:
-            late = [uav for uav, since in self._asked_for.items() if now - since > _HAND_S]
-            return [uav for uav in late if uav not in self.claims.held]
+            late = [uav for uav, since in self._requested.items() if now - since > _HANDOVER_TIMEOUT_S]
+            return [uav for uav in late if uav not in self.state.owned]
 
-    def _copy(self, worker: str, uavs: list[int]) -> None:
+    def _fetch_snapshots(self, worker: str, uavs: list[int]) -> None:
         """Request snapshots from one owner and acquire each on arrival.
 
         One at a time: unread snapshots must fit into the buffers between two processes, else they are dropped.
         """
-        until = time.monotonic() + _COPIES_S
+        until = time.monotonic() + _BATCH_TIMEOUT_S
         for uav in uavs:
-            left = min(until - time.monotonic(), _COPY_S)
-            if left > 0.0 and uav not in self.claims.held:
-                payload = msgspec.msgpack.encode(Wanted(uavs=(uav,)))
-                for twin in self._bus.gather(Handover, worker, payload, left):
-                    self._copied(worker, uavs, twin)
+            remaining_s = min(until - time.monotonic(), _SNAPSHOT_TIMEOUT_S)
+            if remaining_s > 0.0 and uav not in self.state.owned:
+                payload = msgspec.msgpack.encode(HandoverRequest(uavs=(uav,)))
+                for twin in self._bus.get_stream(Handover, worker, payload, remaining_s):
+                    self._accept_snapshot(worker, uavs, twin)
 
-    def _copied(self, worker: str, uavs: list[int], twin: Handover) -> None:
+    def _accept_snapshot(self, worker: str, uavs: list[int], twin: Handover) -> None:
         now = time.monotonic()  # the owner responds: keep waiting for the rest
         with self._lock:
-            self._asked_for = self._asked_for | dict.fromkeys(uavs, now)
-            wanted = twin.uav in uavs and twin.uav not in self.claims.held and timely(twin.epoch)
-            if not wanted or not self.claims.may_write(time.monotonic()):
+            self._requested = self._requested | dict.fromkeys(uavs, now)
+            accepted = twin.uav in uavs and twin.uav not in self.state.owned and is_plausible_epoch(twin.epoch)
+            if not accepted or not self.state.may_write(time.monotonic()):
                 return
-            self.claims.note(twin.uav, Rank(twin.epoch, worker))
-            epoch = self.claims.take(twin.uav, _wall_ms())
-        self._keeper.adopt(twin.uav, epoch, twin)
+            self.state.record(twin.uav, FencingToken(twin.epoch, worker))
+            epoch = self.state.acquire(twin.uav, _wall_ms())
+        self._store.acquire(twin.uav, epoch, twin)
 
-    def _take(self, uavs: list[int]) -> None:
+    def _acquire(self, uavs: list[int]) -> None:
         for uav in uavs:
             with self._lock:
-                epoch = self.claims.take(uav, _wall_ms())
-            self._keeper.adopt(uav, epoch, None)
-        self._recall(uavs)
+                epoch = self.state.acquire(uav, _wall_ms())
+            self._store.acquire(uav, epoch, None)
+        self._rehydrate(uavs)
 
-    def _recall(self, uavs: list[int]) -> None:
+    def _rehydrate(self, uavs: list[int]) -> None:
         if uavs and self.threaded:
-            self._recalling.append(self._begin(self._keeper.recall, uavs))
+            self._query_threads.append(self._start_thread(self._store.rehydrate, uavs))
         elif uavs:
-            self._keeper.recall(uavs)
+            self._store.rehydrate(uavs)
 
-    def _mend(self) -> None:
+    def _repair(self) -> None:
         """Repair rare inconsistencies after crossed or lost messages or an internal error."""
         now = time.monotonic()
-        if now - self._mended < _MEND_S:
+        if now - self._repaired_t < _REPAIR_PERIOD_S:
             return
-        self._mended = now
-        if self._stranger:
-            self._stranger = False
-            self._bus.recount(self._token)
-        self._recalling = [hand for hand in self._recalling if hand.is_alive()]
-        busy = bool(self._recalling) or any(hand.is_alive() for hand in self._asking.values())
+        self._repaired_t = now
+        if self._unknown_peer:
+            self._unknown_peer = False
+            self._bus.list_liveliness(self._on_token)
+        self._query_threads = [thread for thread in self._query_threads if thread.is_alive()]
+        busy = bool(self._query_threads) or any(thread.is_alive() for thread in self._request_threads.values())
         with self._lock:
-            held, kept = dict(self.claims.held), self._keeper.kept
-            self._keeper.drop(kept.keys() - held.keys() - self._asked_for.keys())
-        if lacking := [uav for uav in held if not kept.get(uav)] if not busy else []:
-            _log.warning("%d owned aircraft have no twin; restored from published data", len(lacking))
-            for uav in lacking:
-                self._keeper.adopt(uav, held[uav], None)
-            self._recall(lacking)
+            owned, ready = dict(self.state.owned), self._store.ready_by_uav
+            self._store.release(ready.keys() - owned.keys() - self._requested.keys())
+        if missing := [uav for uav in owned if not ready.get(uav)] if not busy else []:
+            _log.warning("%d owned aircraft have no twin; restored from published data", len(missing))
+            for uav in missing:
+                self._store.acquire(uav, owned[uav], None)
+            self._rehydrate(missing)
 
-    def _begin(self, act: Callable[..., None], *given: Any) -> threading.Thread:
+    def _start_thread(self, task: Callable[..., None], *arguments: Any) -> threading.Thread:
         """Run a task in a thread."""
-        thread = threading.Thread(target=self._watched, args=(act, *given), daemon=True)
+        thread = threading.Thread(target=self._run_task, args=(task, *arguments), daemon=True)
         thread.start()
         return thread
 
-    def _watched(self, act: Callable[..., None], *given: Any) -> None:
+    def _run_task(self, task: Callable[..., None], *arguments: Any) -> None:
         try:
-            act(*given)
+            task(*arguments)
         except ConnectionError:  # the session is closed: shutdown
             return
         except Exception:  # an error must not stop the protocol
             _log.exception("takeover failed with an internal error; report it")
-        self._news.set()
+        self._wakeup.set()
 
-    def _news_to_tell(self) -> bool:
+    def _claim_changed(self) -> bool:
         """Return whether the claim differs from the last announced one."""
         claim = self.claim()
-        return (claim.held, claim.bare) != self._told
+        return (claim.owned, claim.without_history) != self._announced
 
     def _announce(self) -> None:
         claim = self.claim()
-        self._said, self._told = time.monotonic(), (claim.held, claim.bare)
+        self._announced_t, self._announced = time.monotonic(), (claim.owned, claim.without_history)
         self._bus.publish(claim)
 
 
-def _wanted(payload: bytes) -> Wanted:
+def _decode_wanted(payload: bytes) -> HandoverRequest:
     try:
-        return msgspec.msgpack.decode(payload, type=Wanted)
+        return msgspec.msgpack.decode(payload, type=HandoverRequest)
     except (msgspec.DecodeError, RecursionError) as error:
         raise ValueError(f"handover: found no Wanted ({error}); see `fleet schema @handover`") from None
 

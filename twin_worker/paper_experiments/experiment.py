@@ -12,24 +12,24 @@ import numpy as np
 from fleet.contract import Outcome
 from fleet.window import STATES as ALL
 from fleet.window import Window
-from twin_worker.identification.linear.linear_model import AXES, Axis
+from twin_worker.identification.linear.linear_model import AXES, AxisModel
 from twin_worker.identification.linear.linear_prior import INPUTS, STATES
 from twin_worker.identification.linear.prediction_error_method import refine
 from twin_worker.identification.linear.state_space import StateSpace
 from twin_worker.identification.linear.subspace import pbsid
 from twin_worker.identification.linear.subspace_open_loop import projection
-from twin_worker.paper_experiments.recorded_flights import Flown
-from twin_worker.telemetry.flight_phase import mode_of
-from twin_worker.validation.held_out import Unseen
+from twin_worker.paper_experiments.recorded_flights import RecordedFlight
+from twin_worker.telemetry.flight_phase import phase_of
+from twin_worker.validation.held_out import HeldOut
 from twin_worker.validation.verify import fit_percent, verify
 
-FIRST: dict[str, Callable[..., StateSpace]] = {"projection": projection, "pbsid": pbsid}
-NAMES = tuple(name for axis in AXES for name in STATES[axis])
-_LOOSE = 1e-3  # prior precision that only regularises the normal equations [-]
+FIRST_STEPS: dict[str, Callable[..., StateSpace]] = {"projection": projection, "pbsid": pbsid}
+STATE_NAMES = tuple(name for axis in AXES for name in STATES[axis])
+_WEAK_PRECISION = 1e-3  # prior precision that only regularises the normal equations [-]
 
 
 @dataclass(frozen=True)
-class Plan:
+class ExperimentPlan:
     """Settings of an experiment.
 
     Attributes:
@@ -73,7 +73,7 @@ class Experiment:
     sentence: str
 
 
-def both_steps(axis: str, seen: Window, first: str, segment_s: float) -> tuple[Axis, Axis]:
+def both_steps(axis: str, seen: Window, first: str, segment_s: float) -> tuple[AxisModel, AxisModel]:
     """Identify one axis by the first step, and refine it by the prediction error of free runs, without prior.
 
     Args:
@@ -87,57 +87,67 @@ def both_steps(axis: str, seen: Window, first: str, segment_s: float) -> tuple[A
     states, inputs = STATES[axis], INPUTS[axis]
     y, u, ok = seen.columns(states), seen.columns(inputs), seen.ok
     scale = [np.maximum(data[ok].std(axis=0), least) for data, least in ((y, 1e-3), (u, 1e-6))]
-    frame = Axis(states, inputs, np.empty((0, 0)), y[ok].mean(axis=0), scale[0], u[ok].mean(axis=0), scale[1], seen.dt)
-    y, u = frame.scaled(seen)
-    model = FIRST[first](y, u, len(states), ok=ok).outputs_as_states().stabilised()
-    start = np.hstack([model.A, model.B, np.zeros((len(states), 1))])
-    loose = np.full(start.shape, _LOOSE)
-    better = refine(
-        start, y, u, ok, prior=start, precision=loose, length=int(segment_s / seen.dt), discount=1.0, steps=20
+    axis_model = AxisModel(
+        states, inputs, np.empty((0, 0)), y[ok].mean(axis=0), scale[0], u[ok].mean(axis=0), scale[1], seen.dt
     )
-    return replace(frame, D=start), replace(frame, D=better)
+    y, u = axis_model.scaled(seen)
+    model = FIRST_STEPS[first](y, u, len(states), ok=ok).outputs_as_states().stabilised()
+    start = np.hstack([model.A, model.B, np.zeros((len(states), 1))])
+    precision = np.full(start.shape, _WEAK_PRECISION)
+    refined = refine(
+        start,
+        y,
+        u,
+        ok,
+        prior=start,
+        precision=precision,
+        length=int(segment_s / seen.dt),
+        effective_fraction=1.0,
+        steps=20,
+    )
+    return replace(axis_model, D=start), replace(axis_model, D=refined)
 
 
-def experiment(flight: Flown, start: int, first: str, plan: Plan) -> Experiment:
+def run_experiment(flight: RecordedFlight, start: int, first: str, plan: ExperimentPlan) -> Experiment:
     """Identify on the window before row `start` and run free from it.
 
     Raises:
         ValueError: if the data are too short or not informative; the message names the reason.
     """
     window = flight.window(start, plan.seen_s, plan.unseen_s)
-    known, length = round(plan.seen_s / window.dt), round(plan.unseen_s / window.dt)
-    axes = [both_steps(axis, window.part(0, known), first, plan.segment_s) for axis in AXES]
+    n_seen, n_unseen = round(plan.seen_s / window.dt), round(plan.unseen_s / window.dt)
+    axes = [both_steps(axis, window.part(0, n_seen), first, plan.segment_s) for axis in AXES]
     steps = [(axes[0][k], axes[1][k]) for k in (0, 1)]
-    runs, seen = ([_runs(pair, window, at, length) for pair in steps] for at in (known, known - length))
-    actual, before = (window.columns(NAMES)[at : at + length] for at in (known, known - length))
-    verdict = verify(steps[1], window, known)
+    runs, seen_runs = ([_free_run(pair, window, at, n_unseen) for pair in steps] for at in (n_seen, n_seen - n_unseen))
+    actual, seen_actual = (window.columns(STATE_NAMES)[at : at + n_unseen] for at in (n_seen, n_seen - n_unseen))
+    verdict = verify(steps[1], window, n_seen)
     return Experiment(
         uav=flight.uav,
-        t=float(window.t[known]),
-        mode=mode_of(window.part(known, known + length)),
-        mode_seen=mode_of(window.part(known - length, known)),
-        seconds=window.t[known : known + length] - window.t[known],
+        t=float(window.t[n_seen]),
+        mode=phase_of(window.part(n_seen, n_seen + n_unseen)),
+        mode_seen=phase_of(window.part(n_seen - n_unseen, n_seen)),
+        seconds=window.t[n_seen : n_seen + n_unseen] - window.t[n_seen],
         actual=actual,
         first=runs[0],
         refined=runs[1],
         fit=np.array([fit_percent(actual, run) for run in runs]),
-        fit_seen=np.array([fit_percent(before, run) for run in seen]),
+        fit_seen=np.array([fit_percent(seen_actual, run) for run in seen_runs]),
         outcome=verdict.outcome,
         sentence=verdict.sentence,
     )
 
 
-def _runs(pair: tuple[Axis, Axis], window: Window, start: int, length: int) -> np.ndarray:
+def _free_run(pair: tuple[AxisModel, AxisModel], window: Window, start: int, length: int) -> np.ndarray:
     """Run both axes free from the measured states of a row, (length, 9)."""
-    order = [ALL.index(name) for name in NAMES]
-    return Unseen(pair, window.part(start, start + length), 0).runs(length)[:, order]
+    order = [ALL.index(name) for name in STATE_NAMES]
+    return HeldOut(pair, window.part(start, start + length), 0).runs(length)[:, order]
 
 
-def experiments(flights: Iterable[Flown], first: str, plan: Plan) -> Iterator[Experiment | str]:
+def run_experiments(flights: Iterable[RecordedFlight], first: str, plan: ExperimentPlan) -> Iterator[Experiment | str]:
     """Run all possible experiments; yield the reason as text where one fails."""
     for flight in flights:
         for start in flight.starts(plan.seen_s, plan.unseen_s, plan.every_s):
             try:
-                yield experiment(flight, start, first, plan)
+                yield run_experiment(flight, start, first, plan)
             except ValueError as error:
                 yield f"uav-{flight.uav}: {error}"

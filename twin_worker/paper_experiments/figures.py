@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
-from fleet.report.ink import BAD, INK, LINES, MUTED, spread
-from twin_worker.numerics.plot_style import house
-from twin_worker.telemetry.flight_phase import MODES
+from fleet.report.ink import BAD, INK, LINES, MUTED, axis_limits
+from twin_worker.numerics.plot_style import style_axes
+from twin_worker.telemetry.flight_phase import PHASES
 
 if TYPE_CHECKING:
     from twin_worker.paper_experiments.experiment import Experiment
@@ -18,7 +18,7 @@ _STEPS = (("first", LINES[0], "first step"), ("refined", BAD, "refined"))
 _UNITS = {"u": "m/s", "v": "m/s", "w": "m/s", "p": "rad/s", "q": "rad/s", "r": "rad/s"}
 
 
-def draw(folder: Path, first: str, done: "Sequence[Experiment]", names: Sequence[str]) -> list[Path]:
+def draw(folder: Path, first: str, results: "Sequence[Experiment]", names: Sequence[str]) -> list[Path]:
     """Draw figure 7 for every mode and figure 8, over unseen and seen data, into a folder; return the files.
 
     Args:
@@ -28,11 +28,13 @@ def draw(folder: Path, first: str, done: "Sequence[Experiment]", names: Sequence
         names: state names of the columns
     """
     folder.mkdir(parents=True, exist_ok=True)
-    its = {mode: some for mode in MODES if (some := [one for one in done if one.mode == mode])}
-    fits = {mode: np.array([one.fit for one in some]) for mode, some in its.items()}
-    before = {mode: [one.fit_seen for one in done if one.mode_seen == mode] for mode in MODES}
-    seen = {mode: np.array(some) for mode, some in before.items() if some}
-    figures = {f"fig7_{first}_{mode}.png": _runs(_usual(some), names, first) for mode, some in its.items()}
+    by_mode = {mode: group for mode in PHASES if (group := [result for result in results if result.mode == mode])}
+    fits = {mode: np.array([result.fit for result in group]) for mode, group in by_mode.items()}
+    seen_by_mode = {mode: [result.fit_seen for result in results if result.mode_seen == mode] for mode in PHASES}
+    seen = {mode: np.array(group) for mode, group in seen_by_mode.items() if group}
+    figures = {
+        f"fig7_{first}_{mode}.png": _runs(_median_experiment(group), names, first) for mode, group in by_mode.items()
+    }
     figures[f"fig8_{first}.png"] = _boxes(fits, names, f"{first} and refined, over unseen data")
     figures[f"fig8_{first}_seen.png"] = _boxes(seen, names, f"{first} and refined, over identification data")
     for name, figure in figures.items():
@@ -40,27 +42,27 @@ def draw(folder: Path, first: str, done: "Sequence[Experiment]", names: Sequence
     return [folder / name for name in figures]
 
 
-def _usual(some: "list[Experiment]") -> "Experiment":
+def _median_experiment(group: "list[Experiment]") -> "Experiment":
     """Return the experiment with the median fit of the refined model."""
-    return sorted(some, key=lambda one: float(one.fit[1].mean()))[len(some) // 2]
+    return sorted(group, key=lambda result: float(result.fit[1].mean()))[len(group) // 2]
 
 
-def _runs(one: "Experiment", names: Sequence[str], first: str) -> Figure:
+def _runs(result: "Experiment", names: Sequence[str], first: str) -> Figure:
     """Draw every state of one experiment: measured, first step, refined."""
     figure = Figure(figsize=(11, 7), layout="constrained")
     for k, (ax, name) in enumerate(zip(figure.subplots(3, 3, sharex=True).flat, names, strict=True)):
-        ax.plot(one.seconds, one.actual[:, k], color=INK, lw=1.6, label="measured")
+        ax.plot(result.seconds, result.actual[:, k], color=INK, lw=1.6, label="measured")
         for step, colour, label in _STEPS:
-            run = getattr(one, step)[:, k]
-            ax.plot(one.seconds, run, color=colour, lw=1.1, label=label)
+            run = getattr(result, step)[:, k]
+            ax.plot(result.seconds, run, color=colour, lw=1.1, label=label)
         # scale to the measured line: a diverged run may leave the axes
-        low, high = spread(one.actual[:, k], least=0.02)
+        low, high = axis_limits(result.actual[:, k], min_range=0.02)
         ax.set_ylim(low - (high - low), high + (high - low))
-        fits = " → ".join(f"{one.fit[i, k]:.0f}" for i in (0, 1))
-        house(ax, f"{name} [{_UNITS.get(name, 'rad')}]   fit {fits} %")
+        fits = " → ".join(f"{result.fit[i, k]:.0f}" for i in (0, 1))
+        style_axes(ax, f"{name} [{_UNITS.get(name, 'rad')}]   fit {fits} %")
     figure.axes[0].legend(frameon=False, fontsize=8)
     figure.supxlabel("unseen data [s]", fontsize=9, color=INK)
-    figure.suptitle(f"{one.mode}, uav-{one.uav}: free run from {first} and refined", fontsize=11, color=INK)
+    figure.suptitle(f"{result.mode}, uav-{result.uav}: free run from {first} and refined", fontsize=11, color=INK)
     return figure
 
 
@@ -81,7 +83,7 @@ def _boxes(fits: dict[str, np.ndarray], names: Sequence[str], title: str) -> Fig
             ax.plot([], [], color=colour, lw=5, alpha=0.5, label=label)
         ax.axhline(0, color=MUTED, lw=0.6)
         ax.set_xticks(places, names)
-        house(ax, f"{mode}, n {len(fit)}")
+        style_axes(ax, f"{mode}, n {len(fit)}")
     for ax in list(panels):
         ax.set_visible(False)
     figure.axes[0].legend(frameon=False, fontsize=8)

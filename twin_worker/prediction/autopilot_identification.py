@@ -13,22 +13,22 @@ from math import atan2, degrees, isfinite, pi, radians
 import numpy as np
 
 from fleet.autopilots import laws
-from fleet.autopilots.shadow import shadow
+from fleet.autopilots.shadow import replay_controller
 from fleet.frames import wrap
 from fleet.mission import P_D, P_N, SEQ, VA_C, WAYPOINT
-from twin_worker.estimation.airspeed_setpoint import aimed_at
-from twin_worker.prediction.autopilot_parameters import CRUISE_OF, on_wings
-from twin_worker.prediction.closed_loop import Heard, Situation, heard, known_wind
+from twin_worker.estimation.airspeed_setpoint import reported_setpoint
+from twin_worker.prediction.autopilot_parameters import CRUISE_OF, fixed_wing_controller
+from twin_worker.prediction.closed_loop import PredictionContext, ReplayWindow, autopilot_wind, replay_inputs
 
-OWN = {"ardupilot": "arduplane", "px4": "px4"}
-EVERY_S = 10.0  # interval of replays [s]
-_BELIEVED = radians(6.0)  # largest error to the commanded banks of an accepted law [rad]
-_TURN = radians(12.0)  # smaller banks do not distinguish laws [rad]
-_NEWS = 0.15  # smoothing weight of the newest replay
-_FLAT = radians(0.3), 8  # band below the steepest bank, and minimum reports in it, that indicate a limit [rad]
-_NEAR = (0.7, 1.4)  # default minimum and maximum airspeed over cruise [-]
-_SHARPEST = radians(35.0)  # minimum turn that determines the switch distance [rad]
-_SHAPES: dict[str, dict[str, tuple[float, ...]]] = {  # turn parameters, tried if not received
+LAW_OF_AUTOPILOT = {"ardupilot": "arduplane", "px4": "px4"}
+REPLAY_INTERVAL_S = 10.0  # interval of replays [s]
+_MAX_BANK_ERROR = radians(6.0)  # largest error to the commanded banks of an accepted law [rad]
+_MIN_TURN_BANK = radians(12.0)  # smaller banks do not distinguish laws [rad]
+_SMOOTHING = 0.15  # smoothing weight of the newest replay
+_LIMIT_BAND = radians(0.3), 8  # band below the steepest bank, and minimum reports in it, that indicate a limit [rad]
+_SPEED_RANGE = (0.7, 1.4)  # default minimum and maximum airspeed over cruise [-]
+_MIN_SWITCH_TURN = radians(35.0)  # minimum turn that determines the switch distance [rad]
+_TURN_PARAMETERS: dict[str, dict[str, tuple[float, ...]]] = {  # turn parameters, tried if not received
     "arduplane": {
         "NAVL1_PERIOD": (8.0, 10.0, 12.0, 13.0, 14.0, 15.0, 16.0, 17.0, 18.0, 20.0, 22.0, 25.0, 30.0),
         "NAVL1_DAMPING": (0.65, 0.7, 0.75, 0.8, 0.85, 0.95),
@@ -36,8 +36,8 @@ _SHAPES: dict[str, dict[str, tuple[float, ...]]] = {  # turn parameters, tried i
     "px4": {"NPFG_PERIOD": (6.0, 8.0, 10.0, 12.0, 14.0, 17.0, 20.0, 25.0)},
     "textbook": {"k_path": (0.01, 0.015, 0.02, 0.03, 0.04, 0.06, 0.08)},
 }
-_LIMIT = {"arduplane": ("ROLL_LIMIT_DEG", 1.0), "px4": ("FW_R_LIM", 1.0), "textbook": ("phi_max", radians(1.0))}
-_RANGE: dict[str, tuple[str, ...]] = {
+_BANK_LIMIT = {"arduplane": ("ROLL_LIMIT_DEG", 1.0), "px4": ("FW_R_LIM", 1.0), "textbook": ("phi_max", radians(1.0))}
+_SPEED_LIMITS: dict[str, tuple[str, ...]] = {
     "arduplane": ("AIRSPEED_MIN", "AIRSPEED_MAX"),
     "px4": ("FW_AIRSPD_MIN", "FW_AIRSPD_MAX"),
     "textbook": (),
@@ -45,7 +45,7 @@ _RANGE: dict[str, tuple[str, ...]] = {
 
 
 @dataclass
-class Learnt:
+class AutopilotEstimate:
     """Identified law and parameters of one autopilot.
 
     Attributes:
@@ -61,15 +61,15 @@ class Learnt:
 
     law: str = ""
     values: dict[str, float] = field(default_factory=dict)
-    said: str = ""
-    steepest: np.ndarray = field(default_factory=lambda: np.empty(0))
-    switched: dict[int, float] = field(default_factory=dict)
+    reason: str = ""
+    steepest_banks: np.ndarray = field(default_factory=lambda: np.empty(0))
+    switch_radii: dict[int, float] = field(default_factory=dict)
     cost: dict[tuple[str, str, float], float] = field(default_factory=dict)
-    miss: dict[str, float] = field(default_factory=dict)
-    t: float = -np.inf
+    bank_error: dict[str, float] = field(default_factory=dict)
+    replay_t: float = -np.inf
 
 
-def learn_law(learnt: Learnt, autopilot: str, now: Situation) -> None:
+def identify_autopilot(estimate: AutopilotEstimate, autopilot: str, context: PredictionContext) -> None:
     """Replay the flight to identify unknown law and parameters; update `estimate` in place.
 
     Args:
@@ -77,102 +77,110 @@ def learn_law(learnt: Learnt, autopilot: str, now: Situation) -> None:
         autopilot: reported autopilot type
         context: newest telemetry; its law and values are ignored
     """
-    own = OWN.get(autopilot)
-    lacking = {law: laws.parameters(law, now.onboard.params)[1] for law in ((own,) if own else _SHAPES)}
-    if own:
-        learnt.law, learnt.said = own, ""
-    if own and not any(lacking.values()):
-        learnt.values = {}
+    own_law = LAW_OF_AUTOPILOT.get(autopilot)
+    missing = {
+        law: laws.parameters(law, context.onboard.params)[1] for law in ((own_law,) if own_law else _TURN_PARAMETERS)
+    }
+    if own_law:
+        estimate.law, estimate.reason = own_law, ""
+    if own_law and not any(missing.values()):
+        estimate.values = {}
         return
-    seen = heard(now)
-    if not isinstance(seen, Heard):
+    replay = replay_inputs(context)
+    if not isinstance(replay, ReplayWindow):
         return
-    learnt.t = float(seen.good.t[-1])
-    _watch_banks(learnt, seen.phi_c)
-    turned = bool((np.abs(seen.phi_c) > _TURN).any())
-    found = {law: _values(learnt, law, absent, now, seen) for law, absent in lacking.items()}
-    if turned:
-        for law, absent in lacking.items():
-            _replay(learnt, law, absent, (now, seen), found[law])
-    if own is None:
-        _choose(learnt, autopilot)
-    if learnt.law:
-        learnt.values = found[learnt.law]
+    estimate.replay_t = float(replay.window.t[-1])
+    _update_banks(estimate, replay.phi_c)
+    has_turns = bool((np.abs(replay.phi_c) > _MIN_TURN_BANK).any())
+    values = {law: _read_values(estimate, law, absent, context, replay) for law, absent in missing.items()}
+    if has_turns:
+        for law, absent in missing.items():
+            _fit_turn_parameters(estimate, law, absent, (context, replay), values[law])
+    if own_law is None:
+        _select_law(estimate, autopilot)
+    if estimate.law:
+        estimate.values = values[estimate.law]
 
 
-def _watch_banks(learnt: Learnt, phi_c: np.ndarray) -> None:
+def _update_banks(estimate: AutopilotEstimate, phi_c: np.ndarray) -> None:
     """Store the steepest commanded banks."""
-    banks = np.concatenate([learnt.steepest, np.abs(phi_c[np.isfinite(phi_c)])])
-    learnt.steepest = np.sort(banks)[-200:]
+    banks = np.concatenate([estimate.steepest_banks, np.abs(phi_c[np.isfinite(phi_c)])])
+    estimate.steepest_banks = np.sort(banks)[-200:]
 
 
-def _values(learnt: Learnt, law: str, absent: tuple[str, ...], now: Situation, seen: Heard) -> dict[str, float]:
+def _read_values(
+    estimate: AutopilotEstimate, law: str, absent: tuple[str, ...], context: PredictionContext, replay: ReplayWindow
+) -> dict[str, float]:
     """Read the parameters that need no replay from the flight."""
     values: dict[str, float] = {}
-    name, unit = _LIMIT[law]
-    if name in absent and len(learnt.steepest):
-        top = float(learnt.steepest[-1])
-        if (learnt.steepest > top - _FLAT[0]).sum() >= _FLAT[1] and top > _TURN:
+    name, unit = _BANK_LIMIT[law]
+    if name in absent and len(estimate.steepest_banks):
+        top = float(estimate.steepest_banks[-1])
+        if (estimate.steepest_banks > top - _LIMIT_BAND[0]).sum() >= _LIMIT_BAND[1] and top > _MIN_TURN_BANK:
             values[name] = degrees(top) * unit
     cruise = CRUISE_OF[law]
     if cruise in absent:
-        values[cruise] = _cruise(learnt, now, seen, cruise)
-        values |= dict(zip(_RANGE[law], (share * values[cruise] for share in _NEAR), strict=False))
+        values[cruise] = _cruise_airspeed(estimate, context, replay, cruise)
+        values |= dict(zip(_SPEED_LIMITS[law], (ratio * values[cruise] for ratio in _SPEED_RANGE), strict=False))
     if law == "arduplane" and "WP_RADIUS" in absent:
-        learnt.switched.update(_switches(seen))
-        if learnt.switched:
-            values["WP_RADIUS"] = float(np.median(list(learnt.switched.values())))
+        estimate.switch_radii.update(_switch_radii(replay))
+        if estimate.switch_radii:
+            values["WP_RADIUS"] = float(np.median(list(estimate.switch_radii.values())))
     return {name: value for name, value in values.items() if name in absent}
 
 
-def _cruise(learnt: Learnt, now: Situation, seen: Heard, name: str) -> float:
+def _cruise_airspeed(estimate: AutopilotEstimate, context: PredictionContext, replay: ReplayWindow, name: str) -> float:
     """Return the set-point on a leg without commanded speed, else the identified or the flown airspeed [m/s]."""
-    at = np.flatnonzero(seen.legs[:, SEQ] == seen.seq[-1])
-    told = aimed_at(now.history, learnt.t)
-    if len(at) and seen.legs[at[0], VA_C] <= 0 and isfinite(told):
-        return told
-    flown = seen.Va[np.isfinite(seen.Va) & (seen.Va > 3.0)]
-    return learnt.values.get(name, float(np.median(flown)) if len(flown) else 15.0)
+    leg_rows = np.flatnonzero(replay.legs[:, SEQ] == replay.seq[-1])
+    setpoint = reported_setpoint(context.history, estimate.replay_t)
+    if len(leg_rows) and replay.legs[leg_rows[0], VA_C] <= 0 and isfinite(setpoint):
+        return setpoint
+    airspeeds = replay.Va[np.isfinite(replay.Va) & (replay.Va > 3.0)]
+    return estimate.values.get(name, float(np.median(airspeeds)) if len(airspeeds) else 15.0)
 
 
-def _switches(seen: Heard) -> dict[int, float]:
+def _switch_radii(replay: ReplayWindow) -> dict[int, float]:
     """Return the waypoint radius of each switch between two lines [m], by time: distance over turn fraction."""
-    found: dict[int, float] = {}
-    dt = float(seen.t[1] - seen.t[0])
-    for k in np.flatnonzero(np.diff(seen.seq)).tolist():
-        i = np.flatnonzero(seen.legs[:, SEQ] == seen.seq[k])
-        if not len(i) or not 0 < i[0] < len(seen.legs) - 1 or (seen.legs[i[0] - 1 : i[0] + 2, 0] != WAYPOINT).any():
+    radii: dict[int, float] = {}
+    dt = float(replay.t[1] - replay.t[0])
+    for k in np.flatnonzero(np.diff(replay.seq)).tolist():
+        i = np.flatnonzero(replay.legs[:, SEQ] == replay.seq[k])
+        if not len(i) or not 0 < i[0] < len(replay.legs) - 1 or (replay.legs[i[0] - 1 : i[0] + 2, 0] != WAYPOINT).any():
             continue
-        a, b, c = seen.legs[i[0] - 1 : i[0] + 2, P_N:P_D]
+        a, b, c = replay.legs[i[0] - 1 : i[0] + 2, P_N:P_D]
         turn = abs(wrap(atan2(c[1] - b[1], c[0] - b[0]) - atan2(b[1] - a[1], b[0] - a[0])))
-        late = min(int(0.5 / dt), k)  # mean delay of a report once a second
-        if turn > _SHARPEST:
-            away = float(np.hypot(*(seen.p[k - late, :2] - b)))
-            found[round(float(seen.good.t[0] + seen.t[k]))] = away / (min(turn, pi / 2) / (pi / 2))
-    return found
+        delay_rows = min(int(0.5 / dt), k)  # mean delay of a report once a second
+        if turn > _MIN_SWITCH_TURN:
+            distance = float(np.hypot(*(replay.p[k - delay_rows, :2] - b)))
+            radii[round(float(replay.window.t[0] + replay.t[k]))] = distance / (min(turn, pi / 2) / (pi / 2))
+    return radii
 
 
-def _replay(
-    learnt: Learnt, law: str, absent: tuple[str, ...], flown: tuple[Situation, Heard], values: dict[str, float]
+def _fit_turn_parameters(
+    estimate: AutopilotEstimate,
+    law: str,
+    absent: tuple[str, ...],
+    replay_data: tuple[PredictionContext, ReplayWindow],
+    values: dict[str, float],
 ) -> None:
     """Try the values of the turn parameters one after the other; set the best in `values`."""
-    for name, tried in _SHAPES[law].items():
+    for name, trials in _TURN_PARAMETERS[law].items():
         if name not in absent:
             continue
-        for value in tried:
-            rms = _rms(law, flown, {**values, name: value})
+        for value in trials:
+            rms = _bank_rms(law, replay_data, {**values, name: value})
             key = law, name, value
-            before = learnt.cost.get(key, rms)
-            learnt.cost[key] = before + _NEWS * (rms - before)
-        values[name] = _least([(value, learnt.cost[law, name, value]) for value in tried])
-    rms = _rms(law, flown, values)
-    before = learnt.miss.get(law, rms)
-    learnt.miss[law] = before + _NEWS * (rms - before)
+            previous = estimate.cost.get(key, rms)
+            estimate.cost[key] = previous + _SMOOTHING * (rms - previous)
+        values[name] = _parabola_minimum([(value, estimate.cost[law, name, value]) for value in trials])
+    rms = _bank_rms(law, replay_data, values)
+    previous = estimate.bank_error.get(law, rms)
+    estimate.bank_error[law] = previous + _SMOOTHING * (rms - previous)
 
 
-def _least(tried: list[tuple[float, float]]) -> float:
+def _parabola_minimum(costs: list[tuple[float, float]]) -> float:
     """Return the minimum of the parabola through the value of least cost and its neighbours."""
-    x, y = (np.array(column) for column in zip(*tried, strict=True))
+    x, y = (np.array(column) for column in zip(*costs, strict=True))
     k = int(np.argmin(y))
     if not 0 < k < len(x) - 1:
         return float(x[k])
@@ -180,25 +188,25 @@ def _least(tried: list[tuple[float, float]]) -> float:
     return float(x[k] + np.clip(-b / (2 * a), x[k - 1] - x[k], x[k + 1] - x[k])) if a > 0 else float(x[k])
 
 
-def _rms(law: str, flown: tuple[Situation, Heard], values: Mapping[str, float]) -> float:
+def _bank_rms(law: str, replay_data: tuple[PredictionContext, ReplayWindow], values: Mapping[str, float]) -> float:
     """Replay the flight; return the RMS error of the law to the commanded banks [rad]."""
-    now, seen = flown
-    control = on_wings(now.onboard.params, values, law=law)
-    par = laws.blown(control.par(seen.altitude_m), *known_wind(now, seen.good))
-    _, rms = shadow(par, seen.legs, seen.start, *seen.rows, seen.seq)  # type: ignore[call-arg]
+    context, replay = replay_data
+    controller = fixed_wing_controller(context.onboard.params, values, law=law)
+    par = laws.with_wind(controller.par(replay.altitude_m), *autopilot_wind(context, replay.window))
+    _, rms = replay_controller(par, replay.legs, replay.start_point, *replay.rows, replay.seq)  # type: ignore[call-arg]
     return float(rms) if isfinite(rms) else np.inf
 
 
-def _choose(learnt: Learnt, autopilot: str) -> None:
+def _select_law(estimate: AutopilotEstimate, autopilot: str) -> None:
     """Select the law with the smallest bank error if it is below the limit."""
-    if not learnt.miss:
-        learnt.said = f"autopilot {autopilot}: no commanded bank received in a turn yet, control law unknown"
+    if not estimate.bank_error:
+        estimate.reason = f"autopilot {autopilot}: no commanded bank received in a turn yet, control law unknown"
         return
-    law, miss = min(learnt.miss.items(), key=lambda one: one[1])
-    within = f"the commanded banks within {degrees(miss):.1f} deg"
-    if miss < _BELIEVED:
-        learnt.law = law
-        learnt.said = f"autopilot {autopilot}: control law {laws.LAWS[law].sentence} matches {within}"
+    law, error = min(estimate.bank_error.items(), key=lambda pair: pair[1])
+    within = f"the commanded banks within {degrees(error):.1f} deg"
+    if error < _MAX_BANK_ERROR:
+        estimate.law = law
+        estimate.reason = f"autopilot {autopilot}: control law {laws.LAWS[law].description} matches {within}"
     else:
-        learnt.law = ""
-        learnt.said = f"autopilot {autopilot}: no known control law matches {within}"
+        estimate.law = ""
+        estimate.reason = f"autopilot {autopilot}: no known control law matches {within}"

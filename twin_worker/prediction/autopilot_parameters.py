@@ -13,7 +13,7 @@ import numpy as np
 from fleet.autopilots import copter, laws
 from fleet.contract import Controller
 
-RECEIVED, IDENTIFIED, DEFAULT, ASKED = "received", "identified", "default", "asked"
+RECEIVED, IDENTIFIED, DEFAULT, OVERRIDDEN = "received", "identified", "default", "overridden"
 _ARDUPLANE = (
     "NAVL1_PERIOD", "NAVL1_DAMPING", "WP_RADIUS", "WP_LOITER_RAD", "ROLL_LIMIT_DEG", "AIRSPEED_CRUISE", "AIRSPEED_MIN",
     "AIRSPEED_MAX", "TECS_TIME_CONST", "TECS_CLMB_MAX", "TECS_SINK_MIN", "TECS_SINK_MAX", "TECS_HDEM_TCONST",
@@ -25,17 +25,17 @@ _PX4 = (
     "FW_T_SINK_R_SP", "FW_T_ALT_TC", "FW_T_TAS_TC", "FW_THR_TRIM", "FW_P_LIM_MAX", "FW_P_LIM_MIN",
 )  # fmt: skip
 _TEXTBOOK = ("chi_inf", "k_path", "k_orbit", "R_fillet", "R_orbit", "phi_max", "Va_c", "climb_max", "sink_max")
-TOLD_OF = {"arduplane": _ARDUPLANE, "px4": _PX4, "textbook": _TEXTBOOK}
+PUBLISHED_OF = {"arduplane": _ARDUPLANE, "px4": _PX4, "textbook": _TEXTBOOK}
 """Published parameters by law: those that shape the path."""
-TOLD_OF_GUIDANCE = (*_ARDUPLANE[:5], "AIRSPEED_CRUISE", "TECS_CLMB_MAX", "TECS_SINK_MAX")
-_CONTROLS = 1024  # cached fixed-wing controllers
-_Given = tuple[tuple[str, float], ...]
+PUBLISHED_OF_GUIDANCE = (*_ARDUPLANE[:5], "AIRSPEED_CRUISE", "TECS_CLMB_MAX", "TECS_SINK_MAX")
+_CACHE_SIZE = 1024  # cached fixed-wing controllers
+_Items = tuple[tuple[str, float], ...]
 CRUISE_OF = {"arduplane": "AIRSPEED_CRUISE", "px4": "FW_AIRSPD_TRIM", "textbook": "Va_c"}
 # parameters that a speed override replaces
-CRUISES = (*CRUISE_OF.values(), "WP_SPD", "MPC_XY_CRUISE", "Q_WP_SPD")
+SPEED_PARAMETERS = (*CRUISE_OF.values(), "WP_SPD", "MPC_XY_CRUISE", "Q_WP_SPD")
 
 
-def why_unusable(name: str, value: float) -> str:
+def range_error(name: str, value: float) -> str:
     """Describe why a value is outside the range of a parameter; empty for valid values and unknown parameters."""
     row = next((row for law in laws.LAWS.values() for row in law.table if row.name == name), None)
     if row is None or row.low <= value <= row.high:
@@ -44,7 +44,7 @@ def why_unusable(name: str, value: float) -> str:
 
 
 @dataclass(frozen=True)
-class Control:
+class ControllerTwin:
     """Control law and parameters of a controller twin.
 
     Attributes:
@@ -57,39 +57,39 @@ class Control:
 
     law: str
     values: Mapping[str, float] = field(default_factory=dict)
-    known: Mapping[str, str] = field(default_factory=dict)
-    told: tuple[str, ...] = ()
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    published_names: tuple[str, ...] = ()
     name: str = "arduplane"
 
     def par(self, altitude_m: float) -> np.ndarray:
         """Return the parameter vector of the law's kernels at a height above mean sea level [m]."""
-        return laws.vector(self.name, self._found, altitude_m)
+        return laws.vector(self.name, self._law_values, altitude_m)
 
     @cached_property
-    def _found(self) -> dict[str, float]:
+    def _law_values(self) -> dict[str, float]:
         """Return the values that the law reads, cached because every rollout needs them."""
         return laws.read(self.name, self.values)[0]
 
     @property
-    def absent(self) -> tuple[str, ...]:
+    def default_names(self) -> tuple[str, ...]:
         """Return the names of parameters at their defaults."""
-        return tuple(name for name, how in self.known.items() if how == DEFAULT)
+        return tuple(name for name, source in self.provenance.items() if source == DEFAULT)
 
-    def wire(self) -> Controller:
+    def to_message(self) -> Controller:
         """Return the bus message."""
-        parts: dict[str, dict[str, float]] = {RECEIVED: {}, IDENTIFIED: {}, DEFAULT: {}, ASKED: {}}
-        for name in self.told:
-            parts[self.known[name]][name] = round(float(self.values[name]), 4)
+        parts: dict[str, dict[str, float]] = {RECEIVED: {}, IDENTIFIED: {}, DEFAULT: {}, OVERRIDDEN: {}}
+        for name in self.published_names:
+            parts[self.provenance[name]][name] = round(float(self.values[name]), 4)
         return Controller(law=self.law, **parts)
 
 
-def on_wings(
+def fixed_wing_controller(
     received: Mapping[str, float],
     identified: Mapping[str, float] | None = None,
-    asked: Mapping[str, float] | None = None,
+    overrides: Mapping[str, float] | None = None,
     law: str = "arduplane",
     sentence: str = "",
-) -> Control:
+) -> ControllerTwin:
     """Return the controller twin of a fixed wing.
 
     Args:
@@ -99,27 +99,29 @@ def on_wings(
         law: name in `laws.LAWS`
         sentence: description as in `Prediction` if only the guidance of the law is used
     """
-    given = (tuple(each.items()) if each else () for each in (received, identified, asked))
-    return _on_wings(*given, law, sentence)
+    item_tuples = (tuple(mapping.items()) if mapping else () for mapping in (received, identified, overrides))
+    return _fixed_wing_controller(*item_tuples, law, sentence)
 
 
-@lru_cache(maxsize=_CONTROLS)
-def _on_wings(given: _Given, identified: _Given, wished: _Given, law: str, sentence: str) -> Control:
+@lru_cache(maxsize=_CACHE_SIZE)
+def _fixed_wing_controller(
+    received_items: _Items, identified: _Items, override_items: _Items, law: str, sentence: str
+) -> ControllerTwin:
     """Return the cached controller: reading parameters takes as long as simulating a minute."""
-    received, asked = dict(given), dict(wished)
-    _, missing = laws.read(law, {**received, **asked})
-    learnt = {name: value for name, value in identified if name in missing}
-    values, absent = laws.read(law, {**received, **learnt, **asked})
-    known = dict.fromkeys(values, RECEIVED)
-    known |= dict.fromkeys(learnt, IDENTIFIED) | dict.fromkeys(set(asked) & set(values), ASKED)
-    known |= dict.fromkeys(absent, DEFAULT)
-    told = TOLD_OF_GUIDANCE if sentence else TOLD_OF[law]
-    return Control(sentence or laws.LAWS[law].sentence, values, known, told, law)
+    received, overrides = dict(received_items), dict(override_items)
+    _, missing = laws.read(law, {**received, **overrides})
+    used = {name: value for name, value in identified if name in missing}
+    values, absent = laws.read(law, {**received, **used, **overrides})
+    provenance = dict.fromkeys(values, RECEIVED)
+    provenance |= dict.fromkeys(used, IDENTIFIED) | dict.fromkeys(set(overrides) & set(values), OVERRIDDEN)
+    provenance |= dict.fromkeys(absent, DEFAULT)
+    published = PUBLISHED_OF_GUIDANCE if sentence else PUBLISHED_OF[law]
+    return ControllerTwin(sentence or laws.LAWS[law].description, values, provenance, published, law)
 
 
-def on_rotors(
-    received: Mapping[str, float], prefix: str, limit: copter.Limits, asked: Mapping[str, float] | None = None
-) -> Control:
+def multirotor_controller(
+    received: Mapping[str, float], prefix: str, limit: copter.Limits, overrides: Mapping[str, float] | None = None
+) -> ControllerTwin:
     """Return the controller twin of a hovering aircraft.
 
     Args:
@@ -128,15 +130,15 @@ def on_rotors(
         limit: limits in use, SI; a limit that is neither received nor default is identified from flight
         overrides: parameters of a what-if query
     """
-    asked = asked or {}
-    given = {**received, **asked}
-    usual, absent = copter.limits(given, prefix)
-    values, known = {}, {}
+    overrides = overrides or {}
+    parameters = {**received, **overrides}
+    nominal, absent = copter.limits(parameters, prefix)
+    values, provenance = {}, {}
     for name, row in copter.TABLE.items():
-        names = [(prefix + known_as, unit) for known_as, unit in row.names]
-        called, factor = next((pair for pair in names if pair[0] in given), names[0])
-        values[called] = getattr(limit, name) / factor
-        seen = getattr(limit, name) != getattr(usual, name)
-        told = ASKED if called in asked else RECEIVED
-        known[called] = IDENTIFIED if seen else DEFAULT if name in absent else told
-    return Control(copter.LAW, values, known, tuple(values))
+        names = [(prefix + alias, unit) for alias, unit in row.names]
+        parameter, factor = next((pair for pair in names if pair[0] in parameters), names[0])
+        values[parameter] = getattr(limit, name) / factor
+        is_identified = getattr(limit, name) != getattr(nominal, name)
+        source = OVERRIDDEN if parameter in overrides else RECEIVED
+        provenance[parameter] = IDENTIFIED if is_identified else DEFAULT if name in absent else source
+    return ControllerTwin(copter.LAW, values, provenance, tuple(values))

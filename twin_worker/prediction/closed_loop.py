@@ -7,35 +7,34 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
-import numba as nb
 import numpy as np
 
 from fleet.autopilots import arduplane, laws
-from fleet.autopilots.shadow import shadow
+from fleet.autopilots.shadow import replay_controller
 from fleet.contract import Item
 from fleet.frames import Origin, wrap
-from fleet.mission import FIRST, KIND, LAND, P_D, P_N, READ, SPEED, TAKEOFF, Route, route
+from fleet.mission import FIRST_ITEM, KIND, LAND, P_D, P_N, ROUTE_PARAMS, SPEED, TAKEOFF, Route, unroll_route
 from fleet.physics.simulate import N_STATE, simulate
-from fleet.process.sanitise import below
+from fleet.process.sanitise import format_below
 from fleet.window import Window
-from twin_worker.estimation.airspeed_setpoint import aimed_at, as_told, held_to
+from twin_worker.estimation.airspeed_setpoint import apply_setpoint, inferred_setpoint, reported_setpoint
 from twin_worker.estimation.wind_filter import WindFilter
-from twin_worker.identification.fixed_wing.plant import Plant, acting, settled
-from twin_worker.numerics.interpolation import straight
-from twin_worker.prediction.autopilot_parameters import CRUISE_OF, Control, on_wings
-from twin_worker.prediction.route_override import Instead, gone_over
-from twin_worker.telemetry.history import History
+from twin_worker.identification.fixed_wing.plant import Plant, actuator_state, bias_corrected
+from twin_worker.numerics.interpolation import interpolate_rows, zero_order_hold
+from twin_worker.prediction.autopilot_parameters import CRUISE_OF, ControllerTwin, fixed_wing_controller
+from twin_worker.prediction.route_override import RouteOverride, transfer_controller
+from twin_worker.telemetry.history import TelemetryHistory
 
-LEAST_AHEAD_S = 60.0  # shortest valid rollout [s]
+MIN_ROLLOUT_S = 60.0  # shortest valid rollout [s]
 SHADOW_S = 60.0  # telemetry for the synchronisation of the controller twin [s]
-_WIND_S = 10.0  # maximum age of the autopilot's wind estimate [s]
+_WIND_MAX_AGE_S = 10.0  # maximum age of the autopilot's wind estimate [s]
 _SHADOW_STEP = 2  # window rows per shadow step
-_ROUTES = 1024  # cached routes: missions change rarely, and a route takes as long as a rollout
-_REFUSED = {TAKEOFF: "take-off", LAND: "landing"}
+_CACHE_SIZE = 1024  # cached routes: missions change rarely, and a route takes as long as a rollout
+_NOT_MODELLED = {TAKEOFF: "take-off", LAND: "landing"}
 
 
 @dataclass(frozen=True)
-class Flown:
+class Rollout:
     """Simulated flight ahead, or the reason why there is none.
 
     Attributes:
@@ -50,11 +49,11 @@ class Flown:
     seq: int
     sentence: str
     diverged: bool = False
-    law: Control | None = None
+    controller: ControllerTwin | None = None
 
 
 @dataclass(frozen=True)
-class Start:
+class InitialCondition:
     """Start of rollouts of any model.
 
     Attributes:
@@ -66,30 +65,30 @@ class Start:
         controller: the controller twin
     """
 
-    good: Window
-    control: tuple[np.ndarray, np.ndarray, np.ndarray]
+    window: Window
+    synchronised: tuple[np.ndarray, np.ndarray, np.ndarray]
     state: tuple[np.ndarray, np.ndarray, np.ndarray]
     seq: int
     sentence: str
-    law: Control
+    controller: ControllerTwin
 
 
 @dataclass(frozen=True)
-class Onboard:
+class AutopilotConfig:
     """Route and parameters of the autopilot."""
 
     items: tuple[Item, ...]
     params: Mapping[str, float]  # received
-    since: float  # when route, mode and parameters last changed [s since 1970]
+    changed_t: float  # when route, mode and parameters last changed [s since 1970]
     identified: Mapping[str, float] = field(default_factory=dict)  # from flight; used if not received
-    instead: Instead | None = None  # what-if query, from the start on
+    override: RouteOverride | None = None  # what-if query, from the start on
     autopilot: str = "ardupilot"  # reported type
     law: str = "arduplane"  # name in `laws.LAWS`; empty: unknown
-    why: str = ""  # how the law was selected, or why none is
+    law_reason: str = ""  # how the law was selected, or why none is
 
 
 @dataclass(frozen=True)
-class Heard:
+class ReplayWindow:
     """Telemetry on the present route for the replay of a control law.
 
     Attributes:
@@ -101,9 +100,9 @@ class Heard:
         sentence: problems of the route, or empty
     """
 
-    good: Window
+    window: Window
     legs: np.ndarray
-    start: np.ndarray
+    start_point: np.ndarray
     rows: tuple[np.ndarray, ...]
     seq: np.ndarray
     altitude_m: float
@@ -131,7 +130,7 @@ class Heard:
 
 
 @dataclass(frozen=True)
-class Situation:
+class PredictionContext:
     """Inputs of a prediction.
 
     Attributes:
@@ -143,39 +142,18 @@ class Situation:
     """
 
     window: Window
-    history: History
-    onboard: Onboard
-    wind: WindFilter
+    history: TelemetryHistory
+    onboard: AutopilotConfig
+    wind_filter: WindFilter
     origin: Origin
 
 
-def held(t: np.ndarray, x: np.ndarray, at: np.ndarray, longest: float) -> np.ndarray:
-    """Sample rows with zero-order hold, nan before the first and after `max_age` seconds, (len(query_t), k)."""
-    if not len(t):
-        return np.full((len(at), x.shape[1]), np.nan)
-    out = np.empty((len(at), x.shape[1]))
-    _hold(t, x, np.ascontiguousarray(at), longest, out)
-    return out
-
-
-@nb.njit(cache=True, nogil=True)
-def _hold(t: np.ndarray, x: np.ndarray, at: np.ndarray, longest: float, out: np.ndarray) -> None:
-    """Compute the last row before each of the rising times, nan if there is none or it is too old, (k, m)."""
-    k = -1
-    for i in range(len(at)):
-        while k + 1 < len(t) and t[k + 1] <= at[i]:
-            k += 1
-        known = k >= 0 and not at[i] - t[k] > longest
-        for j in range(x.shape[1]):
-            out[i, j] = x[k, j] if known else np.nan
-
-
-def _reported(history: History, name: str, at: np.ndarray, longest: float) -> np.ndarray:
+def _reported(history: TelemetryHistory, name: str, query_t: np.ndarray, max_age: float) -> np.ndarray:
     """Return the last reported row at each time, nan after `max_age` seconds, (len(query_t), k)."""
-    return held(*history.look(name, at[0] - longest - 1.0), at, longest)
+    return zero_order_hold(*history.rows_since(name, query_t[0] - max_age - 1.0), query_t, max_age)
 
 
-def fly_ahead(now: Situation, plant: Plant, ahead: np.ndarray) -> Flown:
+def fly_ahead(context: PredictionContext, plant: Plant, ahead: np.ndarray) -> Rollout:
     """Predict with the identified model and the controller twin in closed loop.
 
     Args:
@@ -183,131 +161,152 @@ def fly_ahead(now: Situation, plant: Plant, ahead: np.ndarray) -> Flown:
         plant: derivatives model, or longitudinal and lateral linear axes
         ahead: requested look-ahead times, rising, (k,) [s]
     """
-    start = set_out(now)
-    return start if isinstance(start, Flown) else fly_from(start, plant, ahead)
+    initial = synchronise_controller(context)
+    return initial if isinstance(initial, Rollout) else fly_from(initial, plant, ahead)
 
 
-def heard(now: Situation) -> Heard | Flown:
+def replay_inputs(context: PredictionContext) -> ReplayWindow | Rollout:
     """Return the replay data of the present route, or the reason why there are none."""
-    good = _on_this_route(now.window, now.onboard.since)
-    if len(good) < 5.0 / good.dt:
-        return Flown(None, -1, f"{below(good.seconds, 5.0)} s on this route, 5 s are needed; wait")
-    every = slice((len(good) - 1) % _SHADOW_STEP, None, _SHADOW_STEP)
-    at = good.t[every]
-    seq = _reported(now.history, "leg", at, 15.0)[:, 0]
+    window = _window_on_route(context.window, context.onboard.changed_t)
+    if len(window) < 5.0 / window.dt:
+        return Rollout(None, -1, f"{format_below(window.seconds, 5.0)} s on this route, 5 s are needed; wait")
+    stride = slice((len(window) - 1) % _SHADOW_STEP, None, _SHADOW_STEP)
+    times = window.t[stride]
+    seq = _reported(context.history, "leg", times, 15.0)[:, 0]
     if not np.isfinite(seq[-1]):
-        return Flown(None, -1, "the current mission item is not reported (MISSION_CURRENT)")
+        return Rollout(None, -1, "the current mission item is not reported (MISSION_CURRENT)")
     seq = np.where(np.isfinite(seq), seq, seq[np.isfinite(seq)][0]).astype(np.int64)
-    board = now.onboard
-    first = FIRST.get(board.autopilot, 1)
-    way = unrolled(board.items, int(seq[0]), now.origin, board.params, first)
-    said = way.said
-    if not len(way.legs):
-        return Flown(None, int(seq[-1]), said or "the mission has no legs to fly")
-    start = way.start if np.isfinite(way.start).all() else good.p[0]
-    altitude = now.origin.alt_mm * 1e-3 - float(good.p[-1, 2])
-    return Heard(good, way.legs, start, _telemetry(good, every, now.history), seq, altitude, said)
+    onboard = context.onboard
+    first = FIRST_ITEM.get(onboard.autopilot, 1)
+    mission_route = cached_route(onboard.items, int(seq[0]), context.origin, onboard.params, first)
+    problem = mission_route.summary
+    if not len(mission_route.legs):
+        return Rollout(None, int(seq[-1]), problem or "the mission has no legs to fly")
+    start_point = mission_route.start if np.isfinite(mission_route.start).all() else window.p[0]
+    altitude = context.origin.alt_mm * 1e-3 - float(window.p[-1, 2])
+    return ReplayWindow(
+        window, mission_route.legs, start_point, _replay_rows(window, stride, context.history), seq, altitude, problem
+    )
 
 
-def unrolled(items: tuple[Item, ...], seq: int, origin: Origin, params: Mapping[str, float], first: int) -> Route:
+def cached_route(items: tuple[Item, ...], seq: int, origin: Origin, params: Mapping[str, float], first: int) -> Route:
     """Return the cached, read-only result of `fleet.mission.route`: legs from item `seq` on."""
-    return _unrolled(items, seq, origin, tuple((name, params[name]) for name in READ if name in params), first)
+    return _cached_route(
+        items, seq, origin, tuple((name, params[name]) for name in ROUTE_PARAMS if name in params), first
+    )
 
 
-@lru_cache(maxsize=_ROUTES)
-def _unrolled(
+@lru_cache(maxsize=_CACHE_SIZE)
+def _cached_route(
     items: tuple[Item, ...], seq: int, origin: Origin, params: tuple[tuple[str, float], ...], first: int
 ) -> Route:
-    return route(items, seq=seq, origin=origin, params=dict(params), first=first)
+    return unroll_route(items, seq=seq, origin=origin, params=dict(params), first=first)
 
 
-def known_wind(now: Situation, good: Window) -> tuple[float, float]:
+def autopilot_wind(context: PredictionContext, window: Window) -> tuple[float, float]:
     """Return the wind estimate of the autopilot if reported, else of the twin, NED [m/s]."""
-    reported = _reported(now.history, "wind", good.t[-1:], _WIND_S)[0]
-    w_n, w_e = reported if np.isfinite(reported).all() else now.wind.wind[:2]
+    reported = _reported(context.history, "wind", window.t[-1:], _WIND_MAX_AGE_S)[0]
+    w_n, w_e = reported if np.isfinite(reported).all() else context.wind_filter.wind[:2]
     return float(w_n), float(w_e)
 
 
-def set_out(now: Situation) -> Start | Flown:
+def synchronise_controller(context: PredictionContext) -> InitialCondition | Rollout:
     """Synchronise the controller twin with telemetry; return the start of rollouts, or why there is none."""
-    seen, board = heard(now), now.onboard
-    if isinstance(seen, Flown):
-        return seen
-    seq = int(seen.seq[-1])
-    if not board.law:
-        return Flown(None, seq, board.why or "the control law is not known yet")
-    law = on_wings(board.params, board.identified, law=board.law)
-    par = laws.blown(law.par(seen.altitude_m), *known_wind(now, seen.good))
-    told = _aimed(now, float(seen.good.t[-1]), float(law.values[CRUISE_OF[board.law]]))
-    legs = as_told(seen.legs, float(seq), float(law.values[CRUISE_OF[board.law]]), told)
-    ctl, _ = shadow(par, legs, seen.start, *seen.rows, seen.seq)  # type: ignore[call-arg]
-    said = " ".join(filter(None, (board.why, seen.sentence)))
-    begun = Start(seen.good, (ctl, par, legs), _start(now, seen.good), seq, said, law)
-    if board.instead is not None:
-        begun = _otherwise(now, begun, board.instead, told)
-    return _refused(begun) or replace(begun, sentence=" ".join(filter(None, (begun.sentence, _assumed(begun.law)))))
+    replay, onboard = replay_inputs(context), context.onboard
+    if isinstance(replay, Rollout):
+        return replay
+    seq = int(replay.seq[-1])
+    if not onboard.law:
+        return Rollout(None, seq, onboard.law_reason or "the control law is not known yet")
+    controller = fixed_wing_controller(onboard.params, onboard.identified, law=onboard.law)
+    par = laws.with_wind(controller.par(replay.altitude_m), *autopilot_wind(context, replay.window))
+    setpoint = _airspeed_setpoint(context, float(replay.window.t[-1]), float(controller.values[CRUISE_OF[onboard.law]]))
+    legs = apply_setpoint(replay.legs, float(seq), float(controller.values[CRUISE_OF[onboard.law]]), setpoint)
+    ctl, _ = replay_controller(par, legs, replay.start_point, *replay.rows, replay.seq)  # type: ignore[call-arg]
+    sentence = " ".join(filter(None, (onboard.law_reason, replay.sentence)))
+    initial = InitialCondition(
+        replay.window, (ctl, par, legs), _simulation_state(context, replay.window), seq, sentence, controller
+    )
+    if onboard.override is not None:
+        initial = _apply_override(context, initial, onboard.override, setpoint)
+    return _not_modelled(initial) or replace(
+        initial, sentence=" ".join(filter(None, (initial.sentence, _default_warning(initial.controller))))
+    )
 
 
-def _aimed(now: Situation, t: float, cruise: float) -> float:
+def _airspeed_setpoint(context: PredictionContext, t: float, cruise: float) -> float:
     """Return the airspeed set-point: reported, else the flown one of the mission speeds; nan if unknown [m/s]."""
-    told = aimed_at(now.history, t)
-    if np.isfinite(told):
-        return told
-    named = {item.param2 for item in now.onboard.items if item.command == SPEED and 0 < item.param2 < np.inf}
-    return held_to(now.history, t, np.array(sorted(named | {cruise}))) if named else told
+    setpoint = reported_setpoint(context.history, t)
+    if np.isfinite(setpoint):
+        return setpoint
+    mission_speeds = {
+        item.param2 for item in context.onboard.items if item.command == SPEED and 0 < item.param2 < np.inf
+    }
+    return (
+        inferred_setpoint(context.history, t, np.array(sorted(mission_speeds | {cruise})))
+        if mission_speeds
+        else setpoint
+    )
 
 
-def _altitude(now: Situation, good: Window) -> float:
-    return now.origin.alt_mm * 1e-3 - float(good.p[-1, 2])
+def _altitude(context: PredictionContext, window: Window) -> float:
+    return context.origin.alt_mm * 1e-3 - float(window.p[-1, 2])
 
 
-def _otherwise(now: Situation, begun: Start, instead: Instead, told: float) -> Start:
+def _apply_override(
+    context: PredictionContext, initial: InitialCondition, override: RouteOverride, setpoint: float
+) -> InitialCondition:
     """Transfer the synchronised controller to a what-if query; `setpoint`: airspeed set-point so far [m/s]."""
-    name = now.onboard.law
-    law, cruise = on_wings(now.onboard.params, now.onboard.identified, instead.asked, name), CRUISE_OF[name]
-    way = instead.way(now.origin, now.onboard.params)
-    par = laws.blown(law.par(_altitude(now, begun.good)), *known_wind(now, begun.good))
-    legs, (ctl, _, before) = way.legs, begun.control
+    law_name = context.onboard.law
+    controller, cruise = (
+        fixed_wing_controller(context.onboard.params, context.onboard.identified, override.parameters, law_name),
+        CRUISE_OF[law_name],
+    )
+    new_route = override.to_route(context.origin, context.onboard.params)
+    par = laws.with_wind(controller.par(_altitude(context, initial.window)), *autopilot_wind(context, initial.window))
+    legs, (ctl, _, old_legs) = new_route.legs, initial.synchronised
     if len(legs):
-        aimed = np.nan if cruise in instead.asked else told
-        legs = as_told(legs, float(instead.seq), float(law.values[cruise]), aimed)
-        ctl = gone_over(ctl, before, par, legs, (instead.anew, begun.good.p[-1]))
-    state = begun.state[0].copy()
-    state[3:6] = instead.at_speed(state[3:6])
-    said = way.said
-    begun = replace(begun, state=(state, *begun.state[1:]), control=(ctl, par, legs))
-    return replace(begun, seq=instead.seq, sentence=said, law=law)
+        new_setpoint = np.nan if cruise in override.parameters else setpoint
+        legs = apply_setpoint(legs, float(override.seq), float(controller.values[cruise]), new_setpoint)
+        ctl = transfer_controller(ctl, old_legs, par, legs, (override.restart_leg, initial.window.p[-1]))
+    state = initial.state[0].copy()
+    state[3:6] = override.scale_to_speed(state[3:6])
+    sentence = new_route.summary
+    initial = replace(initial, state=(state, *initial.state[1:]), synchronised=(ctl, par, legs))
+    return replace(initial, seq=override.seq, sentence=sentence, controller=controller)
 
 
-def _refused(begun: Start) -> Flown | None:
+def _not_modelled(initial: InitialCondition) -> Rollout | None:
     """Return the reason why the current leg is not modelled; None if it is."""
-    ctl, _, legs = begun.control
+    ctl, _, legs = initial.synchronised
     if not len(legs):
-        return Flown(None, begun.seq, begun.sentence or "the mission has no legs to fly")
+        return Rollout(None, initial.seq, initial.sentence or "the mission has no legs to fly")
     kind = int(legs[int(ctl[arduplane.LEG]), KIND])
-    if kind not in _REFUSED:
+    if kind not in _NOT_MODELLED:
         return None
-    return Flown(None, begun.seq, f"{_REFUSED[kind]} is not modelled: no route-aware prediction")
+    return Rollout(None, initial.seq, f"{_NOT_MODELLED[kind]} is not modelled: no route-aware prediction")
 
 
-def _assumed(law: Control) -> str:
+def _default_warning(controller: ControllerTwin) -> str:
     """Describe the parameters that are assumed at their defaults; empty if there are none."""
-    absent = law.absent
-    few = f"({', '.join(absent[:3])} …)"
-    return f"{len(absent)} autopilot parameters not received, defaults assumed {few}" if absent else ""
+    absent = controller.default_names
+    examples = f"({', '.join(absent[:3])} …)"
+    return f"{len(absent)} autopilot parameters not received, defaults assumed {examples}" if absent else ""
 
 
-def fly_from(start: Start, plant: Plant, ahead: np.ndarray) -> Flown:
+def fly_from(initial: InitialCondition, plant: Plant, ahead: np.ndarray) -> Rollout:
     """Simulate one model from the start; arguments as for `fly_ahead`. The path is nan beyond the envelope."""
-    ctl, par, legs = start.control
-    dt = start.good.dt
+    ctl, par, legs = initial.synchronised
+    dt = initial.window.dt
     out = np.empty((int(ahead[-1] / dt) + 2, N_STATE))
     ctl = ctl.copy()
-    done = simulate(ctl, par, legs, settled(plant, start.good), *start.state, dt, out)
-    return at_times(out[:done, :3], dt, start, ctl, ahead)
+    n_rows = simulate(ctl, par, legs, bias_corrected(plant, initial.window), *initial.state, dt, out)
+    return sample_rollout(out[:n_rows, :3], dt, initial, ctl, ahead)
 
 
-def at_times(p: np.ndarray, step: float, start: Start, ctl: np.ndarray, ahead: np.ndarray) -> Flown:
+def sample_rollout(
+    p: np.ndarray, step: float, initial: InitialCondition, ctl: np.ndarray, ahead: np.ndarray
+) -> Rollout:
     """Sample a rollout at the look-ahead times: nan beyond its end, constant position after touchdown.
 
     Args:
@@ -316,59 +315,69 @@ def at_times(p: np.ndarray, step: float, start: Start, ctl: np.ndarray, ahead: n
         ctl: final controller state
         ahead: requested look-ahead times, rising, (k,) [s]
     """
-    landed = _stay_down(p, ctl, start.control[2])
-    if not landed and len(p) <= min(ahead[-1], ahead[0] + LEAST_AHEAD_S) / step:
-        return Flown(None, start.seq, f"the twin leaves its envelope {len(p) * step:.0f} s ahead", True)
-    t, beyond = step * np.arange(len(p)), None if landed else np.nan
-    path = straight(ahead, t, p, beyond)
-    return Flown(path, start.seq, start.sentence, law=start.law)
+    landed = _hold_after_touchdown(p, ctl, initial.synchronised[2])
+    if not landed and len(p) <= min(ahead[-1], ahead[0] + MIN_ROLLOUT_S) / step:
+        return Rollout(None, initial.seq, f"the twin leaves its envelope {len(p) * step:.0f} s ahead", True)
+    t, after_end = step * np.arange(len(p)), None if landed else np.nan
+    path = interpolate_rows(ahead, t, p, after_end)
+    return Rollout(path, initial.seq, initial.sentence, controller=initial.controller)
 
 
-def _stay_down(p: np.ndarray, ctl: np.ndarray, legs: np.ndarray) -> bool:
+def _hold_after_touchdown(p: np.ndarray, ctl: np.ndarray, legs: np.ndarray) -> bool:
     """Fix positions, NED (n, 3) [m], after touchdown at the end of the route; return whether it is reached."""
-    at = int(ctl[arduplane.LEG])
-    if not len(p) or int(legs[at, KIND]) != LAND:
+    leg = int(ctl[arduplane.LEG])
+    if not len(p) or int(legs[leg, KIND]) != LAND:
         return False
-    begin = ctl[arduplane.FROM][:2]
-    line = legs[at, P_N:P_D] - begin
-    short = np.flatnonzero((p[:, :2] - begin) @ line < line @ line)
-    down = int(short[-1]) + 1 if len(short) else 0
-    p[down:] = p[min(down, len(p) - 1)]
-    return down < len(p)
+    leg_start = ctl[arduplane.FROM][:2]
+    line = legs[leg, P_N:P_D] - leg_start
+    before_end = np.flatnonzero((p[:, :2] - leg_start) @ line < line @ line)
+    touchdown_row = int(before_end[-1]) + 1 if len(before_end) else 0
+    p[touchdown_row:] = p[min(touchdown_row, len(p) - 1)]
+    return touchdown_row < len(p)
 
 
-def _on_this_route(window: Window, since: float) -> Window:
+def _window_on_route(window: Window, changed_t: float) -> Window:
     """Return the gap-free flight on the present route, at most `SHADOW_S`."""
-    start = max(int(np.searchsorted(window.t, since)), len(window) - int(SHADOW_S / window.dt))
-    bad = np.flatnonzero(~window.ok)
-    start = max(start, int(bad[-1]) + 1 if len(bad) else 0)
+    start = max(int(np.searchsorted(window.t, changed_t)), len(window) - int(SHADOW_S / window.dt))
+    invalid_rows = np.flatnonzero(~window.ok)
+    start = max(start, int(invalid_rows[-1]) + 1 if len(invalid_rows) else 0)
     return window.part(min(start, len(window) - 2), len(window))
 
 
-def _telemetry(good: Window, every: slice, history: History) -> tuple[np.ndarray, ...]:
+def _replay_rows(window: Window, stride: slice, history: TelemetryHistory) -> tuple[np.ndarray, ...]:
     """Return the synchronisation data at some rows: t p v euler rates Va phi_c theta_c delta."""
-    at = good.t[every]
-    command, Va = _reported(history, "command", at, 1.0), _reported(history, "air", at, 1.0)[:, 0]
-    euler, rates = good.x[every, 6:9].copy(), good.x[every, 3:6]
+    times = window.t[stride]
+    command, Va = _reported(history, "command", times, 1.0), _reported(history, "air", times, 1.0)[:, 0]
+    euler, rates = window.x[stride, 6:9].copy(), window.x[stride, 3:6]
     euler[:, 2] = wrap(euler[:, 2])
-    rows = (at - at[0], good.p[every], good.v[every], euler, rates, Va, command[:, 0], command[:, 1], good.u[every])
+    rows = (
+        times - times[0],
+        window.p[stride],
+        window.v[stride],
+        euler,
+        rates,
+        Va,
+        command[:, 0],
+        command[:, 1],
+        window.u[stride],
+    )
     return tuple(np.ascontiguousarray(row) for row in rows)
 
 
-def _start(now: Situation, good: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _simulation_state(context: PredictionContext, window: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return state (12,), current commands and inputs (6,) and air (4,) at the end of the window."""
-    state = np.concatenate([good.p[-1], good.x[-3:, :6].mean(axis=0), good.x[-1, 6:]])
-    command = _reported(now.history, "command", good.t[-1:], 1.0)[0, :2]
-    command = np.where(np.isfinite(command), command, good.x[-1, 6:8])
-    command = np.concatenate([command, acting(good)])
-    return state, command, np.array([*now.wind.wind[:2], now.wind.scale, _gust(now, good)])
+    state = np.concatenate([window.p[-1], window.x[-3:, :6].mean(axis=0), window.x[-1, 6:]])
+    command = _reported(context.history, "command", window.t[-1:], 1.0)[0, :2]
+    command = np.where(np.isfinite(command), command, window.x[-1, 6:8])
+    command = np.concatenate([command, actuator_state(window)])
+    return state, command, np.array([*context.wind_filter.wind[:2], context.wind_filter.scale, _gust(context, window)])
 
 
-def _gust(now: Situation, good: Window) -> float:
+def _gust(context: PredictionContext, window: Window) -> float:
     """Return the airspeed minus the airspeed by mean wind [m/s]; 0 without an airspeed sensor."""
-    t, air = now.history.look("air", good.t[-1] - 1.0)
-    recent = air[t <= good.t[-1], 0]
+    t, air = context.history.rows_since("air", window.t[-1] - 1.0)
+    recent = air[t <= window.t[-1], 0]
     if not len(recent) or recent.min() < 3.0:
         return 0.0
-    n = int(1.0 / good.dt)
-    return float(recent.mean() * now.wind.scale - np.linalg.norm(good.x[-n:, :3], axis=1).mean())
+    n = int(1.0 / window.dt)
+    return float(recent.mean() * context.wind_filter.scale - np.linalg.norm(window.x[-n:, :3], axis=1).mean())

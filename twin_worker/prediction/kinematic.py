@@ -12,36 +12,36 @@ import numpy as np
 from fleet.autopilots import arduplane
 from fleet.autopilots import greybox as law
 from fleet.autopilots.arduplane import params as P
-from fleet.autopilots.shadow import shadow
+from fleet.autopilots.shadow import replay_controller
 from fleet.contract import Item
 from fleet.frames import G, Origin
 from fleet.mission import KIND, TAKEOFF, VA_C, Route
-from fleet.process.sanitise import below
-from twin_worker.numerics.interpolation import straight
-from twin_worker.prediction.autopilot_parameters import CRUISE_OF, Control, on_wings
-from twin_worker.prediction.closed_loop import unrolled
-from twin_worker.prediction.route_override import Instead, gone_over
+from fleet.process.sanitise import format_below
+from twin_worker.numerics.interpolation import interpolate_rows
+from twin_worker.prediction.autopilot_parameters import CRUISE_OF, ControllerTwin, fixed_wing_controller
+from twin_worker.prediction.closed_loop import cached_route
+from twin_worker.prediction.route_override import RouteOverride, transfer_controller
 from twin_worker.telemetry.track import STEP, Track
 
-LEAST_S = 5.0  # minimum track on this route [s]
+MIN_TRACK_S = 5.0  # minimum track on this route [s]
 _SYNC_S = 60.0  # flight for the synchronisation of the guidance [s]
-_BACK_S, _EVERY_S, _OVER_S = 80.0, 8.0, 20.0  # compared flight, interval of starts, length of a rollout [s]
-_PERIODS = (9.0, 12.0, 16.0, 20.0, 26.0)  # NAVL1_PERIOD tried if not received [s]
-_LAGS = (0.4, 0.8, 1.4)  # tried bank lags [s]
+_COMPARE_S, _START_INTERVAL_S, _RUN_S = 80.0, 8.0, 20.0  # compared flight, interval of starts, length of a rollout [s]
+_PERIOD_VALUES = (9.0, 12.0, 16.0, 20.0, 26.0)  # NAVL1_PERIOD tried if not received [s]
+_LAG_VALUES = (0.4, 0.8, 1.4)  # tried bank lags [s]
 _SPEED_S = 20.0  # window of the mean airspeed [s]
-_SLOWEST = 5.0  # minimum airspeed of fixed-wing flight [m/s]
+_MIN_AIRSPEED = 5.0  # minimum airspeed of fixed-wing flight [m/s]
 CRUISE = CRUISE_OF["arduplane"]
-_RIDGE = 5.0  # prior standard deviation of the wind [m/s]
+_WIND_PRIOR = 5.0  # prior standard deviation of the wind [m/s]
 
 
 @dataclass(frozen=True)
-class Grey:
+class KinematicModel:
     """Identified guidance period [s], bank lag [s], mean error over 20 s [m] and its number of starts."""
 
     period: float = 0.0  # 0: from the parameters
     tau_phi: float = 0.8
-    miss: float = float("nan")
-    starts: int = 0
+    mean_error: float = float("nan")
+    n_starts: int = 0
 
     @property
     def identified(self) -> dict[str, float]:
@@ -50,29 +50,29 @@ class Grey:
 
 
 @dataclass(frozen=True)
-class Board:
+class KinematicConfig:
     """Route and parameters of the autopilot, and wind."""
 
     items: tuple[Item, ...]
     params: dict[str, float]
-    since: float
+    changed_t: float
     origin: Origin
     wind: np.ndarray | None  # NED, (3,) [m/s]; None: no airspeed received
-    instead: Instead | None = None  # what-if query, from the start on
-    first: int = 1  # number of the first mission item to fly
+    override: RouteOverride | None = None  # what-if query, from the start on
+    first_item: int = 1  # number of the first mission item to fly
 
 
 @dataclass(frozen=True)
-class Ahead:
+class KinematicRollout:
     """Rollout, or the reason why there is none."""
 
     path: np.ndarray | None
     seq: int
     sentence: str
-    law: Control | None = None
+    controller: ControllerTwin | None = None
 
 
-def air_of(track: Track, wind: np.ndarray | None) -> tuple[np.ndarray, float]:
+def wind_and_airspeed(track: Track, wind: np.ndarray | None) -> tuple[np.ndarray, float]:
     """Return wind (2,) and mean true airspeed [m/s].
 
     Without a wind, |v - w|^2 = V^2 is linear in w and V^2 - w^2: |v|^2 = 2 v.w + (V^2 - |w|^2).
@@ -82,16 +82,18 @@ def air_of(track: Track, wind: np.ndarray | None) -> tuple[np.ndarray, float]:
         w = np.asarray(wind[:2], float)
     else:
         A = np.column_stack([2 * v, np.ones(len(v))])
-        spread = 2.0 * max(float(np.mean(np.hypot(*v.T))), 5.0)  # a gust of 1 m/s in |v|^2
-        ridge = np.diag([(spread / _RIDGE) ** 2, (spread / _RIDGE) ** 2, 1e-9])
-        middle = np.array([0.0, 0.0, np.mean(np.sum(v * v, axis=1))])
-        w = np.linalg.solve(A.T @ A + ridge, A.T @ (np.sum(v * v, axis=1)) + ridge @ middle)[:2]
+        noise = 2.0 * max(float(np.mean(np.hypot(*v.T))), 5.0)  # a gust of 1 m/s in |v|^2
+        penalty = np.diag([(noise / _WIND_PRIOR) ** 2, (noise / _WIND_PRIOR) ** 2, 1e-9])
+        prior_mean = np.array([0.0, 0.0, np.mean(np.sum(v * v, axis=1))])
+        w = np.linalg.solve(A.T @ A + penalty, A.T @ (np.sum(v * v, axis=1)) + penalty @ prior_mean)[:2]
         w = w * min(1.0, 15.0 / max(float(np.hypot(*w)), 1e-6))
     recent = track.v[track.ok][-int(_SPEED_S / STEP) :]
     return w, float(np.mean(np.linalg.norm(recent - [*w, 0.0], axis=1)))
 
 
-def fly(track: Track, seq: np.ndarray, board: Board, grey: Grey, ahead: np.ndarray) -> Ahead:
+def fly(
+    track: Track, seq: np.ndarray, config: KinematicConfig, model: KinematicModel, ahead: np.ndarray
+) -> KinematicRollout:
     """Predict the flight along the route from the end of the track.
 
     Args:
@@ -100,154 +102,177 @@ def fly(track: Track, seq: np.ndarray, board: Board, grey: Grey, ahead: np.ndarr
         config, model: configuration of the autopilot, and the identified model
         ahead: requested look-ahead times, (k,) [s]
     """
-    first = max(int(np.searchsorted(track.t, board.since)), len(track) - int(_SYNC_S / STEP))
-    bad = np.flatnonzero(~track.ok | ~np.isfinite(seq))
-    first = max(first, int(bad[-1]) + 1 if len(bad) else 0)
-    if len(track) - first < LEAST_S / STEP:
+    first = max(int(np.searchsorted(track.t, config.changed_t)), len(track) - int(_SYNC_S / STEP))
+    invalid_rows = np.flatnonzero(~track.ok | ~np.isfinite(seq))
+    first = max(first, int(invalid_rows[-1]) + 1 if len(invalid_rows) else 0)
+    if len(track) - first < MIN_TRACK_S / STEP:
         reported = len(track) and np.isfinite(seq[-1])
-        why = f"{below(max(len(track) - first, 0) * STEP, LEAST_S)} s on this route, {LEAST_S:.0f} s are needed; wait"
-        return Ahead(None, -1, why if reported else "the current mission item is not reported (MISSION_CURRENT)")
-    seen = track.part(first, len(track))
-    return _fly(seen, seq[first:].astype(np.int64), board, grey, ahead)
+        reason = (
+            f"{format_below(max(len(track) - first, 0) * STEP, MIN_TRACK_S)} s on this route, {MIN_TRACK_S:.0f} s "
+            "are needed; wait"
+        )
+        return KinematicRollout(
+            None, -1, reason if reported else "the current mission item is not reported (MISSION_CURRENT)"
+        )
+    recent = track.part(first, len(track))
+    return _fly_route(recent, seq[first:].astype(np.int64), config, model, ahead)
 
 
-def _fly(seen: Track, seq: np.ndarray, board: Board, grey: Grey, ahead: np.ndarray) -> Ahead:
-    law_now = on_wings(board.params, grey.identified, sentence=law.LAW)
-    par = law_now.par(_altitude(seen, board))
-    way = unrolled(board.items, int(seq[0]), board.origin, board.params, board.first)
-    if not len(way.legs):
-        return Ahead(None, int(seq[-1]), way.said or "the mission has no legs to fly")
-    w, V = air_of(seen, board.wind)
-    if V < _SLOWEST or np.linalg.norm(seen.v[-1] - [*w, 0.0]) < _SLOWEST:
-        return Ahead(None, int(seq[-1]), "too slow to fly on wings")
-    start = way.start if np.isfinite(way.start).all() else seen.p[0]
-    ctl = _synchronised(seen, seq, (par, way.legs, start), w)
-    lags = _lags(seen, way.legs[int(ctl[arduplane.LEG])], par, law_now.absent, (grey, V))
-    flown = _Course(ctl, par, way, lags, law_now)
-    if board.instead is not None:
-        flown = _otherwise(flown, seen, board, grey, board.instead)
-    if not len(flown.way.legs):
-        return Ahead(None, int(seq[-1]), flown.way.said or "the mission has no legs to fly")
-    if int(flown.way.legs[int(flown.ctl[arduplane.LEG]), KIND]) == TAKEOFF:
-        return Ahead(None, int(seq[-1]), "take-off is not modelled: no route-aware prediction")
-    state, out = _state(seen, w), np.empty((int(ahead[-1] / STEP) + 2, 3))
-    if board.instead is not None and board.instead.speed is not None:
-        state[3] = board.instead.speed
-    law.follow(flown.ctl, flown.par, flown.way.legs, flown.lags, state, w, STEP, out)
-    path = straight(ahead, STEP * np.arange(len(out)), out)
-    seq_now = int(seq[-1]) if board.instead is None else board.instead.seq
-    return Ahead(path, seq_now, flown.way.said, flown.law)
+def _fly_route(
+    recent: Track, seq: np.ndarray, config: KinematicConfig, model: KinematicModel, ahead: np.ndarray
+) -> KinematicRollout:
+    controller = fixed_wing_controller(config.params, model.identified, sentence=law.LAW)
+    par = controller.par(_altitude(recent, config))
+    mission_route = cached_route(config.items, int(seq[0]), config.origin, config.params, config.first_item)
+    if not len(mission_route.legs):
+        return KinematicRollout(None, int(seq[-1]), mission_route.summary or "the mission has no legs to fly")
+    w, V = wind_and_airspeed(recent, config.wind)
+    if V < _MIN_AIRSPEED or np.linalg.norm(recent.v[-1] - [*w, 0.0]) < _MIN_AIRSPEED:
+        return KinematicRollout(None, int(seq[-1]), "too slow to fly on wings")
+    start_point = mission_route.start if np.isfinite(mission_route.start).all() else recent.p[0]
+    ctl = _synchronise(recent, seq, (par, mission_route.legs, start_point), w)
+    lags = _lag_parameters(
+        recent, mission_route.legs[int(ctl[arduplane.LEG])], par, controller.default_names, (model, V)
+    )
+    guidance = _RouteGuidance(ctl, par, mission_route, lags, controller)
+    if config.override is not None:
+        guidance = _apply_override(guidance, recent, config, model, config.override)
+    if not len(guidance.route.legs):
+        return KinematicRollout(None, int(seq[-1]), guidance.route.summary or "the mission has no legs to fly")
+    if int(guidance.route.legs[int(guidance.ctl[arduplane.LEG]), KIND]) == TAKEOFF:
+        return KinematicRollout(None, int(seq[-1]), "take-off is not modelled: no route-aware prediction")
+    state, out = _state(recent, w), np.empty((int(ahead[-1] / STEP) + 2, 3))
+    if config.override is not None and config.override.speed is not None:
+        state[3] = config.override.speed
+    law.follow(guidance.ctl, guidance.par, guidance.route.legs, guidance.lags, state, w, STEP, out)
+    path = interpolate_rows(ahead, STEP * np.arange(len(out)), out)
+    start_seq = int(seq[-1]) if config.override is None else config.override.seq
+    return KinematicRollout(path, start_seq, guidance.route.summary, guidance.controller)
 
 
 @dataclass(frozen=True)
-class _Course:
+class _RouteGuidance:
     """State and parameters of the guidance, route, lags and controller."""
 
     ctl: np.ndarray
     par: np.ndarray
-    way: Route
+    route: Route
     lags: np.ndarray
-    law: Control
+    controller: ControllerTwin
 
 
-def _altitude(seen: Track, board: Board) -> float:
-    return board.origin.alt_mm * 1e-3 - float(seen.p[-1, 2])
+def _altitude(recent: Track, config: KinematicConfig) -> float:
+    return config.origin.alt_mm * 1e-3 - float(recent.p[-1, 2])
 
 
-def _otherwise(now: _Course, seen: Track, board: Board, grey: Grey, instead: Instead) -> _Course:
+def _apply_override(
+    guidance: _RouteGuidance, recent: Track, config: KinematicConfig, model: KinematicModel, override: RouteOverride
+) -> _RouteGuidance:
     """Transfer the synchronised guidance to a what-if query; its lags and speed ratio stay."""
-    control = on_wings(board.params, grey.identified, instead.asked, sentence=law.LAW)
-    way, par, lags = instead.way(board.origin, board.params), control.par(_altitude(seen, board)), now.lags.copy()
-    if CRUISE in instead.asked:
-        lags[law.CRUISE] = par[P.VA_CRUISE] * lags[law.SHARE]
-    ctl = now.ctl
-    if len(way.legs):
-        ctl = gone_over(ctl, now.way.legs, par, way.legs, (instead.anew, seen.p[-1]))
-    return _Course(ctl, par, way, lags, control)
+    controller = fixed_wing_controller(config.params, model.identified, override.parameters, sentence=law.LAW)
+    new_route, par, lags = (
+        override.to_route(config.origin, config.params),
+        controller.par(_altitude(recent, config)),
+        guidance.lags.copy(),
+    )
+    if CRUISE in override.parameters:
+        lags[law.CRUISE] = par[P.VA_CRUISE] * lags[law.TAS_RATIO]
+    ctl = guidance.ctl
+    if len(new_route.legs):
+        ctl = transfer_controller(ctl, guidance.route.legs, par, new_route.legs, (override.restart_leg, recent.p[-1]))
+    return _RouteGuidance(ctl, par, new_route, lags, controller)
 
 
-def _synchronised(seen: Track, seq: np.ndarray, way: tuple[np.ndarray, ...], w: np.ndarray) -> np.ndarray:
+def _synchronise(recent: Track, seq: np.ndarray, par_legs_start: tuple[np.ndarray, ...], w: np.ndarray) -> np.ndarray:
     """Synchronise the guidance with the flight."""
-    n = len(seen)
-    nil = np.full(n, np.nan)
-    air = seen.v - [*w, 0.0]
+    n = len(recent)
+    missing = np.full(n, np.nan)
+    air = recent.v - [*w, 0.0]
     psi = np.arctan2(air[:, 1], air[:, 0])
-    euler = np.column_stack([_banks(seen, air), 0.0 * psi, psi])
+    euler = np.column_stack([_banks(recent, air), 0.0 * psi, psi])
     triple, quad = np.full((n, 3), np.nan), np.full((n, 4), np.nan)
-    rows = (seen.t - seen.t[0], seen.p, seen.v, euler, triple, nil, nil, nil, quad, seq)
-    ctl, _ = shadow(*way, *(np.ascontiguousarray(row) for row in rows))  # type: ignore[call-arg]
+    rows = (recent.t - recent.t[0], recent.p, recent.v, euler, triple, missing, missing, missing, quad, seq)
+    ctl, _ = replay_controller(*par_legs_start, *(np.ascontiguousarray(row) for row in rows))  # type: ignore[call-arg]
     return ctl
 
 
-def _banks(seen: Track, air: np.ndarray) -> np.ndarray:
+def _banks(recent: Track, air: np.ndarray) -> np.ndarray:
     """Return the bank at each row: reported, else from the turn rate of the track [rad]."""
     course = np.unwrap(np.arctan2(air[:, 1], air[:, 0]))
     rate = np.gradient(course, STEP)
     smooth = np.convolve(np.pad(rate, 5, mode="edge"), np.ones(11) / 11, mode="valid")
     turn = np.arctan(np.clip(smooth * np.linalg.norm(air[:, :2], axis=1) / G, -1.5, 1.5))
-    return np.where(np.isfinite(seen.euler[:, 0]), seen.euler[:, 0], turn)
+    return np.where(np.isfinite(recent.euler[:, 0]), recent.euler[:, 0], turn)
 
 
-def _state(seen: Track, w: np.ndarray) -> np.ndarray:
-    air = seen.v[-5:].mean(axis=0) - [*w, 0.0]
-    phi = float(_banks(seen.part(max(len(seen) - 40, 0), len(seen)), seen.v[-40:] - [*w, 0.0])[-3:].mean())
-    return np.array([*seen.p[-1], np.linalg.norm(air), phi, atan2(air[1], air[0]), -air[2]])
+def _state(recent: Track, w: np.ndarray) -> np.ndarray:
+    air = recent.v[-5:].mean(axis=0) - [*w, 0.0]
+    phi = float(_banks(recent.part(max(len(recent) - 40, 0), len(recent)), recent.v[-40:] - [*w, 0.0])[-3:].mean())
+    return np.array([*recent.p[-1], np.linalg.norm(air), phi, atan2(air[1], air[0]), -air[2]])
 
 
-def _lags(
-    seen: Track, leg: np.ndarray, par: np.ndarray, absent: tuple[str, ...], told: tuple[Grey, float]
+def _lag_parameters(
+    recent: Track,
+    leg: np.ndarray,
+    par: np.ndarray,
+    absent: tuple[str, ...],
+    model_and_speed: tuple[KinematicModel, float],
 ) -> np.ndarray:
     """Return the parameters of the law: lags and recent speeds."""
-    grey, V = told
-    known = CRUISE not in absent
-    commanded = leg[VA_C] if leg[VA_C] > 0 else par[P.VA_CRUISE] if known else 0.0
-    share = V / commanded if commanded > 0 and 0.7 < V / commanded < 1.5 else par[P.EAS2TAS]
-    cruise = par[P.VA_CRUISE] * share if known else V
+    model, V = model_and_speed
+    cruise_known = CRUISE not in absent
+    commanded = leg[VA_C] if leg[VA_C] > 0 else par[P.VA_CRUISE] if cruise_known else 0.0
+    speed_ratio = V / commanded if commanded > 0 and 0.7 < V / commanded < 1.5 else par[P.EAS2TAS]
+    cruise = par[P.VA_CRUISE] * speed_ratio if cruise_known else V
     out = np.empty(law.N_PAR)
-    out[law.TAU_PHI], out[law.TAU_V], out[law.TAU_H], out[law.TAU_CLIMB] = grey.tau_phi, 4.0, 4.0, 1.5
-    out[law.CRUISE], out[law.SHARE] = (V if not 0.7 < V / cruise < 1.5 else cruise), share
-    rise = -seen.v[:, 2]
+    out[law.TAU_PHI], out[law.TAU_V], out[law.TAU_H], out[law.TAU_CLIMB] = model.tau_phi, 4.0, 4.0, 1.5
+    out[law.CRUISE], out[law.TAS_RATIO] = (V if not 0.7 < V / cruise < 1.5 else cruise), speed_ratio
+    rise = -recent.v[:, 2]
     out[law.CLIMB] = max(float(np.quantile(rise, 0.98)), min(par[P.CLIMB_MAX], 2.5))
     out[law.SINK] = max(float(np.quantile(-rise, 0.98)), min(par[P.SINK_MAX], 2.0))
     return out
 
 
-def compare(track: Track, seq: np.ndarray, board: Board, grey: Grey) -> Grey:
+def fit_model(track: Track, seq: np.ndarray, config: KinematicConfig, model: KinematicModel) -> KinematicModel:
     """Fit period and lag: minimise the mean rollout error from several starts over the last minute."""
-    over = int(_OVER_S / STEP)
-    last = len(track) - 1 - over
-    rows = range(last, max(len(track) - int(_BACK_S / STEP), int(LEAST_S / STEP)), -int(_EVERY_S / STEP))
-    starts = [k for k in rows if track.t[k] > board.since + LEAST_S and track.ok[k - 40 : k + over].all()]
+    run_rows = int(_RUN_S / STEP)
+    last_row = len(track) - 1 - run_rows
+    rows = range(
+        last_row, max(len(track) - int(_COMPARE_S / STEP), int(MIN_TRACK_S / STEP)), -int(_START_INTERVAL_S / STEP)
+    )
+    starts = [k for k in rows if track.t[k] > config.changed_t + MIN_TRACK_S and track.ok[k - 40 : k + run_rows].all()]
     if len(starts) < 3:
-        return grey
+        return model
 
-    def miss(one: Grey) -> float:
-        found = [_strays(track, k, seq, board, one) for k in starts]
-        good = [x for x in found if x is not None]
-        return float(np.mean(good)) if len(good) >= 2 else np.inf
+    def error_of(candidate: KinematicModel) -> float:
+        errors = [_rollout_error(track, k, seq, config, candidate) for k in starts]
+        valid = [x for x in errors if x is not None]
+        return float(np.mean(valid)) if len(valid) >= 2 else np.inf
 
-    _, absent = arduplane.parameters(board.params)
+    _, absent = arduplane.parameters(config.params)
     unknown = "NAVL1_PERIOD" in absent
-    for name, tried in (("period", _PERIODS if unknown else ()), ("tau_phi", _LAGS)):
-        options = [replace(grey, **{name: value}) for value in dict.fromkeys((getattr(grey, name), *tried))]
-        grey = min(options, key=miss)
-    found = miss(grey)
-    return replace(grey, miss=found, starts=len(starts)) if np.isfinite(found) else grey
+    for name, trials in (("period", _PERIOD_VALUES if unknown else ()), ("tau_phi", _LAG_VALUES)):
+        options = [replace(model, **{name: value}) for value in dict.fromkeys((getattr(model, name), *trials))]
+        model = min(options, key=error_of)
+    error = error_of(model)
+    return replace(model, mean_error=error, n_starts=len(starts)) if np.isfinite(error) else model
 
 
-def _strays(track: Track, k: int, seq: np.ndarray, board: Board, grey: Grey) -> float | None:
-    ahead = np.arange(0.0, _OVER_S + 0.5)
-    begin = max(k - int(30 / STEP), 0)
-    made = fly(track.part(begin, k + 1), seq[begin : k + 1], board, grey, ahead)
-    if made.path is None:
+def _rollout_error(
+    track: Track, k: int, seq: np.ndarray, config: KinematicConfig, model: KinematicModel
+) -> float | None:
+    ahead = np.arange(0.0, _RUN_S + 0.5)
+    first = max(k - int(30 / STEP), 0)
+    rollout = fly(track.part(first, k + 1), seq[first : k + 1], config, model, ahead)
+    if rollout.path is None:
         return None
-    flown = track.p[k + np.rint(ahead / STEP).astype(int)]
-    return float(np.linalg.norm(made.path - flown, axis=1).mean())
+    actual = track.p[k + np.rint(ahead / STEP).astype(int)]
+    return float(np.linalg.norm(rollout.path - actual, axis=1).mean())
 
 
-def said(grey: Grey) -> str:
+def describe(model: KinematicModel) -> str:
     """Describe the model and its error."""
-    if not grey.starts:
+    if not model.n_starts:
         return "route flown by guidance and lags, not yet compared with flight"
-    period = f"L1 period {grey.period:.0f} s, " if grey.period else ""
-    return f"route flown by guidance and lags: {period}mean error {grey.miss:.0f} m over {_OVER_S:.0f} s"
+    period = f"L1 period {model.period:.0f} s, " if model.period else ""
+    return f"route flown by guidance and lags: {period}mean error {model.mean_error:.0f} m over {_RUN_S:.0f} s"

@@ -9,19 +9,19 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from twin_worker.confidence.tube_and_horizon import path_length
-from twin_worker.numerics.interpolation import straight
+from twin_worker.numerics.interpolation import interpolate_rows
 
-AT = np.arange(0.0, 61.0, 5.0)  # look-ahead of the scores [s]
-EVERY_S = 5.0  # interval of scored predictions [s]
-ORDER = ("both", "hybrid", "dynamics", "paper")  # preference before any score
-_NEWS = 0.1  # smoothing weight of the newest score
-_CLEARLY = 0.85  # another method replaces the preferred one below this ratio of errors [-]
-_LEAST = 4  # minimum scored predictions
-_HOLE_S = 2.0  # predictions across a longer gap are not scored [s]
+SCORE_AHEAD = np.arange(0.0, 61.0, 5.0)  # look-ahead of the scores [s]
+SCORE_INTERVAL_S = 5.0  # interval of scored predictions [s]
+PREFERENCE = ("both", "hybrid", "dynamics", "paper")  # preference before any score
+_SMOOTHING = 0.1  # smoothing weight of the newest score
+_SWITCH_RATIO = 0.85  # another method replaces the preferred one below this ratio of errors [-]
+_MIN_SCORED = 4  # minimum scored predictions
+_MAX_GAP_S = 2.0  # predictions across a longer gap are not scored [s]
 
 
 @dataclass
-class Contest:
+class MethodSelector:
     """Score the predicted paths of every method against the flight.
 
     Attributes:
@@ -30,15 +30,15 @@ class Contest:
         n_scored: number of scored predictions, by method
     """
 
-    waiting: deque[tuple[float, float, dict[str, np.ndarray]]] = field(default_factory=deque)
-    miss: dict[str, float] = field(default_factory=dict)
-    count: dict[str, int] = field(default_factory=dict)
+    pending: deque[tuple[float, float, dict[str, np.ndarray]]] = field(default_factory=deque)
+    mean_error: dict[str, float] = field(default_factory=dict)
+    n_scored: dict[str, int] = field(default_factory=dict)
 
-    def due(self, t: float) -> bool:
+    def is_due(self, t: float) -> bool:
         """Return whether predictions at `t` are scored, which requires a path of every method."""
-        return not self.waiting or not self.waiting[-1][0] <= t < self.waiting[-1][0] + EVERY_S
+        return not self.pending or not self.pending[-1][0] <= t < self.pending[-1][0] + SCORE_INTERVAL_S
 
-    def keep(self, t: float, speed: float, ahead: np.ndarray, paths: dict[str, np.ndarray]) -> None:
+    def add(self, t: float, speed: float, ahead: np.ndarray, paths: dict[str, np.ndarray]) -> None:
         """Add the predicted path of each method at `t`.
 
         Args:
@@ -47,43 +47,43 @@ class Contest:
             ahead: look-ahead times, (k,) [s]
             paths: NED, (k, 3) [m] by method
         """
-        rows = {method: straight(AT, ahead, path) for method, path in paths.items()}
-        self.waiting.append((t, speed, rows))
+        rows = {method: interpolate_rows(SCORE_AHEAD, ahead, path) for method, path in paths.items()}
+        self.pending.append((t, speed, rows))
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Discard pending predictions that an event has invalidated."""
-        self.waiting.clear()
+        self.pending.clear()
 
-    def answer(self, t: np.ndarray, flown: np.ndarray) -> None:
+    def score(self, t: np.ndarray, positions: np.ndarray) -> None:
         """Score completed predictions with the flight: times (n,) [s since 1970], positions NED (n, 3) [m]."""
-        while self.waiting and len(t) and self.waiting[0][0] + AT[-1] <= t[-1]:
-            begun, speed, paths = self.waiting.popleft()
-            at = begun + AT
-            near = np.abs(t[np.clip(np.searchsorted(t, at), 0, len(t) - 1)] - at)
-            if begun < t[0] or near.max() > _HOLE_S:
+        while self.pending and len(t) and self.pending[0][0] + SCORE_AHEAD[-1] <= t[-1]:
+            start_t, speed, paths = self.pending.popleft()
+            times = start_t + SCORE_AHEAD
+            time_gap = np.abs(t[np.clip(np.searchsorted(t, times), 0, len(t) - 1)] - times)
+            if start_t < t[0] or time_gap.max() > _MAX_GAP_S:
                 continue
-            truth = straight(at, t, flown)
-            length = path_length(truth, speed)
+            actual = interpolate_rows(times, t, positions)
+            length = path_length(actual, speed)
             for method, path in paths.items():
-                self._take(method, float(np.mean(np.linalg.norm(path - truth, axis=1)[1:] / length[1:])))
+                self._update(method, float(np.mean(np.linalg.norm(path - actual, axis=1)[1:] / length[1:])))
 
-    def _take(self, method: str, miss: float) -> None:
-        n = self.count[method] = self.count.get(method, 0) + 1
-        before = self.miss.get(method, miss)
-        self.miss[method] = before + max(_NEWS, 1.0 / n) * (miss - before)
+    def _update(self, method: str, error: float) -> None:
+        n = self.n_scored[method] = self.n_scored.get(method, 0) + 1
+        previous = self.mean_error.get(method, error)
+        self.mean_error[method] = previous + max(_SMOOTHING, 1.0 / n) * (error - previous)
 
     def best(self, methods: tuple[str, ...]) -> str:
         """Return the first of `PREFERENCE` among methods, unless another has a clearly smaller error."""
-        known = [method for method in methods if self.count.get(method, 0) >= _LEAST]
-        if len(known) < len(methods):
-            return min(methods, key=ORDER.index)
-        usual = min(methods, key=ORDER.index)
-        least = min(known, key=lambda method: self.miss[method])
-        return least if self.miss[least] < _CLEARLY * self.miss[usual] else usual
+        scored = [method for method in methods if self.n_scored.get(method, 0) >= _MIN_SCORED]
+        if len(scored) < len(methods):
+            return min(methods, key=PREFERENCE.index)
+        preferred = min(methods, key=PREFERENCE.index)
+        best_scored = min(scored, key=lambda method: self.mean_error[method])
+        return best_scored if self.mean_error[best_scored] < _SWITCH_RATIO * self.mean_error[preferred] else preferred
 
-    def said(self, method: str) -> str:
+    def describe(self, method: str) -> str:
         """Describe the errors of all methods; empty before enough scores."""
-        if len(self.miss) < 2 or self.count.get(method, 0) < _LEAST:
+        if len(self.mean_error) < 2 or self.n_scored.get(method, 0) < _MIN_SCORED:
             return ""
-        others = ", ".join(f"{name} {miss:.1%}" for name, miss in self.miss.items() if name != method)
-        return f"{method}: mean error {self.miss[method]:.1%} of path length ({others})"
+        others = ", ".join(f"{name} {error:.1%}" for name, error in self.mean_error.items() if name != method)
+        return f"{method}: mean error {self.mean_error[method]:.1%} of path length ({others})"

@@ -8,13 +8,13 @@ import numpy as np
 from fleet.autopilots import arduplane, laws
 from fleet.contract import Item
 from fleet.frames import Origin
-from fleet.mission import VA_C, Route, route
+from fleet.mission import VA_C, Route, unroll_route
 
-_STILL = 0.5  # stationary below this speed [m/s]
+_STATIONARY_SPEED = 0.5  # stationary below this speed [m/s]
 
 
 @dataclass(frozen=True)
-class Instead:
+class RouteOverride:
     """Route, parameters and speed of a what-if query, from the start of the prediction on.
 
     Attributes:
@@ -28,26 +28,30 @@ class Instead:
 
     items: tuple[Item, ...]
     seq: int
-    asked: Mapping[str, float] = field(default_factory=dict)
-    anew: bool = False
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    restart_leg: bool = False
     speed: float | None = None
-    first: int = 1
+    first_item: int = 1
 
-    def way(self, origin: Origin, received: Mapping[str, float]) -> Route:
+    def to_route(self, origin: Origin, received: Mapping[str, float]) -> Route:
         """Return the route."""
-        return route(self.items, seq=self.seq, origin=origin, params={**received, **self.asked}, first=self.first)
+        return unroll_route(
+            self.items, seq=self.seq, origin=origin, params={**received, **self.parameters}, first=self.first_item
+        )
 
-    def at_speed(self, velocity: np.ndarray, psi: float = 0.0) -> np.ndarray:
+    def scale_to_speed(self, velocity: np.ndarray, psi: float = 0.0) -> np.ndarray:
         """Scale a velocity (3,) [m/s] to the requested speed; a stationary aircraft uses the heading `psi` [rad]."""
         if self.speed is None:
             return velocity
-        now = float(np.linalg.norm(velocity))
-        along = velocity / now if now > _STILL else np.array([np.cos(psi), np.sin(psi), 0.0])
+        present_speed = float(np.linalg.norm(velocity))
+        along = (
+            velocity / present_speed if present_speed > _STATIONARY_SPEED else np.array([np.cos(psi), np.sin(psi), 0.0])
+        )
         return self.speed * along
 
 
-def gone_over(
-    ctl: np.ndarray, was: np.ndarray, par: np.ndarray, legs: np.ndarray, begin: tuple[bool, np.ndarray]
+def transfer_controller(
+    ctl: np.ndarray, old_legs: np.ndarray, par: np.ndarray, legs: np.ndarray, restart: tuple[bool, np.ndarray]
 ) -> np.ndarray:
     """Return the controller state on another route: filters and integrators stay, an identical leg continues.
 
@@ -56,13 +60,13 @@ def gone_over(
         par, legs: new parameters and legs
         restart: whether to restart the leg unconditionally, and the aircraft position, NED, (3,) [m]
     """
-    out, (anew, p) = ctl.copy(), begin
-    rest = [column for column in range(legs.shape[1]) if column != VA_C]
+    out, (restart_leg, p) = ctl.copy(), restart
+    compared = [column for column in range(legs.shape[1]) if column != VA_C]
     out[arduplane.LEG] = 0
-    if anew or not np.array_equal(was[int(ctl[arduplane.LEG]), rest], legs[0, rest]):
+    if restart_leg or not np.array_equal(old_legs[int(ctl[arduplane.LEG]), compared], legs[0, compared]):
         laws.begin(out, par, legs, 0, p)
         return out
-    again = ctl.copy()
-    arduplane.set_leg(again, par, legs, 0, ctl[arduplane.FROM])
-    out[arduplane.TURN] = again[arduplane.TURN]
+    restarted = ctl.copy()
+    arduplane.set_leg(restarted, par, legs, 0, ctl[arduplane.FROM])
+    out[arduplane.TURN] = restarted[arduplane.TURN]
     return out

@@ -12,11 +12,11 @@ from twin_worker.telemetry.track import STEP as TRACK_STEP
 from twin_worker.telemetry.track import Track
 
 STEP = 0.5  # filter step [s]
-_ROWS = 24  # past steps that the filter uses
-_TURN = 0.3  # turn rate of the two turning models [rad/s]
-_FASTEST = 1e3  # faster rows are invalid [m/s]
+_FILTER_STEPS = 24  # past steps that the filter uses
+_TURN_RATE = 0.3  # turn rate of the two turning models [rad/s]
+_MAX_SPEED = 1e3  # faster rows are invalid [m/s]
 # transition probabilities per step
-_STAY = np.array([[0.97, 0.015, 0.015], [0.06, 0.93, 0.01], [0.06, 0.01, 0.93]])
+_MODEL_TRANSITION = np.array([[0.97, 0.015, 0.015], [0.06, 0.93, 0.01], [0.06, 0.01, 0.93]])
 
 
 def _transition(rate: float) -> np.ndarray:
@@ -43,7 +43,7 @@ def _filter(rate: float, noise: float, start: np.ndarray) -> KalmanFilter:
     return filt
 
 
-def turn_on(flown: Track, ahead: np.ndarray) -> np.ndarray | None:
+def constant_turn_prediction(track: Track, ahead: np.ndarray) -> np.ndarray | None:
     """Predict from the end of a track, NED, (k, 3) [m]; None with fewer than four gap-free steps.
 
     A clock jump puts rows of two times on one grid; rows before the last jump are ignored.
@@ -52,21 +52,21 @@ def turn_on(flown: Track, ahead: np.ndarray) -> np.ndarray | None:
         track: newest flight
         ahead: requested look-ahead times, (k,) [s]
     """
-    every = round(STEP / TRACK_STEP)
-    whole = flown.whole()
-    rows = slice((len(whole) - 1) % every, None, every)
-    p, v = _after_leap(whole.p[rows][-_ROWS:], whole.v[rows][-_ROWS:])
+    stride = round(STEP / TRACK_STEP)
+    unbroken = track.unbroken_tail()
+    rows = slice((len(unbroken) - 1) % stride, None, stride)
+    p, v = _after_jump(unbroken.p[rows][-_FILTER_STEPS:], unbroken.v[rows][-_FILTER_STEPS:])
     return imm(p, v, ahead) if len(p) >= 4 else None
 
 
-def _after_leap(p: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _after_jump(p: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return positions and velocities, (n, 3), after the last implausible row; nan is implausible."""
-    flown = np.linalg.norm(v, axis=1) < _FASTEST
-    flown[1:] &= np.linalg.norm(np.diff(p, axis=0), axis=1) < _FASTEST * STEP
-    leaps = np.flatnonzero(~flown)
-    first = int(leaps[-1]) if len(leaps) else 0
+    plausible = np.linalg.norm(v, axis=1) < _MAX_SPEED
+    plausible[1:] &= np.linalg.norm(np.diff(p, axis=0), axis=1) < _MAX_SPEED * STEP
+    jumps = np.flatnonzero(~plausible)
+    first = int(jumps[-1]) if len(jumps) else 0
     # the row after a position jump is valid
-    first += int(len(leaps) > 0 and not np.linalg.norm(v[first]) < _FASTEST)
+    first += int(len(jumps) > 0 and not np.linalg.norm(v[first]) < _MAX_SPEED)
     return p[first:], v[first:]
 
 
@@ -81,8 +81,8 @@ def imm(p: np.ndarray, v: np.ndarray, ahead: np.ndarray) -> np.ndarray:
         mean path, NED, (k, 3) [m]
     """
     rows = np.column_stack([p[:, 0], v[:, 0], p[:, 1], v[:, 1]])
-    filters = [_filter(rate, noise, rows[0]) for rate, noise in ((0.0, 0.5), (_TURN, 1.0), (-_TURN, 1.0))]
-    estimator = IMMEstimator(filters, np.array([0.8, 0.1, 0.1]), _STAY)
+    filters = [_filter(rate, noise, rows[0]) for rate, noise in ((0.0, 0.5), (_TURN_RATE, 1.0), (-_TURN_RATE, 1.0))]
+    estimator = IMMEstimator(filters, np.array([0.8, 0.1, 0.1]), _MODEL_TRANSITION)
     for row in rows[1:]:
         estimator.predict()
         estimator.update(row)
@@ -100,8 +100,8 @@ def _run_forward(estimator: IMMEstimator, steps: int) -> np.ndarray:
     F = np.stack([filt.F for filt in estimator.filters])
     track = [mu @ x]
     for _ in range(steps):
-        mixed = mu @ _STAY
-        x = np.einsum("jab,jb->ja", F, (_STAY * mu[:, None]).T @ x / mixed[:, None])
+        mixed = mu @ _MODEL_TRANSITION
+        x = np.einsum("jab,jb->ja", F, (_MODEL_TRANSITION * mu[:, None]).T @ x / mixed[:, None])
         mu = mixed
         track.append(mu @ x)
     return np.array(track)[:, [0, 2]]

@@ -6,67 +6,71 @@ from collections.abc import Callable
 import numpy as np
 
 from fleet.contract import Message, Prediction
-from twin_worker.ownership.twin_store import Held
-from twin_worker.twin.state.schedule import SOON
-from twin_worker.twin.steps.extrapolate import LATEST_S, OVERDUE_S, renewed
+from twin_worker.ownership.twin_store import OwnedTwin
+from twin_worker.twin.state.schedule import EARLY_FRACTION
+from twin_worker.twin.steps.extrapolate import MAX_OVERDUE_AGE_S, MAX_ROLLOUT_AGE_S, propagate
 
-LOOK_S = 0.4  # between checks for aircraft without a prediction [s]
-OLD_S = 1.0  # minimum age of the last published prediction before a fallback is due [s]
-_LATE = 1.2  # the same in scheduled prediction periods [-]
-_LACKING = 2.0  # multiple of that age at which the aircraft counts as without a prediction [-]
-_BACK_S = 1.0  # telemetry this far before the last prediction means that the clock was set back [s]
-_FARTHEST = 2e9  # larger coordinates are invalid [1e-7 deg, mm]
+CHECK_PERIOD_S = 0.4  # between checks for aircraft without a prediction [s]
+MIN_OVERDUE_S = 1.0  # minimum age of the last published prediction before a fallback is due [s]
+_OVERDUE_PERIODS = 1.2  # the same in scheduled prediction periods [-]
+_MISSING_FACTOR = 2.0  # multiple of that age at which the aircraft counts as without a prediction [-]
+_CLOCK_BACK_S = 1.0  # telemetry this far before the last prediction means that the clock was set back [s]
+_MAX_COORDINATE = 2e9  # larger coordinates are invalid [1e-7 deg, mm]
 
 
-def stand_in(held: Held) -> Prediction | None:
+def fallback_prediction(owned: OwnedTwin) -> Prediction | None:
     """Propagate the last prediction of a locked twin, without a change to the twin."""
-    twin, rows = held.twin, held.placed
-    if rows is None or not held.ready:
+    twin, rows = owned.twin, owned.last_position
+    if rows is None or not owned.ready:
         return None
     try:
         t, x = rows.t.numpy(), rows.x.numpy().astype(float)
     except ValueError:
         return None
-    if not len(t) or x.shape != (len(t), 3) or not (np.abs(x[-1]) < _FARTHEST).all():
+    if not len(t) or x.shape != (len(t), 3) or not (np.abs(x[-1]) < _MAX_COORDINATE).all():
         return None
-    said = max(held.stood, twin.prediction.t if twin.prediction else -np.inf)
-    if not t[-1] >= said + SOON * min(twin.pace.renew, twin.pace.predict):
+    published_t = max(owned.fallback_t, twin.prediction.latest.t if twin.prediction.latest else -np.inf)
+    if not t[-1] >= published_t + EARLY_FRACTION * min(twin.config.schedule.renew, twin.config.schedule.predict):
         return None
-    made = renewed(twin, float(t[-1]), x[-1])
-    if made is not None:
-        held.stood = made.t
-    return made
+    prediction = propagate(twin, float(t[-1]), x[-1])
+    if prediction is not None:
+        owned.fallback_t = prediction.t
+    return prediction
 
 
-def stand_in_for(holding: list[Held], publish: Callable[[Message, Held], None]) -> None:
+def publish_fallbacks(owned_twins: list[OwnedTwin], publish: Callable[[Message, OwnedTwin], None]) -> None:
     """Propagate the predictions of all twins that are overdue, due to lack of CPU time or a lock."""
-    for held in holding:
-        late = time.monotonic() - held.published > _due_s(held)
-        if late and (made := stand_in(held)) is not None:
-            publish(made, held)
+    for owned in owned_twins:
+        overdue = time.monotonic() - owned.published_at > _due_s(owned)
+        if overdue and (prediction := fallback_prediction(owned)) is not None:
+            publish(prediction, owned)
 
 
-def lacks_prediction(held: Held, now: float) -> bool:
+def lacks_prediction(owned: OwnedTwin, now: float) -> bool:
     """Return whether an aircraft has no recent prediction, not even a propagated one, at `now`, monotonic [s]."""
-    return now - held.published > _LACKING * _due_s(held)
+    return now - owned.published_at > _MISSING_FACTOR * _due_s(owned)
 
 
-def _due_s(held: Held) -> float:
-    pace = held.twin.pace
-    return max(OLD_S, _LATE * min(pace.predict, pace.renew))
+def _due_s(owned: OwnedTwin) -> float:
+    schedule = owned.twin.config.schedule
+    return max(MIN_OVERDUE_S, _OVERDUE_PERIODS * min(schedule.predict, schedule.renew))
 
 
-def said_already(result: Message, held: Held) -> bool:
+def is_superseded(result: Message, owned: OwnedTwin) -> bool:
     """Return whether a late prediction is older than the fallback published meanwhile."""
-    if not isinstance(result, Prediction) or not held.stood - OVERDUE_S < result.t <= held.stood:
+    if not isinstance(result, Prediction) or not owned.fallback_t - MAX_OVERDUE_AGE_S < result.t <= owned.fallback_t:
         return False
-    return result.t > held.stood - LATEST_S or held.placed is None or _newest(held) > held.stood - _BACK_S
+    return (
+        result.t > owned.fallback_t - MAX_ROLLOUT_AGE_S
+        or owned.last_position is None
+        or _newest_position_t(owned) > owned.fallback_t - _CLOCK_BACK_S
+    )
 
 
-def _newest(held: Held) -> float:
+def _newest_position_t(owned: OwnedTwin) -> float:
     """Return the time of the newest received position [s since 1970]."""
     try:
-        t = held.placed.t.numpy() if held.placed is not None else np.empty(0)
+        t = owned.last_position.t.numpy() if owned.last_position is not None else np.empty(0)
     except ValueError:
         return np.inf
     return float(t[-1]) if len(t) else np.inf

@@ -7,18 +7,18 @@ from collections.abc import Callable
 from functools import partial
 
 from fleet.contract import Message
-from twin_worker.ownership.twin_store import Held
-from twin_worker.service.cpu_share import Beside
-from twin_worker.service.work_rates import Rates
+from twin_worker.ownership.twin_store import OwnedTwin
+from twin_worker.service.cpu_share import CpuShareLimiter
+from twin_worker.service.work_rates import WorkRates
 from twin_worker.twin.state.schedule import Work
 from twin_worker.twin.step import identify, identify_due
 
 _log = logging.getLogger(__name__)
 _IDLE_S = 0.05
-Publish = Callable[[Message, Held], None]
+Publish = Callable[[Message, OwnedTwin], None]
 
 
-class Learner:
+class IdentificationThread:
     """Identifies the aircraft whose identification is oldest.
 
     Args:
@@ -30,13 +30,13 @@ class Learner:
 
     def __init__(
         self,
-        holding: Callable[[], list[Held]],
-        publish: Callable[[Message, Held], None],
-        rates: Rates,
-        beside: Beside | None = None,
+        owned_twins: Callable[[], list[OwnedTwin]],
+        publish: Callable[[Message, OwnedTwin], None],
+        rates: WorkRates,
+        cpu_share: CpuShareLimiter | None = None,
     ) -> None:
-        self._holding, self._publish, self._rates = holding, publish, rates
-        self._beside = beside or Beside()
+        self._owned_twins, self._publish, self._rates = owned_twins, publish, rates
+        self._cpu_share = cpu_share or CpuShareLimiter()
 
     def run(self, stop: threading.Event) -> None:
         """Identify until `stop` is set, at the same priority as the prediction thread.
@@ -44,28 +44,32 @@ class Learner:
         At a lower priority, a busy machine could suspend it while it holds a lock that the prediction thread needs.
         """
         while not stop.is_set():
-            held = self._next()
-            if held is None:
+            owned = self._next_due()
+            if owned is None:
                 stop.wait(_IDLE_S)
             else:
-                self._beside.do(partial(self._try, held), stop)
+                self._cpu_share.run(partial(self._run_one, owned), stop)
 
-    def _try(self, held: Held) -> None:
+    def _run_one(self, owned: OwnedTwin) -> None:
         try:
-            self._identify(held)
+            self._identify(owned)
         except Exception as error:  # an error in one aircraft must not stop the others
-            held.failed = f"{held.twin.name}: found an internal error ({error}), expected a model; report it"
-            _log.exception(held.failed)
+            owned.defect = f"{owned.twin.name}: found an internal error ({error}), expected a model; report it"
+            _log.exception(owned.defect)
 
-    def _next(self) -> Held | None:
-        found = [held for held in self._holding() if held.twin.prediction is not None and identify_due(held.twin)]
-        return min(found, key=lambda held: held.twin.identify_t, default=None)
+    def _next_due(self) -> OwnedTwin | None:
+        due = [
+            owned
+            for owned in self._owned_twins()
+            if owned.twin.prediction.latest is not None and identify_due(owned.twin)
+        ]
+        return min(due, key=lambda owned: owned.twin.identification.timer.last, default=None)
 
-    def _identify(self, held: Held) -> None:
-        with held.lock:
-            if not held.ready:
+    def _identify(self, owned: OwnedTwin) -> None:
+        with owned.lock:
+            if not owned.ready:
                 return
-            results = identify(held.twin)
-        self._rates.note(Work.IDENTIFY, time.monotonic())
+            results = identify(owned.twin)
+        self._rates.record(Work.IDENTIFY, time.monotonic())
         for result in results:
-            self._publish(result, held)
+            self._publish(result, owned)

@@ -9,18 +9,18 @@ from typing import Any
 import msgspec
 from msgspec import Raw
 
-from fleet.bus.codec import Stamp, Wire, encode
+from fleet.bus.codec import EncodedMessage, Stamp, encode
 from fleet.contract import Prediction, Predictions, WhatIf
-from twin_worker.ownership.twin_store import Held
+from twin_worker.ownership.twin_store import OwnedTwin
 from twin_worker.whatif import query
-from twin_worker.whatif.answer import answer
-from twin_worker.whatif.resample import resample, wanted
+from twin_worker.whatif.answer import answer_query
+from twin_worker.whatif.resample import read_grid, resample
 
 _log = logging.getLogger(__name__)
-Stamped = Iterator[tuple[Any, Stamp]]
+StampedMessages = Iterator[tuple[Any, Stamp]]
 
 
-class Answers:
+class QueryHandlers:
     """Query handlers; each answer carries the aircraft's fencing token.
 
     Args:
@@ -28,39 +28,43 @@ class Answers:
         owned_twins: returns the ready twins, by UAV id
     """
 
-    def __init__(self, writer: int, holding: Callable[[], list[Held]]) -> None:
-        self._writer, self._holding = writer, holding
+    def __init__(self, writer: int, owned_twins: Callable[[], list[OwnedTwin]]) -> None:
+        self._writer, self._owned_twins = writer, owned_twins
 
-    def predictions(self, uav: int | None, asked: dict[str, str], payload: bytes) -> Stamped:
+    def predictions(self, uav: int | None, parameters: dict[str, str], payload: bytes) -> StampedMessages:
         """Return the newest prediction of one aircraft or all, on the requested grid, or the result of a what-if.
 
         Raises:
             ValueError: when the grid or the query is invalid or cannot be answered; the message states the reason.
         """
-        grid = wanted(asked)
+        grid = read_grid(parameters)
         if payload:
-            supposed = self._supposed(uav, query.read(payload))
-            return self.stamped((held, resample(made, grid)) for held, made in supposed)
-        found = ((held, told(held)) for held in self.of(uav))
+            what_ifs = self._what_if_predictions(uav, query.read_query(payload))
+            return self.with_stamps((owned, resample(prediction, grid)) for owned, prediction in what_ifs)
+        latest = ((owned, latest_prediction(owned)) for owned in self.select(uav))
         if grid is None:
-            return self.stamped(found)
-        return self.stamped((held, made and resample(made.message(), grid)) for held, made in found)
+            return self.with_stamps(latest)
+        return self.with_stamps((owned, made and resample(made.message(), grid)) for owned, made in latest)
 
-    def at_once(self) -> Predictions:
+    def all_predictions(self) -> Predictions:
         """Return the newest prediction of every owned aircraft."""
-        found = [(Raw(made.payload), held.epoch) for held in self._holding() if (made := told(held)) is not None]
-        predictions, epochs = (tuple(each) for each in zip(*found, strict=True)) if found else ((), ())
+        encoded = [
+            (Raw(latest.payload), owned.epoch)
+            for owned in self._owned_twins()
+            if (latest := latest_prediction(owned)) is not None
+        ]
+        predictions, epochs = (tuple(column) for column in zip(*encoded, strict=True)) if encoded else ((), ())
         return Predictions(t=time.time(), predictions=predictions, epochs=epochs)
 
-    def of(self, uav: int | None) -> list[Held]:
+    def select(self, uav: int | None) -> list[OwnedTwin]:
         """Return the requested aircraft if owned; all for None."""
-        return [held for held in self._holding() if uav in (None, held.twin.uav)]
+        return [owned for owned in self._owned_twins() if uav in (None, owned.twin.config.uav)]
 
-    def stamped(self, pairs: Iterable[tuple[Held, Any]]) -> Stamped:
+    def with_stamps(self, pairs: Iterable[tuple[OwnedTwin, Any]]) -> StampedMessages:
         """Pair each message with its stamp; skip None."""
-        return ((message, Stamp(held.epoch, self._writer)) for held, message in pairs if message is not None)
+        return ((message, Stamp(owned.epoch, self._writer)) for owned, message in pairs if message is not None)
 
-    def _supposed(self, uav: int | None, asked: WhatIf) -> list[tuple[Held, Prediction]]:
+    def _what_if_predictions(self, uav: int | None, what_if: WhatIf) -> list[tuple[OwnedTwin, Prediction]]:
         """Run a what-if on a copy of one twin.
 
         Raises:
@@ -68,19 +72,19 @@ class Answers:
         """
         if uav is None:
             raise ValueError("what if: found a query for every aircraft, expected one; ask e.g. parauav/7/prediction")
-        return [(held, suppose(held, asked)) for held in self.of(uav)]
+        return [(owned, run_what_if(owned, what_if)) for owned in self.select(uav)]
 
 
-def suppose(held: Held, asked: WhatIf) -> Prediction:
+def run_what_if(owned: OwnedTwin, what_if: WhatIf) -> Prediction:
     """Run a what-if on a copy of the twin, on the caller's thread.
 
     Raises:
         ValueError: when it cannot be answered; the message states the reason.
     """
-    with held.lock:
-        twin = copy.deepcopy(held.twin)
+    with owned.lock:
+        twin = copy.deepcopy(owned.twin)
     try:
-        return answer(twin, asked)
+        return answer_query(twin, what_if)
     except ValueError:
         raise
     except Exception as error:  # an error in one query must not stop the others
@@ -88,13 +92,14 @@ def suppose(held: Held, asked: WhatIf) -> Prediction:
         raise ValueError(f"{twin.name}: found an internal error ({error}), expected a prediction; report it") from None
 
 
-def told(held: Held) -> Wire | None:
+def latest_prediction(owned: OwnedTwin) -> EncodedMessage | None:
     """Return the newest prediction, encoded with its law and parameters; None before the first."""
-    made, control = held.twin.prediction, held.twin.control
-    if made is None:
+    prediction, control = owned.twin.prediction.latest, owned.twin.prediction.controller
+    if prediction is None:
         return None
-    if held.told is None or held.told[0] is not made:
-        known = control is None or made.controller is not None
-        whole = made if known else msgspec.structs.replace(made, controller=control.wire())  # type: ignore[union-attr]
-        held.told = made, Wire(Prediction, made.uav, encode(whole))
-    return held.told[1]
+    if owned.encoded is None or owned.encoded[0] is not prediction:
+        complete = prediction
+        if control is not None and prediction.controller is None:
+            complete = msgspec.structs.replace(prediction, controller=control.to_message())
+        owned.encoded = prediction, EncodedMessage(Prediction, prediction.uav, encode(complete))
+    return owned.encoded[1]

@@ -5,31 +5,31 @@ import numpy as np
 from fleet.airframes import GENERIC, load
 from fleet.airframes.airframe import servo_map
 from fleet.autopilots import arduplane, copter, greybox
-from fleet.autopilots.shadow import shadow
+from fleet.autopilots.shadow import replay_controller
 from fleet.bus.codec import encode
-from fleet.contract import Array, History, Item, Prediction, Rows, Sample, State
+from fleet.contract import Array, History, Item, Prediction, Rows, Sample, TwinState
 from fleet.frames import Origin, to_geodetic, wrap
-from fleet.mission import route
+from fleet.mission import unroll_route
 from fleet.physics import point_mass
 from fleet.physics.simulate import N_STATE, coupled_plant, linear_plant, simulate
 from fleet.window import Window
-from twin_worker.alerts.traffic import Traffic
-from twin_worker.confidence.adaptive_conformal import Levels
-from twin_worker.confidence.prediction_log import Ledger
+from twin_worker.alerts.traffic import TrafficMonitor
+from twin_worker.confidence.adaptive_conformal import AdaptiveLevels
+from twin_worker.confidence.prediction_log import PredictionLog
 from twin_worker.estimation.wind_filter import WindFilter
 from twin_worker.identification.fixed_wing import attitude_lag
 from twin_worker.identification.fixed_wing.derivatives_model import identify
 from twin_worker.identification.fixed_wing.linearise import linearise
-from twin_worker.identification.fixed_wing.plant import settled
+from twin_worker.identification.fixed_wing.plant import bias_corrected
 from twin_worker.identification.linear.linear_model import AXES, identify_axis
+from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.numerics.prediction_errors import AHEAD
-from twin_worker.ownership.history_decoder import read
-from twin_worker.prediction.closed_loop import held
-from twin_worker.telemetry.history import History as Telemetry
-from twin_worker.telemetry.resample import Grid
-from twin_worker.twin.state.flight_phase import moves
-from twin_worker.twin.steps.extrapolate import shifted, widened
-from twin_worker.validation.held_out import Unseen
+from twin_worker.ownership.history_decoder import decode_history
+from twin_worker.telemetry.history import TelemetryHistory as Telemetry
+from twin_worker.telemetry.resample import Resampler
+from twin_worker.twin.state.flight_phase import speed_extremes
+from twin_worker.twin.steps.extrapolate import shift_to_position, widen_tube
+from twin_worker.validation.held_out import HeldOut
 from twin_worker.validation.verify import verify
 
 _SPEED = 22.0  # [m/s]
@@ -41,106 +41,110 @@ _ITEMS = tuple(
 
 def warm_up() -> None:
     """Run every compiled function of the worker once; about one second from the disk cache."""
-    window = _flight()
+    window = _synthetic_flight()
     axes = [identify_axis(axis, window, 2.0)[1] for axis in AXES]
     par, _ = arduplane.parameters({})
-    legs = route(_ITEMS, seq=1, origin=_HOME, params={}).legs
+    legs = unroll_route(_ITEMS, seq=1, origin=_HOME, params={}).legs
     n = len(window)
     euler, rates = np.ascontiguousarray(window.x[:, 6:]), np.ascontiguousarray(window.x[:, 3:6])
-    heard = [np.full(n, _SPEED), np.zeros(n), np.zeros(n), window.u, np.ones(n, np.int64)]
-    rows = [window.t - window.t[0], window.p, window.v, euler, rates, *heard]
-    ctl, _ = shadow(par, legs, window.p[0], *rows)  # type: ignore
+    inputs = [np.full(n, _SPEED), np.zeros(n), np.zeros(n), window.u, np.ones(n, np.int64)]
+    rows = [window.t - window.t[0], window.p, window.v, euler, rates, *inputs]
+    ctl, _ = replay_controller(par, legs, window.p[0], *rows)  # type: ignore
     state = np.concatenate([window.p[-1], window.x[-1]])
-    paper = linear_plant(*(part for axis in axes for part in (axis.physical(), axis.means)))
+    linear = linear_plant(*(part for axis in axes for part in (axis.physical(), axis.means)))
     coupled = coupled_plant(identify(window, np.zeros(2), load(GENERIC)).par, np.array([_SPEED, 0.0]))
     air = np.array([0.0, 0.0, 1.0, 0.0])
-    grey_ctl = ctl.copy()
-    for plant in (paper, coupled):
+    kinematic_ctl = ctl.copy()
+    for plant in (linear, coupled):
         simulate(ctl.copy(), par, legs, plant, state, np.zeros(6), air, window.dt, np.empty((50, N_STATE)))
 
-    _in_the_large((ctl.copy(), par, legs), window)
-    ahead, grey = np.empty((5, 3)), np.ones(greybox.N_PAR)
-    greybox.follow(grey_ctl, par, legs, grey, np.array([*window.p[-1], _SPEED, 0.0, 0.0, 0.0]), np.zeros(2), 0.1, ahead)  # type: ignore
-    segments, told = np.ones((2, copter.N_SEGMENT)), np.ones(copter.N_PAR)
-    _meet()
-    _go_on()
-    _recall()
-    _remember(window)
-    _learn()
-    copter.follow(np.zeros(copter.N_FOLLOW), segments, np.zeros(3), np.zeros(3), told, 0.1, ahead)  # type: ignore
+    _run_point_mass((ctl.copy(), par, legs), window)
+    ahead, factors = np.empty((5, 3)), np.ones(greybox.N_PAR)
+    greybox.follow(
+        kinematic_ctl, par, legs, factors, np.array([*window.p[-1], _SPEED, 0.0, 0.0, 0.0]), np.zeros(2), 0.1, ahead
+    )  # type: ignore
+    segments, parameters = np.ones((2, copter.N_SEGMENT)), np.ones(copter.N_PAR)
+    _run_traffic()
+    _run_propagation()
+    _run_history_decoder()
+    _run_telemetry(window)
+    _run_identification()
+    copter.follow(np.zeros(copter.N_FOLLOW), segments, np.zeros(3), np.zeros(3), parameters, 0.1, ahead)  # type: ignore
 
 
-def _in_the_large(control: tuple[np.ndarray, np.ndarray, np.ndarray], window: Window) -> None:
+def _run_point_mass(control: tuple[np.ndarray, np.ndarray, np.ndarray], window: Window) -> None:
     """Run the point-mass model, alone and as a batch of two."""
-    body, air, start = np.ones(point_mass.N_BODY), np.ones(point_mass.N_AIR), np.zeros(point_mass.N_START)
-    body[point_mass.V_0] = start[point_mass.V] = _SPEED
-    start[:3], chance = window.p[-1], np.zeros((2, 5, 4))
-    point_mass.fly(control[0].copy(), *control[1:], body, air, start, chance[0], point_mass.STEP, np.empty((5, 3)))
-    twice = [np.tile(row, (2, 1)) for row in (body, air, start)]
-    point_mass.bundle(control, *twice, chance, np.arange(0, 17, 4), np.empty((2, 5, 3)))  # type: ignore
+    parameters, air, start = np.ones(point_mass.N_PARAMETERS), np.ones(point_mass.N_AIR), np.zeros(point_mass.N_START)
+    parameters[point_mass.V_0] = start[point_mass.V] = _SPEED
+    start[:3], noise = window.p[-1], np.zeros((2, 5, 4))
+    point_mass.simulate_route(
+        control[0].copy(), *control[1:], parameters, air, start, noise[0], point_mass.STEP, np.empty((5, 3))
+    )
+    batch = [np.tile(row, (2, 1)) for row in (parameters, air, start)]
+    point_mass.simulate_ensemble(control, *batch, noise, np.arange(0, 17, 4), np.empty((2, 5, 3)))  # type: ignore
     attitude_lag.identify(window.x[:, 6], window.x[:, 6])
 
 
-def _meet() -> None:
+def _run_traffic() -> None:
     """Run the conflict detection for two aircraft on a collision course."""
-    traffic, ahead = Traffic(), np.arange(0.0, 20.0)
-    for uav, way in ((0, 1.0), (1, -1.0)):
-        path = np.column_stack([way * _SPEED * (ahead - 10.0), 0.0 * ahead, -100.0 + 0.0 * ahead])
-        made = Prediction(
+    traffic, ahead = TrafficMonitor(), np.arange(0.0, 20.0)
+    for uav, direction in ((0, 1.0), (1, -1.0)):
+        path = np.column_stack([direction * _SPEED * (ahead - 10.0), 0.0 * ahead, -100.0 + 0.0 * ahead])
+        prediction = Prediction(
             uav=uav,
             t=1e9,
-            state=State.PREDICTING,
+            state=TwinState.PREDICTING,
             method="",
             origin=(_HOME.lat_e7, _HOME.lon_e7, _HOME.alt_mm),
             ahead=Array.of(ahead),
             path=Array.of(path),
-            tube=Array.of(np.ones((20, 3))),
+            prediction_region_half_axes=Array.of(np.ones((20, 3))),
         )
-        traffic.hear(made)
-    traffic.judge(0, 1e9)
+        traffic.receive(prediction)
+    traffic.assess(0, 1e9)
 
 
-def _go_on() -> None:
+def _run_propagation() -> None:
     """Propagate a prediction, update the wind filter, and detect flight."""
     ahead, path = (Array.of(values).numpy() for values in (np.arange(5.0), np.zeros((5, 3))))
-    shifted(ahead, path, 1.0, np.zeros(3), np.empty((4, 3), np.float32))  # type: ignore[call-arg]
-    widened(ahead, path, 1.0, np.empty((4, 3), np.float32))  # type: ignore[call-arg]
-    moves(np.zeros((3, 3)))  # type: ignore[call-arg]
+    shift_to_position(ahead, path, 1.0, np.zeros(3), np.empty((4, 3), np.float32))  # type: ignore[call-arg]
+    widen_tube(ahead, path, 1.0, np.empty((4, 3), np.float32))  # type: ignore[call-arg]
+    speed_extremes(np.zeros((3, 3)))  # type: ignore[call-arg]
     WindFilter().update(1e9, np.array([_SPEED, 0.0, 0.0]), _SPEED, 0.0)
 
 
-def _recall() -> None:
+def _run_history_decoder() -> None:
     """Decode a history message."""
     rows = Rows(t=Array.of([1e9], "<f8"), x=Array.of(np.zeros((1, 3))))
-    read(encode(History(uav=0, t=1e9, samples=(Sample(uav=0, t=1e9, velocity=rows),))))
+    decode_history(encode(History(uav=0, t=1e9, samples=(Sample(uav=0, t=1e9, velocity=rows),))))
 
 
-def _remember(window: Window) -> None:
+def _run_telemetry(window: Window) -> None:
     """Resample telemetry, hold an input, and score a prediction."""
-    place = to_geodetic(_HOME, window.p).astype(float)
+    positions = to_geodetic(_HOME, window.p).astype(float)
     history = Telemetry()
-    for name, rows in (("attitude", window.x[:, 3:]), ("velocity", window.v), ("position", place)):
-        history.put(name, window.t, rows)
-    history.put("servo", window.t, np.full((len(window), 8), 1500.0))
-    Grid().window(history, _HOME, servo_map({}), np.zeros(3), until=float(window.t[-1]), seconds=10.0)
-    held(window.t, window.v, window.t, 1.0)
-    book = Ledger()
-    book.add(0.0, "", "", np.outer(AHEAD, [_SPEED, 0.0, 0.0]), _SPEED)
-    Levels().learn(book, *book.answer(window.t, window.p), book.live)
+    for name, rows in (("attitude", window.x[:, 3:]), ("velocity", window.v), ("position", positions)):
+        history.replace_rows(name, window.t, rows)
+    history.replace_rows("servo", window.t, np.full((len(window), 8), 1500.0))
+    Resampler().window(history, _HOME, servo_map({}), np.zeros(3), until=float(window.t[-1]), seconds=10.0)
+    zero_order_hold(window.t, window.v, window.t, 1.0)
+    log = PredictionLog()
+    log.add(0.0, "", "", np.outer(AHEAD, [_SPEED, 0.0, 0.0]), _SPEED)
+    AdaptiveLevels().update(log, *log.evaluate(window.t, window.p), log.live)
 
 
-def _learn() -> None:
+def _run_identification() -> None:
     """Identify, verify and compute the shrinkage sample, as the first identification holds an aircraft's lock."""
-    window = _flight(60.0)
-    plant, known = identify(window, np.zeros(2), load(GENERIC)), len(window) // 2
-    verify(plant, window, known, 0.0, None)
-    settled(plant, window)
-    Unseen(plant, window, known).lesson(20.0, 5.0)
+    window = _synthetic_flight(60.0)
+    plant, n_train = identify(window, np.zeros(2), load(GENERIC)), len(window) // 2
+    verify(plant, window, n_train, 0.0, None)
+    bias_corrected(plant, window)
+    HeldOut(plant, window, n_train).shrinkage_sample(20.0, 5.0)
     linearise(plant, window)
     wrap(np.zeros((2, 3))[:, 2])
 
 
-def _flight(seconds: float = 20.0, dt: float = 0.04) -> Window:
+def _synthetic_flight(seconds: float = 20.0, dt: float = 0.04) -> Window:
     """Return a synthetic flight due north with noise in every channel."""
     n = int(seconds / dt)
     rng = np.random.default_rng(0)

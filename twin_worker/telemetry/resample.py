@@ -11,17 +11,17 @@ import numpy as np
 from fleet.airframes.airframe import ServoMap
 from fleet.frames import Origin, to_ned
 from fleet.window import INPUTS, STATES, Window
-from twin_worker.telemetry.history import History
+from twin_worker.telemetry.history import TelemetryHistory
 
 DT = 0.04  # grid of every window [s]
 LONGEST_GAP = {"attitude": 0.5, "velocity": 1.0, "servo": 0.5, "position": 1.0}  # longer gaps are not filled [s]
-_SETTLED_S = 1.5  # rows older than this no longer arrive [s]
-_BEFORE_S = 4.0  # rows before a segment that its interpolation uses [s]
-_LEAST_ROWS = 4, 8  # minimum of every kind, to continue and to start
-_FEWEST = 50  # minimum grid times of a window
-_BENT = 8.0  # largest span of the four points of a cubic, in median gaps [-]
-_LOST = 1.6  # gap that indicates lost samples, in median gaps [-]
-_LAID, _TURN, _WIDTH = 12, 16, 22  # first column of inputs, first of cosines and sines, number of columns
+_FINAL_AFTER_S = 1.5  # rows older than this no longer arrive [s]
+_CONTEXT_S = 4.0  # rows before a segment that its interpolation uses [s]
+_MIN_ROWS = 4, 8  # minimum of every kind, to continue and to start
+_MIN_WINDOW_ROWS = 50  # minimum grid times of a window
+_MAX_CUBIC_GAPS = 8.0  # largest span of the four points of a cubic, in median gaps [-]
+_LOST_GAP_RATIO = 1.6  # gap that indicates lost samples, in median gaps [-]
+_INPUTS_AT, _TRIG_AT, _N_COLUMNS = 12, 16, 22  # first column of inputs, first of cosines and sines, number of columns
 _SPARE_S = 20.0  # spare capacity on growth [s]
 
 
@@ -35,11 +35,11 @@ def lagrange(t: np.ndarray, y: np.ndarray, grid: np.ndarray) -> np.ndarray:
     Returns:
         values on the grid, (n, k)
     """
-    return _laid(t, y, grid, (0.0, np.inf, np.inf))[0]
+    return _interpolate(t, y, grid, (0.0, np.inf, np.inf))[0]
 
 
-def fill(
-    t: np.ndarray, y: np.ndarray, grid: np.ndarray, longest: float, bent: float = _BENT
+def interpolate_samples(
+    t: np.ndarray, y: np.ndarray, grid: np.ndarray, max_gap: float, max_cubic_gaps: float = _MAX_CUBIC_GAPS
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Interpolate samples on the grid: cubic where dense, linear across a short gap, invalid across a long gap.
 
@@ -53,20 +53,20 @@ def fill(
     if len(t) < 4:
         return np.zeros((len(grid), y.shape[1])), np.zeros(len(grid), bool), np.zeros(len(grid), bool)
     gaps = np.sort(np.diff(t))
-    usual = 0.5 * float(gaps[(len(gaps) - 1) // 2] + gaps[len(gaps) // 2])
-    return _laid(t, y, grid, (usual, longest, bent * usual))
+    median_gap = 0.5 * float(gaps[(len(gaps) - 1) // 2] + gaps[len(gaps) // 2])
+    return _interpolate(t, y, grid, (median_gap, max_gap, max_cubic_gaps * median_gap))
 
 
-def _laid(
+def _interpolate(
     t: np.ndarray, y: np.ndarray, grid: np.ndarray, limits: tuple[float, float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     out, ok, lost = np.empty((len(grid), y.shape[1])), np.empty(len(grid), bool), np.empty(len(grid), bool)
-    _lay_each(t, np.ascontiguousarray(y, float), np.ascontiguousarray(grid), limits, out, ok, lost)
+    _interpolate_each(t, np.ascontiguousarray(y, float), np.ascontiguousarray(grid), limits, out, ok, lost)
     return out, ok, lost
 
 
 @nb.njit(cache=True, nogil=True)  # no fastmath: a gap exactly as long as the limit is filled
-def _lay_each(
+def _interpolate_each(
     t: np.ndarray,
     y: np.ndarray,
     grid: np.ndarray,
@@ -79,29 +79,29 @@ def _lay_each(
 
     L(a) = sum_i b_i prod_(j != i) (a - a_j) / (a_i - a_j).  Source: Huang 2021 eq. 19.
     """
-    (usual, longest, reach), n, right = limits, len(t), 1
+    (median_gap, max_gap, max_span), n, right = limits, len(t), 1
     weight = np.empty(4)
     for g in range(len(grid)):
         while right < n - 1 and t[right] < grid[g]:
             right += 1
-        gap, at = t[right] - t[right - 1], min(max(grid[g], t[0]), t[n - 1])
-        ok[g] = t[0] - usual <= grid[g] <= t[n - 1] + usual and gap <= longest
-        lost[g] = ok[g] and gap > _LOST * usual
+        gap, t_clamped = t[right] - t[right - 1], min(max(grid[g], t[0]), t[n - 1])
+        ok[g] = t[0] - median_gap <= grid[g] <= t[n - 1] + median_gap and gap <= max_gap
+        lost[g] = ok[g] and gap > _LOST_GAP_RATIO * median_gap
         first, count = max(min(right - 2, n - 4), 0), 4
-        if n < 4 or t[min(right + 1, n - 1)] - t[max(right - 2, 0)] > reach:
+        if n < 4 or t[min(right + 1, n - 1)] - t[max(right - 2, 0)] > max_span:
             first, count = right - 1, 2
         for i in range(count):
             weight[i] = 1.0
             for j in range(count):
                 if j != i:
-                    weight[i] *= (at - t[first + j]) / (t[first + i] - t[first + j])
+                    weight[i] *= (t_clamped - t[first + j]) / (t[first + i] - t[first + j])
         for k in range(y.shape[1]):
             out[g, k] = 0.0
             for i in range(count):
                 out[g, k] += weight[i] * y[first + i, k]
 
 
-class Grid:
+class Resampler:
     """Resample telemetry of one aircraft on multiples of `DT`; final rows are computed once, the tail every time."""
 
     def __init__(self, keep_s: float = 160.0) -> None:
@@ -110,7 +110,7 @@ class Grid:
         self._servos: ServoMap | None = None
         self._first, self._stop = 0, 0  # range in use of the three arrays below
         self._k = np.empty(0, np.int64)  # grid times in steps of DT
-        self._laid = np.empty((0, _WIDTH))  # attitude, velocity, position, inputs, cosines and sines
+        self._values = np.empty((0, _N_COLUMNS))  # attitude, velocity, position, inputs, cosines and sines
         self._ok = np.empty((0, 2), bool)  # measured or filled; filled
 
     def clear(self) -> None:
@@ -118,7 +118,14 @@ class Grid:
         self._first, self._stop = 0, 0
 
     def window(
-        self, history: History, origin: Origin, servos: ServoMap, wind: np.ndarray, *, until: float, seconds: float
+        self,
+        history: TelemetryHistory,
+        origin: Origin,
+        servos: ServoMap,
+        wind: np.ndarray,
+        *,
+        until: float,
+        seconds: float,
     ) -> Window | None:
         """Resample new telemetry and return the newest `seconds` before `until`.
 
@@ -132,61 +139,61 @@ class Grid:
         Returns:
             the window, or None while a required kind of row is missing
         """
-        if self._origin != origin or self._servos is None or not servos.same(self._servos):
+        if self._origin != origin or self._servos is None or not servos.equals(self._servos):
             self.clear()
         self._origin, self._servos = origin, servos
         if not self._extend(history, until):
             return None
         used = slice(self._first, self._stop)
-        k, laid, known = self._k[used], self._laid[used], self._ok[used]
+        k, values, flags = self._k[used], self._values[used], self._ok[used]
         first = k.searchsorted(ceil((until - seconds) / DT - 1e-3))
-        last = k.searchsorted(floor(until / DT + 1e-3), side="right")
-        rows = slice(first, last)
-        if last - first < _FEWEST:
+        stop = k.searchsorted(floor(until / DT + 1e-3), side="right")
+        rows = slice(first, stop)
+        if stop - first < _MIN_WINDOW_ROWS:
             return None
-        x, u, p, v = (np.empty((last - first, width)) for width in (len(STATES), len(INPUTS), 3, 3))
-        _seen(laid[rows], np.asarray(wind, float), x, u, p, v)
-        ok, filled = known[rows].T.copy()
+        x, u, p, v = (np.empty((stop - first, width)) for width in (len(STATES), len(INPUTS), 3, 3))
+        _fill_window(values[rows], np.asarray(wind, float), x, u, p, v)
+        ok, filled = flags[rows].T.copy()
         return Window(k[rows] * DT, x, u, p, v, ok, filled)
 
-    def _extend(self, history: History, until: float) -> bool:
+    def _extend(self, history: TelemetryHistory, until: float) -> bool:
         """Resample the tail that may still receive rows; return whether every kind is available."""
-        begun = self._stop > self._first
-        settled = self._k[self._stop - 1] * DT - _SETTLED_S if begun else max(until - self.keep_s, 0.0)
-        rows = {name: history.look(name, settled - _BEFORE_S) for name in LONGEST_GAP}
-        if any(len(t) < _LEAST_ROWS[not begun] for t, _ in rows.values()):
-            return begun
-        start = settled if begun else max(settled, *(float(t[0]) for t, _ in rows.values()))
+        started = self._stop > self._first
+        final_t = self._k[self._stop - 1] * DT - _FINAL_AFTER_S if started else max(until - self.keep_s, 0.0)
+        rows = {name: history.rows_since(name, final_t - _CONTEXT_S) for name in LONGEST_GAP}
+        if any(len(t) < _MIN_ROWS[not started] for t, _ in rows.values()):
+            return started
+        start = final_t if started else max(final_t, *(float(t[0]) for t, _ in rows.values()))
         stop = min(until, *(float(t[-1]) for t, _ in rows.values()))
         k = np.arange(ceil(start / DT), floor(stop / DT) + 1)
         if not len(k):
-            return begun
+            return started
         assert self._origin is not None
-        laid, ok, filled = _lay(rows, k * DT, self._origin)
-        self._join(k, laid, np.column_stack([ok, filled]))
+        values, ok, filled = _resample_rows(rows, k * DT, self._origin)
+        self._append(k, values, np.column_stack([ok, filled]))
         return True
 
-    def _join(self, k: np.ndarray, laid: np.ndarray, ok: np.ndarray) -> None:
+    def _append(self, k: np.ndarray, values: np.ndarray, ok: np.ndarray) -> None:
         """Replace all rows from `k[0]` on with these rows, (n,), (n, 20), (n, 2)."""
-        at = [k[0] - int(self.keep_s / DT), k[0]]
-        first, stop = (self._first + int(row) for row in self._k[self._first : self._stop].searchsorted(at))
+        bounds = [k[0] - int(self.keep_s / DT), k[0]]
+        first, stop = (self._first + int(row) for row in self._k[self._first : self._stop].searchsorted(bounds))
         if self._stop > self._first:  # angles continue without a jump of 2 pi
-            before = self._laid[stop - 1, :3] if stop > first else np.zeros(3)
-            laid[:, :3] += 2 * np.pi * np.round((before - laid[0, :3]) / (2 * np.pi))
+            previous = self._values[stop - 1, :3] if stop > first else np.zeros(3)
+            values[:, :3] += 2 * np.pi * np.round((previous - values[0, :3]) / (2 * np.pi))
         if stop + len(k) > len(self._k):
-            self._make_place(first, stop, len(k))
+            self._grow(first, stop, len(k))
             first, stop = 0, stop - first
         new = slice(stop, stop + len(k))
         assert self._servos is not None
-        self._k[new], self._laid[new, :_LAID], self._ok[new] = k, laid[:, :_LAID], ok
-        self._laid[new, _LAID:_TURN] = self._servos.inputs(laid[:, _LAID:])
-        _turn(self._laid[new])
+        self._k[new], self._values[new, :_INPUTS_AT], self._ok[new] = k, values[:, :_INPUTS_AT], ok
+        self._values[new, _INPUTS_AT:_TRIG_AT] = self._servos.inputs(values[:, _INPUTS_AT:])
+        _fill_trig(self._values[new])
         self._first, self._stop = first, new.stop
 
-    def _make_place(self, first: int, stop: int, more: int) -> None:
+    def _grow(self, first: int, stop: int, n_new: int) -> None:
         """Move rows `first` to `stop` to larger arrays with space for `n_new` rows and a reserve."""
-        size = stop - first + more + int(_SPARE_S / DT)
-        for name in ("_k", "_laid", "_ok"):
+        size = stop - first + n_new + int(_SPARE_S / DT)
+        for name in ("_k", "_values", "_ok"):
             old = getattr(self, name)
             new = np.empty((size, *old.shape[1:]), old.dtype)
             new[: stop - first] = old[first:stop]
@@ -194,21 +201,23 @@ class Grid:
 
 
 @nb.njit(cache=True, nogil=True)  # no fastmath: as `fleet.frames.ned_to_body` has it
-def _turn(laid: np.ndarray) -> None:
+def _fill_trig(values: np.ndarray) -> None:
     """Compute cosines and sines of the angles of every row, which every new wind reuses."""
-    for k in range(len(laid)):
+    for k in range(len(values)):
         for i in range(3):
-            laid[k, _TURN + 2 * i], laid[k, _TURN + 2 * i + 1] = cos(laid[k, i]), sin(laid[k, i])
+            values[k, _TRIG_AT + 2 * i], values[k, _TRIG_AT + 2 * i + 1] = cos(values[k, i]), sin(values[k, i])
 
 
 @nb.njit(cache=True, nogil=True)  # no fastmath: as `fleet.frames.ned_to_body` has it
-def _seen(laid: np.ndarray, wind: np.ndarray, x: np.ndarray, u: np.ndarray, p: np.ndarray, v: np.ndarray) -> None:
+def _fill_window(
+    values: np.ndarray, wind: np.ndarray, x: np.ndarray, u: np.ndarray, p: np.ndarray, v: np.ndarray
+) -> None:
     """Compute states, (n, 9), inputs, (n, 4), positions and velocities, (n, 3), from rows of `Resampler`."""
-    for k in range(len(laid)):
-        row = laid[k]
+    for k in range(len(values)):
+        row = values[k]
         cf, sf, ct, st, cp, sp = row[16], row[17], row[18], row[19], row[20], row[21]
         for i in range(4):
-            u[k, i] = row[_LAID + i]
+            u[k, i] = row[_INPUTS_AT + i]
         for i in range(3):
             v[k, i], p[k, i] = row[6 + i], row[9 + i]
             x[k, 6 + i], x[k, 3 + i] = row[i], row[3 + i]
@@ -219,25 +228,27 @@ def _seen(laid: np.ndarray, wind: np.ndarray, x: np.ndarray, u: np.ndarray, p: n
         x[k, 2] = cf * st * ahead - sf * right + cf * ct * d
 
 
-def _lay(
+def _resample_rows(
     rows: dict[str, tuple[np.ndarray, np.ndarray]], grid: np.ndarray, origin: Origin
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Interpolate every kind on the grid; return columns of `Resampler`, mask of valid rows, mask of filled rows."""
     t, attitude = rows["attitude"]
     unwrapped = np.hstack([np.unwrap(attitude[:, :3], axis=0), attitude[:, 3:]])
-    t_p, place = rows["position"]
-    laid = [
-        fill(t, unwrapped, grid, LONGEST_GAP["attitude"]),
-        fill(*rows["velocity"], grid, LONGEST_GAP["velocity"]),
-        fill(t_p, to_ned(origin, *place.T), grid, LONGEST_GAP["position"]),
-        fill(*rows["servo"], grid, LONGEST_GAP["servo"], 0.0),  # a cubic would overshoot, a servo does not
+    t_p, position = rows["position"]
+    columns = [
+        interpolate_samples(t, unwrapped, grid, LONGEST_GAP["attitude"]),
+        interpolate_samples(*rows["velocity"], grid, LONGEST_GAP["velocity"]),
+        interpolate_samples(t_p, to_ned(origin, *position.T), grid, LONGEST_GAP["position"]),
+        interpolate_samples(
+            *rows["servo"], grid, LONGEST_GAP["servo"], 0.0
+        ),  # a cubic would overshoot, a servo does not
     ]
-    values, ok, filled = zip(*laid, strict=True)
+    values, ok, filled = zip(*columns, strict=True)
     return np.hstack(values), np.logical_and.reduce(ok), np.logical_or.reduce(filled)
 
 
 def preprocess(
-    history: History, origin: Origin, servos: ServoMap, wind: np.ndarray, *, until: float, seconds: float
+    history: TelemetryHistory, origin: Origin, servos: ServoMap, wind: np.ndarray, *, until: float, seconds: float
 ) -> Window | None:
     """Resample the newest `seconds` before `until` on one grid; arguments as for `Resampler.window`."""
-    return Grid(seconds).window(history, origin, servos, wind, until=until, seconds=seconds)
+    return Resampler(seconds).window(history, origin, servos, wind, until=until, seconds=seconds)

@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleet.frames import Origin, to_ned, wrap
-from twin_worker.numerics.interpolation import straight
-from twin_worker.telemetry.history import History
-from twin_worker.telemetry.resample import fill
+from twin_worker.numerics.interpolation import interpolate_rows
+from twin_worker.telemetry.history import TelemetryHistory
+from twin_worker.telemetry.resample import interpolate_samples
 
 STEP = 0.1  # grid of every track [s]
-_LONGEST = 2.5  # longer gaps are not filled: 1 Hz with a lost row [s]
+_MAX_GAP_S = 2.5  # longer gaps are not filled: 1 Hz with a lost row [s]
 _SLOPE_S = 1.0  # half-width of the position slope that replaces velocity [s]
-_OLD_S = 3.0  # attitude or velocity this much older than the newest position is considered lost [s]
+_STALE_S = 3.0  # attitude or velocity this much older than the newest position is considered lost [s]
 
 
 @dataclass(frozen=True)
@@ -43,17 +43,19 @@ class Track:
         s = slice(start, stop)
         return Track(self.t[s], self.p[s], self.v[s], self.euler[s], self.ok[s], self.sentence)
 
-    def whole(self, since: float = -np.inf) -> "Track":
+    def unbroken_tail(self, since: float = -np.inf) -> "Track":
         """Return the gap-free tail from `since` on."""
         bad = np.flatnonzero(~self.ok)
         return self.part(max(int(bad[-1]) + 1 if len(bad) else 0, int(np.searchsorted(self.t, since))), len(self))
 
-    def turned(self, history: History) -> "Track":
+    def with_attitude(self, history: TelemetryHistory) -> "Track":
         """Return the track with attitude."""
         return replace(self, euler=_attitude(history, self.t))
 
 
-def track(history: History, origin: Origin, *, until: float, seconds: float, turned: bool = True) -> Track | None:
+def resample_track(
+    history: TelemetryHistory, origin: Origin, *, until: float, seconds: float, with_attitude: bool = True
+) -> Track | None:
     """Resample the newest `seconds` before `until` on one grid; differentiate positions if velocity is missing.
 
     Without `with_attitude` the attitude is nan: its interpolation takes longer than the rest.
@@ -61,49 +63,51 @@ def track(history: History, origin: Origin, *, until: float, seconds: float, tur
     Returns:
         the track, or None with less than 1.5 s of positions
     """
-    t_p, position = history.look("position", until - seconds - 2.0)
+    t_p, position = history.rows_since("position", until - seconds - 2.0)
     if len(t_p) < 3:
         return None
-    t_v, velocity = history.look("velocity", until - seconds - 2.0)
-    moving = len(t_v) >= 4 and t_v[-1] > t_p[-1] - _OLD_S
-    stop = min(until, float(t_p[-1]), float(t_v[-1]) if moving else np.inf)
-    start = max(until - seconds, float(t_p[0]), float(t_v[0]) if moving else -np.inf)
+    t_v, velocity = history.rows_since("velocity", until - seconds - 2.0)
+    velocity_sent = len(t_v) >= 4 and t_v[-1] > t_p[-1] - _STALE_S
+    stop = min(until, float(t_p[-1]), float(t_v[-1]) if velocity_sent else np.inf)
+    start = max(until - seconds, float(t_p[0]), float(t_v[0]) if velocity_sent else -np.inf)
     n = int((stop - start) / STEP) + 1
     if n < 1.5 / STEP:
         return None
     grid = stop - STEP * np.arange(n)[::-1]
-    p, ok = _laid(t_p, to_ned(origin, *position.T), grid)
-    if moving:
-        v, also = _laid(t_v, velocity, grid)
-        ok &= also
+    p, ok = _interpolate(t_p, to_ned(origin, *position.T), grid)
+    if velocity_sent:
+        v, velocity_ok = _interpolate(t_v, velocity, grid)
+        ok &= velocity_ok
     else:
         v = _slope(grid, p)
-    said = "" if moving else "no velocity rows: velocity is differentiated from positions, with less precision"
-    found = Track(grid, p, v, np.full((n, 3), np.nan), ok, said)
-    return found.turned(history) if turned else found
+    sentence = (
+        "" if velocity_sent else "no velocity rows: velocity is differentiated from positions, with less precision"
+    )
+    result = Track(grid, p, v, np.full((n, 3), np.nan), ok, sentence)
+    return result.with_attitude(history) if with_attitude else result
 
 
-def _laid(t: np.ndarray, x: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _interpolate(t: np.ndarray, x: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Interpolate rows on the grid, linearly if there are fewer than four."""
     if len(t) < 4:
-        return straight(grid, t, x), np.ones(len(grid), bool)
-    values, ok, _ = fill(t, x, grid, _LONGEST)
+        return interpolate_rows(grid, t, x), np.ones(len(grid), bool)
+    values, ok, _ = interpolate_samples(t, x, grid, _MAX_GAP_S)
     return values, ok
 
 
 def _slope(t: np.ndarray, p: np.ndarray) -> np.ndarray:
-    before, after = np.maximum(t - _SLOPE_S, t[0]), np.minimum(t + _SLOPE_S, t[-1])
-    ends = [straight(at, t, p) for at in (before, after)]
-    return (ends[1] - ends[0]) / (after - before)[:, None]
+    left, right = np.maximum(t - _SLOPE_S, t[0]), np.minimum(t + _SLOPE_S, t[-1])
+    ends = [interpolate_rows(query_t, t, p) for query_t in (left, right)]
+    return (ends[1] - ends[0]) / (right - left)[:, None]
 
 
-def _attitude(history: History, grid: np.ndarray) -> np.ndarray:
+def _attitude(history: TelemetryHistory, grid: np.ndarray) -> np.ndarray:
     """Return phi theta psi on the grid; nan where the nearest row is too far away."""
-    t, x = history.look("attitude", grid[0] - 2.0)
-    if len(t) < 2 or t[-1] < grid[-1] - _OLD_S:
+    t, x = history.rows_since("attitude", grid[0] - 2.0)
+    if len(t) < 2 or t[-1] < grid[-1] - _STALE_S:
         return np.full((len(grid), 3), np.nan)
     euler = np.column_stack([np.interp(grid, t, np.unwrap(x[:, i])) for i in range(3)])
     euler[:, 2] = wrap(euler[:, 2])
     right = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
-    euler[(t[right] - t[right - 1] > _LONGEST) | (grid < t[0] - 1.0)] = np.nan
+    euler[(t[right] - t[right - 1] > _MAX_GAP_S) | (grid < t[0] - 1.0)] = np.nan
     return euler

@@ -9,21 +9,21 @@ import numpy as np
 
 from fleet.contract import Item, Mission, Prediction, Status, WhatIf
 from fleet.frames import Origin, to_ned
-from fleet.mission import FIRST
-from twin_worker.prediction.autopilot_parameters import CRUISES
-from twin_worker.prediction.kinematic import air_of
-from twin_worker.prediction.route_override import Instead
+from fleet.mission import FIRST_ITEM
+from twin_worker.prediction.autopilot_parameters import SPEED_PARAMETERS
+from twin_worker.prediction.kinematic import wind_and_airspeed
+from twin_worker.prediction.route_override import RouteOverride
 from twin_worker.twin.state.state import ROUTE_MODES, Twin
-from twin_worker.twin.state.vehicle_class import NO_WINGS, seen
-from twin_worker.twin.steps.predict_step import foresee
-from twin_worker.whatif.move_history import Motion, moved
+from twin_worker.twin.state.vehicle_class import WINGLESS, recent_track
+from twin_worker.twin.steps.predict_step import predict
+from twin_worker.whatif.move_history import Motion, move_history
 
-_FAR_M = 50_000.0  # a start farther away than this gets its own local frame [m]
-_BACK_S = 6.0  # flight on which the controller is synchronised if the aircraft is on another route [s]
-_SPEED = 178  # MAV_CMD: DO_CHANGE_SPEED
+_NEW_FRAME_M = 50_000.0  # a start farther away than this gets its own local frame [m]
+_REPLAY_S = 6.0  # flight on which the controller is synchronised if the aircraft is on another route [s]
+_CHANGE_SPEED = 178  # MAV_CMD: DO_CHANGE_SPEED
 
 
-def answer(twin: Twin, asked: WhatIf) -> Prediction:
+def answer_query(twin: Twin, query: WhatIf) -> Prediction:
     """Predict under the conditions of a query.
 
     Args:
@@ -32,126 +32,139 @@ def answer(twin: Twin, asked: WhatIf) -> Prediction:
     Raises:
         ValueError: when start or route are missing; the message names what is missing.
     """
-    if twin.origin is None or not np.isfinite(twin.history.newest):
+    if twin.telemetry.origin is None or not np.isfinite(twin.telemetry.history.newest):
         raise ValueError(f"what if: {twin.name} has sent no position yet, expected one; wait for its telemetry")
-    if asked.seq is not None and asked.items is None:
-        _check_seq(twin, asked.seq)
-    said = list(_words(twin, asked))
-    follows = not twin.why_no_route() and bool(len(twin.history.rows("leg")[0]))
-    if asked.start is not None or asked.wind is not None:
-        _move(twin, asked)
-    if asked.items is not None or asked.seq is not None or asked.start is not None:
-        said += _into_auto(twin)
-    if asked != WhatIf(wind=asked.wind):
-        twin.instead = _instead(twin, asked)
-        if not follows or asked.start is not None:
-            _as_if_on_it(twin, twin.instead)
-    twin.prediction, twin.over = None, False  # the answer begins at the last good state, however old
-    twin.control_t = -np.inf  # the answer always contains control law and parameters
-    made = [m for m in foresee(twin, twin.history.newest) if isinstance(m, Prediction)]
-    if not made:
+    if query.seq is not None and query.items is None:
+        _check_seq(twin, query.seq)
+    changes = list(_describe_changes(twin, query))
+    on_route = not twin.no_route_reason() and bool(len(twin.telemetry.history.rows("leg")[0]))
+    if query.start is not None or query.wind is not None:
+        _move_flight(twin, query)
+    if query.items is not None or query.seq is not None or query.start is not None:
+        changes += _engage_route_mode(twin)
+    if query != WhatIf(wind=query.wind):
+        override = _override(twin, query)
+        twin.prediction.set_override(override)
+        if not on_route or query.start is not None:
+            _fill_leg_history(twin, override)
+    twin.prediction.forget_published()  # the answer begins at the last good state, and contains the control law
+    predictions = [
+        message for message in predict(twin, twin.telemetry.history.newest) if isinstance(message, Prediction)
+    ]
+    if not predictions:
         raise ValueError(f"what if: {twin.name} has sent too few recent positions, expected 2 s of them; wait")
-    return msgspec.structs.replace(made[0], sentence=f"what if {', '.join(said)}: {made[0].sentence}".rstrip(": "))
+    return msgspec.structs.replace(
+        predictions[0], sentence=f"what if {', '.join(changes)}: {predictions[0].sentence}".rstrip(": ")
+    )
 
 
 def _check_seq(twin: Twin, seq: int) -> None:
-    have = {item.seq for item in twin.mission.items} if twin.mission else set()
-    if seq not in have:
-        span = f"one of {min(have)}..{max(have)}" if have else "a mission on board"
-        raise ValueError(f"what if: found seq {seq} for {twin.name}, expected {span}; choose one, or give items")
+    available = {item.seq for item in twin.onboard.mission.items} if twin.onboard.mission else set()
+    if seq not in available:
+        expected = f"one of {min(available)}..{max(available)}" if available else "a mission on board"
+        raise ValueError(f"what if: found seq {seq} for {twin.name}, expected {expected}; choose one, or give items")
 
 
-def _words(twin: Twin, asked: WhatIf) -> Iterator[str]:
+def _describe_changes(twin: Twin, query: WhatIf) -> Iterator[str]:
     """Yield descriptions of what the query changes."""
-    if asked.items is not None:
-        yield f"it flew a mission of {len(asked.items)} items"
-    if asked.seq is not None:
-        yield f"it flew to item {asked.seq}"
-    if asked.speed is not None:
-        yield f"it flew at {asked.speed:g} m/s"
-    if asked.start is not None:
-        place = f"{asked.start.lat_e7 * 1e-7:.5f}, {asked.start.lon_e7 * 1e-7:.5f} at {asked.start.alt_mm * 1e-3:.0f} m"
-        heading = "" if asked.start.heading is None else f" heading {degrees(asked.start.heading) % 360:.0f} deg"
-        speed = "" if asked.start.speed is None else f" with {asked.start.speed:g} m/s"
-        yield f"it were at {place}{heading}{speed}"
-    if asked.wind is not None:
-        yield f"the wind blew {asked.wind[0]:g} m/s north and {asked.wind[1]:g} east"
-    for name, value in list(asked.params.items())[:5]:
-        was = twin.received.get(name)
-        yield f"{name[:20]} were {value:g}" + (f" instead of {was:g}" if was is not None else "")
-    if len(asked.params) > 5:
-        yield f"and {len(asked.params) - 5} more parameters were changed"
-    if asked == WhatIf():
+    if query.items is not None:
+        yield f"it flew a mission of {len(query.items)} items"
+    if query.seq is not None:
+        yield f"it flew to item {query.seq}"
+    if query.speed is not None:
+        yield f"it flew at {query.speed:g} m/s"
+    if query.start is not None:
+        position = (
+            f"{query.start.lat_e7 * 1e-7:.5f}, {query.start.lon_e7 * 1e-7:.5f} at {query.start.alt_mm * 1e-3:.0f} m"
+        )
+        heading = "" if query.start.heading is None else f" heading {degrees(query.start.heading) % 360:.0f} deg"
+        speed = "" if query.start.speed is None else f" with {query.start.speed:g} m/s"
+        yield f"it were at {position}{heading}{speed}"
+    if query.wind is not None:
+        yield f"the wind blew {query.wind[0]:g} m/s north and {query.wind[1]:g} east"
+    for name, value in list(query.params.items())[:5]:
+        current = twin.received_params.get(name)
+        yield f"{name[:20]} were {value:g}" + (f" instead of {current:g}" if current is not None else "")
+    if len(query.params) > 5:
+        yield f"and {len(query.params) - 5} more parameters were changed"
+    if query == WhatIf():
         yield "nothing were changed"
 
 
-def _move(twin: Twin, asked: WhatIf) -> None:
+def _move_flight(twin: Twin, query: WhatIf) -> None:
     """Transform the flight so far to the start and wind of the query."""
-    assert twin.origin is not None
-    told = twin.wind.wind
-    if not np.isfinite(twin.wind.t):
-        flown = seen(twin)
-        told = np.append(air_of(flown, None)[0], 0.0) if flown is not None and flown.ok.any() else np.zeros(3)
-    then = told if asked.wind is None else np.array([*asked.wind, 0.0])
-    winds = (np.zeros(3), np.zeros(3)) if twin.vehicle in NO_WINGS else (told, then)
-    if (start := asked.start) is None:
-        moved(twin.history, twin.origin, Motion(None, None, *winds))
+    assert twin.telemetry.origin is not None
+    wind_before = twin.environment.wind.wind
+    if not np.isfinite(twin.environment.wind.t):
+        track = recent_track(twin)
+        wind_before = (
+            np.append(wind_and_airspeed(track, None)[0], 0.0) if track is not None and track.ok.any() else np.zeros(3)
+        )
+    wind_after = wind_before if query.wind is None else np.array([*query.wind, 0.0])
+    winds = (np.zeros(3), np.zeros(3)) if twin.vehicle in WINGLESS else (wind_before, wind_after)
+    if (start := query.start) is None:
+        move_history(twin.telemetry.history, twin.telemetry.origin, Motion(None, None, *winds))
     else:
         to = Origin(start.lat_e7, start.lon_e7, start.alt_mm)
-        moved(twin.history, twin.origin, Motion(to, start.heading, *winds))
-        far = to_ned(twin.origin, *(np.array([x]) for x in to))[0]
-        twin.origin = to if float(np.linalg.norm(far)) > _FAR_M else twin.origin
-    if asked.wind is not None:
-        twin.wind.blow(twin.history.newest, then)
-        twin.history.put("wind", np.array([twin.history.newest]), then[None, :2])  # the autopilot's estimate, too
-        twin.rotor = replace(twin.rotor, wind=(float(then[0]), float(then[1])))
-    twin.grid.clear()
+        move_history(twin.telemetry.history, twin.telemetry.origin, Motion(to, start.heading, *winds))
+        offset = to_ned(twin.telemetry.origin, *(np.array([x]) for x in to))[0]
+        if float(np.linalg.norm(offset)) > _NEW_FRAME_M:
+            twin.telemetry.set_origin(to)
+    if query.wind is not None:
+        twin.environment.wind.reset_wind(twin.telemetry.history.newest, wind_after)
+        twin.telemetry.history.replace_rows(
+            "wind", np.array([twin.telemetry.history.newest]), wind_after[None, :2]
+        )  # the autopilot's estimate, too
+        wind = float(wind_after[0]), float(wind_after[1])
+        twin.models.store_multirotor(replace(twin.models.multirotor, wind=wind))
+    twin.telemetry.resampler.clear()
 
 
-def _into_auto(twin: Twin) -> Iterator[str]:
+def _engage_route_mode(twin: Twin) -> Iterator[str]:
     """Set the status to armed and a route mode; yield a description if the mode changes."""
-    status = twin.status or Status(uav=twin.uav, t=twin.history.newest)
+    status = twin.onboard.status or Status(uav=twin.config.uav, t=twin.telemetry.history.newest)
     if status.mode not in ROUTE_MODES:
         yield f"its mode were {ROUTE_MODES[0]}"
         status = msgspec.structs.replace(status, mode=ROUTE_MODES[0])
-    twin.status = msgspec.structs.replace(status, armed=True)
+    twin.onboard.set_status(msgspec.structs.replace(status, armed=True), record=False)
 
 
-def _instead(twin: Twin, asked: WhatIf) -> Instead:
+def _override(twin: Twin, query: WhatIf) -> RouteOverride:
     """Build the route override from route and parameters of the query."""
-    on_board = twin.mission.items if twin.mission else ()
-    items = on_board if asked.items is None else asked.items
-    params = dict(asked.params)
-    if asked.speed is not None:
-        params = dict.fromkeys(CRUISES, asked.speed) | params
-        items = tuple(_at_speed(item, asked.speed) for item in items)
-    seq = asked.seq
+    mission_items = twin.onboard.mission.items if twin.onboard.mission else ()
+    items = mission_items if query.items is None else query.items
+    params = dict(query.params)
+    if query.speed is not None:
+        params = dict.fromkeys(SPEED_PARAMETERS, query.speed) | params
+        items = tuple(_with_speed(item, query.speed) for item in items)
+    seq = query.seq
     if seq is None:
-        seq = _first(items, twin) if asked.items is not None else _in_force(twin)
-    anew = (asked.seq is not None and asked.seq != _in_force(twin)) or asked.start is not None
-    return Instead(items, seq, params, anew, asked.start.speed if asked.start else None, twin.first_item)
+        seq = _first_item(items, twin) if query.items is not None else _active_seq(twin)
+    restart = (query.seq is not None and query.seq != _active_seq(twin)) or query.start is not None
+    return RouteOverride(items, seq, params, restart, query.start.speed if query.start else None, twin.first_item)
 
 
-def _at_speed(item: Item, speed: float) -> Item:
-    return msgspec.structs.replace(item, param2=speed) if item.command == _SPEED else item
+def _with_speed(item: Item, speed: float) -> Item:
+    return msgspec.structs.replace(item, param2=speed) if item.command == _CHANGE_SPEED else item
 
 
-def _first(items: tuple[Item, ...], twin: Twin) -> int:
+def _first_item(items: tuple[Item, ...], twin: Twin) -> int:
     """Return the sequence number of the first item to fly."""
     first = twin.first_item
     return min((item.seq for item in items if item.seq >= first), default=first)
 
 
-def _in_force(twin: Twin) -> int:
-    _, leg = twin.history.rows("leg")
-    told = int(leg[-1, 0]) if len(leg) else twin.mission.seq if twin.mission else -1
-    return told if told >= 0 else FIRST.get(twin.autopilot, 1)
+def _active_seq(twin: Twin) -> int:
+    _, leg = twin.telemetry.history.rows("leg")
+    seq = int(leg[-1, 0]) if len(leg) else twin.onboard.mission.seq if twin.onboard.mission else -1
+    return seq if seq >= 0 else FIRST_ITEM.get(twin.autopilot, 1)
 
 
-def _as_if_on_it(twin: Twin, instead: Instead) -> None:
+def _fill_leg_history(twin: Twin, override: RouteOverride) -> None:
     """Record the last seconds as flown on the queried route, if the aircraft was on none or on another."""
-    now = twin.history.newest
-    twin.since = now - _BACK_S
-    twin.mission = Mission(uav=twin.uav, t=now, items=instead.items, seq=instead.seq, complete=True)
-    t = np.arange(now - 2 * _BACK_S, now + 0.5, 1.0)
-    twin.history.put("leg", t, np.full((len(t), 1), float(instead.seq)))
+    now = twin.telemetry.history.newest
+    twin.onboard.plan_changed(now - _REPLAY_S)
+    items = override.items
+    twin.onboard.set_mission(Mission(uav=twin.config.uav, t=now, items=items, seq=override.seq, complete=True))
+    t = np.arange(now - 2 * _REPLAY_S, now + 0.5, 1.0)
+    twin.telemetry.history.replace_rows("leg", t, np.full((len(t), 1), float(override.seq)))

@@ -19,7 +19,7 @@ from viser import Icon, _icons, _messages
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-HOME = ("localhost", "127.0.0.1", "::1")  # loopback names
+LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")  # loopback names
 POLICY = (  # no external resources, no framing by other sites
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' ws: wss: data: blob:; "
     "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
@@ -35,7 +35,7 @@ ICONS = (  # icons of tabs, buttons and commands
     Icon.MOVIE,
     Icon.TABLE,
 )
-PORTS = {"http": "80", "https": "443"}  # default ports, omitted by browsers
+DEFAULT_PORTS = {"http": "80", "https": "443"}  # default ports, omitted by browsers
 REFUSED = (  # messages that this page never sends
     _messages.FileTransferStartUpload,
     _messages.FileTransferPart,
@@ -43,8 +43,8 @@ REFUSED = (  # messages that this page never sends
     _messages.ShareUrlDisconnect,
 )
 VIOLATION = 1008  # close code for a policy violation (RFC 6455, 7.4.1)
-Answering = Callable[[Any, Request], Response | None]
-Handling = Callable[[Any], Awaitable[None]]
+RequestHandler = Callable[[Any, Request], Response | None]
+SocketHandler = Callable[[Any], Awaitable[None]]
 
 _log = logging.getLogger(__name__)
 
@@ -63,12 +63,17 @@ def serve(host: str, port: int, name: str = "") -> viser.ViserServer:
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     logging.getLogger("websockets.server").setLevel(logging.WARNING)  # it logs page requests as rejected connections
     _read_icons()
-    with quiet(), _guarded({*HOME, host.strip("[]").lower(), *filter(None, [name.lower()])}, anyone=_is_any(host)):
+    with (
+        without_stdout(),
+        _guarded_sockets(
+            {*LOCAL_NAMES, host.strip("[]").lower(), *filter(None, [name.lower()])}, any_host=_is_any(host)
+        ),
+    ):
         server = viser.ViserServer(host=host, port=port, verbose=False)
     for kind in REFUSED:
         server._websock_server.unregister_handler(kind)
     if port and server.get_port() != port:
-        with quiet():
+        with without_stdout():
             server.stop()
         raise OSError(
             f"--port: found {port} in use by another program, expected a free port; stop it or choose another"
@@ -79,8 +84,8 @@ def serve(host: str, port: int, name: str = "") -> viser.ViserServer:
 def _read_icons() -> None:
     """Read all icons from the archive of viser at once; viser reopens it for each icon (25 ms)."""
     with zipfile.ZipFile(_icons.ICONS_DIR / "tabler-icons.zip") as archive:
-        once = SimpleNamespace(ZipFile=lambda _: contextlib.nullcontext(archive))
-        original, _icons.zipfile = _icons.zipfile, once  # type: ignore[assignment]
+        stub = SimpleNamespace(ZipFile=lambda _: contextlib.nullcontext(archive))
+        original, _icons.zipfile = _icons.zipfile, stub  # type: ignore[assignment]
         try:
             for icon in ICONS:
                 _icons.svg_from_icon(icon)
@@ -88,7 +93,7 @@ def _read_icons() -> None:
             _icons.zipfile = original  # type: ignore[assignment]
 
 
-def quiet() -> contextlib.redirect_stdout:
+def without_stdout() -> contextlib.redirect_stdout:
     """Suppress the banner that viser prints."""
     return contextlib.redirect_stdout(io.StringIO())
 
@@ -99,22 +104,22 @@ def _is_any(host: str) -> bool:
 
 
 @contextlib.contextmanager
-def _guarded(names: set[str], *, anyone: bool) -> Iterator[None]:
+def _guarded_sockets(names: set[str], *, any_host: bool) -> Iterator[None]:
     """Install the request filter and message checks while viser opens its server."""
     original = sockets.serve
 
-    def guarded(handler: Handling, *args: Any, process_request: Answering, **options: Any) -> Any:
-        answer = doorman(process_request, names, anyone=anyone)
-        return original(checked(handler), *args, process_request=answer, **options)
+    def serve_guarded(handler: SocketHandler, *args: Any, process_request: RequestHandler, **options: Any) -> Any:
+        filtered = request_filter(process_request, names, any_host=any_host)
+        return original(check_messages(handler), *args, process_request=filtered, **options)
 
-    sockets.serve = guarded  # type: ignore[assignment,misc]
+    sockets.serve = serve_guarded  # type: ignore[assignment,misc]
     try:
         yield
     finally:
         sockets.serve = original  # type: ignore[misc]
 
 
-def doorman(inner: Answering, names: set[str], *, anyone: bool) -> Answering:
+def request_filter(inner: RequestHandler, names: set[str], *, any_host: bool) -> RequestHandler:
     """Return a request handler that refuses foreign requests and adds security headers and the loading page.
 
     A page of another site in the operator's browser cannot open the websocket (scheme, host and port of its `Origin`
@@ -129,12 +134,12 @@ def doorman(inner: Answering, names: set[str], *, anyone: bool) -> Answering:
     """
     page = _page()
 
-    def answer(connection: Any, request: Request) -> Response | None:
-        host = _name(request.headers.get("Host", ""))
+    def filter_request(connection: Any, request: Request) -> Response | None:
+        host = _host_name(request.headers.get("Host", ""))
         origin = request.headers.get("Origin")
-        if not anyone and host not in names:
+        if not any_host and host not in names:
             return _refusal(f"viewer: found host {host[:80]!r}, expected {sorted(names)}; start the viewer with --name")
-        if origin is not None and not _is_own(origin, request, proxied=host in names and host not in HOME):
+        if origin is not None and not _is_own(origin, request, proxied=host in names and host not in LOCAL_NAMES):
             return _refusal(
                 "viewer: found a request of another site, expected one of this page; open the page directly"
             )
@@ -144,7 +149,7 @@ def doorman(inner: Answering, names: set[str], *, anyone: bool) -> Answering:
             return _response(http.HTTPStatus.OK, page, {"Content-Type": "text/html", "Content-Encoding": "gzip"})
         return inner(connection, request)
 
-    return answer
+    return filter_request
 
 
 def _is_own(origin: str, request: Request, *, proxied: bool) -> bool:
@@ -159,44 +164,44 @@ def _is_own(origin: str, request: Request, *, proxied: bool) -> bool:
     host = request.headers.get("Host", "").lower()
     forwarded = request.headers.get("X-Forwarded-Proto", "").lower()
     schemes = {forwarded} if forwarded else {"http", "https"} if proxied else {"http"}
-    return scheme in schemes & PORTS.keys() and _with_port(address, scheme) == _with_port(host, scheme)
+    return scheme in schemes & DEFAULT_PORTS.keys() and _with_port(address, scheme) == _with_port(host, scheme)
 
 
 def _with_port(address: str, scheme: str) -> tuple[str, str]:
     """Return host and port; without a port the default of the scheme."""
     rest = address.rpartition("]")[2]  # IPv6 address in brackets
-    return _name(address), rest.partition(":")[2] or PORTS[scheme]
+    return _host_name(address), rest.partition(":")[2] or DEFAULT_PORTS[scheme]
 
 
-def checked(handler: Handling) -> Handling:
+def check_messages(handler: SocketHandler) -> SocketHandler:
     """Return a websocket handler that closes the connection on a malformed or refused message and logs it."""
 
-    async def serve_one(connection: Any) -> None:
+    async def serve_checked(connection: Any) -> None:
         asyncio.get_running_loop().set_exception_handler(_log_defect)
         receive = connection.recv
 
         async def receive_checked(*args: Any, **options: Any) -> Any:
-            raw = await receive(*args, **options)
-            if fault := _fault(raw):
+            payload = await receive(*args, **options)
+            if fault := _message_fault(payload):
                 _log.warning("page: found %s, expected a message of this page; connection closed", fault)
                 await connection.close(VIOLATION, "viewer: message refused")
                 return await receive(*args, **options)  # raises: connection closed
-            return raw
+            return payload
 
         connection.recv = receive_checked
         await handler(connection)
 
-    return serve_one
+    return serve_checked
 
 
-def _fault(raw: object) -> str:
+def _message_fault(payload: object) -> str:
     """Describe the fault of a message; empty when it is valid."""
-    if not isinstance(raw, bytes):
+    if not isinstance(payload, bytes):
         return "text"
     try:
-        message = _messages.Message.deserialize(raw)
+        message = _messages.Message.deserialize(payload)
     except Exception as error:  # untrusted input: any exception of the library
-        return f"{len(raw)} malformed bytes ({type(error).__name__})"
+        return f"{len(payload)} malformed bytes ({type(error).__name__})"
     return f"a {type(message).__name__}" if isinstance(message, REFUSED) else ""
 
 
@@ -207,7 +212,7 @@ def _log_defect(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> Non
     _log.warning("page: %s", f"a message failed ({type(error).__name__}: {error})" if error else context["message"])
 
 
-def _name(address: str) -> str:
+def _host_name(address: str) -> str:
     """Return the host of `name:port` or `[::1]:port`."""
     if address.startswith("["):
         return address[1:].partition("]")[0].lower()
@@ -217,10 +222,13 @@ def _name(address: str) -> str:
 def _page() -> bytes:
     """Return the page of viser, gzipped, with title and a text for browsers without WebGL."""
     source = Path(viser.__file__).with_name("client") / "build" / "index.html"
-    text, first = source.read_text(encoding="utf-8"), Path(__file__).with_name("first.html").read_text(encoding="utf-8")
+    text, loading_html = (
+        source.read_text(encoding="utf-8"),
+        Path(__file__).with_name("first.html").read_text(encoding="utf-8"),
+    )
     at = text.index("<body")
     at = text.index(">", at) + 1
-    return gzip.compress((text[:at] + first + text[at:]).encode())
+    return gzip.compress((text[:at] + loading_html + text[at:]).encode())
 
 
 def _refusal(sentence: str) -> Response:

@@ -5,14 +5,14 @@ from typing import Any
 import numpy as np
 from viser import uplot
 
-from viewer.store.errors import AHEADS_S, by_ahead, errors
+from viewer.store.errors import LOOK_AHEADS_S, prediction_errors, rms_by_look_ahead
 from viewer.store.place import UNIT_M
-from viewer.store.store import Feed
+from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
-from viewer.text.mismatch_text import within
+from viewer.text.mismatch_text import is_located
 from viewer.theme.palette import Palette
 
-AHEAD_S = 5.0  # look-ahead whose error is shown over time [s]
+ERROR_AHEAD_S = 5.0  # look-ahead whose error is shown over time [s]
 PAST_S = 60.0  # length of the histories [s]
 
 
@@ -21,17 +21,19 @@ class Charts:
 
     def __init__(self, gui: Any, palette: Palette) -> None:
         self._gui, p = gui, palette
-        two = np.array([0.0, 1.0])
+        placeholder = np.array([0.0, 1.0])
         self._band = self._chart(
             "Error by look-ahead, m",
-            (("measured", p.flown), ("band", p.tube), ("horizon", p.horizon)),
-            (two,) * 4,
+            (("measured", p.actual), ("band", p.tube), ("horizon", p.horizon)),
+            (placeholder,) * 4,
         )
         self._error = self._chart(
-            f"Error {AHEAD_S:.0f} s ahead, m", (("measured", p.muted), ("located mismatch", p.mismatch)), (two,) * 3
+            f"Error {ERROR_AHEAD_S:.0f} s ahead, m",
+            (("measured", p.muted), ("located mismatch", p.mismatch)),
+            (placeholder,) * 3,
         )
-        self._fit = self._chart("Mean fit per verdict, %", (("fit", p.verified),), (two, two))
-        self._alt = self._chart("Altitude, m", (("flown", p.flown), ("predicted", p.predicting)), (two,) * 3)
+        self._fit = self._chart("Mean fit per verdict, %", (("fit", p.verified),), (placeholder, placeholder))
+        self._alt = self._chart("Altitude, m", (("flown", p.actual), ("predicted", p.predicting)), (placeholder,) * 3)
 
     def _chart(self, title: str, lines: tuple, data: tuple) -> tuple[Any, Any]:
         legend = " ".join(f'<span style="color:{colour};white-space:nowrap">━ {name}</span>' for name, colour in lines)
@@ -50,21 +52,21 @@ class Charts:
         )
         return head, plot
 
-    def draw(self, vehicle: Vehicle | None, feed: Feed, now: float) -> None:
+    def draw(self, vehicle: Vehicle | None, store: FleetStore, now: float) -> None:
         """Update the data; hide a chart without data."""
         if vehicle is None:
             for chart in (self._band, self._error, self._fit, self._alt):
-                _put(chart, None)
+                _show(chart, None)
             return
-        trail = feed.trail(vehicle)
-        made, off = errors(feed.past(vehicle), trail)
-        _put(self._band, band(vehicle, off), from_zero=True)
-        _put(self._error, over_time(made, off, vehicle), from_zero=True)
-        _put(self._fit, _history(feed.fits(vehicle), 1))
-        _put(self._alt, _altitude(vehicle, trail, now))
+        trail = store.trail(vehicle)
+        issued, distances = prediction_errors(store.past(vehicle), trail)
+        _show(self._band, band(vehicle, distances), from_zero=True)
+        _show(self._error, over_time(issued, distances, vehicle), from_zero=True)
+        _show(self._fit, _history(store.fits(vehicle), 1))
+        _show(self._alt, _altitude(vehicle, trail, now))
 
 
-def _put(chart: tuple[Any, Any], data: tuple[np.ndarray, ...] | None, *, from_zero: bool = False) -> None:
+def _show(chart: tuple[Any, Any], data: tuple[np.ndarray, ...] | None, *, from_zero: bool = False) -> None:
     """Show data, x first. The y range is explicit, as NaN gaps break automatic scaling."""
     for part in chart:
         part.visible = data is not None
@@ -74,24 +76,24 @@ def _put(chart: tuple[Any, Any], data: tuple[np.ndarray, ...] | None, *, from_ze
     x0, x1 = np.floor(data[0][0] / 10) * 10, np.ceil(data[0][-1] / 10) * 10
     scales = {
         "x": {"time": False, "range": (float(x0), float(x1))},
-        "y": {"range": scale(np.concatenate([*data[1:], *zero]))},
+        "y": {"range": axis_range(np.concatenate([*data[1:], *zero]))},
     }
     if chart[1].scales != scales:  # a new scale recreates the chart
         chart[1].scales = scales
     chart[1].data = data
 
 
-def scale(y: np.ndarray) -> tuple[float, float]:
+def axis_range(y: np.ndarray) -> tuple[float, float]:
     """Return a y range over the finite values in multiples of 1, 2 or 5 times 10^k, so that it rarely changes."""
     y = y[np.isfinite(y)]
     low, high = (float(y.min()), float(y.max())) if len(y) else (0.0, 1.0)
-    rough = max(high - low, 0.02 * abs(high), 1e-3) / 2
-    power = 10.0 ** np.floor(np.log10(rough))
-    step = float(power * next(m for m in (1, 2, 5, 10) if m * power >= rough * 0.999))
+    rough_step = max(high - low, 0.02 * abs(high), 1e-3) / 2
+    power = 10.0 ** np.floor(np.log10(rough_step))
+    step = float(power * next(m for m in (1, 2, 5, 10) if m * power >= rough_step * 0.999))
     return float(np.floor(low / step) * step), float((np.floor(high / step) + 1) * step)
 
 
-def band(vehicle: Vehicle | None, off: np.ndarray) -> tuple[np.ndarray, ...] | None:
+def band(vehicle: Vehicle | None, distances: np.ndarray) -> tuple[np.ndarray, ...] | None:
     """Return measured error and largest half-axis of the band against look-ahead, and a vertical horizon line.
 
     Args:
@@ -100,33 +102,33 @@ def band(vehicle: Vehicle | None, off: np.ndarray) -> tuple[np.ndarray, ...] | N
     Returns:
         x [s], measured, band, horizon [m]
     """
-    if vehicle is None or (told := vehicle.forecast) is None:
+    if vehicle is None or (forecast := vehicle.forecast) is None:
         return None
-    last = min(float(told.ahead[-1]), max(1.4 * told.until, 10.0))
-    horizon = [told.until, told.until + 1e-3]
-    x = np.unique(np.concatenate([AHEADS_S[last >= AHEADS_S], np.linspace(0, last, 40), horizon]))
-    wide = told.width(x).max(axis=1) * UNIT_M
-    measured = by_ahead(off)
-    known = np.isfinite(measured)
+    last = min(float(forecast.ahead[-1]), max(1.4 * forecast.horizon_s, 10.0))
+    horizon = [forecast.horizon_s, forecast.horizon_s + 1e-3]
+    x = np.unique(np.concatenate([LOOK_AHEADS_S[last >= LOOK_AHEADS_S], np.linspace(0, last, 40), horizon]))
+    half_axis = forecast.half_axes_at(x).max(axis=1) * UNIT_M
+    measured = rms_by_look_ahead(distances)
+    valid = np.isfinite(measured)
     line = np.full(len(x), np.nan)
-    if known.any():
-        ends = AHEADS_S[known][[0, -1]]
+    if valid.any():
+        ends = LOOK_AHEADS_S[valid][[0, -1]]
         inside = (x >= ends[0]) & (x <= ends[1])
-        line[inside] = np.interp(x[inside], AHEADS_S[known], measured[known])
-    upright = np.full(len(x), np.nan)
-    upright[np.searchsorted(x, horizon)] = [0.0, wide.max()]
-    return x, line, wide, upright
+        line[inside] = np.interp(x[inside], LOOK_AHEADS_S[valid], measured[valid])
+    horizon_line = np.full(len(x), np.nan)
+    horizon_line[np.searchsorted(x, horizon)] = [0.0, half_axis.max()]
+    return x, line, half_axis, horizon_line
 
 
-def over_time(made: np.ndarray, off: np.ndarray, vehicle: Vehicle) -> tuple[np.ndarray, ...] | None:
+def over_time(issued: np.ndarray, distances: np.ndarray, vehicle: Vehicle) -> tuple[np.ndarray, ...] | None:
     """Return the error at one look-ahead over time, and separately where a mismatch was located."""
-    at = int(AHEAD_S - AHEADS_S[0])
-    known = np.isfinite(off[:, at])
-    if known.sum() < 2:
+    at = int(ERROR_AHEAD_S - LOOK_AHEADS_S[0])
+    valid = np.isfinite(distances[:, at])
+    if valid.sum() < 2:
         return None
-    due, error = made[known] + AHEAD_S, off[known, at]
-    strange = np.where(within(due, vehicle.mismatch), error, np.nan)
-    return due - due[-1], error, strange
+    due, error = issued[valid] + ERROR_AHEAD_S, distances[valid, at]
+    mismatched = np.where(is_located(due, vehicle.mismatch), error, np.nan)
+    return due - due[-1], error, mismatched
 
 
 def _history(rows: np.ndarray, column: int) -> tuple[np.ndarray, ...] | None:
@@ -134,21 +136,21 @@ def _history(rows: np.ndarray, column: int) -> tuple[np.ndarray, ...] | None:
     if len(rows) < 2:
         return None
     x = rows[:, 0] - rows[-1, 0]
-    keep = (x >= -PAST_S) & np.concatenate([np.diff(x) > 0, [True]])
-    return (x[keep], rows[keep, column]) if keep.sum() > 1 else None
+    recent = (x >= -PAST_S) & np.concatenate([np.diff(x) > 0, [True]])
+    return (x[recent], rows[recent, column]) if recent.sum() > 1 else None
 
 
 def _altitude(vehicle: Vehicle | None, trail: np.ndarray, now: float) -> tuple[np.ndarray, ...] | None:
     """Return flown and predicted altitude: (x, flown, predicted) [s from now, m above mean sea level]."""
-    flown = _history(trail, 3)
-    if vehicle is None or flown is None:
+    history = _history(trail, 3)
+    if vehicle is None or history is None:
         return None
     base = vehicle.alt_m - trail[-1, 3] * UNIT_M
-    x, up = flown[0], flown[1] * UNIT_M + base
+    x, up = history[0], history[1] * UNIT_M + base
     if vehicle.forecast is None:
         return x, up, np.full(len(x), np.nan)
-    told = vehicle.forecast
-    ahead = np.linspace(0.1, max(told.until, 0.2), 40)
-    predicted = told.at(ahead + max(float(trail[-1, 0]) - told.t, 0.0))[:, 2] * UNIT_M + base
+    forecast = vehicle.forecast
+    ahead = np.linspace(0.1, max(forecast.horizon_s, 0.2), 40)
+    predicted = forecast.position_at(ahead + max(float(trail[-1, 0]) - forecast.t, 0.0))[:, 2] * UNIT_M + base
     blank = np.full(len(ahead), np.nan), np.full(len(x), np.nan)
     return np.concatenate([x, ahead]), np.concatenate([up, blank[0]]), np.concatenate([blank[1], predicted])

@@ -8,7 +8,7 @@ import viser
 
 from viewer.store.vehicle import Vehicle
 
-MOST = 200  # UAVs in the palette; the search field finds the others
+MAX_OFFERED = 200  # UAVs in the palette; the search field finds the others
 
 
 class Commands:
@@ -22,8 +22,8 @@ class Commands:
 
     def offer(self, fleet: list[Vehicle]) -> None:
         """Add selection commands for the first `MAX_OFFERED` UAVs."""
-        for vehicle in fleet[:MOST]:
-            if vehicle.uav not in self._offered and len(self._offered) < MOST:
+        for vehicle in fleet[:MAX_OFFERED]:
+            if vehicle.uav not in self._offered and len(self._offered) < MAX_OFFERED:
                 command = self._gui.add_command(f"Select {vehicle.name}", icon=viser.Icon.DRONE)
                 command.on_trigger(partial(self._pick, vehicle.uav))
                 self._offered.add(vehicle.uav)

@@ -10,18 +10,18 @@ import viser
 from viewer.browser.browser import Browser
 from viewer.panels.charts import Charts
 from viewer.panels.commands import Commands
-from viewer.panels.detail import about, facts
-from viewer.panels.event_list import listing
-from viewer.store.states import Router, notices
-from viewer.store.store import Feed
+from viewer.panels.detail import figures_html, status_html
+from viewer.panels.event_list import event_list_html
+from viewer.store.states import RouterStatus, notices
+from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
-from viewer.text.clicks import clicked
-from viewer.text.missed_events import since
-from viewer.text.words import MAX_ROWS, alerts, empty, legend, severity, summary, table
-from viewer.theme.palette import WORD, Palette, triple
+from viewer.text.clicks import parse_click
+from viewer.text.missed_events import missed_events_html
+from viewer.text.words import MAX_ROWS, alerts_html, empty_html, legend_html, severity, summary_html, table
+from viewer.theme.palette import STATE_TEXT, Palette, triple
 
 STALE = "No data from the viewer: this page is out of date. Restart the viewer; the page reconnects automatically."
-NOBODY = "–"  # menu entry without a selection
+NO_UAV = "–"  # menu entry without a selection
 
 
 class Panels:
@@ -37,9 +37,9 @@ class Panels:
         self._gui, self._palette, self._choose = browser.client.gui, palette, choose
         self._presence, self._browser = browser.presence, browser
         self._commands = Commands(self._gui, choose, actions)
-        self._beat = False
-        self._router = Router()
-        self.ground_said = ""  # error of the terrain files
+        self._pulse = False
+        self._router = RouterStatus()
+        self.ground_error = ""  # error of the terrain files
         self.seek = ""  # page code that seeks to the time of an event
         self._gui.configure_theme(
             dark_mode=palette.dark, show_logo=False, show_share_button=False, brand_color=triple(palette.predicting)
@@ -49,7 +49,7 @@ class Panels:
         self._gui.main_panel.set_width(340)
         css = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
         self._gui.add_html(f"<style>:root{{--muted:{palette.muted}}}{css}</style>")
-        self._banner, self._broken, self._legend = (self._gui.add_html("") for _ in range(3))
+        self._banner, self._error, self._legend = (self._gui.add_html("") for _ in range(3))
         self._build_left()
         self._build_right()
 
@@ -62,11 +62,11 @@ class Panels:
             self._show = gui.add_button_group("Show", ("All", "Alerts", "Selected"))
             self._filter = "All"
             self._table = gui.add_html("")
-            self._menu = gui.add_dropdown("Select", (NOBODY,))
-            self._picked = gui.add_text("picked", "", visible=False)
+            self._menu = gui.add_dropdown("Select", (NO_UAV,))
+            self._pick_input = gui.add_text("picked", "", visible=False)
         with tabs.add_tab("Alerts", viser.Icon.ALERT_TRIANGLE):
-            self._since = gui.add_html("")
-            self._read = gui.add_button("Mark as read", visible=False)
+            self._missed = gui.add_html("")
+            self._acknowledge = gui.add_button("Mark as read", visible=False)
             self._alerts = gui.add_html("")
         with tabs.add_tab("Display", viser.Icon.ADJUSTMENTS):
             self.predicted = gui.add_checkbox("Predicted paths", True)
@@ -77,10 +77,10 @@ class Panels:
             self.follow: Any = gui.add_checkbox("Follow selected", False)
             light = gui.add_checkbox("Light colours", not self._palette.dark)
             self.glyph = gui.add_slider("Aircraft size", min=0.5, max=4.0, step=0.1, initial_value=1.0)
-        self._read.on_click(lambda _: self._presence.seen())
+        self._acknowledge.on_click(lambda _: self._presence.acknowledge())
         self._menu.on_update(lambda _: self._pick(self._menu.value.removeprefix("UAV-")))
-        self._picked.on_update(lambda _: self._pick(self._picked.value))
-        light.on_update(lambda _: self._browser.paint(light=light.value))
+        self._pick_input.on_update(lambda _: self._pick(self._pick_input.value))
+        light.on_update(lambda _: self._browser.set_theme(light=light.value))
         self._show.on_click(lambda _: setattr(self, "_filter", self._show.value))
 
     def _build_right(self) -> None:
@@ -95,73 +95,78 @@ class Panels:
 
     def _pick(self, text: str) -> None:
         """Select the UAV that a click wrote into the hidden input."""
-        if (found := clicked(text)) is not None:
-            self._choose(*found)
+        if (click := parse_click(text)) is not None:
+            self._choose(*click)
 
-    def say_broken(self, sentence: str) -> None:
+    def show_error(self, sentence: str) -> None:
         """Show a drawing error; an empty sentence removes it."""
-        said = (
+        html = (
             f'<div class="uav"><div class="say" style="border-color:{self._palette.mismatch}">{escape(sentence)}</div>'
         )
-        said = f"{said}</div>" if sentence else ""
-        if self._broken.content != said:
-            self._broken.content = said
+        html = f"{html}</div>" if sentence else ""
+        if self._error.content != html:
+            self._error.content = html
 
-    def draw(self, fleet: list[Vehicle], feed: Feed, now: float, selected: int | None) -> None:
+    def draw(self, fleet: list[Vehicle], store: FleetStore, now: float, selected: int | None) -> None:
         """Update all panels; call it about once per second and when the selection changes."""
-        self._beat, palette, pick = not self._beat, self._palette, self._handler()
-        chosen = next((vehicle for vehicle in fleet if vehicle.uav == selected), None)
-        kept = [vehicle for vehicle in fleet if self._passes(vehicle, now, selected)]
-        kept = sorted(kept, key=lambda vehicle: severity(vehicle, now))[:MAX_ROWS]
-        self._presence.here()
-        missed = since(fleet, self._presence.away, palette, pick)
-        said = (
-            (self._banner, f'<div class="stale {"a" if self._beat else "b"}">{STALE}</div>'),
-            (self._notices, notices(feed, self._router.say(feed.router, now), self.ground_said, palette)),
-            (self._summary, summary(fleet, feed, palette, now) if fleet else empty(feed, now)),
-            (self._table, table(kept, palette, now, total=len(fleet), pick=pick, selected=selected) if fleet else ""),
-            (self._legend, legend(fleet, palette)),
-            (self._since, missed),
-            (self._alerts, alerts(fleet, feed, palette, pick)),
-            (self._facts, facts(chosen, now) if chosen is not None else ""),
+        self._pulse, palette, pick = not self._pulse, self._palette, self._handler()
+        selected_vehicle = next((vehicle for vehicle in fleet if vehicle.uav == selected), None)
+        shown = [vehicle for vehicle in fleet if self._passes(vehicle, now, selected)]
+        shown = sorted(shown, key=lambda vehicle: severity(vehicle, now))[:MAX_ROWS]
+        self._presence.mark_present()
+        missed = missed_events_html(fleet, self._presence.absence, palette, pick)
+        contents = (
+            (self._banner, f'<div class="stale {"a" if self._pulse else "b"}">{STALE}</div>'),
+            (
+                self._notices,
+                notices(store, self._router.describe(store.router_available, now), self.ground_error, palette),
+            ),
+            (self._summary, summary_html(fleet, store, palette, now) if fleet else empty_html(store, now)),
+            (self._table, table(shown, palette, now, total=len(fleet), pick=pick, selected=selected) if fleet else ""),
+            (self._legend, legend_html(fleet, palette)),
+            (self._missed, missed),
+            (self._alerts, alerts_html(fleet, store, palette, pick)),
+            (self._facts, figures_html(selected_vehicle, now) if selected_vehicle is not None else ""),
         )
         with self._browser.client.atomic():  # contents first: the block delays all other messages
-            for html, text in said:
+            for html, text in contents:
                 html.content = text
-            self._list(kept)
-            self._read.visible = bool(missed)
-            self.show(chosen, now)
-            told = listing(chosen.events, palette, self.seek) if chosen is not None else ""
-            if told != self._events.content:  # an unchanged list keeps its scroll position
-                self._events.content = told
-        self._charts.draw(chosen, feed, now)
+            self._update_menu(shown)
+            self._acknowledge.visible = bool(missed)
+            self.show(selected_vehicle, now)
+            events_html = (
+                event_list_html(selected_vehicle.events, palette, self.seek) if selected_vehicle is not None else ""
+            )
+            if events_html != self._events.content:  # an unchanged list keeps its scroll position
+                self._events.content = events_html
+        self._charts.draw(selected_vehicle, store, now)
         self._commands.offer(fleet)
 
-    def show(self, chosen: Vehicle | None, now: float) -> None:
+    def show(self, vehicle: Vehicle | None, now: float) -> None:
         """Show the status of the selected UAV."""
-        nobody = '<div class="uav soft">No UAV selected: click a row or an aircraft, or press Ctrl+K.</div>'
-        said = about(chosen, self._palette, now) if chosen is not None else nobody
-        if said != self._about.content:
-            self._about.content = said
+        placeholder = '<div class="uav soft">No UAV selected: click a row or an aircraft, or press Ctrl+K.</div>'
+        html = status_html(vehicle, self._palette, now) if vehicle is not None else placeholder
+        if html != self._about.content:
+            self._about.content = html
 
     def _passes(self, vehicle: Vehicle, now: float, selected: int | None) -> bool:
         if self._filter == "Alerts" and not vehicle.alerts:
             return False
         if self._filter == "Selected" and vehicle.uav != selected:
             return False
-        if not (wanted := self._search.value.lower().split()):
+        if not (terms := self._search.value.lower().split()):
             return True
         mode = vehicle.status.mode if vehicle.status is not None else ""
-        text = f"{vehicle.name} {vehicle.uav} {WORD[vehicle.state(now)]} {mode}".lower()
-        return all(word in text for word in wanted)
+        text = f"{vehicle.name} {vehicle.uav} {STATE_TEXT[vehicle.state(now)]} {mode}".lower()
+        return all(term in text for term in terms)
 
     def _handler(self) -> str:
         """Return the click handler of a table row: it writes the id into the hidden input."""
-        message = f"{{{{type:'GuiUpdateMessage',uuid:'{self._picked._impl.uuid}',updates:{{{{value:'{{}}'}}}}}}}}"
+        message = f"{{{{type:'GuiUpdateMessage',uuid:'{self._pick_input._impl.uuid}',updates:{{{{value:'{{}}'}}}}}}}}"
         return f"var m=window.__viserMutable;m&&m.sendMessage({message})"
 
-    def _list(self, kept: list[Vehicle]) -> None:
+    def _update_menu(self, shown: list[Vehicle]) -> None:
         """List the rows of the table in the menu."""
-        names = NOBODY, *(vehicle.name for vehicle in kept)
+        names = NO_UAV, *(vehicle.name for vehicle in shown)
         if self._menu.options != names:
             self._menu.options = names

@@ -4,19 +4,19 @@ from typing import Any
 
 import numpy as np
 
-from viewer.scene.labels import Sight
+from viewer.scene.labels import CameraView
 
 FOV = np.radians(50.0)  # vertical field of view [rad]
 IN_VIEW_M = 20_000.0  # points farther from the centre of the fleet are not framed [m]
-CLOSE = 1.3  # margin around a focused aircraft for its labels [-]
-BELOW = 0.12  # share of the image height below the timeline [-]
+FOCUS_MARGIN = 1.3  # margin around a focused aircraft for its labels [-]
+BOTTOM_SHARE = 0.12  # share of the image height below the timeline [-]
 CLOSEST = 5.0  # smallest distance [10 m]
-NOBODY = 60.0 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)  # framed without UAVs [10 m]
-VIEW = (np.radians(-125.0), np.radians(38.0))  # camera direction: azimuth from east, elevation [rad]
+EMPTY_VIEW = 60.0 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)  # framed without UAVs [10 m]
+VIEW_ANGLES = (np.radians(-125.0), np.radians(38.0))  # camera direction: azimuth from east, elevation [rad]
 
 
 def frame(
-    points: np.ndarray, aspect: float, margin: float = 1.1, away: np.ndarray | None = None
+    points: np.ndarray, aspect: float, margin: float = 1.1, direction: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute the camera position so that every point is in view.
 
@@ -28,30 +28,33 @@ def frame(
     Returns:
         position and look-at, two (3,) [10 m]
     """
-    azimuth, elevation = VIEW
-    if away is not None and np.linalg.norm(away[:2]) > 1e-6:
-        azimuth, elevation = np.arctan2(away[1], away[0]), np.arctan2(away[2], np.linalg.norm(away[:2]))
-    to_eye = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    azimuth, elevation = VIEW_ANGLES
+    if direction is not None and np.linalg.norm(direction[:2]) > 1e-6:
+        azimuth, elevation = (
+            np.arctan2(direction[1], direction[0]),
+            np.arctan2(direction[2], np.linalg.norm(direction[:2])),
+        )
+    to_camera = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    up = np.cross(to_eye, right)
+    up = np.cross(to_camera, right)
     look_at = (points.min(axis=0) + points.max(axis=0)) / 2
     for _ in range(3):  # centre and distance depend on each other: iterate
-        x, y, z = (points - look_at) @ right, (points - look_at) @ up, (points - look_at) @ to_eye
-        wide, tall = np.tan(FOV / 2) * aspect, np.tan(FOV / 2) * (1 - BELOW)
+        x, y, z = (points - look_at) @ right, (points - look_at) @ up, (points - look_at) @ to_camera
+        wide, tall = np.tan(FOV / 2) * aspect, np.tan(FOV / 2) * (1 - BOTTOM_SHARE)
         distance = float(np.max(np.maximum(np.abs(x) / wide, np.abs(y) / tall) * margin + z))
         distance = max(distance, CLOSEST)
         depth = distance - z
         look_at = look_at + right * _middle(x / depth) * distance + up * _middle(y / depth) * distance
-    eye = look_at + to_eye * distance - up * BELOW * np.tan(FOV / 2) * distance
-    sink = (eye[2] - float(points[:, 2].mean())) / to_eye[2]  # orbit about the height of the fleet
-    return eye, eye - to_eye * max(sink, CLOSEST / 2)
+    position = look_at + to_camera * distance - up * BOTTOM_SHARE * np.tan(FOV / 2) * distance
+    ground_distance = (position[2] - float(points[:, 2].mean())) / to_camera[2]  # orbit about the height of the fleet
+    return position, position - to_camera * max(ground_distance, CLOSEST / 2)
 
 
 def _middle(x: np.ndarray) -> float:
     return float(x.min() + x.max()) / 2
 
 
-def near(points: np.ndarray, reach: float) -> np.ndarray:
+def within_reach(points: np.ndarray, reach: float) -> np.ndarray:
     """Return the points (n, 3) within `reach` [10 m] of the most central one, at least one."""
     centre = points[np.argmin(np.linalg.norm(points - np.median(points, axis=0), axis=1))]
     return points[np.linalg.norm(points - centre, axis=1) < reach]
@@ -63,7 +66,7 @@ class Camera:
     def __init__(self, client: Any) -> None:
         self._client = client
         self._placed: np.ndarray | None = None
-        self._turned = False  # camera moved by this page, maybe not yet reported by the client
+        self._moved_by_page = False  # camera moved by this page, maybe not yet reported by the client
 
     @property
     def aspect(self) -> float:
@@ -71,27 +74,27 @@ class Camera:
         camera = self._client.camera
         return camera.image_width / max(camera.image_height, 1) or 1.0
 
-    def sight(self) -> Sight:
+    def view(self) -> CameraView:
         """Return the current camera view."""
         camera = self._client.camera
-        return Sight(np.array(camera.position), np.array(camera.look_at), float(camera.fov), self.aspect)
+        return CameraView(np.array(camera.position), np.array(camera.look_at), float(camera.fov), self.aspect)
 
-    def show(self, points: np.ndarray, *, again: bool = False) -> None:
+    def show(self, points: np.ndarray, *, force: bool = False) -> None:
         """Frame the points (n, 3) [10 m]; keep a camera that the operator moved, unless `force`."""
         camera, placed = self._client.camera, self._placed
         moved = placed is not None and np.linalg.norm(camera.position - placed) > 0.01 * np.linalg.norm(placed)
-        if (moved or self._turned) and not again:
+        if (moved or self._moved_by_page) and not force:
             return
-        self._turned = False
+        self._moved_by_page = False
         camera.position, camera.look_at = frame(points, self.aspect)
         self._placed = np.array(camera.position)
 
     def fly_to(self, points: np.ndarray) -> None:
         """Frame points (n, 3) [10 m] from the current direction."""
         camera = self._client.camera
-        self._turned = True
-        away = np.array(camera.position) - np.array(camera.look_at)
-        camera.position, camera.look_at = frame(points, self.aspect, CLOSE, away)
+        self._moved_by_page = True
+        direction = np.array(camera.position) - np.array(camera.look_at)
+        camera.position, camera.look_at = frame(points, self.aspect, FOCUS_MARGIN, direction)
 
     def follow(self, step: np.ndarray) -> None:
         """Translate by the step (3,) of the followed UAV [10 m]."""
@@ -99,7 +102,7 @@ class Camera:
         camera.position, camera.look_at = camera.position + step, camera.look_at + step
 
 
-def start_at(server: Any, points: np.ndarray = NOBODY) -> None:
+def set_initial_view(server: Any, points: np.ndarray = EMPTY_VIEW) -> None:
     """Set the initial camera of new pages to frame points (n, 3) [10 m]."""
     start = server.initial_camera
     start.fov, start.near, start.far = FOV, 0.1, 5000.0

@@ -2,42 +2,49 @@
 
 import numpy as np
 
-from fleet.contract import State
+from fleet.contract import TwinState
 from viewer.store.place import UNIT_M, scene_quat
-from viewer.store.received.inbox import CROWD
-from viewer.store.store import Feed
+from viewer.store.received.inbox import LARGE_FLEET
+from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.text.mismatch_text import in_force
 
 CHUNKS, STEPS = 5, 12  # the trail: chunks of 12 s and a head of up to 12 s, one point per second
-MINUTE = np.arange(float(CHUNKS + 1) * STEPS, -1.0, -1.0)  # age of each trail point, (73,) [s]
-COARSE = ((60, 1), (CROWD, 2))  # (most UAVs, seconds between drawn trail points); else 4
-TURNS = 5  # calls in which all positions of a large fleet are decoded once
+TRAIL_AGES_S = np.arange(float(CHUNKS + 1) * STEPS, -1.0, -1.0)  # age of each trail point, (73,) [s]
+TRAIL_STRIDES = ((60, 1), (LARGE_FLEET, 2))  # (most UAVs, seconds between drawn trail points); else 4
+READ_PARTS = 5  # calls in which all positions of a large fleet are decoded once
 COAST_S, STALE_S = 1.5, 2.5  # longest extrapolation; longest interval for a velocity [s]
-FASTEST = 30.0  # a higher speed is a jump [10 m/s]
-LEAP_M = 1_000.0  # a larger step in one second restarts the trail, as for a restarted recording [m]
-HOVER = ("multirotor", "helicopter")  # vehicle types drawn with rotors
-LOOKS = ("muted", "predicting", "verified", "identifying", "lost", "mismatch")  # palette colour of each display status
-WAITING, PREDICTING, VERIFIED, IDENTIFYING, LOST, MISMATCH = range(len(LOOKS))
-_OF_STATE = {
-    State.PREDICTING: PREDICTING,
-    State.VERIFIED: VERIFIED,
-    State.IDENTIFYING: IDENTIFYING,
-    State.LINK_LOST: LOST,
+MAX_SPEED = 30.0  # a higher speed is a jump [10 m/s]
+JUMP_M = 1_000.0  # a larger step in one second restarts the trail, as for a restarted recording [m]
+ROTORCRAFT = ("multirotor", "helicopter")  # vehicle types drawn with rotors
+STATUS_COLOURS = (
+    "muted",
+    "predicting",
+    "verified",
+    "identifying",
+    "lost",
+    "mismatch",
+)  # palette colour of each display status
+WAITING, PREDICTING, VERIFIED, IDENTIFYING, LOST, MISMATCH = range(len(STATUS_COLOURS))
+_STATUS_OF_STATE = {
+    TwinState.PREDICTING: PREDICTING,
+    TwinState.VERIFIED: VERIFIED,
+    TwinState.IDENTIFYING: IDENTIFYING,
+    TwinState.LINK_LOST: LOST,
 }
 
 
-def look(vehicle: Vehicle, now: float) -> int:
+def display_status(vehicle: Vehicle, now: float) -> int:
     """Return the display status of a UAV; a mismatch or an alert takes precedence over all but a lost link."""
     state = vehicle.state(now)
     if vehicle.ended:
         return WAITING
-    if state is not State.LINK_LOST and (vehicle.alerts or in_force(vehicle.mismatch)):
+    if state is not TwinState.LINK_LOST and (vehicle.alerts or in_force(vehicle.mismatch)):
         return MISMATCH
-    return _OF_STATE.get(state, WAITING)
+    return _STATUS_OF_STATE.get(state, WAITING)
 
 
-class Flock:
+class FleetArrays:
     """Drawn UAVs in the order of their ids; arrays of length n."""
 
     def __init__(self) -> None:
@@ -46,41 +53,43 @@ class Flock:
         self.now = 0.0  # time of the snapshots, monotonic [s]
         self.uavs: tuple[int, ...] = ()
         self._rows: dict[int, int] = {}  # row of each UAV
-        self.looks = np.zeros(0, int)  # indices into STATUS_COLOURS
-        self.hover = np.zeros(0, bool)  # rotors instead of wings
+        self.statuses = np.zeros(0, int)  # indices into STATUS_COLOURS
+        self.has_rotors = np.zeros(0, bool)  # rotors instead of wings
         self.at = np.zeros((0, 3))  # scene ENU [10 m]
         self.quat = np.zeros((0, 4))  # orientation, scalar first
-        self.changes = 0  # counts changes of the drawn UAVs and restarted trails
-        self.beats = 0  # seconds of trail
-        self.ring = np.zeros((0, len(MINUTE), 3))  # a minute of trail, newest last
-        self._ghosts: list[tuple[int, Vehicle]] = []  # UAVs without telemetry, drawn at a predicted or last position
-        self._turn = 0  # part of a large fleet decoded last
-        self._told = np.zeros((0, 3))  # large fleet: last decoded positions [10 m]
-        self._heard = np.zeros(0)  # their arrival, monotonic [s]
-        self._speed = np.zeros((0, 3))  # velocities at that time [10 m/s]
+        self.revision = 0  # counts changes of the drawn UAVs and restarted trails
+        self.trail_steps = 0  # seconds of trail
+        self.trails = np.zeros((0, len(TRAIL_AGES_S), 3))  # a minute of trail, newest last
+        self._predicted_only: list[
+            tuple[int, Vehicle]
+        ] = []  # UAVs without telemetry, drawn at a predicted or last position
+        self._read_part = 0  # part of a large fleet decoded last
+        self._read_positions = np.zeros((0, 3))  # large fleet: last decoded positions [10 m]
+        self._read_times = np.zeros(0)  # their arrival, monotonic [s]
+        self._velocities = np.zeros((0, 3))  # velocities at that time [10 m/s]
 
     @property
-    def crowd(self) -> bool:
+    def large_fleet(self) -> bool:
         """Return whether the fleet is large: then only exceptional UAVs have predicted paths."""
-        return len(self.uavs) > CROWD
+        return len(self.uavs) > LARGE_FLEET
 
     @property
     def stride(self) -> int:
         """Return the seconds between the drawn points of a trail."""
-        return next((step for most, step in COARSE if len(self.uavs) <= most), 4)
+        return next((step for limit, step in TRAIL_STRIDES if len(self.uavs) <= limit), 4)
 
     @property
     def chunks(self) -> int:
         """Return the number of closed trail chunks to draw."""
-        return CHUNKS if len(self.uavs) <= COARSE[0][0] else 2 if self.crowd else 3
+        return CHUNKS if len(self.uavs) <= TRAIL_STRIDES[0][0] else 2 if self.large_fleet else 3
 
     @property
     def exceptions(self) -> np.ndarray:
         """Return a mask of UAVs with an alert, mismatch or lost link, (n,)."""
-        return (self.looks == MISMATCH) | (self.looks == LOST)
+        return (self.statuses == MISMATCH) | (self.statuses == LOST)
 
     @property
-    def needy(self) -> list[tuple[Vehicle, int]]:
+    def exceptional(self) -> list[tuple[Vehicle, int]]:
         """Return UAVs with an alert, mismatch or lost link, and their rows."""
         return [(self._shown[i], i) for i in np.flatnonzero(self.exceptions).tolist()]
 
@@ -88,35 +97,41 @@ class Flock:
         """Return the row of a UAV; None when it is not drawn."""
         return self._rows.get(uav) if uav is not None else None
 
-    def meet(self, fleet: list[Vehicle], now: float) -> None:
+    def update_fleet(self, fleet: list[Vehicle], now: float) -> None:
         """Update UAVs and statuses; call it once per second."""
         self.fleet, self.now = fleet, now
-        shown = [(vehicle, at) for vehicle in fleet if (at := vehicle.where(now)) is not None]
+        shown = [(vehicle, at) for vehicle in fleet if (at := vehicle.position(now)) is not None]
         self._shown = [vehicle for vehicle, _ in shown]
         uavs = tuple(vehicle.uav for vehicle in self._shown)
-        self.looks = np.array([look(vehicle, now) for vehicle, _ in shown], int)
-        hover = np.array([v.status is not None and v.status.vehicle in HOVER for v, _ in shown], bool)
-        if uavs != self.uavs or not np.array_equal(hover, self.hover):
-            self._enlist(uavs, np.array([at for _, at in shown]).reshape(-1, 3))
-            self.hover = hover
-        self._ghosts = [(i, v) for i, (v, _) in enumerate(shown) if v.ended or v.at is None or self.looks[i] == LOST]
-        for i, _ in self._ghosts:
+        self.statuses = np.array([display_status(vehicle, now) for vehicle, _ in shown], int)
+        has_rotors = np.array([v.status is not None and v.status.vehicle in ROTORCRAFT for v, _ in shown], bool)
+        if uavs != self.uavs or not np.array_equal(has_rotors, self.has_rotors):
+            self._set_uavs(uavs, np.array([at for _, at in shown]).reshape(-1, 3))
+            self.has_rotors = has_rotors
+        self._predicted_only = [
+            (i, v) for i, (v, _) in enumerate(shown) if v.ended or v.at is None or self.statuses[i] == LOST
+        ]
+        for i, _ in self._predicted_only:
             self.at[i] = shown[i][1]
-            if self.crowd:
-                self._told[i] = shown[i][1]
+            if self.large_fleet:
+                self._read_positions[i] = shown[i][1]
 
-    def _enlist(self, uavs: tuple[int, ...], at: np.ndarray) -> None:
+    def _set_uavs(self, uavs: tuple[int, ...], at: np.ndarray) -> None:
         """Replace the set of UAVs; remaining UAVs keep their trails."""
-        ring = np.repeat(at[:, None], len(MINUTE), axis=1)
+        trails = np.repeat(at[:, None], len(TRAIL_AGES_S), axis=1)
         for i, uav in enumerate(uavs):
             if uav in self._rows:
-                ring[i] = self.ring[self._rows[uav]]
-        self.ring, self.uavs, self.at, self.changes = ring, uavs, at, self.changes + 1
+                trails[i] = self.trails[self._rows[uav]]
+        self.trails, self.uavs, self.at, self.revision = trails, uavs, at, self.revision + 1
         self._rows = {uav: i for i, uav in enumerate(uavs)}
         self.quat = np.tile([1.0, 0.0, 0.0, 0.0], (len(uavs), 1))
-        self._told, self._heard, self._speed = at.copy(), np.full(len(uavs), -np.inf), np.zeros_like(at)
+        self._read_positions, self._read_times, self._velocities = (
+            at.copy(),
+            np.full(len(uavs), -np.inf),
+            np.zeros_like(at),
+        )
 
-    def pose(self, feed: Feed, now: float) -> None:
+    def update_poses(self, store: FleetStore, now: float) -> None:
         """Update positions and attitudes; call it once per frame.
 
         Of a large fleet each call decodes a part and extrapolates the others; exceptional and selected UAVs are
@@ -124,42 +139,42 @@ class Flock:
         """
         if not self.uavs:
             return
-        if not self.crowd:
-            self._take_all(feed, now)
+        if not self.large_fleet:
+            self._read_all(store, now)
             return
-        self._turn = (self._turn + 1) % TURNS
-        chosen = np.zeros(len(self.uavs), bool)
-        chosen[self._turn :: TURNS] = True
-        close = [row for uav in feed.close if (row := self._rows.get(uav)) is not None]
-        chosen[close] = True
-        self._take(feed, np.flatnonzero(chosen))
-        self._speed[close] = 0.0
-        self._speed[[i for i, _ in self._ghosts]] = 0.0
-        self.at = self._told + self._speed * np.clip(now - self._heard, 0.0, COAST_S)[:, None]
+        self._read_part = (self._read_part + 1) % READ_PARTS
+        selected = np.zeros(len(self.uavs), bool)
+        selected[self._read_part :: READ_PARTS] = True
+        immediate = [row for uav in store.immediate_uavs if (row := self._rows.get(uav)) is not None]
+        selected[immediate] = True
+        self._read_some(store, np.flatnonzero(selected))
+        self._velocities[immediate] = 0.0
+        self._velocities[[i for i, _ in self._predicted_only]] = 0.0
+        self.at = self._read_positions + self._velocities * np.clip(now - self._read_times, 0.0, COAST_S)[:, None]
 
-    def _take_all(self, feed: Feed, now: float) -> None:
+    def _read_all(self, store: FleetStore, now: float) -> None:
         """Read all poses; UAVs without telemetry use the predicted position."""
-        places, turns, _ = feed.poses(self.uavs)
-        heard = np.isfinite(places[:, 0])
-        heard[[i for i, _ in self._ghosts]] = False
-        self.at = np.where(heard[:, None], places, self.at)
-        for i, vehicle in self._ghosts:
-            if (spot := vehicle.where(now)) is not None:
-                self.at[i] = spot
-        self.quat = scene_quat(*turns.T)
+        positions, attitudes, _ = store.poses(self.uavs)
+        received = np.isfinite(positions[:, 0])
+        received[[i for i, _ in self._predicted_only]] = False
+        self.at = np.where(received[:, None], positions, self.at)
+        for i, vehicle in self._predicted_only:
+            if (point := vehicle.position(now)) is not None:
+                self.at[i] = point
+        self.quat = scene_quat(*attitudes.T)
 
-    def _take(self, feed: Feed, rows: np.ndarray) -> None:
+    def _read_some(self, store: FleetStore, rows: np.ndarray) -> None:
         """Read the poses of some rows (k,) and update their velocities."""
-        places, turns, heard = feed.poses(tuple(self.uavs[i] for i in rows))
-        new = np.isfinite(places[:, 0]) & (heard > self._heard[rows])
-        self.quat[rows] = scene_quat(*turns.T)
-        rows, places, heard = rows[new], places[new], heard[new]
-        speed = (places - self._told[rows]) / (heard - self._heard[rows])[:, None]
-        sound = (np.linalg.norm(speed, axis=1) < FASTEST) & (heard - self._heard[rows] < STALE_S)
-        self._speed[rows] = np.where(sound[:, None], speed, 0.0)
-        self._told[rows], self._heard[rows] = places, heard
+        positions, attitudes, received = store.poses(tuple(self.uavs[i] for i in rows))
+        new = np.isfinite(positions[:, 0]) & (received > self._read_times[rows])
+        self.quat[rows] = scene_quat(*attitudes.T)
+        rows, positions, received = rows[new], positions[new], received[new]
+        velocities = (positions - self._read_positions[rows]) / (received - self._read_times[rows])[:, None]
+        valid = (np.linalg.norm(velocities, axis=1) < MAX_SPEED) & (received - self._read_times[rows] < STALE_S)
+        self._velocities[rows] = np.where(valid[:, None], velocities, 0.0)
+        self._read_positions[rows], self._read_times[rows] = positions, received
 
-    def beat(self, played: dict[int, np.ndarray]) -> None:
+    def extend_trails(self, played: dict[int, np.ndarray]) -> None:
         """Append the positions to the trails, once per second.
 
         Args:
@@ -167,23 +182,23 @@ class Flock:
         """
         if not self.uavs:
             return
-        self.ring = np.concatenate([self.ring[:, 1:], self.at[:, None]], axis=1)
-        leapt = np.linalg.norm(self.ring[:, -1] - self.ring[:, -2], axis=1) > LEAP_M / UNIT_M
-        self.ring[leapt] = self.ring[leapt, -1:]
+        self.trails = np.concatenate([self.trails[:, 1:], self.at[:, None]], axis=1)
+        jumped = np.linalg.norm(self.trails[:, -1] - self.trails[:, -2], axis=1) > JUMP_M / UNIT_M
+        self.trails[jumped] = self.trails[jumped, -1:]
         for i, uav in enumerate(self.uavs):
             if uav in played:
-                self.ring[i] = played[uav]
-        self.beats += 1
-        self.changes += bool(leapt.any() or played)
+                self.trails[i] = played[uav]
+        self.trail_steps += 1
+        self.revision += bool(jumped.any() or played)
 
     def chunk(self, age: int) -> np.ndarray:
         """Return the points of one closed chunk of trail, (n, k, 3); `age` 0 is the newest."""
-        last = len(MINUTE) - 1 - self.beats % STEPS - age * STEPS
-        return self.ring[:, last - STEPS : last + 1 : self.stride]
+        last = len(TRAIL_AGES_S) - 1 - self.trail_steps % STEPS - age * STEPS
+        return self.trails[:, last - STEPS : last + 1 : self.stride]
 
     def head(self) -> np.ndarray:
         """Return the newest stretch of trail up to the current position, (n, k, 3), k constant."""
-        run = self.beats % STEPS
-        points = self.ring[:, len(MINUTE) - 1 - run :: self.stride]
+        newest_steps = self.trail_steps % STEPS
+        points = self.trails[:, len(TRAIL_AGES_S) - 1 - newest_steps :: self.stride]
         missing = STEPS // self.stride + 2 - points.shape[1]
         return np.concatenate([points, np.repeat(self.at[:, None], missing, axis=1)], axis=1)

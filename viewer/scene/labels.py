@@ -4,10 +4,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-MOST = 8
+MAX_LABELS = 8
 SCALE = 0.82  # font scale of every label: one size, as the page rasterises each size separately
-LETTER, LINE = 0.0068 * SCALE, 0.020 * SCALE  # character width and line height over image height [-]
-EDGE = 0.02  # margin to the image edge [image heights]
+CHAR_WIDTH, LINE_HEIGHT = 0.0068 * SCALE, 0.020 * SCALE  # character width and line height over image height [-]
+EDGE_MARGIN = 0.02  # margin to the image edge [image heights]
 _SHIFT = {"bottom-center": (-0.5, 0.0), "bottom-left": (0.0, 0.0), "top-center": (-0.5, -1.0), "top-left": (0.0, -1.0)}
 _SHIFT |= {"bottom-right": (-1.0, 0.0), "top-right": (-1.0, -1.0)}
 _OTHER_SIDE = {"bottom-left": "bottom-right", "top-left": "top-right"}  # fallback anchor at the image edge
@@ -28,29 +28,29 @@ class Labels:
     def __init__(self, scene: Any) -> None:
         self._nodes = [
             scene.add_label(f"/labels/{k}", "", font_screen_scale=SCALE, depth_test=False, visible=False)
-            for k in range(MOST)
+            for k in range(MAX_LABELS)
         ]
-        self._held: dict[str, Any] = {}  # key -> node
+        self._assigned: dict[str, Any] = {}  # key -> node
 
-    def draw(self, tags: list[Tag], sight: "Sight") -> None:
+    def draw(self, tags: list[Tag], camera_view: "CameraView") -> None:
         """Show the labels that fit, in order of priority."""
-        shown = fitting(tags, sight)
+        shown = visible_labels(tags, camera_view)
         keys = {tag.key for tag in shown}
-        for key in [key for key in self._held if key not in keys]:
-            self._held.pop(key).visible = False
-        free = iter([node for node in self._nodes if not any(node is held for held in self._held.values())])
+        for key in [key for key in self._assigned if key not in keys]:
+            self._assigned.pop(key).visible = False
+        free = iter([node for node in self._nodes if not any(node is used for used in self._assigned.values())])
         for tag in shown:
-            if tag.key not in self._held:
-                self._held[tag.key] = next(free)
-            node = self._held[tag.key]
+            if tag.key not in self._assigned:
+                self._assigned[tag.key] = next(free)
+            node = self._assigned[tag.key]
             node.text, node.anchor = tag.text, tag.anchor
             node.position, node.visible = tuple(float(x) for x in tag.at), True
 
 
-class Sight(NamedTuple):
+class CameraView(NamedTuple):
     """View of a camera: position, direction and field of view."""
 
-    eye: np.ndarray  # (3,) [10 m]
+    position: np.ndarray  # (3,) [10 m]
     look_at: np.ndarray  # (3,) [10 m]
     fov: float  # vertical [rad]
     aspect: float  # width over height [-]
@@ -58,46 +58,46 @@ class Sight(NamedTuple):
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Project points (n, 3): right and up of the image centre in image heights, (n, 2), and depth (n,)."""
         right, up = self.axes()
-        off = points - self.eye
-        depth = off @ np.cross(up, right)
-        flat = np.stack([off @ right, off @ up], axis=-1)
+        offsets = points - self.position
+        depth = offsets @ np.cross(up, right)
+        flat = np.stack([offsets @ right, offsets @ up], axis=-1)
         return flat / (2 * np.tan(self.fov / 2) * np.maximum(depth, 1e-3)[:, None]), depth
 
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the image directions right and up, two (3,)."""
-        ahead = (self.look_at - self.eye) / (np.linalg.norm(self.look_at - self.eye) or 1.0)
-        right = np.cross(ahead, [0.0, 0.0, 1.0])
+        forward = (self.look_at - self.position) / (np.linalg.norm(self.look_at - self.position) or 1.0)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
         right = right / (np.linalg.norm(right) or 1.0)
-        return right, np.cross(right, ahead)
+        return right, np.cross(right, forward)
 
 
-def fitting(tags: list[Tag], sight: Sight) -> list[Tag]:
+def visible_labels(tags: list[Tag], camera_view: CameraView) -> list[Tag]:
     """Return the labels inside the image without overlap, at most `MAX_LABELS`."""
     if not tags:
         return []
-    spots, depth = sight.project(np.array([tag.at for tag in tags]))
+    points, depth = camera_view.project(np.array([tag.at for tag in tags]))
     shown: list[Tag] = []
     boxes: list[np.ndarray] = []
-    half = np.array([sight.aspect / 2 - EDGE, 0.5 - EDGE])
-    for tag, spot, far in zip(tags, spots, depth, strict=True):
+    half = np.array([camera_view.aspect / 2 - EDGE_MARGIN, 0.5 - EDGE_MARGIN])
+    for tag, point, label_depth in zip(tags, points, depth, strict=True):
         for anchor in (tag.anchor, *filter(None, (_OTHER_SIDE.get(tag.anchor),))):
-            box = _box(one := tag._replace(anchor=anchor), spot)
-            inside = far > 0 and (np.abs(box) <= half).all()
+            box = _box(candidate := tag._replace(anchor=anchor), point)
+            inside = label_depth > 0 and (np.abs(box) <= half).all()
             if inside and not any(_overlap(box, other) for other in boxes):
-                shown.append(one)
+                shown.append(candidate)
                 boxes.append(box)
                 break
-        if len(shown) == MOST:
+        if len(shown) == MAX_LABELS:
             break
     return shown
 
 
-def _box(tag: Tag, spot: np.ndarray) -> np.ndarray:
+def _box(tag: Tag, point: np.ndarray) -> np.ndarray:
     """Return the corners of a label in the image, (2, 2) [image heights]."""
-    size = np.array([LETTER * len(tag.text), LINE])
-    low = spot + np.array(_SHIFT[tag.anchor]) * size
+    size = np.array([CHAR_WIDTH * len(tag.text), LINE_HEIGHT])
+    low = point + np.array(_SHIFT[tag.anchor]) * size
     return np.stack([low, low + size])
 
 
-def _overlap(one: np.ndarray, other: np.ndarray) -> bool:
-    return bool((one[0] < other[1]).all() and (other[0] < one[1]).all())
+def _overlap(box: np.ndarray, other: np.ndarray) -> bool:
+    return bool((box[0] < other[1]).all() and (other[0] < box[1]).all())

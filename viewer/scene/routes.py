@@ -19,9 +19,9 @@ from viewer.store.mission_items import (
     VTOL_TAKEOFF,
     WAYPOINT,
 )
-from viewer.store.place import UNIT_M, Place
+from viewer.store.place import UNIT_M, SceneFrame
 
-AT_A_PLACE = {
+POSITIONED = {
     WAYPOINT,
     LOITER_UNLIM,
     LOITER_TURNS,
@@ -33,17 +33,17 @@ AT_A_PLACE = {
     VTOL_TAKEOFF,
     VTOL_LAND,
 }
-RADIUS_IN = {LOITER_UNLIM: "param3", LOITER_TURNS: "param3", LOITER_TIME: "", LOITER_TO_ALT: "param2"}
+RADIUS_FIELD = {LOITER_UNLIM: "param3", LOITER_TURNS: "param3", LOITER_TIME: "", LOITER_TO_ALT: "param2"}
 ABSOLUTE = {0, 5}  # MAV_FRAME: GLOBAL, GLOBAL_INT; every other altitude counts from home
 RADIUS_M = 60.0  # default loiter radius: WP_LOITER_RAD of ArduPlane [m]
 MAX_M = 50_000.0  # larger altitudes and radii are not drawn [m]
 
 
-class Route(NamedTuple):
+class RouteLines(NamedTuple):
     """Lines of a mission, scene ENU [10 m]."""
 
     legs: np.ndarray  # straight legs, (n, 2, 3)
-    back: np.ndarray  # jumps and returns, drawn dashed, (m, 2, 3)
+    returns: np.ndarray  # jumps and returns, drawn dashed, (m, 2, 3)
     circles: np.ndarray  # loiter circles as segments, (k, 2, 3)
     points: np.ndarray  # positions of the items, (p, 3)
     items: np.ndarray  # their numbers, (p,)
@@ -51,7 +51,7 @@ class Route(NamedTuple):
 
 
 _NO_LINES, _NO_ITEMS = np.zeros((0, 2, 3)), np.zeros(0, int)
-NOTHING = Route(_NO_LINES, _NO_LINES, _NO_LINES, np.zeros((0, 3)), _NO_ITEMS, _NO_ITEMS)
+NOTHING = RouteLines(_NO_LINES, _NO_LINES, _NO_LINES, np.zeros((0, 3)), _NO_ITEMS, _NO_ITEMS)
 
 
 def home_alt_m(mission: Mission | None) -> float | None:
@@ -63,7 +63,7 @@ def home_alt_m(mission: Mission | None) -> float | None:
     return float(first.alt_m) if is_home and any(item.frame not in ABSOLUTE for item in rest) else None
 
 
-def route(mission: Mission | None, place: Place, ground: float) -> Route:
+def mission_lines(mission: Mission | None, scene_frame: SceneFrame, ground: float) -> RouteLines:
     """Convert a mission to lines.
 
     Args:
@@ -74,38 +74,40 @@ def route(mission: Mission | None, place: Place, ground: float) -> Route:
     if mission is None:
         return NOTHING
     home = home_alt_m(mission)
-    base = (home - place.origin.alt_mm * 1e-3) / UNIT_M if home is not None else ground
-    spots: dict[int, np.ndarray] = {}
+    base = (home - scene_frame.origin.alt_mm * 1e-3) / UNIT_M if home is not None else ground
+    positions: dict[int, np.ndarray] = {}
     legs: list[np.ndarray] = []
-    back: list[np.ndarray] = []
+    returns: list[np.ndarray] = []
     circles: list[np.ndarray] = []
     ends: list[int] = []
     last = None
     for index, item in enumerate(mission.items):
         if home is not None and index == 0:
-            spots[item.seq] = _spot(item, place, base, None)[:1].reshape(-1) if _usable(item) else np.zeros(0)
+            positions[item.seq] = (
+                _item_position(item, scene_frame, base, None)[:1].reshape(-1) if _usable(item) else np.zeros(0)
+            )
             continue
         if item.command == DO_JUMP:
-            back += _jump(item, spots, last)
-        if item.command == RTL and last is not None and (first := spots.get(0)) is not None and first.size:
-            back.append(np.stack([last, first]))
-        if item.command not in AT_A_PLACE or not _usable(item):
+            returns += _jump(item, positions, last)
+        if item.command == RTL and last is not None and (first := positions.get(0)) is not None and first.size:
+            returns.append(np.stack([last, first]))
+        if item.command not in POSITIONED or not _usable(item):
             continue
-        found = _spot(item, place, base, last)
-        if not len(found):
+        located = _item_position(item, scene_frame, base, last)
+        if not len(located):
             continue
-        spot = spots[item.seq] = found[0]
-        if last is not None and np.linalg.norm(spot - last) > 1e-6:
-            legs.append(np.stack([last, spot]))
+        position = positions[item.seq] = located[0]
+        if last is not None and np.linalg.norm(position - last) > 1e-6:
+            legs.append(np.stack([last, position]))
             ends.append(item.seq)
-        if item.command in RADIUS_IN:
-            circles.append(circle(spot, _radius_m(item) / UNIT_M))
-        last = spot
-    points = [spot for spot in spots.values() if spot.size]
-    items = [seq for seq, spot in spots.items() if spot.size]
-    return Route(
+        if item.command in RADIUS_FIELD:
+            circles.append(circle(position, _radius_m(item) / UNIT_M))
+        last = position
+    points = [position for position in positions.values() if position.size]
+    items = [seq for seq, position in positions.items() if position.size]
+    return RouteLines(
         np.array(legs).reshape(-1, 2, 3),
-        np.array(back).reshape(-1, 2, 3),
+        np.array(returns).reshape(-1, 2, 3),
         np.concatenate(circles) if circles else NOTHING.circles,
         np.array(points).reshape(-1, 3),
         np.clip(np.array(items, dtype=object), -1, 10**6).astype(int),
@@ -124,24 +126,30 @@ def _usable(item: Item) -> bool:
     return bool(np.isfinite(item.alt_m)) and abs(item.alt_m) < MAX_M
 
 
-def _spot(item: Item, place: Place, base: float, last: np.ndarray | None) -> np.ndarray:
+def _item_position(item: Item, scene_frame: SceneFrame, base: float, last: np.ndarray | None) -> np.ndarray:
     """Return the scene position of an item, (1, 3), or (0, 3) without one; 0, 0 is the previous position."""
-    up = (item.alt_m - place.origin.alt_mm * 1e-3) / UNIT_M if item.frame in ABSOLUTE else base + item.alt_m / UNIT_M
+    up = (
+        (item.alt_m - scene_frame.origin.alt_mm * 1e-3) / UNIT_M
+        if item.frame in ABSOLUTE
+        else base + item.alt_m / UNIT_M
+    )
     if item.lat_e7 == 0 and item.lon_e7 == 0:
         return np.zeros((0, 3)) if last is None else np.array([[last[0], last[1], up]])
     try:
-        spot = place.geodetic(np.array([item.lat_e7]), np.array([item.lon_e7]), np.array([place.origin.alt_mm]))
+        position = scene_frame.from_geodetic(
+            np.array([item.lat_e7]), np.array([item.lon_e7]), np.array([scene_frame.origin.alt_mm])
+        )
     except (ValueError, OverflowError):
         return np.zeros((0, 3))
-    spot[0, 2] = up
-    return spot
+    position[0, 2] = up
+    return position
 
 
 def _radius_m(item: Item) -> float:
-    radius = abs(getattr(item, RADIUS_IN[item.command])) if RADIUS_IN[item.command] else 0.0
+    radius = abs(getattr(item, RADIUS_FIELD[item.command])) if RADIUS_FIELD[item.command] else 0.0
     return radius if np.isfinite(radius) and 0 < radius < MAX_M else RADIUS_M
 
 
-def _jump(item: Item, spots: dict[int, np.ndarray], last: np.ndarray | None) -> list[np.ndarray]:
-    target = spots.get(int(item.param1)) if np.isfinite(item.param1) else None
+def _jump(item: Item, positions: dict[int, np.ndarray], last: np.ndarray | None) -> list[np.ndarray]:
+    target = positions.get(int(item.param1)) if np.isfinite(item.param1) else None
     return [np.stack([last, target])] if last is not None and target is not None and target.size else []

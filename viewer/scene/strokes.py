@@ -6,7 +6,7 @@ import numpy as np
 
 from viewer.theme.palette import line_colour
 
-_NONE = np.zeros((1, 2, 3), np.float32)  # viser requires at least one segment; this one has zero length
+_EMPTY = np.zeros((1, 2, 3), np.float32)  # viser requires at least one segment; this one has zero length
 
 
 class Strokes:
@@ -14,14 +14,14 @@ class Strokes:
 
     def __init__(self, scene: Any, name: str, width: float) -> None:
         self._node = scene.add_line_segments(
-            name, _NONE, np.zeros((1, 2, 3), np.uint8), thickness=width, thickness_units="screen"
+            name, _EMPTY, np.zeros((1, 2, 3), np.uint8), thickness=width, thickness_units="screen"
         )
 
     def draw(self, segments: np.ndarray, colours: np.ndarray | None = None) -> None:
         """Show segments (n, 2, 3) [10 m]; colours (3,), (n, 3) or (n, 2, 3), sRGB [0..255]; None keeps them."""
         segments = np.asarray(segments, np.float32).reshape(-1, 2, 3)
         if not len(segments):
-            segments, colours = _NONE, np.zeros(3)
+            segments, colours = _EMPTY, np.zeros(3)
         if colours is not None:
             self.colour(colours, len(segments))
         self._node.points = segments
@@ -44,7 +44,7 @@ def chain(points: np.ndarray) -> np.ndarray:
     return np.stack([points[..., :-1, :], points[..., 1:, :]], axis=-2)
 
 
-def rounded(points: np.ndarray, parts: int) -> np.ndarray:
+def smooth_curve(points: np.ndarray, parts: int) -> np.ndarray:
     """Interpolate points (..., n, 3) smoothly in `parts` per step: (..., (n - 1) parts + 1, 3)."""
     if parts < 2 or points.shape[-2] < 2:
         return points
@@ -64,11 +64,11 @@ def dashed(points: np.ndarray) -> np.ndarray:
 
 def dash_lines(segments: np.ndarray, length: float) -> np.ndarray:
     """Cut straight segments (n, 2, 3) into dashes of about `length`, at most 200 each: (m, 2, 3)."""
-    cut = []
+    dashes = []
     for a, b in segments:
         steps = int(np.clip(np.linalg.norm(b - a) / length, 2, 400))
-        cut.append(dashed(a + np.linspace(0, 1, steps + 1)[:, None] * (b - a)))
-    return np.concatenate(cut) if cut else np.zeros((0, 2, 3))
+        dashes.append(dashed(a + np.linspace(0, 1, steps + 1)[:, None] * (b - a)))
+    return np.concatenate(dashes) if dashes else np.zeros((0, 2, 3))
 
 
 def faded(colour: np.ndarray, ground: np.ndarray, shares: np.ndarray) -> np.ndarray:
@@ -77,18 +77,18 @@ def faded(colour: np.ndarray, ground: np.ndarray, shares: np.ndarray) -> np.ndar
     return chain(joints)
 
 
-def closed(ring: np.ndarray) -> np.ndarray:
+def closed_loops(ring: np.ndarray) -> np.ndarray:
     """Return the closed loops of corners (..., sides, 3): (..., sides, 2, 3)."""
     return np.stack([ring, np.roll(ring, -1, axis=-2)], axis=-2)
 
 
-def disc(centre: np.ndarray, radius: float, sides: int = 40) -> np.ndarray:
+def circle_corners(centre: np.ndarray, radius: float, sides: int = 40) -> np.ndarray:
     """Return the corners of a horizontal circle around a point (3,): (sides, 3)."""
     turn = np.linspace(0, 2 * np.pi, sides, endpoint=False)
     return centre + radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(sides)], axis=-1)
 
 
-class Sheaf:
+class SegmentBatch:
     """Segments of several colours for one node."""
 
     def __init__(self) -> None:

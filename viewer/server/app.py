@@ -12,191 +12,210 @@ import viser
 
 from fleet.bus.bus_protocol import Bus
 from viewer.browser.browser import Browser
-from viewer.scene.camera import IN_VIEW_M, near, start_at
-from viewer.scene.fleet_arrays import MINUTE, Flock
+from viewer.scene.camera import IN_VIEW_M, set_initial_view, within_reach
+from viewer.scene.fleet_arrays import TRAIL_AGES_S, FleetArrays
 from viewer.scene.routes import home_alt_m
 from viewer.scene.selection.selected import BEYOND_S
-from viewer.scene.terrain.land import Land
+from viewer.scene.terrain.land import TerrainLayer
 from viewer.server.view import View
-from viewer.store.backfill import FEW, Bygone
+from viewer.store.backfill import SMALL_FLEET, Backfill
 from viewer.store.place import UNIT_M
-from viewer.store.store import Feed
-from viewer.store.track import placed
+from viewer.store.store import FleetStore
+from viewer.store.track import positions_at
 from viewer.store.vehicle import Vehicle
 from viewer.theme.palette import DARK, LIGHT
-from viewer.timeline.recordings import Tapes
+from viewer.timeline.recordings import RecordingStore
 
 _log = logging.getLogger(__name__)
 TICK_S = 0.1
-SECOND = 10  # ticks of a second
-MOST_CLOSE = 50  # UAVs of a large fleet with alerts that are decoded every time
-SLOW_S = 10.0  # interval between requests for missing messages [s]
+TICKS_PER_S = 10  # ticks of a second
+MAX_IMMEDIATE = 50  # UAVs of a large fleet with alerts that are decoded every time
+REQUEST_S = 10.0  # interval between requests for missing messages [s]
 
 
 class App:
     """Draw the store: aircraft at 10 Hz, in a large fleet at 5 Hz, everything else more slowly."""
 
-    def __init__(self, bus: Bus, server: viser.ViserServer, *, light: bool = False, land: Land | None = None) -> None:
+    def __init__(
+        self, bus: Bus, server: viser.ViserServer, *, light: bool = False, terrain_layer: TerrainLayer | None = None
+    ) -> None:
         self._palette = LIGHT if light else DARK
-        self.feed, self.flock, self._server = Feed(bus), Flock(), server
-        self._bygone = Bygone(bus, self.feed)
-        self.tapes, self._land = Tapes(), land or Land(None, None)
+        self.store, self.fleet_arrays, self._server = FleetStore(bus), FleetArrays(), server
+        self._backfill = Backfill(bus, self.store)
+        self.recordings, self._terrain_layer = RecordingStore(), terrain_layer or TerrainLayer(None, None)
         self.views: dict[int, View] = {}  # by client
-        self._unfit: set[int] = set()  # clients whose page could not be opened
+        self._failed_clients: set[int] = set()  # clients whose page could not be opened
         self._wake = threading.Event()
-        self._ground, self._cloud = 0.0, np.zeros((0, 3))
-        start_at(server)
+        self._ground_height, self._framing_points = 0.0, np.zeros((0, 3))
+        set_initial_view(server)
 
     def run(self, stop: threading.Event) -> None:
         """Draw until `stop` is set."""
-        asker = threading.Thread(target=self._ask, args=(stop,), name="viewer-ask", daemon=True)
-        asker.start()
+        requester = threading.Thread(target=self._request_loop, args=(stop,), name="viewer-ask", daemon=True)
+        requester.start()
         tick, due = 0, time.monotonic()
         while not stop.is_set():
             self.tick(tick)
             tick, due = tick + 1, due + TICK_S
             if (late := time.monotonic() - due) > TICK_S:
                 due += late
-            while (left := due - time.monotonic()) > 0:
-                if self._wake.wait(left):
+            while (remaining_s := due - time.monotonic()) > 0:
+                if self._wake.wait(remaining_s):
                     self._wake.clear()
-                    self.answer()
-        asker.join(timeout=5)
+                    self.draw_selections()
+        requester.join(timeout=5)
 
-    def _ask(self, stop: threading.Event) -> None:
+    def _request_loop(self, stop: threading.Event) -> None:
         """Request messages published before the start, repeatedly while some are missing."""
         while not stop.is_set():
-            fleet = self.feed.all()
+            fleet = self.store.all()
             if not fleet or any(v.mission is None or v.model is None for v in fleet):
                 with contextlib.suppress(OSError, RuntimeError):
-                    self.feed.catch_up()
-            for _ in range(int(SLOW_S)):
-                self._bygone.ask()
+                    self.store.request_latest()
+            for _ in range(int(REQUEST_S)):
+                self._backfill.request()
                 if stop.wait(1.0):
                     return
 
     def tick(self, tick: int) -> None:
         """Draw the content due at this tick."""
-        if not (self.flock.crowd and tick % 2):
-            self.feed.listen()
-        self._welcome()
-        if tick % SECOND and not self.views:
+        if not (self.fleet_arrays.large_fleet and tick % 2):
+            self.store.poll()
+        self._update_clients()
+        if tick % TICKS_PER_S and not self.views:
             return  # no client: 1 Hz is enough for the trails
         now = time.monotonic()
-        if tick % SECOND == 0 or not self.flock.uavs:
-            self._second(now)
-        elif tick % 2 == 0 and self.flock.uavs and not self.flock.crowd:
-            self.tapes.take(self.feed, self.feed.all, now)
-        if self.flock.crowd and tick % 2:
+        if tick % TICKS_PER_S == 0 or not self.fleet_arrays.uavs:
+            self._update_fleet(now)
+        elif tick % 2 == 0 and self.fleet_arrays.uavs and not self.fleet_arrays.large_fleet:
+            self.recordings.record(self.store, self.store.all, now)
+        if self.fleet_arrays.large_fleet and tick % 2:
             return
-        self.flock.pose(self.feed, now)
+        self.fleet_arrays.update_poses(self.store, now)
         for view in list(self.views.values()):
-            guarded(view, partial(self._draw, view, now, tick))
+            draw_guarded(view, partial(self._draw, view, now, tick))
 
     def _draw(self, view: View, now: float, tick: int) -> None:
         """Draw the content due on one page."""
-        if tick % SECOND == view.offset or view.dirty:
-            self._settle(view, now)
-        if self.flock.uavs:
-            view.move(self.flock, now, tick)
+        if tick % TICKS_PER_S == view.offset or view.dirty:
+            self._draw_slow(view, now)
+        if self.fleet_arrays.uavs:
+            view.draw_moving(self.fleet_arrays, now, tick)
 
-    def _settle(self, view: View, now: float) -> None:
+    def _draw_slow(self, view: View, now: float) -> None:
         """Draw the slow content of one page."""
-        self._land.show(view.client, self.feed.place, view.palette, self._ground)
-        view.panels.ground_said = self._land.sentence
-        view.scene.ground.grid.show(not self._land.lies)
-        view.settle(self.flock, now, self._ground)
-        if len(self._cloud):
-            view.frame(self._cloud, self._news(), self._ground)
+        self._terrain_layer.show(view.client, self.store.scene_frame, view.palette, self._ground_height)
+        view.panels.ground_error = self._terrain_layer.sentence
+        view.scene.ground.grid.show(not self._terrain_layer.available)
+        view.draw_slow(self.fleet_arrays, now, self._ground_height)
+        if len(self._framing_points):
+            view.frame_fleet(self._framing_points, self._framing_key(), self._ground_height)
 
-    def answer(self) -> None:
+    def draw_selections(self) -> None:
         """Draw new selections immediately; lists and charts follow at the next tick."""
         now = time.monotonic()
         for view in list(self.views.values()):
             if view.dirty:
-                guarded(view, partial(view.turn, self.flock, now, self._ground))
+                draw_guarded(view, partial(view.draw_selection, self.fleet_arrays, now, self._ground_height))
 
-    def _welcome(self) -> None:
+    def _update_clients(self) -> None:
         """Open views for new clients, remove those of closed clients, redraw after a theme change."""
         clients = self._server.get_clients()
-        for gone in self.views.keys() - clients.keys():
-            del self.views[gone]
-        self._unfit &= clients.keys()
-        for number in clients.keys() - self.views.keys() - self._unfit:
-            self._open(number, Browser(clients[number], self._palette, self._wake.set))
-        for number, view in list(self.views.items()):
+        for departed in self.views.keys() - clients.keys():
+            del self.views[departed]
+        self._failed_clients &= clients.keys()
+        for client_id in clients.keys() - self.views.keys() - self._failed_clients:
+            self._open_view(client_id, Browser(clients[client_id], self._palette, self._wake.set))
+        for client_id, view in list(self.views.items()):
             if view.browser.palette is not view.palette:
-                self._open(number, view.browser, view)
+                self._open_view(client_id, view.browser, view)
 
-    def _open(self, number: int, browser: Browser, before: View | None = None) -> None:
+    def _open_view(self, client_id: int, browser: Browser, previous: View | None = None) -> None:
         """Open a view, or replace one; after a failure the page stays closed until it reconnects."""
         try:
             with browser.client.atomic():
-                if before is not None:
+                if previous is not None:
                     browser.client.scene.reset()
                     browser.client.gui.reset()
-                    self._land.forget(number)
-                view = View(browser, self.feed, self.tapes, browser.palette, self._wake.set)
+                    self._terrain_layer.reset_client(client_id)
+                view = View(browser, self.store, self.recordings, browser.palette, self._wake.set)
         except Exception:  # an error on one page must not end the others
-            self._unfit.add(number)
-            self.views.pop(number, None)
-            _log.exception("page %d could not be opened; other pages continue; reload it", number)
+            self._failed_clients.add(client_id)
+            self.views.pop(client_id, None)
+            _log.exception("page %d could not be opened; other pages continue; reload it", client_id)
             return
-        view.offset = number * 4 % SECOND
-        if before is not None:
-            view.carry(before)
-        self.views[number] = view
+        view.offset = client_id * 4 % TICKS_PER_S
+        if previous is not None:
+            view.restore(previous)
+        self.views[client_id] = view
 
-    def _second(self, now: float) -> None:
+    def _update_fleet(self, now: float) -> None:
         """Update the fleet, its states and trails; called once per second."""
-        fleet, place = self.feed.all(), self.feed.place
-        self.tapes.take(self.feed, lambda: fleet, now)
-        if not self.flock.uavs:
-            self.flock.meet(fleet, now)
-            self.flock.pose(self.feed, now)
-        needy = [self.flock.uavs[i] for i in np.flatnonzero(self.flock.exceptions)[:MOST_CLOSE]]
-        chosen = [view.selected for view in self.views.values() if view.selected is not None]
-        self.feed.inbox.keen, self.feed.close = frozenset(chosen), frozenset((*needy, *chosen))
-        played = [(v, rows) for v in fleet if v.recorded and len(rows := self.feed.track(v))]
-        self.flock.beat({v.uav: placed(rows, v.t - MINUTE, np.inf) for v, rows in [*played, *self._off_beat(fleet)]})
-        self.flock.meet(fleet, now)
-        if place is None or not self.flock.uavs:
+        fleet, scene_frame = self.store.all(), self.store.scene_frame
+        self.recordings.record(self.store, lambda: fleet, now)
+        if not self.fleet_arrays.uavs:
+            self.fleet_arrays.update_fleet(fleet, now)
+            self.fleet_arrays.update_poses(self.store, now)
+        exceptional = [self.fleet_arrays.uavs[i] for i in np.flatnonzero(self.fleet_arrays.exceptions)[:MAX_IMMEDIATE]]
+        selected = [view.selected for view in self.views.values() if view.selected is not None]
+        self.store.inbox.full_rate_uavs, self.store.immediate_uavs = (
+            frozenset(selected),
+            frozenset((*exceptional, *selected)),
+        )
+        played = [(v, rows) for v in fleet if v.recorded and len(rows := self.store.track(v))]
+        self.fleet_arrays.extend_trails(
+            {
+                v.uav: positions_at(rows, v.t - TRAIL_AGES_S, np.inf)
+                for v, rows in [*played, *self._irregular_tracks(fleet)]
+            }
+        )
+        self.fleet_arrays.update_fleet(fleet, now)
+        if scene_frame is None or not self.fleet_arrays.uavs:
             return
-        self._ground = guess_ground(fleet, place.origin.alt_mm * 1e-3, self._ground)
-        told = [] if self.flock.crowd else [v.forecast for v in fleet if v.forecast is not None]
-        ahead = [one.at(np.linspace(0, max(one.until, BEYOND_S), 8)) for one in told]
+        self._ground_height = estimate_ground(fleet, scene_frame.origin.alt_mm * 1e-3, self._ground_height)
+        forecasts = [] if self.fleet_arrays.large_fleet else [v.forecast for v in fleet if v.forecast is not None]
+        predicted_paths = [
+            forecast.position_at(np.linspace(0, max(forecast.horizon_s, BEYOND_S), 8)) for forecast in forecasts
+        ]
         paths = [rows[:, 1:] for _, rows in played]
-        self._cloud = near(np.vstack([self.flock.at, *ahead, *paths]), IN_VIEW_M / UNIT_M)
+        self._framing_points = within_reach(
+            np.vstack([self.fleet_arrays.at, *predicted_paths, *paths]), IN_VIEW_M / UNIT_M
+        )
         if not self.views:
-            start_at(self._server, self._cloud)
+            set_initial_view(self._server, self._framing_points)
 
-    def _off_beat(self, fleet: list[Vehicle]) -> list[tuple[Vehicle, np.ndarray]]:
+    def _irregular_tracks(self, fleet: list[Vehicle]) -> list[tuple[Vehicle, np.ndarray]]:
         """Return the tracks of UAVs that are not in real time or were just backfilled."""
-        early, few = self._bygone.news(), len(fleet) <= FEW
-        found = [v for v in fleet if not v.recorded and (v.uav in early or (few and v.time.pace != 1.0))]
-        return [(v, rows) for v in found if len(rows := self.feed.track(v))]
+        backfilled, is_small = self._backfill.take_filled(), len(fleet) <= SMALL_FLEET
+        vehicles = [v for v in fleet if not v.recorded and (v.uav in backfilled or (is_small and v.time.rate != 1.0))]
+        return [(v, rows) for v in vehicles if len(rows := self.store.track(v))]
 
-    def _news(self) -> tuple:
+    def _framing_key(self) -> tuple:
         """Return the values whose change requires new framing."""
-        fleet, place = self.flock.fleet, self.feed.place
-        told = sum(v.forecast is not None for v in fleet)
-        return place.origin if place else None, len(self.flock.uavs), told, sum(v.ended for v in fleet)
+        fleet, scene_frame = self.fleet_arrays.fleet, self.store.scene_frame
+        predicted_count = sum(v.forecast is not None for v in fleet)
+        return (
+            scene_frame.origin if scene_frame else None,
+            len(self.fleet_arrays.uavs),
+            predicted_count,
+            sum(v.ended for v in fleet),
+        )
 
 
-def guarded(view: View, draw: Callable[[], None]) -> None:
+def draw_guarded(view: View, draw: Callable[[], None]) -> None:
     """Draw on one page; show and log an error there without affecting other pages."""
     try:
         draw()
     except Exception as error:
-        if view.stumble(f"{type(error).__name__}: {error}"):
+        if view.show_error(f"{type(error).__name__}: {error}"):
             _log.exception("page %d could not be drawn; other pages continue", view.client.client_id)
 
 
-def guess_ground(fleet: list[Vehicle], origin_m: float, before: float) -> float:
+def estimate_ground(fleet: list[Vehicle], origin_m: float, previous: float) -> float:
     """Estimate ground height: lowest home, else lowest disarmed height, else 60 m below all, scene [10 m]."""
     homes = [alt for vehicle in fleet if (alt := home_alt_m(vehicle.mission)) is not None]
     if homes:
         return (min(homes) - origin_m) / UNIT_M
     if floors := [vehicle.floor for vehicle in fleet if np.isfinite(vehicle.floor)]:
         return min([*floors, *(float(v.at[2]) for v in fleet if v.at is not None)]) - 0.05
-    return min([before, *(float(v.at[2]) - 6.0 for v in fleet if v.at is not None)])
+    return min([previous, *(float(v.at[2]) - 6.0 for v in fleet if v.at is not None)])

@@ -11,74 +11,85 @@ from viewer.browser.browser import Browser
 from viewer.export.panel import Export
 from viewer.panels.detail import clip
 from viewer.panels.panels import Panels
-from viewer.scene.alert_labels import callouts
-from viewer.scene.camera import IN_VIEW_M, Camera, near
-from viewer.scene.fleet_arrays import LOST, MISMATCH, Flock, look
+from viewer.scene.alert_labels import alert_labels
+from viewer.scene.camera import IN_VIEW_M, Camera, within_reach
+from viewer.scene.fleet_arrays import LOST, MISMATCH, FleetArrays, display_status
 from viewer.scene.labels import Labels
-from viewer.scene.routes import NOTHING, route
+from viewer.scene.routes import NOTHING, mission_lines
 from viewer.scene.scene import Scene
 from viewer.scene.selection.selected import BEYOND_S, Selection
-from viewer.store.place import UNIT_M, Place
-from viewer.store.store import Feed
+from viewer.store.place import UNIT_M, SceneFrame
+from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.theme.palette import Palette
 from viewer.timeline.deck import Timeline
-from viewer.timeline.recordings import Tapes
+from viewer.timeline.recordings import RecordingStore
 
-WHOLE_S = 3.0  # time without an error after which the error text is removed [s]
-SINCE_S = 40.0  # flown path framed with a focused aircraft [s]
-ROOM = 1.35  # margin of the frame while the flown path grows [-]
+RECOVERY_S = 3.0  # time without an error after which the error text is removed [s]
+FOCUS_PATH_S = 40.0  # flown path framed with a focused aircraft [s]
+FRAME_MARGIN = 1.35  # margin of the frame while the flown path grows [-]
 
 
 class View:
     """The page of one client: its scene, its panels, its camera, its selection."""
 
-    def __init__(self, browser: Browser, feed: Feed, tapes: Tapes, palette: Palette, wake: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        browser: Browser,
+        store: FleetStore,
+        recordings: RecordingStore,
+        palette: Palette,
+        wake: Callable[[], None],
+    ) -> None:
         client = browser.client
-        self.client, self.browser, self._feed, self.palette, self._wake = client, browser, feed, palette, wake
-        self.scene = Scene(client.scene, palette, self.choose)
+        self.client, self.browser, self._store, self.palette, self._wake = client, browser, store, palette, wake
+        self.scene = Scene(client.scene, palette, self.select)
         self.selection, self._labels = Selection(client.scene, palette), Labels(client.scene)
-        self.panels = Panels(browser, palette, self.visit, self._actions())
-        self.timeline = Timeline(client, feed, tapes, palette, self._stir)
-        self.panels.seek = self.timeline.sender()
+        self.panels = Panels(browser, palette, self.focus_on, self._actions())
+        self.timeline = Timeline(client, store, recordings, palette, self._redraw)
+        self.panels.seek = self.timeline.send_code()
         with self.timeline.tab("Export", viser.Icon.DOWNLOAD):
-            Export(client, feed, tapes, palette, lambda: self.selected)
+            Export(client, store, recordings, palette, lambda: self.selected)
         self.camera = Camera(client)
         self.selected: int | None = None
         self.dirty = True  # the selection changed and is not drawn yet
         self.offset = 0  # tick of the second at which slow content is drawn
-        self._seen: tuple = ()
-        self._again = False  # frame again even if the camera was moved
-        self._framed = np.zeros((2, 3))  # corners of the box last framed [10 m]
+        self._framed_key: tuple = ()
+        self._force_framing = False  # frame again even if the camera was moved
+        self._framed_box = np.zeros((2, 3))  # corners of the box last framed [10 m]
         self._followed: tuple[int, np.ndarray] | None = None
-        self._defect, self._stumbled = "", 0.0  # last drawing error and its time, monotonic [s]
+        self._error, self._error_time = "", 0.0  # last drawing error and its time, monotonic [s]
 
-    def carry(self, before: "View") -> None:
+    def restore(self, previous: "View") -> None:
         """Restore selection, time shown and camera of the view before a theme change."""
-        self.selected, self.camera, self.offset = before.selected, before.camera, before.offset
-        self.timeline.player = before.timeline.player
-        self._seen, self._framed, self._followed = before._seen, before._framed, before._followed
+        self.selected, self.camera, self.offset = previous.selected, previous.camera, previous.offset
+        self.timeline.player = previous.timeline.player
+        self._framed_key, self._framed_box, self._followed = (
+            previous._framed_key,
+            previous._framed_box,
+            previous._followed,
+        )
 
-    def stumble(self, defect: str) -> bool:
+    def show_error(self, error: str) -> bool:
         """Show a drawing error on the page; return whether it is new."""
-        self._stumbled = time.monotonic()
-        if defect == self._defect:
+        self._error_time = time.monotonic()
+        if error == self._error:
             return False
-        self._defect = defect
+        self._error = error
         with contextlib.suppress(RuntimeError, AssertionError):  # the page may be closing
-            self.panels.say_broken(
-                f"This page could not be drawn ({clip(defect)}) and may show old data; other pages continue. "
+            self.panels.show_error(
+                f"This page could not be drawn ({clip(error)}) and may show old data; other pages continue. "
                 "Reload it; if the error remains, see the log of the viewer."
             )
         return True
 
-    def _recover(self) -> None:
+    def _clear_error(self) -> None:
         """Remove the error text once everything is drawn again."""
-        if self._defect and time.monotonic() - self._stumbled > WHOLE_S:
-            self._defect = ""
-            self.panels.say_broken("")
+        if self._error and time.monotonic() - self._error_time > RECOVERY_S:
+            self._error = ""
+            self.panels.show_error("")
 
-    def _stir(self) -> None:
+    def _redraw(self) -> None:
         """Request an immediate redraw after a change of the time shown."""
         self.dirty = True
         self._wake()
@@ -94,129 +105,135 @@ class View:
     def show_all(self) -> None:
         """Frame everything again, even if the camera was moved."""
         self.panels.follow.value = False
-        self._seen, self._again = (), True
+        self._framed_key, self._force_framing = (), True
 
     def next_exception(self) -> None:
         """Focus on the next UAV with an alert, mismatch or lost link, in the order of ids."""
-        needy = [v.uav for v in self._feed.all() if look(v, time.monotonic()) in (MISMATCH, LOST)]
-        later = [uav for uav in needy if self.selected is None or uav > self.selected]
-        if needy:
-            self.visit((later or needy)[0])
+        exceptional = [v.uav for v in self._store.all() if display_status(v, time.monotonic()) in (MISMATCH, LOST)]
+        later = [uav for uav in exceptional if self.selected is None or uav > self.selected]
+        if exceptional:
+            self.focus_on((later or exceptional)[0])
 
     def toggle_follow(self) -> None:
         """Toggle following the selected UAV."""
         self.panels.follow.value = not self.panels.follow.value
 
-    def chosen(self) -> Vehicle | None:
+    def selected_vehicle(self) -> Vehicle | None:
         """Return the selected UAV at the time shown; None when there is none."""
-        return self.timeline.one(self.selected) if self.selected is not None else None
+        return self.timeline.vehicle(self.selected) if self.selected is not None else None
 
-    def choose(self, uav: int) -> None:
+    def select(self, uav: int) -> None:
         """Select a known UAV and draw it immediately."""
-        if self._feed.one(uav) is not None:
+        if self._store.get(uav) is not None:
             self.selected, self.dirty = uav, True
-            self.browser.remembered.uav = None
-            self.panels.show(self.chosen(), time.monotonic())  # before the slower 3-D content
+            self.browser.preferences.uav = None
+            self.panels.show(self.selected_vehicle(), time.monotonic())  # before the slower 3-D content
             self.client.flush()
             self._wake()
 
-    def visit(self, uav: int, t: float | None = None) -> None:
+    def focus_on(self, uav: int, t: float | None = None) -> None:
         """Select a UAV, move the camera to it and, if given, show its data time `t` [s since 1970]."""
         if t is not None:
-            self.timeline.show(self._feed.all(), uav, t)
-        self.choose(uav)
-        vehicle, place = self.timeline.one(uav), self._feed.place
-        if vehicle is None or place is None or (at := vehicle.where(time.monotonic())) is None:
+            self.timeline.show(self._store.all(), uav, t)
+        self.select(uav)
+        vehicle, scene_frame = self.timeline.vehicle(uav), self._store.scene_frame
+        if vehicle is None or scene_frame is None or (at := vehicle.position(time.monotonic())) is None:
             return
-        told, flown = vehicle.forecast, self._feed.track(vehicle)
-        until = max(told.until, BEYOND_S) if told is not None else 0.0
-        ahead = [told.at(np.linspace(0, until, 40))] if told is not None else []
-        around = np.vstack([at, *ahead, flown[flown[:, 0] > vehicle.clock(time.monotonic()) - SINCE_S, 1:]])
-        self.camera.fly_to(np.vstack([around, around * [1, 1, 0] + [0, 0, self.scene.ground.height]]))
+        forecast, track = vehicle.forecast, self._store.track(vehicle)
+        horizon_s = max(forecast.horizon_s, BEYOND_S) if forecast is not None else 0.0
+        ahead = [forecast.position_at(np.linspace(0, horizon_s, 40))] if forecast is not None else []
+        points = np.vstack([at, *ahead, track[track[:, 0] > vehicle.data_time(time.monotonic()) - FOCUS_PATH_S, 1:]])
+        self.camera.fly_to(np.vstack([points, points * [1, 1, 0] + [0, 0, self.scene.ground.height]]))
 
-    def move(self, flock: Flock, now: float, tick: int) -> None:
+    def draw_moving(self, fleet_arrays: FleetArrays, now: float, tick: int) -> None:
         """Draw moving content: aircraft at the full rate, trail heads, stems and the selected UAV more slowly."""
         with self.client.atomic():
-            self._move(self.timeline.flock(flock, self.selected, now), now, tick)
+            self._draw_moving(self.timeline.fleet_arrays(fleet_arrays, self.selected, now), now, tick)
 
-    def _move(self, flock: Flock, now: float, tick: int) -> None:
-        self.scene.glyphs.draw(flock)
-        if tick % (10 if flock.crowd else 2) == 0:
-            self.scene.draw_heads(flock, self.selected)
-            self.scene.draw_stems(flock)
-            self.scene.draw_alerts(flock)
+    def _draw_moving(self, fleet_arrays: FleetArrays, now: float, tick: int) -> None:
+        self.scene.glyphs.draw(fleet_arrays)
+        if tick % (10 if fleet_arrays.large_fleet else 2) == 0:
+            self.scene.draw_heads(fleet_arrays, self.selected)
+            self.scene.draw_stems(fleet_arrays)
+            self.scene.draw_alerts(fleet_arrays)
         if tick % 5 == 0 and not self.timeline.player.live:
             self.timeline.draw(self.selected)
         if tick % 2 == 0:
-            self._point(flock, now)
+            self._draw_labels(fleet_arrays, now)
         self._follow(now)
 
-    def turn(self, flock: Flock, now: float, ground: float) -> None:
+    def draw_selection(self, fleet_arrays: FleetArrays, now: float, ground: float) -> None:
         """Draw the selected UAV immediately: path, route, tube, labels."""
         with self.client.atomic():
-            self._draw_chosen(now, ground)
-            self._point(self.timeline.flock(flock, self.selected, now), now)
+            self._draw_selected(now, ground)
+            self._draw_labels(self.timeline.fleet_arrays(fleet_arrays, self.selected, now), now)
         self.client.flush()
 
-    def _point(self, flock: Flock, now: float) -> None:
+    def _draw_labels(self, fleet_arrays: FleetArrays, now: float) -> None:
         """Draw the selected UAV, scale the aircraft to the camera distance and draw the labels."""
-        sight, scene = self.camera.sight(), self.scene
-        scene.glyphs.draw(flock)  # another time may have other UAVs
+        camera_view, scene = self.camera.view(), self.scene
+        scene.glyphs.draw(fleet_arrays)  # another time may have other UAVs
         size = self.panels.glyph.value
-        scene.glyphs.look(flock, sight, selected=self.selected, size=size)
-        chosen = self.chosen()
-        if chosen is None:
+        scene.glyphs.update_appearance(fleet_arrays, camera_view, selected=self.selected, size=size)
+        vehicle = self.selected_vehicle()
+        if vehicle is None:
             self.selection.clear()
         else:
-            self.selection.draw(chosen, self._feed, now, ground=scene.ground.height, unit=scene.glyphs.unit)
-        said = [*self.selection.tags, *self.selection.marks[:1], *callouts(flock, self.selected, scene.glyphs.unit)]
-        self._labels.draw([*said, *self.selection.marks[1:]], sight)
+            self.selection.draw(vehicle, self._store, now, ground=scene.ground.height, unit=scene.glyphs.unit)
+        tags = [
+            *self.selection.tags,
+            *self.selection.marks[:1],
+            *alert_labels(fleet_arrays, self.selected, scene.glyphs.unit),
+        ]
+        self._labels.draw([*tags, *self.selection.marks[1:]], camera_view)
 
-    def settle(self, flock: Flock, now: float, ground: float) -> None:
+    def draw_slow(self, fleet_arrays: FleetArrays, now: float, ground: float) -> None:
         """Draw slow content once per second and on a new selection: trails, predictions, routes, panels."""
-        flock = self.timeline.flock(flock, self.selected, now)
+        fleet_arrays = self.timeline.fleet_arrays(fleet_arrays, self.selected, now)
         self.dirty = False
-        self._recall(flock)
+        self._restore_selection(fleet_arrays)
         self.timeline.draw(self.selected)
-        self.panels.draw(flock.fleet, self._feed, flock.now, self.selected)
-        if (place := self._feed.place) is not None and flock.uavs:
+        self.panels.draw(fleet_arrays.fleet, self._store, fleet_arrays.now, self.selected)
+        if (scene_frame := self._store.scene_frame) is not None and fleet_arrays.uavs:
             with self.client.atomic():
-                self._draw(flock, now, place, ground)
-        self._recover()
+                self._draw(fleet_arrays, now, scene_frame, ground)
+        self._clear_error()
 
-    def _draw(self, flock: Flock, now: float, place: Place, ground: float) -> None:
+    def _draw(self, fleet_arrays: FleetArrays, now: float, scene_frame: SceneFrame, ground: float) -> None:
         options, scene = self.panels, self.scene
         scene.ground.raise_to(ground)
-        scene.draw_trails(flock, self.selected)
-        scene.draw_predicted(flock, now, self.selected if options.tube.value else None)
+        scene.draw_trails(fleet_arrays, self.selected)
+        scene.draw_predicted(fleet_arrays, now, self.selected if options.tube.value else None)
         scene.predicted.show(options.predicted.value)
         scene.stems.show(options.stems.value)
         for strokes in (*scene.trails, scene.head):
             strokes.show(options.trails.value)
-        others = [v for v in flock.fleet if v.uav != self.selected] if options.routes.value else []
-        scene.draw_routes([route(v.mission, place, ground) for v in others])
+        others = [v for v in fleet_arrays.fleet if v.uav != self.selected] if options.routes.value else []
+        scene.draw_routes([mission_lines(v.mission, scene_frame, ground) for v in others])
         self.selection.tube = options.tube.value
-        self._draw_chosen(now, ground)
+        self._draw_selected(now, ground)
 
-    def _recall(self, flock: Flock) -> None:
+    def _restore_selection(self, fleet_arrays: FleetArrays) -> None:
         """Restore the selection of the browser; without one, select the first UAV with a prediction."""
-        remembered = self.browser.remembered
-        if flock.index(remembered.uav) is not None:
-            self.selected, remembered.uav = remembered.uav, None
-        if self.selected is None and (known := [v for v in flock.fleet if flock.index(v.uav) is not None]):
-            self.selected = max(known, key=lambda v: (v.forecast is not None, -v.uav)).uav
-        remembered.keep(self.selected)
+        preferences = self.browser.preferences
+        if fleet_arrays.index(preferences.uav) is not None:
+            self.selected, preferences.uav = preferences.uav, None
+        if self.selected is None and (
+            drawn := [v for v in fleet_arrays.fleet if fleet_arrays.index(v.uav) is not None]
+        ):
+            self.selected = max(drawn, key=lambda v: (v.forecast is not None, -v.uav)).uav
+        preferences.save(self.selected)
 
-    def _draw_chosen(self, now: float, ground: float) -> None:
+    def _draw_selected(self, now: float, ground: float) -> None:
         """Draw the selected UAV's flown path and mission."""
-        chosen, place = self.chosen(), self._feed.place
-        if chosen is None or place is None:
+        vehicle, scene_frame = self.selected_vehicle(), self._store.scene_frame
+        if vehicle is None or scene_frame is None:
             return
-        self.selection.draw_flight(chosen, self._feed.track(chosen), now, self.scene.glyphs.unit)
-        own = route(chosen.mission, place, ground)
-        self.selection.draw_route(chosen, own, self.camera.sight(), self.scene.glyphs.unit)
+        self.selection.draw_flight(vehicle, self._store.track(vehicle), now, self.scene.glyphs.unit)
+        lines = mission_lines(vehicle.mission, scene_frame, ground)
+        self.selection.draw_route(vehicle, lines, self.camera.view(), self.scene.glyphs.unit)
 
-    def frame(self, cloud: np.ndarray, seen: tuple, ground: float) -> None:
+    def frame_fleet(self, points: np.ndarray, key: tuple, ground: float) -> None:
         """Frame the fleet when its content, its extent or the aspect ratio changes.
 
         Args:
@@ -226,24 +243,30 @@ class View:
         """
         if not self.timeline.player.live:
             return
-        chosen, place = self.chosen(), self._feed.place
-        own = route(chosen.mission, place, ground) if chosen is not None and place is not None else NOTHING
-        flown = self._feed.track(chosen)[:, 1:] if chosen is not None else NOTHING.points
-        cloud = near(np.vstack([cloud, own.points, own.circles.reshape(-1, 3), flown]), IN_VIEW_M / UNIT_M)
-        seen = (*seen, bool(len(own.points)), round(self.camera.aspect, 1))
-        if seen == self._seen and not outgrown(cloud, self._framed):
+        vehicle, scene_frame = self.selected_vehicle(), self._store.scene_frame
+        lines = (
+            mission_lines(vehicle.mission, scene_frame, ground)
+            if vehicle is not None and scene_frame is not None
+            else NOTHING
+        )
+        track = self._store.track(vehicle)[:, 1:] if vehicle is not None else NOTHING.points
+        points = within_reach(
+            np.vstack([points, lines.points, lines.circles.reshape(-1, 3), track]), IN_VIEW_M / UNIT_M
+        )
+        key = (*key, bool(len(lines.points)), round(self.camera.aspect, 1))
+        if key == self._framed_key and not outgrown(points, self._framed_box):
             return
-        grown, self._seen = seen == self._seen, seen
-        self._framed = np.stack([cloud.min(axis=0), cloud.max(axis=0)])
+        grown, self._framed_key = key == self._framed_key, key
+        self._framed_box = np.stack([points.min(axis=0), points.max(axis=0)])
         if grown:  # a growing path gets a margin, so that the camera does not move every second
-            cloud = cloud.mean(axis=0) + (cloud - cloud.mean(axis=0)) * [ROOM, ROOM, 1.0]
+            points = points.mean(axis=0) + (points - points.mean(axis=0)) * [FRAME_MARGIN, FRAME_MARGIN, 1.0]
         with self.client.atomic():
-            self.camera.show(np.vstack([cloud, cloud * [1, 1, 0] + [0, 0, ground]]), again=self._again)
-        self._again = False
+            self.camera.show(np.vstack([points, points * [1, 1, 0] + [0, 0, ground]]), force=self._force_framing)
+        self._force_framing = False
 
     def _follow(self, now: float) -> None:
-        vehicle = self.chosen() if self.panels.follow.value else None
-        at = vehicle.where(now) if vehicle is not None else None
+        vehicle = self.selected_vehicle() if self.panels.follow.value else None
+        at = vehicle.position(now) if vehicle is not None else None
         if vehicle is None or at is None:
             self._followed = None
             return
@@ -252,7 +275,7 @@ class View:
         self._followed = vehicle.uav, at
 
 
-def outgrown(cloud: np.ndarray, framed: np.ndarray) -> bool:
+def outgrown(points: np.ndarray, box: np.ndarray) -> bool:
     """Return whether points (n, 3) leave a box, corners (2, 3), by more than its margin."""
-    spare = 0.4 * (ROOM - 1) * max(float(np.linalg.norm(framed[1] - framed[0])), 10.0)
-    return bool(((framed[0] - cloud.min(axis=0)) > spare).any() or ((cloud.max(axis=0) - framed[1]) > spare).any())
+    spare = 0.4 * (FRAME_MARGIN - 1) * max(float(np.linalg.norm(box[1] - box[0])), 10.0)
+    return bool(((box[0] - points.min(axis=0)) > spare).any() or ((points.max(axis=0) - box[1]) > spare).any())

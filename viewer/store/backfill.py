@@ -5,53 +5,53 @@ import time
 
 from fleet.bus.bus_protocol import Bus
 from fleet.contract import History
-from viewer.store.received.inbox import Head
-from viewer.store.store import Feed
+from viewer.store.received.inbox import SampleSubset
+from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 
-FEW = 60  # UAVs up to which all are backfilled; in a larger fleet only the selected ones
-ASK_S = 2.0  # wait for a gateway that does not answer [s]
-MOST = 4_000  # newest samples used of one answer
+SMALL_FLEET = 60  # UAVs up to which all are backfilled; in a larger fleet only the selected ones
+TIMEOUT_S = 2.0  # wait for a gateway that does not answer [s]
+MAX_SAMPLES = 4_000  # newest samples used of one answer
 
 
-class Bygone:
+class Backfill:
     """Requests history on its own thread; the render thread takes the results."""
 
-    def __init__(self, bus: Bus, feed: Feed) -> None:
-        self._bus, self._feed = bus, feed
-        self._asked: set[int] = set()
-        self._laid: set[int] = set()
+    def __init__(self, bus: Bus, store: FleetStore) -> None:
+        self._bus, self._store = bus, store
+        self._requested: set[int] = set()
+        self._filled: set[int] = set()
 
-    def ask(self) -> None:
+    def request(self) -> None:
         """Request the history of UAVs not requested yet, one at a time, as a gateway serves no more."""
-        if self._feed.place is None:
+        if self._store.scene_frame is None:
             return
-        known = self._feed.known
-        wanted = known if len(known) <= FEW else known & self._feed.inbox.keen
-        for uav in sorted(wanted - self._asked):
-            self._asked.add(uav)
+        uavs = self._store.uavs
+        targets = uavs if len(uavs) <= SMALL_FLEET else uavs & self._store.inbox.full_rate_uavs
+        for uav in sorted(targets - self._requested):
+            self._requested.add(uav)
             with contextlib.suppress(OSError, RuntimeError):
-                for said in self._bus.gather(History, uav, b"", ASK_S):
-                    self._lay(said)
+                for history in self._bus.get_stream(History, uav, b"", TIMEOUT_S):
+                    self._prepend_history(history)
 
-    def _lay(self, said: History) -> None:
+    def _prepend_history(self, history: History) -> None:
         """Process a history in a separate vehicle and prepend its path to the received one."""
-        place, early = self._feed.place, Vehicle(said.uav)
-        if place is None:
+        scene_frame, past_vehicle = self._store.scene_frame, Vehicle(history.uav)
+        if scene_frame is None:
             return
-        for sample in sorted(said.samples[-MOST:], key=lambda one: one.t):
+        for sample in sorted(history.samples[-MAX_SAMPLES:], key=lambda item: item.t):
             with contextlib.suppress(ValueError, IndexError, TypeError, OverflowError):  # skip a malformed sample
-                head = Head(sample.uav, sample.t, sample.attitude, sample.position, sample.air)
-                early.hear_sample(head, place, time.monotonic())
-        found = self._feed.one(said.uav)
-        if found is None or place is not self._feed.place:
+                subset = SampleSubset(sample.uav, sample.t, sample.attitude, sample.position, sample.air)
+                past_vehicle.update_from_sample(subset, scene_frame, time.monotonic())
+        vehicle = self._store.get(history.uav)
+        if vehicle is None or scene_frame is not self._store.scene_frame:
             return
-        with self._feed.lock:  # a snapshot shares its histories with the original
-            found.track.lay_before(early.track.rows())
-            found.trail.lay_before(early.trail.rows())
-        self._laid.add(said.uav)
+        with self._store.lock:  # a snapshot shares its histories with the original
+            vehicle.track.prepend(past_vehicle.track.rows())
+            vehicle.trail.prepend(past_vehicle.trail.rows())
+        self._filled.add(history.uav)
 
-    def news(self) -> frozenset[int]:
+    def take_filled(self) -> frozenset[int]:
         """Return the UAVs backfilled since the last call."""
-        laid, self._laid = frozenset(self._laid), set()
-        return laid
+        filled, self._filled = frozenset(self._filled), set()
+        return filled

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from viewer.store.forecast import Kept
+from viewer.store.forecast import PastPrediction
 from viewer.store.place import UNIT_M
 
-AHEADS_S = np.arange(1.0, 31.0)  # look-aheads at which errors are measured [s]
-LEAST = 3  # fewer errors at a look-ahead give no RMS
+LOOK_AHEADS_S = np.arange(1.0, 31.0)  # look-aheads at which errors are measured [s]
+MIN_PREDICTIONS = 3  # fewer errors at a look-ahead give no RMS
 
 
-def errors(past: list[Kept], trail: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def prediction_errors(predictions: list[PastPrediction], trail: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Compute the position error of every prediction at every elapsed look-ahead.
 
     Args:
@@ -18,20 +18,20 @@ def errors(past: list[Kept], trail: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     Returns:
         issue times (k,) [s] and errors (k, 30) [m]; NaN where the flown position is not available
     """
-    if not past or len(trail) < 2:
-        return np.zeros(0), np.zeros((0, len(AHEADS_S)))
-    made = np.array([told.t for told in past])
-    due = made[:, None] + AHEADS_S
-    flown = np.stack([np.interp(due, trail[:, 0], trail[:, i]) for i in (1, 2, 3)], axis=-1)
-    told = np.stack([one.at(AHEADS_S) for one in past])
-    off = UNIT_M * np.linalg.norm(told - flown, axis=-1)
-    reach = np.array([min(one.until, float(one.ahead[-1])) for one in past])
-    unanswered = (due > trail[-1, 0]) | (due < trail[0, 0]) | (reach[:, None] < AHEADS_S)
-    return made, np.where(unanswered, np.nan, off)
+    if not predictions or len(trail) < 2:
+        return np.zeros(0), np.zeros((0, len(LOOK_AHEADS_S)))
+    issued = np.array([predicted.t for predicted in predictions])
+    due = issued[:, None] + LOOK_AHEADS_S
+    actual = np.stack([np.interp(due, trail[:, 0], trail[:, i]) for i in (1, 2, 3)], axis=-1)
+    predicted = np.stack([prediction.position_at(LOOK_AHEADS_S) for prediction in predictions])
+    distances = UNIT_M * np.linalg.norm(predicted - actual, axis=-1)
+    claimed_s = np.array([min(prediction.horizon_s, float(prediction.ahead[-1])) for prediction in predictions])
+    unavailable = (due > trail[-1, 0]) | (due < trail[0, 0]) | (claimed_s[:, None] < LOOK_AHEADS_S)
+    return issued, np.where(unavailable, np.nan, distances)
 
 
-def by_ahead(off: np.ndarray) -> np.ndarray:
+def rms_by_look_ahead(distances: np.ndarray) -> np.ndarray:
     """Return the RMS error at each look-ahead, (30,) [m]; NaN for fewer than `MIN_PREDICTIONS` errors."""
-    n = np.isfinite(off).sum(axis=0)
-    mean = np.nansum(off**2, axis=0) / np.maximum(n, 1)
-    return np.where(n >= LEAST, np.sqrt(mean), np.nan)
+    n = np.isfinite(distances).sum(axis=0)
+    mean = np.nansum(distances**2, axis=0) / np.maximum(n, 1)
+    return np.where(n >= MIN_PREDICTIONS, np.sqrt(mean), np.nan)

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fleet.contract import (
-    About,
     Alert,
+    AlertKey,
     AlertKind,
-    Found,
+    DiagnosisOutcome,
     Item,
     Link,
     Mismatch,
@@ -25,18 +25,18 @@ from fleet.contract import (
 )
 from fleet.contract import Event as Happened
 from viewer.store.mission_items import ITEM_NAMES
-from viewer.store.received.inbox import Head
-from viewer.theme.events import LATEST, MAX_RAISED, Event, Kind
+from viewer.store.received.inbox import SampleSubset
+from viewer.theme.events import LATEST, MAX_ALERTS, EventKind, TimelineEvent
 
-MAX_WORDS = 200  # characters kept of a received text
+MAX_TEXT = 200  # characters kept of a received text
 QUIET_S = 2.5  # without a gateway status for this long, link alerts of the worker count [s]
 MAX_CAUSES = 8  # names accepted of one mismatch
 MAX_STEPS = 20  # mission item changes accepted of one sample
-LASTS_S = 12.0  # failing verifications for this long are an event: about three verdicts [s]
-SOUND = (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST)  # outcomes that confirm a model, new or active
+UNVERIFIED_S = 12.0  # failing verifications for this long are an event: about three verdicts [s]
+ACCEPTED = (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST)  # outcomes that confirm a model, new or active
 
 
-class Known(NamedTuple):
+class DetectorState(NamedTuple):
     """Latest values of one UAV whose change is an event."""
 
     mode: str = ""
@@ -47,85 +47,95 @@ class Known(NamedTuple):
     items: tuple[Item, ...] = ()
     seq: int = -1
     verdict: str | None = None  # last reported: none (no model), sound or doubted; None before any
-    sound_t: float = -np.inf  # time of the last accepted verification [s since 1970]
-    raised: frozenset[About] = frozenset()  # active alerts, by `Alert.about`
-    found: tuple[str, ...] = ()  # outcome and names of the last reported mismatch
-    told_t: float = 0.0  # time of the last event in predictions [s since 1970]
+    accepted_t: float = -np.inf  # time of the last accepted verification [s since 1970]
+    raised: frozenset[AlertKey] = frozenset()  # active alerts, by `Alert.about`
+    mismatch: tuple[str, ...] = ()  # outcome and names of the last reported mismatch
+    prediction_event_t: float = 0.0  # time of the last event in predictions [s since 1970]
 
 
-Told = tuple[Known, list[Event]]
+Detection = tuple[DetectorState, list[TimelineEvent]]
 
 
-def hear(known: Known, message: Any) -> Told:
+def detect_events(state: DetectorState, message: Any) -> Detection:
     """Compare a message with the state; return the next state and the events in order.
 
     Raises:
         ValueError: when rows of a sample have a wrong shape; the gateway must resend.
     """
-    tell = _TELLS.get(type(message))
-    if tell is None:
-        return known, []
-    known, events = tell(known, message)
-    return known, [event for event in events if 0 < event.t < LATEST]
+    detector = _DETECTORS.get(type(message))
+    if detector is None:
+        return state, []
+    state, events = detector(state, message)
+    return state, [event for event in events if 0 < event.t < LATEST]
 
 
-def _status(known: Known, status: Status) -> Told:
+def _status(state: DetectorState, status: Status) -> Detection:
     lost = status.link is Link.LOST
-    if known.lost is None:
-        known = known._replace(lost=None if lost else False)
-    known, events = _link(known, status.t, lost) if known.lost is not None else (known, [])
-    known = known._replace(status_t=status.t)
-    if status.mode and status.mode != known.mode:
-        events.append(Event(status.t, Kind.MODE, _clip(status.mode)))
-    if status.armed != known.armed:
-        kind = Kind.ARMED if status.armed else Kind.DISARMED
-        events.append(Event(status.t, kind, kind.value))
+    if state.lost is None:
+        state = state._replace(lost=None if lost else False)
+    state, events = _link(state, status.t, lost) if state.lost is not None else (state, [])
+    state = state._replace(status_t=status.t)
+    if status.mode and status.mode != state.mode:
+        events.append(TimelineEvent(status.t, EventKind.MODE, _clip(status.mode)))
+    if status.armed != state.armed:
+        kind = EventKind.ARMED if status.armed else EventKind.DISARMED
+        events.append(TimelineEvent(status.t, kind, kind.value))
     sentence = "" if lost else status.sentence  # while lost, the sentence only counts seconds
-    if sentence and sentence != known.sentence:
-        events.append(Event(status.t, Kind.WARNING, _own_words(sentence, status.uav)))
-    return known._replace(mode=status.mode or known.mode, armed=status.armed, sentence=sentence), events
+    if sentence and sentence != state.sentence:
+        events.append(TimelineEvent(status.t, EventKind.WARNING, _without_uav_prefix(sentence, status.uav)))
+    return state._replace(mode=status.mode or state.mode, armed=status.armed, sentence=sentence), events
 
 
-def _link(known: Known, t: float, lost: bool) -> Told:
-    if lost == bool(known.lost):
-        return known, []
-    event = Event(t, Kind.LOST, "link lost") if lost else Event(t, Kind.BACK, "link back")
-    return known._replace(lost=lost), [event]
+def _link(state: DetectorState, t: float, lost: bool) -> Detection:
+    if lost == bool(state.lost):
+        return state, []
+    event = (
+        TimelineEvent(t, EventKind.LINK_LOST, "link lost")
+        if lost
+        else TimelineEvent(t, EventKind.LINK_RESTORED, "link back")
+    )
+    return state._replace(lost=lost), [event]
 
 
-def _alert(known: Known, alert: Alert) -> Told:
+def _alert(state: DetectorState, alert: Alert) -> Detection:
     if alert.kind is AlertKind.LINK_LOST:  # a worker may lag behind the gateway
-        return _link(known, alert.t, alert.active) if alert.t > known.status_t + QUIET_S else (known, [])
-    if alert.active == (alert.about in known.raised):
-        return known, []
+        return _link(state, alert.t, alert.active) if alert.t > state.status_t + QUIET_S else (state, [])
+    if alert.active == (alert.about in state.raised):
+        return state, []
     name = alert.kind.value.replace("_", " ") + (f" with uav-{alert.other}" if alert.other >= 0 else "")
     if not alert.active:
-        return known._replace(raised=known.raised - {alert.about}), [Event(alert.t, Kind.EASED, f"{name} cleared")]
-    if len(known.raised) >= MAX_RAISED:
-        return known, []
-    said = _own_words(alert.sentence, alert.uav) or name
-    return known._replace(raised=known.raised | {alert.about}), [Event(alert.t, Kind.ALERT, said)]
+        return state._replace(raised=state.raised - {alert.about}), [
+            TimelineEvent(alert.t, EventKind.CLEARED, f"{name} cleared")
+        ]
+    if len(state.raised) >= MAX_ALERTS:
+        return state, []
+    text = _without_uav_prefix(alert.sentence, alert.uav) or name
+    return state._replace(raised=state.raised | {alert.about}), [TimelineEvent(alert.t, EventKind.ALERT, text)]
 
 
-def _mismatch(known: Known, told: Mismatch) -> Told:
+def _mismatch(state: DetectorState, mismatch: Mismatch) -> Detection:
     """Detect a change of outcome or names of a mismatch; a suspected mismatch is no event."""
-    stands = told.outcome in (Found.NAMED, Found.UNKNOWN)
-    found = (told.outcome.value, *(one.name for one in told.causes[:MAX_CAUSES])) if stands else ()
-    if found == known.found:
-        return known, []
-    known = known._replace(found=found)
-    if not stands:
-        return known, [Event(told.t, Kind.EASED, "mismatch cleared")]
-    return known, [Event(told.t, Kind.MISMATCH, _own_words(told.sentence, told.uav) or "mismatch")]
+    reported = mismatch.outcome in (DiagnosisOutcome.NAMED, DiagnosisOutcome.UNKNOWN)
+    names = (mismatch.outcome.value, *(cause.name for cause in mismatch.causes[:MAX_CAUSES])) if reported else ()
+    if names == state.mismatch:
+        return state, []
+    state = state._replace(mismatch=names)
+    if not reported:
+        return state, [TimelineEvent(mismatch.t, EventKind.CLEARED, "mismatch cleared")]
+    return state, [
+        TimelineEvent(
+            mismatch.t, EventKind.MISMATCH, _without_uav_prefix(mismatch.sentence, mismatch.uav) or "mismatch"
+        )
+    ]
 
 
-def _mission(known: Known, mission: Mission) -> Told:
+def _mission(state: DetectorState, mission: Mission) -> Detection:
     if len(mission.items) < 2 or not mission.complete:  # a single item is home
-        return known, []
-    if known.items and _plan(mission.items) == _plan(known.items):
-        return known._replace(items=mission.items), []
-    said = f"{'new mission' if known.items else 'mission'} on board, {len(mission.items)} items"
-    return known._replace(items=mission.items), [Event(mission.t, Kind.MISSION, said)]
+        return state, []
+    if state.items and _plan(mission.items) == _plan(state.items):
+        return state._replace(items=mission.items), []
+    text = f"{'new mission' if state.items else 'mission'} on board, {len(mission.items)} items"
+    return state._replace(items=mission.items), [TimelineEvent(mission.t, EventKind.MISSION, text)]
 
 
 def _plan(items: tuple[Item, ...]) -> list[tuple[int, int, int, str]]:
@@ -133,19 +143,21 @@ def _plan(items: tuple[Item, ...]) -> list[tuple[int, int, int, str]]:
     return [(item.command, item.lat_e7, item.lon_e7, f"{item.alt_m:.1f}") for item in items[1:]]
 
 
-def _sample(known: Known, sample: Head) -> Told:
+def _sample(state: DetectorState, sample: SampleSubset) -> Detection:
     if sample.leg is None:
-        return known, []
+        return state, []
     t, x = sample.leg.t.numpy(), sample.leg.x.numpy()
     if x.ndim != 2 or x.shape[1] != 1 or t.shape != (len(x),):
         raise ValueError(f"uav-{sample.uav}: leg rows have shape {x.shape}, expected (n, 1) and n times; resend")
-    sound = np.isfinite(x[:, 0]) & (np.abs(x[:, 0]) < 1e6)
-    t, seqs = t[sound], x[sound, 0].astype(int)
-    steps = np.flatnonzero(np.diff(seqs, prepend=known.seq))[-MAX_STEPS:]
+    valid = np.isfinite(x[:, 0]) & (np.abs(x[:, 0]) < 1e6)
+    t, seqs = t[valid], x[valid, 0].astype(int)
+    steps = np.flatnonzero(np.diff(seqs, prepend=state.seq))[-MAX_STEPS:]
     if not len(steps):
-        return known, []
-    events = [Event(float(t[k]), Kind.ITEM, _item(known.items, int(seqs[k]))) for k in steps if seqs[k] > 0]
-    return known._replace(seq=int(seqs[-1])), events
+        return state, []
+    events = [
+        TimelineEvent(float(t[k]), EventKind.ITEM, _item(state.items, int(seqs[k]))) for k in steps if seqs[k] > 0
+    ]
+    return state._replace(seq=int(seqs[-1])), events
 
 
 def _item(items: tuple[Item, ...], seq: int) -> str:
@@ -154,69 +166,71 @@ def _item(items: tuple[Item, ...], seq: int) -> str:
     return f"item {seq}" if command is None else f"item {seq}: {ITEM_NAMES.get(command, f'command {command}')}"
 
 
-def _model(known: Known, model: Model) -> Told:
+def _model(state: DetectorState, model: Model) -> Detection:
     """Detect the first verified model, persistent verification failure, and recovery.
 
     Verdicts arrive every few seconds and alternate near a threshold: only a lasting change is an event.
     """
-    newest, before = model.verdict, known.verdict
-    sound_t = model.t if before is None or newest.outcome in SOUND else known.sound_t
-    known = known._replace(sound_t=sound_t)
-    if model.in_force is None:
-        news, event = "none", Event(model.t, Kind.NO_MODEL, f"no model yet: {_outcome(newest)}")
+    newest, before = model.verdict, state.verdict
+    accepted_t = model.t if before is None or newest.outcome in ACCEPTED else state.accepted_t
+    state = state._replace(accepted_t=accepted_t)
+    if model.active_verdict is None:
+        status, event = "none", TimelineEvent(model.t, EventKind.NO_MODEL, f"no model yet: {_outcome(newest)}")
     elif before in (None, "none"):
-        said = _own_words(model.in_force.sentence, model.uav)
-        news, event = "sound", Event(model.t, Kind.VERIFIED, f"model verified: {said}")
-    elif newest.outcome in SOUND:
-        news, event = "sound", Event(model.t, Kind.SOUND, "model verified again")
-    elif model.t - sound_t >= LASTS_S:
-        words = f"no verification for {LASTS_S:.0f} s ({_outcome(newest)}); an earlier model stays active"
-        news, event = "doubted", Event(model.t, Kind.DOUBTED, words)
+        summary = _without_uav_prefix(model.active_verdict.sentence, model.uav)
+        status, event = "sound", TimelineEvent(model.t, EventKind.VERIFIED, f"model verified: {summary}")
+    elif newest.outcome in ACCEPTED:
+        status, event = "sound", TimelineEvent(model.t, EventKind.ACCEPTED, "model verified again")
+    elif model.t - accepted_t >= UNVERIFIED_S:
+        text = f"no verification for {UNVERIFIED_S:.0f} s ({_outcome(newest)}); an earlier model stays active"
+        status, event = "doubted", TimelineEvent(model.t, EventKind.UNVERIFIED, text)
     else:
-        return known, []
-    return (known, []) if news == before else (known._replace(verdict=news), [event])
+        return state, []
+    return (state, []) if status == before else (state._replace(verdict=status), [event])
 
 
-_TOLD = {  # events in predictions; other messages report modes, missions and the link sooner
-    Happened.PARAMETERS: Kind.PARAMETERS,
-    Happened.TAKE_OFF: Kind.TAKE_OFF,
-    Happened.LANDING: Kind.LANDING,
-    Happened.TOUCH_DOWN: Kind.GROUND,
-    Happened.HORIZON_OVER: Kind.BLIND,
-    Happened.TELEMETRY_BROKEN: Kind.BLIND,
-    Happened.TELEMETRY_WHOLE: Kind.SIGHT,
-    Happened.CLOCK: Kind.FRAME,
-    Happened.ORIGIN: Kind.FRAME,
+_PREDICTION_EVENTS = {  # events in predictions; other messages report modes, missions and the link sooner
+    Happened.PARAMETERS: EventKind.PARAMETERS,
+    Happened.TAKE_OFF: EventKind.TAKE_OFF,
+    Happened.LANDING: EventKind.LANDING,
+    Happened.TOUCH_DOWN: EventKind.GROUND,
+    Happened.COASTING_EXPIRED: EventKind.TELEMETRY_LOST,
+    Happened.POSITION_LOST: EventKind.TELEMETRY_LOST,
+    Happened.POSITION_RESTORED: EventKind.TELEMETRY_RESTORED,
+    Happened.CLOCK: EventKind.FRAME,
+    Happened.ORIGIN: EventKind.FRAME,
 }
 
 
-def _prediction(known: Known, prediction: Prediction) -> Told:
+def _prediction(state: DetectorState, prediction: Prediction) -> Detection:
     """Detect the event that restarted a prediction, once."""
-    if prediction.event is None or prediction.event_t == known.told_t:
-        return known, []
-    kind = _TOLD.get(prediction.event)
-    said = _clip(prediction.event_said) or prediction.event.value.replace("_", " ")
-    return known._replace(told_t=prediction.event_t), [Event(prediction.event_t, kind, said)] if kind else []
+    if prediction.event is None or prediction.event_t == state.prediction_event_t:
+        return state, []
+    kind = _PREDICTION_EVENTS.get(prediction.event)
+    text = _clip(prediction.event_text) or prediction.event.value.replace("_", " ")
+    return state._replace(prediction_event_t=prediction.event_t), [
+        TimelineEvent(prediction.event_t, kind, text)
+    ] if kind else []
 
 
 def _outcome(verdict: Verdict) -> str:
     return verdict.outcome.value.replace("_", " ")
 
 
-def _own_words(sentence: str, uav: int) -> str:
+def _without_uav_prefix(sentence: str, uav: int) -> str:
     return _clip(sentence.removeprefix(f"uav-{uav}: "))
 
 
 def _clip(text: str) -> str:
-    return text if len(text) <= MAX_WORDS else text[: MAX_WORDS - 1] + "…"
+    return text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 1] + "…"
 
 
-_TELLS: dict[type, Callable[[Known, Any], Told]] = {
+_DETECTORS: dict[type, Callable[[DetectorState, Any], Detection]] = {
     Status: _status,
     Alert: _alert,
     Mismatch: _mismatch,
     Mission: _mission,
-    Head: _sample,
+    SampleSubset: _sample,
     Model: _model,
     Prediction: _prediction,
 }

@@ -6,24 +6,24 @@ from typing import NamedTuple
 import numpy as np
 
 from fleet.contract import Prediction
-from viewer.store.place import REACH_M, UNIT_M, Place
+from viewer.store.place import REACH_M, UNIT_M, SceneFrame
 
 MAX_STEPS, MAX_AHEAD_S = 5_000, 3_600.0  # accepted look-ahead: steps, and time [s]
-_CHORD_S, _MOST_PARTS = 1.5, 4  # steps longer than this are subdivided, into at most so many parts
-KEPT_S = 31.0  # look-ahead kept of a past prediction [s]
+_CHORD_S, _MAX_PARTS = 1.5, 4  # steps longer than this are subdivided, into at most so many parts
+PAST_AHEAD_S = 31.0  # look-ahead kept of a past prediction [s]
 
 
-class Forecast:
+class ScenePrediction:
     """Checked prediction with arrays in scene coordinates."""
 
-    def __init__(self, message: Prediction, place: Place, heard: float) -> None:
+    def __init__(self, message: Prediction, scene_frame: SceneFrame, received: float) -> None:
         self.t = message.t  # start, data time [s since 1970]
-        self.heard = heard  # arrival, monotonic [s]
+        self.received = received  # arrival, monotonic [s]
         self.message = message
-        self.place = place
+        self.scene_frame = scene_frame
 
     @cached_property
-    def until(self) -> float:
+    def horizon_s(self) -> float:
         """Return the confidence horizon, at most the last look-ahead sent [s]."""
         horizon, last = self.message.horizon_s, float(self.message.ahead.numpy()[-1])
         return float(min(max(horizon if np.isfinite(horizon) else 0.0, 0.0), last))
@@ -45,52 +45,56 @@ class Forecast:
 
     @cached_property
     def _scene_arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        told = self.message
-        ahead, path, tube = (a.numpy().astype(float) for a in (told.ahead, told.path, told.tube))
+        message = self.message
+        ahead, path, tube = (
+            a.numpy().astype(float) for a in (message.ahead, message.path, message.prediction_region_half_axes)
+        )
         tube = np.clip(np.nan_to_num(tube / UNIT_M), 0.0, 1e4)
-        return smooth(ahead, self.place.local(told.ned_origin(), path), tube)
+        return refined(ahead, self.scene_frame.from_ned(message.ned_origin(), path), tube)
 
-    def at(self, ahead: np.ndarray | float) -> np.ndarray:
+    def position_at(self, ahead: np.ndarray | float) -> np.ndarray:
         """Interpolate the mean path at look-aheads (k,) [s] -> (k, 3) [10 m]; constant beyond both ends."""
         return np.stack([np.interp(ahead, self.ahead, self.path[:, i]) for i in range(3)], axis=-1)
 
-    def width(self, ahead: np.ndarray) -> np.ndarray:
+    def half_axes_at(self, ahead: np.ndarray) -> np.ndarray:
         """Interpolate the half-axes at look-aheads (k,) [s] -> (k, 3) [10 m]."""
         return np.stack([np.interp(ahead, self.ahead, self.tube[:, i]) for i in range(3)], axis=-1)
 
-    def kept(self, before: "Kept | None" = None) -> "Kept":
+    def to_past(self, previous: "PastPrediction | None" = None) -> "PastPrediction":
         """Return the reduced record of this prediction; `previous` is the record before it."""
         path, ahead = self.message.path.numpy(), self.message.ahead.numpy()
-        ahead = ahead[: int(np.searchsorted(ahead, KEPT_S, side="right"))]
-        same = before is not None and np.array_equal(before.ahead, ahead)
-        kept = before.ahead if before is not None and same else ahead.copy()
-        return Kept(self.t, self.until, kept, path[: len(ahead)].copy(), self.message.origin, self.place)
+        ahead = ahead[: int(np.searchsorted(ahead, PAST_AHEAD_S, side="right"))]
+        same = previous is not None and np.array_equal(previous.ahead, ahead)
+        shared_ahead = previous.ahead if previous is not None and same else ahead.copy()
+        return PastPrediction(
+            self.t, self.horizon_s, shared_ahead, path[: len(ahead)].copy(), self.message.origin, self.scene_frame
+        )
 
 
-class Kept(NamedTuple):
+class PastPrediction(NamedTuple):
     """Reduced record of a past prediction, as sent: a few hundred bytes."""
 
     t: float  # start, data time [s since 1970]
-    until: float  # horizon [s]
+    horizon_s: float  # horizon [s]
     ahead: np.ndarray  # (n,) [s]
     ned: np.ndarray  # from `origin`, (n, 3) [m]
     origin: tuple[int, int, int]  # lat, lon [1e-7 deg], alt [mm]
-    place: Place
+    scene_frame: SceneFrame
 
-    def at(self, ahead: np.ndarray | float) -> np.ndarray:
+    def position_at(self, ahead: np.ndarray | float) -> np.ndarray:
         """Interpolate the mean path at look-aheads (k,) [s] -> (k, 3) [10 m]."""
-        path = self.place.local(self.origin, self.ned)
+        path = self.scene_frame.from_ned(self.origin, self.ned)
         return np.stack([np.interp(ahead, self.ahead, path[:, i]) for i in range(3)], axis=-1)
 
 
-def forecast(message: Prediction, place: Place, heard: float) -> Forecast | None:
+def check_prediction(message: Prediction, scene_frame: SceneFrame, received: float) -> ScenePrediction | None:
     """Check a prediction; return None when it has no path.
 
     Raises:
         ValueError: when its arrays disagree, are not finite or not increasing in time; the worker must resend.
         OutOfRangeError: when it is farther than 100 km from the fleet.
     """
-    ahead, path, tube = (a.numpy() for a in (message.ahead, message.path, message.tube))
+    ahead, path, tube = (a.numpy() for a in (message.ahead, message.path, message.prediction_region_half_axes))
     n = ahead.shape[0] if ahead.ndim == 1 else -1
     if n == 0:
         return None
@@ -99,20 +103,20 @@ def forecast(message: Prediction, place: Place, heard: float) -> Forecast | None
             f"uav-{message.uav}: prediction has shapes {ahead.shape} {path.shape} {tube.shape}, "
             f"expected (n,) (n, 3) (n, 3) with 2 to {MAX_STEPS} steps; resend"
         )
-    rises = (ahead[1:] > ahead[:-1]).all() and abs(ahead[0]) <= MAX_AHEAD_S and abs(ahead[-1]) <= MAX_AHEAD_S
-    if not rises or not np.isfinite(message.t):
+    is_rising = (ahead[1:] > ahead[:-1]).all() and abs(ahead[0]) <= MAX_AHEAD_S and abs(ahead[-1]) <= MAX_AHEAD_S
+    if not is_rising or not np.isfinite(message.t):
         raise ValueError(f"uav-{message.uav}: prediction has times that do not increase within one hour; resend")
     if not np.abs(path).max() <= REACH_M:  # also rejects NaN
         raise ValueError(f"uav-{message.uav}: prediction has a path that is not finite or beyond 100 km; resend")
-    place.spot(*message.origin)
-    return Forecast(message, place, heard)
+    scene_frame.from_geodetic_point(*message.origin)
+    return ScenePrediction(message, scene_frame, received)
 
 
-def smooth(ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def refined(ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Insert points between look-aheads that are seconds apart, as chords cut turns by metres."""
     if np.diff(ahead).max() <= _CHORD_S or len(ahead) < 4:
         return ahead, path, tube
-    parts = np.minimum(np.ceil(np.diff(ahead) / _CHORD_S), _MOST_PARTS).astype(int)
+    parts = np.minimum(np.ceil(np.diff(ahead) / _CHORD_S), _MAX_PARTS).astype(int)
     at = np.interp(np.arange(parts.sum() + 1), np.concatenate([[0], np.cumsum(parts)]), ahead)
     return at, _cubic(ahead, path, at), np.stack([np.interp(at, ahead, column) for column in tube.T], axis=-1)
 

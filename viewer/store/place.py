@@ -3,17 +3,17 @@
 import numpy as np
 
 from fleet.frames import Origin, to_geodetic, to_ned
-from viewer.store.received.inbox import Head
+from viewer.store.received.inbox import SampleSubset
 
 UNIT_M = 10.0  # metres per scene unit: keeps the fleet between the near and far planes of the renderer
 REACH_M = 100_000.0  # beyond this distance the tangent plane is inaccurate and nothing is drawn
 
 
-class TooFar(ValueError):
+class OutOfRangeError(ValueError):
     """Position beyond the range of the scene frame."""
 
 
-class Place:
+class SceneFrame:
     """Common local frame; its origin is the first reported position, until no UAV is within range."""
 
     def __init__(self, origin: Origin) -> None:
@@ -21,7 +21,7 @@ class Place:
         north, east, _ = to_ned(origin, *(np.array([x + 1e6]) for x in origin))[0]
         self._east, self._north = east / 1e6 / UNIT_M, north / 1e6 / UNIT_M  # linear map [10 m / 1e-7 deg]
 
-    def geodetic(self, lat_e7: np.ndarray, lon_e7: np.ndarray, alt_mm: np.ndarray) -> np.ndarray:
+    def from_geodetic(self, lat_e7: np.ndarray, lon_e7: np.ndarray, alt_mm: np.ndarray) -> np.ndarray:
         """Map geodetic positions, (n,) [1e-7 deg, 1e-7 deg, mm], to the scene: (n, 3) ENU [10 m].
 
         Raises:
@@ -33,13 +33,14 @@ class Place:
             raise ValueError("position: found an invalid latitude, longitude or altitude; check the sender")
         scene = ned_to_scene(to_ned(self.origin, lat, lon, alt))
         if (np.abs(scene) > REACH_M / UNIT_M).any():
-            away = np.abs(scene).max() * UNIT_M / 1000
-            raise TooFar(
-                f"position: found {away:.0f} km from the scene origin, expected at most 100 km; open another viewer"
+            distance_km = np.abs(scene).max() * UNIT_M / 1000
+            raise OutOfRangeError(
+                f"position: found {distance_km:.0f} km from the scene origin, expected at most 100 km; open "
+                "another viewer"
             )
         return scene
 
-    def spot(self, lat_e7: float, lon_e7: float, alt_mm: float) -> tuple[float, float, float]:
+    def from_geodetic_point(self, lat_e7: float, lon_e7: float, alt_mm: float) -> tuple[float, float, float]:
         """Map one position as `from_geodetic` does, without numpy: east, north, up [10 m].
 
         Raises:
@@ -52,17 +53,19 @@ class Place:
         reach = REACH_M / UNIT_M
         if -reach <= east <= reach and -reach <= north <= reach and -reach <= up <= reach:
             return east, north, up
-        found = self.geodetic(*(np.array([x]) for x in (lat_e7, lon_e7, alt_mm)))[0]  # raises, or crosses 180 degrees
-        return float(found[0]), float(found[1]), float(found[2])
+        point = self.from_geodetic(*(np.array([x]) for x in (lat_e7, lon_e7, alt_mm)))[
+            0
+        ]  # raises, or crosses 180 degrees
+        return float(point[0]), float(point[1]), float(point[2])
 
-    def local(self, origin: tuple[int, int, int], ned: np.ndarray) -> np.ndarray:
+    def from_ned(self, origin: tuple[int, int, int], ned: np.ndarray) -> np.ndarray:
         """Map NED positions relative to another origin, (n, 3) [m], to the scene: (n, 3) ENU [10 m]."""
         ned = np.asarray(ned, float)
         if not np.isfinite(ned).all() or (np.abs(ned) > 2 * REACH_M).any():
             raise ValueError("path: found values that are not finite or beyond 200 km, expected metres; resend")
         if tuple(origin) == tuple(self.origin):
             return ned_to_scene(ned)
-        return self.geodetic(*to_geodetic(Origin(*origin), ned).T)
+        return self.from_geodetic(*to_geodetic(Origin(*origin), ned).T)
 
 
 def ned_to_scene(ned: np.ndarray) -> np.ndarray:
@@ -88,17 +91,17 @@ def scene_quat(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarra
     )
 
 
-def first_fix(sample: Head) -> Origin | None:
+def first_fix(sample: SampleSubset) -> Origin | None:
     """Return the first position of a sample as frame origin; None before a fix."""
     if sample.position is None:
         return None
     x = sample.position.x.numpy()
     if x.ndim != 2 or x.shape[1] < 3 or not len(x) or not np.isfinite(x[0]).all() or not x[0, :2].any():
         return None
-    return checked(Origin(int(x[0, 0]), int(x[0, 1]), int(x[0, 2])))
+    return checked_origin(Origin(int(x[0, 0]), int(x[0, 1]), int(x[0, 2])))
 
 
-def checked(origin: Origin) -> Origin:
+def checked_origin(origin: Origin) -> Origin:
     """Return the origin unchanged; raise ValueError when it is invalid."""
     if abs(origin.lat_e7) > 890_000_000 or abs(origin.lon_e7) > 1_800_000_000 or abs(origin.alt_mm) > 100_000_000:
         raise ValueError(f"origin: found {origin}, expected latitude < 89 deg and altitude < 100 km; check the sender")

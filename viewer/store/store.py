@@ -8,192 +8,194 @@ from typing import Any
 
 import numpy as np
 
-from fleet.bus.bus_protocol import Bus, key
-from fleet.bus.bus_protocol import Letter as Said
-from fleet.bus.codec import Stamp, decode_from, encoding
-from fleet.bus.epoch_fence import GIVE_UP_S, Fence
+from fleet.bus.bus_protocol import Bus, RawMessage, key_of
+from fleet.bus.codec import Stamp, decode_for_key, encoding
+from fleet.bus.epoch_fence import WRITER_TIMEOUT_S, EpochFence
 from fleet.contract import (
-    Account,
     Alert,
     AlertKind,
-    FleetRow,
     FleetState,
+    GatewayCounters,
     Mismatch,
     Mission,
     Model,
     Prediction,
     Sample,
-    State,
     Status,
+    TwinState,
 )
-from viewer.store.forecast import Kept, forecast
-from viewer.store.place import Place, TooFar, checked, first_fix
-from viewer.store.received.inbox import CROWD, Head, Inbox, Letter, Newest, read
-from viewer.store.vehicle import ENDED_S, JUMP_S, Vehicle
-from viewer.theme.events import MAX_RAISED
+from viewer.store.forecast import PastPrediction, check_prediction
+from viewer.store.place import OutOfRangeError, SceneFrame, checked_origin, first_fix
+from viewer.store.received.inbox import LARGE_FLEET, CoalescingQueue, Inbox, QueuedMessage, SampleSubset, decode_sample
+from viewer.store.vehicle import ENDED_S, JUMP_S, Vehicle, stamp_of
+from viewer.theme.events import MAX_ALERTS
 
 MAX_VEHICLES = 2_000  # ids are untrusted input: further UAVs are counted, not stored
 COASTING_S = 1.0  # a prediction later than this after the last sample is not compared with the flight [s]
-SOON_S = 1.2  # longest delay of a sample in a large fleet [s]
-WAIT_S = {Prediction: 3.0, Status: 2.0}  # decoding interval in a large fleet for UAVs without alerts [s]
+MAX_SAMPLE_WAIT_S = 1.2  # longest delay of a sample in a large fleet [s]
+COALESCE_S = {Prediction: 3.0, Status: 2.0}  # decoding interval in a large fleet for UAVs without alerts [s]
 PAST_S = 65.0  # age up to which past predictions are compared with the flight [s]
 MAX_AWAY = 10_000  # rejected UAVs that are counted
 MAX_LINKS = 64  # links whose texts are stored
 MAX_WRITERS = 16  # workers whose texts are stored; a restarted worker counts as new
 # topics requested at the start, so that a late viewer is complete
-LATE = (Status, Mission, Model, Prediction, Alert, Mismatch, FleetState, Account)
+INITIAL_TOPICS = (Status, Mission, Model, Prediction, Alert, Mismatch, FleetState, GatewayCounters)
 
 
-class Feed:
+class FleetStore:
     """All received data, one `Vehicle` per UAV; written by bus threads, read by the render thread."""
 
     def __init__(self, bus: Bus, clock: Callable[[], float] = time.monotonic) -> None:
         self._vehicles: dict[int, Vehicle] = {}
         self.inbox = Inbox()
-        self._place: Place | None = None
+        self._scene_frame: SceneFrame | None = None
         self.sentences: dict[int, str] = {}  # status text of each worker
         self._counts: Counter[str] = Counter()
         self.links: dict[str, str] = {}  # texts of gateways about their links
-        self.away: set[int] = set()  # UAVs beyond MAX_VEHICLES
-        self.since = clock()
+        self.rejected_uavs: set[int] = set()  # UAVs beyond MAX_VEHICLES
+        self.started = clock()
         self.lock = threading.Lock()
-        self._bus, self._clock, self._fence = bus, clock, Fence(clock)
-        hears: dict[type, Callable[[Any, Stamp | None, float], None]] = {
+        self._bus, self._clock, self._fence = bus, clock, EpochFence(clock)
+        handlers: dict[type, Callable[[Any, Stamp | None, float], None]] = {
             Sample: self._sample,
-            Status: self._keep("status"),
-            Mission: self._keep("mission"),
-            Account: self._account,
+            Status: self._latest_setter("status"),
+            Mission: self._latest_setter("mission"),
+            GatewayCounters: self._account,
             Model: self._model,
             Prediction: self._prediction,
             Alert: self._alert,
             Mismatch: self._mismatch,
             FleetState: self._fleet,
         }
-        self._hears = hears
-        self.close: frozenset[int] = frozenset()  # UAVs decoded on arrival, also in a large fleet
-        self._newest: dict[type, Newest] = {kind: Newest(wait_s) for kind, wait_s in WAIT_S.items()}
-        for kind in hears:
-            bus.collect(kind, self._came(kind))
+        self._handlers = handlers
+        self.immediate_uavs: frozenset[int] = frozenset()  # UAVs decoded on arrival, also in a large fleet
+        self._coalescing: dict[type, CoalescingQueue] = {
+            kind: CoalescingQueue(wait_s) for kind, wait_s in COALESCE_S.items()
+        }
+        for kind in handlers:
+            bus.subscribe_buffered(kind, self._receiver(kind))
 
     @property
     def vehicles(self) -> dict[int, Vehicle]:
         """Return all UAVs, after decoding queued samples."""
         with self.lock:
-            self._read()
+            self._read_samples()
             return self._vehicles
 
     @property
-    def known(self) -> set[int]:
+    def uavs(self) -> set[int]:
         """Return the ids of all UAVs, without decoding queued samples."""
         with self.lock:
             return set(self._vehicles)
 
     @property
-    def place(self) -> Place | None:
+    def scene_frame(self) -> SceneFrame | None:
         """Return the scene frame; None before the first position."""
         with self.lock:
-            if self._place is None or not self.inbox.crowd:
-                self._read()
-            return self._place
+            if self._scene_frame is None or not self.inbox.large_fleet:
+                self._read_samples()
+            return self._scene_frame
 
     @property
     def counts(self) -> Counter[str]:
         """Return the number of messages of each class, and of malformed and outdated ones."""
         with self.lock:
-            self._read()
+            self._read_samples()
             return self._counts
 
-    def listen(self) -> None:
+    def poll(self) -> None:
         """Receive the messages since the last call; call it about ten times per second."""
-        self._bus.hand_out((Sample,) if self.inbox.crowd else ())
+        self._bus.dispatch((Sample,) if self.inbox.large_fleet else ())
         with self.lock:
-            for kind, newest in self._newest.items():
-                for uav, letter in newest.due(self._clock()):
-                    self._open(kind, uav, letter)
+            for kind, queue in self._coalescing.items():
+                for uav, queued in queue.due(self._clock()):
+                    self._decode(kind, uav, queued)
 
-    def _came(self, kind: type) -> Callable[[list[Said]], None]:
+    def _receiver(self, kind: type) -> Callable[[list[RawMessage]], None]:
         """Return the callback of one class: it queues samples and deferrable messages and decodes the others."""
-        newest, named_so = self._newest.get(kind), encoding(kind)
+        queue, expected_encoding = self._coalescing.get(kind), encoding(kind)
 
-        def came(letters: list[Said]) -> None:
+        def receive(messages: list[RawMessage]) -> None:
             now = self._clock()
-            sound = [letter for letter in letters if letter[2] == named_so]
+            valid = [message for message in messages if message[2] == expected_encoding]
             with self.lock:
-                self._counts["strange"] += len(letters) - len(sound)
+                self._counts["strange"] += len(messages) - len(valid)
                 if kind is Sample:
-                    return self.inbox.put(sound, now)
-                for uav, payload, _, stamp in sound:
-                    letter = Letter(payload, now, stamp)
-                    if newest is None or uav is None or not self._may_wait(kind, uav):
-                        if newest is not None and uav is not None:
-                            newest.drop(uav)
-                        self._open(kind, uav, letter)
+                    return self.inbox.put(valid, now)
+                for uav, payload, _, stamp in valid:
+                    message = QueuedMessage(payload, now, stamp)
+                    if queue is None or uav is None or not self._is_deferrable(kind, uav):
+                        if queue is not None and uav is not None:
+                            queue.drop(uav)
+                        self._decode(kind, uav, message)
                     else:
-                        newest.put(uav, letter)
+                        queue.put(uav, message)
 
-        return came
+        return receive
 
-    def _may_wait(self, kind: type, uav: int) -> bool:
+    def _is_deferrable(self, kind: type, uav: int) -> bool:
         """Return whether decoding may wait: large fleet, UAV not immediate, an earlier message present."""
-        if not self.inbox.crowd or uav in self.close:
+        if not self.inbox.large_fleet or uav in self.immediate_uavs:
             return False
         vehicle = self._vehicles.get(uav)
         return vehicle is not None and getattr(vehicle, kind.topic) is not None  # type: ignore[attr-defined]
 
-    def _open(self, kind: type, uav: int | None, letter: Letter) -> None:
+    def _decode(self, kind: type, uav: int | None, queued: QueuedMessage) -> None:
         """Decode one message, after the samples before it; the caller owns the lock."""
-        if not self.inbox.crowd:
-            self._read()
+        if not self.inbox.large_fleet:
+            self._read_samples()
         try:
-            message: Any = decode_from(kind, uav, letter.payload)
+            message: Any = decode_for_key(kind, uav, queued.payload)
         except ValueError:
             self._counts["strange"] += 1
             return
-        self._hear(kind, message, letter.stamp, letter.now)
+        self._handle(kind, message, queued.stamp, queued.now)
 
-    def _read(self, uavs: Iterable[int] | None = None) -> None:
+    def _read_samples(self, uavs: Iterable[int] | None = None) -> None:
         """Decode the queued samples of all or some UAVs; the caller owns the lock."""
-        for uav, letter in self.inbox.take(uavs):
+        for uav, queued in self.inbox.take(uavs):
             try:
-                sample = read(letter.payload)
+                sample = decode_sample(queued.payload)
             except ValueError:
                 self._counts["strange"] += 1
                 continue
             if sample.uav == uav:
-                self._hear(Sample, sample, None, letter.now)
+                self._handle(Sample, sample, None, queued.now)
             else:
                 self._counts["strange"] += 1
-        self.inbox.crowd = len(self._vehicles) > CROWD
+        self.inbox.large_fleet = len(self._vehicles) > LARGE_FLEET
 
     @property
-    def router(self) -> bool:
+    def router_available(self) -> bool:
         """Return whether a router is connected."""
         return bool(self._bus.router)
 
     @property
-    def listening(self) -> str:
+    def sample_key(self) -> str:
         """Return the key expression of samples."""
-        return key(Sample, "*")
+        return key_of(Sample, "*")
 
-    def catch_up(self) -> None:
+    def request_latest(self) -> None:
         """Request the latest messages published before the start; keep newer ones."""
-        for kind in LATE:
-            hear = self._guarded(kind)
-            for message, stamp in self._bus.ask(kind):
-                if not self._is_known(message):
-                    hear(message, stamp)
+        for kind in INITIAL_TOPICS:
+            handle = self._locked_handler(kind)
+            for message, stamp in self._bus.get(kind):
+                if not self._has_newer(message):
+                    handle(message, stamp)
 
-    def _is_known(self, message: Any) -> bool:
+    def _has_newer(self, message: Any) -> bool:
         """Return whether an equally new message arrived during the request."""
         with self.lock:
-            held = getattr(self._vehicles.get(getattr(message, "uav", -1)), message.topic, None)
-        return held is not None and held.t >= message.t
+            current = getattr(self._vehicles.get(getattr(message, "uav", -1)), message.topic, None)
+        return current is not None and current.t >= message.t
 
     def all(self) -> list[Vehicle]:
         """Return snapshots of all UAVs in the order of their ids."""
         with self.lock:
-            self._read(self.inbox.waiting(self._clock() - SOON_S) if self.inbox.crowd else None)
-            return [self._vehicles[uav].still(self._clock()) for uav in sorted(self._vehicles)]
+            self._read_samples(
+                self.inbox.waiting_since(self._clock() - MAX_SAMPLE_WAIT_S) if self.inbox.large_fleet else None
+            )
+            return [self._vehicles[uav].snapshot(self._clock()) for uav in sorted(self._vehicles)]
 
     def poses(self, uavs: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return positions, attitudes and arrival times of some UAVs; do not decode others.
@@ -201,22 +203,25 @@ class Feed:
         Returns:
             scene ENU (n, 3) [10 m], NaN where unknown; phi theta psi (n, 3) [rad]; monotonic (n,) [s]
         """
-        nowhere = np.full(3, np.nan)
+        no_position = np.full(3, np.nan)
         with self.lock:
-            self._read(uavs if self.inbox.crowd else None)
-            found = [self._vehicles[uav] for uav in uavs]
-            places = [one.at if one.at is not None else nowhere for one in found]
-            turns, heard = [one.attitude for one in found], [one.heard for one in found]
-        return np.array(places).reshape(-1, 3), np.array(turns).reshape(-1, 3), np.array(heard)
+            self._read_samples(uavs if self.inbox.large_fleet else None)
+            vehicles = [self._vehicles[uav] for uav in uavs]
+            positions = [vehicle.at if vehicle.at is not None else no_position for vehicle in vehicles]
+            attitudes, received = (
+                [vehicle.attitude for vehicle in vehicles],
+                [vehicle.sample_received for vehicle in vehicles],
+            )
+        return np.array(positions).reshape(-1, 3), np.array(attitudes).reshape(-1, 3), np.array(received)
 
-    def one(self, uav: int) -> Vehicle | None:
+    def get(self, uav: int) -> Vehicle | None:
         """Return a snapshot of one UAV; None when it is unknown."""
         with self.lock:
-            self._read((uav,) if self.inbox.crowd else None)
-            found = self._vehicles.get(uav)
-            return found.still(self._clock()) if found is not None else None
+            self._read_samples((uav,) if self.inbox.large_fleet else None)
+            vehicle = self._vehicles.get(uav)
+            return vehicle.snapshot(self._clock()) if vehicle is not None else None
 
-    def said(self) -> list[str]:
+    def worker_texts(self) -> list[str]:
         """Return the status texts of the workers."""
         with self.lock:
             return [text for text in self.sentences.values() if text]
@@ -231,7 +236,7 @@ class Feed:
         with self.lock:
             return vehicle.track.rows()
 
-    def past(self, vehicle: Vehicle) -> list[Kept]:
+    def past(self, vehicle: Vehicle) -> list[PastPrediction]:
         """Copy the past predictions of the last minute, oldest first."""
         with self.lock:
             return list(vehicle.past)
@@ -241,31 +246,31 @@ class Feed:
         with self.lock:
             return np.array(vehicle.fits, float).reshape(-1, 2)
 
-    def _guarded(self, kind: type) -> Callable[[Any, Stamp | None], None]:
+    def _locked_handler(self, kind: type) -> Callable[[Any, Stamp | None], None]:
         """Return a handler of one class that takes the lock and counts malformed messages."""
 
-        def hear(message: Any, stamp: Stamp | None) -> None:
+        def handle(message: Any, stamp: Stamp | None) -> None:
             with self.lock:
-                if not self.inbox.crowd:
-                    self._read()
-                self._hear(kind, message, stamp, self._clock())
+                if not self.inbox.large_fleet:
+                    self._read_samples()
+                self._handle(kind, message, stamp, self._clock())
 
-        return hear
+        return handle
 
-    def _hear(self, kind: type, message: Any, stamp: Stamp | None, now: float) -> None:
+    def _handle(self, kind: type, message: Any, stamp: Stamp | None, now: float) -> None:
         try:
-            self._hears[kind](message, stamp, now)
+            self._handlers[kind](message, stamp, now)
             self._counts[kind.__name__] += 1
         except (ValueError, IndexError, TypeError, OverflowError) as error:
             self._counts["strange"] += 1
             if (vehicle := self._vehicles.get(getattr(message, "uav", -1))) is not None:
-                vehicle.refused = now, f"A {kind.__name__.lower()} was rejected: {error}"
+                vehicle.refusal = now, f"A {kind.__name__.lower()} was rejected: {error}"
 
     def _vehicle(self, uav: int) -> Vehicle:
         if uav not in self._vehicles:
             if len(self._vehicles) >= MAX_VEHICLES or not 0 <= uav < 1_000_000:
-                if len(self.away) < MAX_AWAY:
-                    self.away.add(uav)
+                if len(self.rejected_uavs) < MAX_AWAY:
+                    self.rejected_uavs.add(uav)
                 raise ValueError(
                     f"uav-{uav}: found {len(self._vehicles)} UAVs or an id of 1,000,000 or more, "
                     f"expected at most {MAX_VEHICLES} UAVs; open another viewer"
@@ -273,84 +278,86 @@ class Feed:
             self._vehicles[uav] = Vehicle(uav)
         return self._vehicles[uav]
 
-    def _sample(self, sample: Head, _: Stamp | None, now: float) -> None:
-        if self._place is None and (origin := first_fix(sample)) is not None:
-            self._place = Place(origin)
-        if self._place is None:
+    def _sample(self, sample: SampleSubset, _: Stamp | None, now: float) -> None:
+        if self._scene_frame is None and (origin := first_fix(sample)) is not None:
+            self._scene_frame = SceneFrame(origin)
+        if self._scene_frame is None:
             return
         vehicle = self._vehicle(sample.uav)
         try:
-            vehicle.hear_sample(sample, self._place, now)
-        except TooFar:
-            others = (v for v in self._vehicles.values() if v is not vehicle and v.at is not None)
-            if (origin := first_fix(sample)) is None or any(now - v.heard < GIVE_UP_S for v in others):
+            vehicle.update_from_sample(sample, self._scene_frame, now)
+        except OutOfRangeError:
+            other_vehicles = (v for v in self._vehicles.values() if v is not vehicle and v.at is not None)
+            if (origin := first_fix(sample)) is None or any(
+                now - v.sample_received < WRITER_TIMEOUT_S for v in other_vehicles
+            ):
                 raise
-            self._move(Place(origin))
-            vehicle.hear_sample(sample, self._place, now)
-        vehicle.note(sample, now)
+            self._set_frame(SceneFrame(origin))
+            vehicle.update_from_sample(sample, self._scene_frame, now)
+        vehicle.process(sample, now)
 
-    def _move(self, place: Place) -> None:
+    def _set_frame(self, scene_frame: SceneFrame) -> None:
         """Move the scene origin: no UAV flies near the old one, as after a wrong first position."""
-        self._place = place
+        self._scene_frame = scene_frame
         for vehicle in self._vehicles.values():
-            vehicle.forget()
+            vehicle.reset()
 
-    def _keep(self, name: str) -> Callable[[Any, Stamp | None, float], None]:
-        def hear(message: Any, _: Stamp | None, now: float) -> None:
+    def _latest_setter(self, name: str) -> Callable[[Any, Stamp | None, float], None]:
+        def set_latest(message: Any, _: Stamp | None, now: float) -> None:
             vehicle = self._vehicle(message.uav)
             setattr(vehicle, name, message)
-            vehicle.note(message, now)
+            vehicle.process(message, now)
 
-        return hear
+        return set_latest
 
-    def _believe(self, vehicle: Vehicle, stamp: Stamp | None, now: float) -> bool:
+    def _accept(self, vehicle: Vehicle, stamp: Stamp | None, now: float) -> bool:
         """Return whether the fencing token of a worker message is current for a UAV."""
-        if not self._fence.believes(vehicle.uav, stamp):
+        if not self._fence.accepts(vehicle.uav, stamp):
             self._counts["outdated"] += 1
             return False
-        vehicle.believed = now
+        vehicle.result_accepted = now
         return True
 
     def _model(self, model: Model, stamp: Stamp | None, now: float) -> None:
         vehicle = self._vehicle(model.uav)
-        if not self._believe(vehicle, stamp, now):
+        if not self._accept(vehicle, stamp, now):
             return
         vehicle.model = model
-        vehicle.note(model, now)
+        vehicle.process(model, now)
         fits = [fit for fit in model.verdict.fit.values() if np.isfinite(fit)]
         if fits and np.isfinite(model.t):
             vehicle.fits.append((model.t, float(np.clip(np.mean(fits), 0, 100))))
 
     def _prediction(self, message: Prediction, stamp: Stamp | None, now: float) -> None:
         vehicle = self._vehicle(message.uav)
-        if not self._believe(vehicle, stamp, now):
+        if not self._accept(vehicle, stamp, now):
             return
         if vehicle.prediction is not None and 0 < vehicle.prediction.t - message.t < JUMP_S:
             return  # delayed: a newer one is present
-        vehicle.note(message, now)
+        vehicle.process(message, now)
         vehicle.controller = message.controller or vehicle.controller
-        if self._place is None and message.path.shape[0]:
-            self._place = Place(checked(message.ned_origin()))
-        found = forecast(message, self._place, now) if self._place is not None else None
-        vehicle.prediction, vehicle.forecast = message, found
-        if found is None:
+        if self._scene_frame is None and message.path.shape[0]:
+            self._scene_frame = SceneFrame(checked_origin(message.ned_origin()))
+        scene_prediction = check_prediction(message, self._scene_frame, now) if self._scene_frame is not None else None
+        vehicle.prediction, vehicle.forecast = message, scene_prediction
+        if scene_prediction is None:
             return
-        if vehicle.past and found.t < vehicle.past[-1].t - JUMP_S:
+        if vehicle.past and scene_prediction.t < vehicle.past[-1].t - JUMP_S:
             vehicle.past.clear()
         coasting = message.coast_s > COASTING_S
-        vehicle.sure = vehicle.sure if coasting else found
-        if not coasting and (not vehicle.past or found.t - vehicle.past[-1].t >= 0.9):
-            vehicle.past.append(found.kept(vehicle.past[-1] if vehicle.past else None))
-            while vehicle.past[0].t < found.t - PAST_S:
+        vehicle.last_updated_forecast = vehicle.last_updated_forecast if coasting else scene_prediction
+        if not coasting and (not vehicle.past or scene_prediction.t - vehicle.past[-1].t >= 0.9):
+            vehicle.past.append(scene_prediction.to_past(vehicle.past[-1] if vehicle.past else None))
+            while vehicle.past[0].t < scene_prediction.t - PAST_S:
                 vehicle.past.popleft()
 
-    def _mismatch(self, found: Mismatch, stamp: Stamp | None, now: float) -> None:
-        vehicle = self._vehicle(found.uav)
-        if self._believe(vehicle, stamp, now) and np.isfinite(found.t):
-            vehicle.mismatch = found
-            vehicle.note(found, now)
+    def _mismatch(self, mismatch: Mismatch, stamp: Stamp | None, now: float) -> None:
+        vehicle = self._vehicle(mismatch.uav)
+        if self._accept(vehicle, stamp, now) and np.isfinite(mismatch.t):
+            vehicle.mismatch = mismatch
+            vehicle.process(mismatch, now)
 
-    def _account(self, account: Account, _: Stamp | None, now: float) -> None:
+    def _account(self, account: GatewayCounters, _: Stamp | None, now: float) -> None:
         """Update link texts and which UAVs are replayed from a recording."""
         for link in account.per_link[:MAX_LINKS]:
             self.links.pop(link.link, None)
@@ -359,16 +366,16 @@ class Feed:
         played = bool(account.links) and all(link.startswith("replay:") for link in account.links)
         for uav in account.uavs:
             vehicle = self._vehicles.get(uav)
-            if vehicle is not None and (played or now - vehicle.player > ENDED_S):
-                vehicle.player = now if played else -np.inf
+            if vehicle is not None and (played or now - vehicle.replay_seen > ENDED_S):
+                vehicle.replay_seen = now if played else -np.inf
 
     def _alert(self, alert: Alert, stamp: Stamp | None, now: float) -> None:
         vehicle = self._vehicle(alert.uav)
-        if stamp is not None and not self._believe(vehicle, stamp, now):  # no token: from a gateway
+        if stamp is not None and not self._accept(vehicle, stamp, now):  # no token: from a gateway
             return
-        vehicle.note(alert, now)
-        others = {about: held for about, held in vehicle.alerts.items() if about != alert.about}
-        if len(others) < MAX_RAISED or not alert.active:
+        vehicle.process(alert, now)
+        others = {about: raised for about, raised in vehicle.alerts.items() if about != alert.about}
+        if len(others) < MAX_ALERTS or not alert.active:
             vehicle.alerts = {**others, alert.about: alert} if alert.active else others
 
     def _fleet(self, fleet: FleetState, stamp: Stamp | None, now: float) -> None:
@@ -377,19 +384,13 @@ class Feed:
             del self.sentences[next(iter(self.sentences))]
         for row in fleet.rows:
             vehicle = self._vehicle(row.uav)
-            if row.state is not State.UNCLAIMED and self._believe(vehicle, _stamp_of(row), now):
+            if row.state is not TwinState.UNCLAIMED and self._accept(vehicle, stamp_of(row), now):
                 vehicle.row = row
 
     def alerts(self) -> list[tuple[Vehicle, AlertKind, Alert]]:
         """Return the active alerts, newest first."""
         with self.lock:
             now = self._clock()
-            copies = [vehicle.still(now) for vehicle in self._vehicles.values() if vehicle.alerts]
-            found = [(copy, alert.kind, alert) for copy in copies for alert in copy.alerts.values()]
-        return sorted(found, key=lambda one: -one[2].t)
-
-
-def _stamp_of(row: FleetRow) -> Stamp:
-    """Return the fencing token of a fleet table row; the writer is untrusted text."""
-    hexadecimal = len(row.worker) == 16 and all(letter in "0123456789abcdef" for letter in row.worker)
-    return Stamp(row.epoch, int(row.worker, 16) if hexadecimal else 0)
+            copies = [vehicle.snapshot(now) for vehicle in self._vehicles.values() if vehicle.alerts]
+            active = [(copy, alert.kind, alert) for copy in copies for alert in copy.alerts.values()]
+        return sorted(active, key=lambda entry: -entry[2].t)

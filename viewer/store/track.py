@@ -9,41 +9,41 @@ from viewer.store.place import UNIT_M
 POINTS = 800
 TRAIL_ROWS = 900  # about 90 s at 10 Hz
 STEP_S = 0.5  # initial spacing of the points [s]
-SETTLE_S = 30.0  # initial positions may be wrong: a jump within this time restarts the path [s]
-LEAP_M, LEAP_M_S = 50.0, 60.0  # a jump exceeds JUMP_M plus JUMP_M_S times the interval [m], [m/s]
+STARTUP_S = 30.0  # initial positions may be wrong: a jump within this time restarts the path [s]
+JUMP_M, JUMP_M_S = 50.0, 60.0  # a jump exceeds JUMP_M plus JUMP_M_S times the interval [m], [m/s]
 
 
-class Track:
+class FlightTrack:
     """Path of a flight; when the buffer is full, every second point is dropped."""
 
     def __init__(self) -> None:
         self._rows = np.full((POINTS, 4), np.nan)  # t [s], scene ENU [10 m]; preallocated
         self._n, self._step, self._last = 0, STEP_S, -np.inf
 
-    def add(self, spots: list[tuple[float, float, float, float]]) -> bool:
+    def add(self, points: list[tuple[float, float, float, float]]) -> bool:
         """Append points in time order, t [s], scene ENU [10 m]; skip older ones. Return whether the path jumped."""
-        if leapt := self._leaps(spots[0]):
+        if jumped := self._is_jump(points[0]):
             self.clear()
-        for spot in spots:
-            if spot[0] < self._last + self._step:
+        for point in points:
+            if point[0] < self._last + self._step:
                 continue
             if self._n == POINTS:
                 self._n, self._step = POINTS // 2, 2 * self._step
                 self._rows[: self._n] = self._rows[::2].copy()
-            self._rows[self._n] = spot
-            self._n, self._last = self._n + 1, spot[0]
-        return leapt
+            self._rows[self._n] = point
+            self._n, self._last = self._n + 1, point[0]
+        return jumped
 
-    def _leaps(self, spot: tuple[float, float, float, float]) -> bool:
-        if not self._n or spot[0] - self._rows[0, 0] > SETTLE_S:
+    def _is_jump(self, point: tuple[float, float, float, float]) -> bool:
+        if not self._n or point[0] - self._rows[0, 0] > STARTUP_S:
             return False
         last = self._rows[self._n - 1].tolist()
-        return UNIT_M * dist(spot[1:], last[1:]) > LEAP_M + LEAP_M_S * max(spot[0] - last[0], 0.0)
+        return UNIT_M * dist(point[1:], last[1:]) > JUMP_M + JUMP_M_S * max(point[0] - last[0], 0.0)
 
-    def lay_before(self, rows: np.ndarray) -> None:
+    def prepend(self, rows: np.ndarray) -> None:
         """Prepend earlier points (n, 4), as of `rows`; skip points that are not earlier."""
-        held = self.rows()
-        joined = np.vstack([_before(rows, held), held])
+        current = self.rows()
+        joined = np.vstack([_before(rows, current), current])
         self.clear()
         if len(joined):
             self.add([tuple(row) for row in joined.tolist()])
@@ -69,10 +69,10 @@ class Trail:
         self._rows[self._n % TRAIL_ROWS] = row
         self._n += 1
 
-    def lay_before(self, rows: np.ndarray) -> None:
+    def prepend(self, rows: np.ndarray) -> None:
         """Prepend earlier rows (n, 5) up to the capacity; skip rows that are not earlier."""
-        held = self.rows()
-        joined = np.vstack([_before(rows, held), held])[-TRAIL_ROWS:]
+        current = self.rows()
+        joined = np.vstack([_before(rows, current), current])[-TRAIL_ROWS:]
         self._rows[: len(joined)], self._n = joined, len(joined)
 
     def clear(self) -> None:
@@ -86,12 +86,12 @@ class Trail:
         return np.roll(self._rows, -(self._n % TRAIL_ROWS), axis=0)
 
 
-def _before(rows: np.ndarray, held: np.ndarray) -> np.ndarray:
+def _before(rows: np.ndarray, current: np.ndarray) -> np.ndarray:
     """Return the rows earlier than the first current one."""
-    return rows[rows[:, 0] < held[0, 0]] if len(held) else rows
+    return rows[rows[:, 0] < current[0, 0]] if len(current) else rows
 
 
-def placed(rows: np.ndarray, t: np.ndarray, slack: float = 2.0) -> np.ndarray:
+def positions_at(rows: np.ndarray, t: np.ndarray, slack: float = 2.0) -> np.ndarray:
     """Interpolate positions on a path.
 
     Args:
@@ -104,6 +104,6 @@ def placed(rows: np.ndarray, t: np.ndarray, slack: float = 2.0) -> np.ndarray:
     t = np.asarray(t, float)
     if not len(rows):
         return np.full((len(t), 3), np.nan)
-    found = np.stack([np.interp(t, rows[:, 0], rows[:, k]) for k in (1, 2, 3)], axis=-1)
-    found[(t < rows[0, 0] - slack) | (t > rows[-1, 0] + slack)] = np.nan
-    return found
+    positions = np.stack([np.interp(t, rows[:, 0], rows[:, k]) for k in (1, 2, 3)], axis=-1)
+    positions[(t < rows[0, 0] - slack) | (t > rows[-1, 0] + slack)] = np.nan
+    return positions

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from fleet.bus.codec import Stamp
 from fleet.contract import (
-    About,
     Alert,
+    AlertKey,
     AlertKind,
     Controller,
     FleetRow,
@@ -19,24 +20,24 @@ from fleet.contract import (
     Model,
     Prediction,
     Rows,
-    State,
     Status,
+    TwinState,
 )
-from viewer.store.event_detection import Known, hear
-from viewer.store.forecast import Forecast, Kept
-from viewer.store.place import UNIT_M, Place
+from viewer.store.event_detection import DetectorState, detect_events
+from viewer.store.forecast import PastPrediction, ScenePrediction
+from viewer.store.place import UNIT_M, SceneFrame
 from viewer.store.received.datatime import DataTime
-from viewer.store.received.inbox import Head
-from viewer.store.received.rows import last, stacked
-from viewer.store.track import Track, Trail
-from viewer.theme.events import Event, closed, merged
+from viewer.store.received.inbox import SampleSubset
+from viewer.store.received.rows import last_row, position_rows
+from viewer.store.track import FlightTrack, Trail
+from viewer.theme.events import TimelineEvent, closed_at, merged
 
 SILENT_S = 3.0  # without a sample for this long the link counts as lost [s]
-ABANDONED_S = 30.0  # without a worker message for this long the UAV counts as unclaimed [s]
+UNCLAIMED_S = 30.0  # without a worker message for this long the UAV counts as unclaimed [s]
 LATE_S = 5.0  # a prediction older than this is reported as late, wall time [s]
 ENDED_S = 3.0  # a replay without messages for this long has ended [s]
 JUMP_S = 5.0  # a larger step back in time is another flight: reset [s]
-AWAY_S = 86_400.0  # a status farther from the sample time belongs to another flight [s]
+OTHER_FLIGHT_S = 86_400.0  # a status farther from the sample time belongs to another flight [s]
 
 
 @dataclass
@@ -44,8 +45,8 @@ class Vehicle:
     """One UAV on the page."""
 
     uav: int
-    believed: float = -np.inf  # last accepted worker result, monotonic [s]
-    heard: float = -np.inf  # arrival of the last sample, monotonic [s]
+    result_accepted: float = -np.inf  # last accepted worker result, monotonic [s]
+    sample_received: float = -np.inf  # arrival of the last sample, monotonic [s]
     t: float = -np.inf  # fleet time of the newest sample [s]
     at: np.ndarray | None = None  # newest position, scene ENU, (3,) [10 m]
     floor: float = np.nan  # lowest height while disarmed, scene [10 m]
@@ -58,20 +59,20 @@ class Vehicle:
     prediction: Prediction | None = None
     mismatch: Mismatch | None = None
     controller: Controller | None = None  # active control law, as last received
-    forecast: Forecast | None = None
+    forecast: ScenePrediction | None = None
     row: FleetRow | None = None
     time: DataTime = field(default_factory=DataTime)
-    player: float = -np.inf  # last message of the replaying gateway, monotonic [s]; -inf: live
-    judged: tuple[float, State] | None = None  # of a snapshot: time and value of the last computed state
+    replay_seen: float = -np.inf  # last message of the replaying gateway, monotonic [s]; -inf: live
+    state_cache: tuple[float, TwinState] | None = None  # of a snapshot: time and value of the last computed state
     ended: bool = False  # the recording has ended: the page shows its last instant
-    known: Known = field(default_factory=Known)
-    events: tuple[Event, ...] = ()  # oldest first; immutable, replaced as a whole
-    alerts: dict[About, Alert] = field(default_factory=dict)  # replaced as a whole, never mutated
-    refused: tuple[float, str] = (-np.inf, "")  # last rejected message: time, monotonic [s], and reason
+    detector_state: DetectorState = field(default_factory=DetectorState)
+    events: tuple[TimelineEvent, ...] = ()  # oldest first; immutable, replaced as a whole
+    alerts: dict[AlertKey, Alert] = field(default_factory=dict)  # replaced as a whole, never mutated
+    refusal: tuple[float, str] = (-np.inf, "")  # last rejected message: time, monotonic [s], and reason
     trail: Trail = field(default_factory=Trail)  # newest stretch of the flight, as received
-    track: Track = field(default_factory=Track)  # the whole flight, thinned
-    past: deque[Kept] = field(default_factory=lambda: deque(maxlen=65))  # predictions of the last minute
-    sure: Forecast | None = None  # newest prediction made with current telemetry
+    track: FlightTrack = field(default_factory=FlightTrack)  # the whole flight, thinned
+    past: deque[PastPrediction] = field(default_factory=lambda: deque(maxlen=65))  # predictions of the last minute
+    last_updated_forecast: ScenePrediction | None = None  # newest prediction made with current telemetry
     fits: deque = field(default_factory=lambda: deque(maxlen=64))  # t, mean fit [%]
 
     @property
@@ -79,130 +80,138 @@ class Vehicle:
         """Return the display name of the UAV."""
         return f"UAV-{self.uav:03d}"
 
-    def state(self, now: float) -> State:
+    def state(self, now: float) -> TwinState:
         """Return the state of the twin; the most severe condition wins. `now` is monotonic [s]."""
-        if self.judged is None:
-            return self._judge(now)
-        if self.judged[0] != now:
-            self.judged = now, self._judge(now)
-        return self.judged[1]
+        if self.state_cache is None:
+            return self._compute_state(now)
+        if self.state_cache[0] != now:
+            self.state_cache = now, self._compute_state(now)
+        return self.state_cache[1]
 
-    def _judge(self, now: float) -> State:
-        silent = now - self.heard > SILENT_S / min(self.time.pace, 1.0)  # a slow replay has longer gaps
-        if silent or (self.status is not None and self.status.link is Link.LOST):
-            return State.LINK_LOST
-        if now - self.believed > ABANDONED_S:
-            return State.WAITING if self.believed == -np.inf else State.UNCLAIMED
+    def _compute_state(self, now: float) -> TwinState:
+        is_silent = now - self.sample_received > SILENT_S / min(self.time.rate, 1.0)  # a slow replay has longer gaps
+        if is_silent or (self.status is not None and self.status.link is Link.LOST):
+            return TwinState.LINK_LOST
+        if now - self.result_accepted > UNCLAIMED_S:
+            return TwinState.WAITING if self.result_accepted == -np.inf else TwinState.UNCLAIMED
         if self.row is not None:
             return self.row.state
         if self.prediction is not None:
             return self.prediction.state
         if self.model is not None:
-            return State.VERIFIED if self.model.in_force is not None else State.IDENTIFYING
-        return State.WAITING
+            return TwinState.VERIFIED if self.model.active_verdict is not None else TwinState.IDENTIFYING
+        return TwinState.WAITING
 
-    def still(self, now: float) -> "Vehicle":
+    def snapshot(self, now: float) -> "Vehicle":
         """Return an immutable copy; the histories stay shared, read them through the store.
 
         A recording that has ended stays at its last instant: later worker messages do not belong to the flight.
         """
         copy = object.__new__(Vehicle)
         copy.__dict__.update(self.__dict__)
-        copy.judged = np.nan, State.WAITING
-        if self.recorded and now - self.player > ENDED_S and now - self.heard > ENDED_S:
-            copy.ended, copy.events = True, closed(self.events, self.time.t)
+        copy.state_cache = np.nan, TwinState.WAITING
+        if self.recorded and now - self.replay_seen > ENDED_S and now - self.sample_received > ENDED_S:
+            copy.ended, copy.events = True, closed_at(self.events, self.time.t)
             copy.alerts = {
                 about: alert for about, alert in self.alerts.items() if alert.kind is not AlertKind.LINK_LOST
             }
-            copy.forecast = self.sure
+            copy.forecast = self.last_updated_forecast
             copy.prediction = copy.forecast.message if copy.forecast is not None else self.prediction
         return copy
 
     @property
     def recorded(self) -> bool:
         """Return whether the UAV is replayed from a recording."""
-        return self.player > -np.inf
+        return self.replay_seen > -np.inf
 
-    def age(self, now: float) -> float:
+    def sample_age_s(self, now: float) -> float:
         """Return the data time since the last sample [s]; infinite before the first."""
-        return max(self.clock(now) - self.t, 0.0) if np.isfinite(self.t) else np.inf
+        return max(self.data_time(now) - self.t, 0.0) if np.isfinite(self.t) else np.inf
 
-    def late(self, now: float) -> float:
+    def prediction_lag_s(self, now: float) -> float:
         """Return the lag of the newest prediction behind data time [s]; 0 below `LATE_S`."""
-        behind = self.clock(now) - self.forecast.t if self.forecast is not None else 0.0
-        return behind if behind > LATE_S * max(self.time.pace, 1.0) else 0.0
+        lag_s = self.data_time(now) - self.forecast.t if self.forecast is not None else 0.0
+        return lag_s if lag_s > LATE_S * max(self.time.rate, 1.0) else 0.0
 
-    def clock(self, now: float) -> float:
+    def data_time(self, now: float) -> float:
         """Estimate the current data time [s] from the newest message; it stops at the end of a recording."""
         if self.ended:
             return self.time.t
         if self.time.t == -np.inf and self.forecast is not None:
-            return self.forecast.t + (now - self.forecast.heard)
-        return self.time.at(now)
+            return self.forecast.t + (now - self.forecast.received)
+        return self.time.estimate(now)
 
-    def note(self, message: Any, now: float) -> None:
+    def process(self, message: Any, now: float) -> None:
         """Update data time and events from a message."""
-        if isinstance(message, Head | Status) and abs(message.t - self.t) < AWAY_S:  # also rejects NaN
-            self.time = self.time.hear(message.t, now)
-        if isinstance(message, Head) and self._no_news(message):
+        if isinstance(message, SampleSubset | Status) and abs(message.t - self.t) < OTHER_FLIGHT_S:  # also rejects NaN
+            self.time = self.time.update(message.t, now)
+        if isinstance(message, SampleSubset) and self._leg_unchanged(message):
             return
-        self.known, fresh = hear(self.known, message)
-        if fresh:
-            self.events = merged(self.events, fresh)
+        self.detector_state, new_events = detect_events(self.detector_state, message)
+        if new_events:
+            self.events = merged(self.events, new_events)
 
-    def _no_news(self, sample: Head) -> bool:
+    def _leg_unchanged(self, sample: SampleSubset) -> bool:
         """Return whether a sample has no mission item or the active one."""
         leg = sample.leg
-        return leg is None or (leg.x.shape == (1, 1) and leg.t.shape == (1,) and last(leg.x) == (self.known.seq,))
+        return leg is None or (
+            leg.x.shape == (1, 1) and leg.t.shape == (1,) and last_row(leg.x) == (self.detector_state.seq,)
+        )
 
-    def where(self, now: float) -> np.ndarray | None:
+    def position(self, now: float) -> np.ndarray | None:
         """Return the position to draw, (3,) [10 m]: last sample, or the prediction when the link is lost."""
         if self.ended and self.at is not None:
             return self.at
-        if self.forecast is not None and (self.at is None or self.state(now) is State.LINK_LOST):
-            return self.forecast.at(self.clock(now) - self.forecast.t)
+        if self.forecast is not None and (self.at is None or self.state(now) is TwinState.LINK_LOST):
+            return self.forecast.position_at(self.data_time(now) - self.forecast.t)
         return self.at
 
-    def hear_sample(self, sample: Head, place: Place, now: float) -> None:
+    def update_from_sample(self, sample: SampleSubset, scene_frame: SceneFrame, now: float) -> None:
         """Update from the newest rows of a sample."""
         if not isfinite(sample.t):
             raise ValueError(
                 f"uav-{self.uav}: sample has time {sample.t}, expected seconds since 1970; check the gateway"
             )
         if sample.t < self.t - JUMP_S:
-            self.forget()
-        self.heard, self.t = now, max(sample.t, self.t)
-        if sample.air is not None and (air := last(sample.air.x)) and isfinite(air[0]):
+            self.reset()
+        self.sample_received, self.t = now, max(sample.t, self.t)
+        if sample.air is not None and (air := last_row(sample.air.x)) and isfinite(air[0]):
             self.Va = air[0]
-        if sample.attitude is not None and (turn := last(sample.attitude.x)) and all(map(isfinite, turn[:3])):
-            self.attitude = turn[0], turn[1], turn[2]
+        if sample.attitude is not None and (angles := last_row(sample.attitude.x)) and all(map(isfinite, angles[:3])):
+            self.attitude = angles[0], angles[1], angles[2]
         if sample.position is not None:
-            self._hear_position(sample.position, place)
+            self._update_position(sample.position, scene_frame)
 
-    def _hear_position(self, position: Rows, place: Place) -> None:
-        t, x = stacked(self.uav, position)
-        spots = [
-            (float(at), *place.spot(lat, lon, alt))
-            for at, (lat, lon, alt, *_) in zip(t, x, strict=True)
-            if isfinite(at) and isfinite(lat) and isfinite(lon) and isfinite(alt) and (lat or lon)
+    def _update_position(self, position: Rows, scene_frame: SceneFrame) -> None:
+        t, x = position_rows(self.uav, position)
+        points = [
+            (float(time), *scene_frame.from_geodetic_point(lat, lon, alt))
+            for time, (lat, lon, alt, *_) in zip(t, x, strict=True)
+            if isfinite(time) and isfinite(lat) and isfinite(lon) and isfinite(alt) and (lat or lon)
         ]
-        if not spots:
+        if not points:
             return
-        if self.track.add(spots):
+        if self.track.add(points):
             self.trail.clear()
             self.floor = np.nan
-        for spot in spots:
-            self.trail.add(*spot, self.Va)
-        up = spots[-1][3]
+        for point in points:
+            self.trail.add(*point, self.Va)
+        up = points[-1][3]
         if self.status is not None and self.status.mode and not self.status.armed:  # no mode: status unknown
             self.floor = min(self.floor, up) if isfinite(self.floor) else up
-        self.at, self.alt_m = np.array(spots[-1][1:]), up * UNIT_M + place.origin.alt_mm * 1e-3
+        self.at, self.alt_m = np.array(points[-1][1:]), up * UNIT_M + scene_frame.origin.alt_mm * 1e-3
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Clear the state of a flight after a clock step back or a new scene origin."""
         self.at, self.alerts, self.floor = None, {}, np.nan
-        self.time, self.known, self.events = DataTime(), Known(), ()
+        self.time, self.detector_state, self.events = DataTime(), DetectorState(), ()
         self.t, self.forecast, self.prediction, self.model, self.row = -np.inf, None, None, None, None
-        self.controller = self.mismatch = self.sure = None
+        self.controller = self.mismatch = self.last_updated_forecast = None
         for history in (self.trail, self.past, self.fits, self.track):
             history.clear()
+
+
+def stamp_of(row: FleetRow) -> Stamp:
+    """Return the fencing token of a fleet table row; the writer is untrusted text."""
+    hexadecimal = len(row.worker) == 16 and all(character in "0123456789abcdef" for character in row.worker)
+    return Stamp(row.epoch, int(row.worker, 16) if hexadecimal else 0)

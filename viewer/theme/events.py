@@ -7,11 +7,11 @@ from enum import StrEnum
 from typing import NamedTuple
 
 MAX_EVENTS = 200  # events of one UAV; the oldest are dropped first
-MAX_RAISED = 64  # simultaneous alerts accepted of one UAV
+MAX_ALERTS = 64  # simultaneous alerts accepted of one UAV
 LATEST = 4e9  # later times are invalid [s since 1970]
 
 
-class Kind(StrEnum):
+class EventKind(StrEnum):
     """Kind of event; each has a glyph and a colour."""
 
     MODE = "mode"
@@ -22,37 +22,37 @@ class Kind(StrEnum):
     WARNING = "warning"
     ALERT = "alert"
     MISMATCH = "mismatch"
-    EASED = "eased"
-    LOST = "lost"
-    BACK = "back"
+    CLEARED = "eased"
+    LINK_LOST = "lost"
+    LINK_RESTORED = "back"
     VERIFIED = "verified"
-    SOUND = "sound"
-    DOUBTED = "doubted"
+    ACCEPTED = "sound"
+    UNVERIFIED = "doubted"
     NO_MODEL = "no model"
     PARAMETERS = "parameters"
     TAKE_OFF = "take-off"
     LANDING = "landing"
     GROUND = "ground"
-    BLIND = "blind"
-    SIGHT = "sight"
+    TELEMETRY_LOST = "blind"
+    TELEMETRY_RESTORED = "sight"
     FRAME = "frame"
     END = "end"
 
 
-class Event(NamedTuple):
+class TimelineEvent(NamedTuple):
     """Event of a UAV."""
 
     t: float  # data time [s since 1970]
-    kind: Kind
+    kind: EventKind
     text: str  # untrusted: escape it in HTML
 
 
-def merged(events: tuple[Event, ...], fresh: list[Event]) -> tuple[Event, ...]:
+def merged(events: tuple[TimelineEvent, ...], new_events: list[TimelineEvent]) -> tuple[TimelineEvent, ...]:
     """Merge events by time; keep the newest `MAX_EVENTS`."""
-    return tuple(sorted((*events, *fresh), key=lambda event: event.t)[-MAX_EVENTS:])
+    return tuple(sorted((*events, *new_events), key=lambda event: event.t)[-MAX_EVENTS:])
 
 
-def closed(events: tuple[Event, ...], t: float) -> tuple[Event, ...]:
+def closed_at(events: tuple[TimelineEvent, ...], t: float) -> tuple[TimelineEvent, ...]:
     """End the events at the end of the recording, t [s]; drop a link loss after it."""
-    flown = tuple(event for event in events if event.t <= t or event.kind is not Kind.LOST)
-    return merged(flown, [Event(t, Kind.END, "end of the recording")] if 0 < t < LATEST else [])
+    remaining = tuple(event for event in events if event.t <= t or event.kind is not EventKind.LINK_LOST)
+    return merged(remaining, [TimelineEvent(t, EventKind.END, "end of the recording")] if 0 < t < LATEST else [])

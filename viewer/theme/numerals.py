@@ -21,18 +21,18 @@ _FIGURES: dict[str, tuple[tuple[tuple[float, float], ...], ...]] = {
 _STEP = {".": 1.4}  # advance width; 3 for the others
 
 
-def written(text: str, tall: float) -> np.ndarray:
+def digit_strokes(text: str, height: float) -> np.ndarray:
     """Return the strokes of digits in the ground plane, text direction east: (n, 2, 3); others are spaces."""
     lines, x = [np.zeros((0, 2, 2))], 0.0
-    for letter in text:
-        for stroke in _FIGURES.get(letter, ()):
+    for character in text:
+        for stroke in _FIGURES.get(character, ()):
             corners = np.array(stroke) + np.array([x, 0.0])
             lines.append(np.stack([corners[:-1], corners[1:]], axis=1))
-        x += _STEP.get(letter, 3.0)
-    flat = np.concatenate(lines) * (tall / 4)
+        x += _STEP.get(character, 3.0)
+    flat = np.concatenate(lines) * (height / 4)
     return np.concatenate([flat, np.zeros((*flat.shape[:2], 1))], axis=-1)
 
 
-def upright(strokes: np.ndarray, right: np.ndarray, up: np.ndarray) -> np.ndarray:
+def face_camera(strokes: np.ndarray, right: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Rotate strokes (n, 2, 3) into the plane of `right` and `up`, both (3,): (n, 2, 3)."""
     return strokes[..., :1] * right + strokes[..., 1:2] * up

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet.contract import State
-from viewer.theme.events import Kind
+from fleet.contract import TwinState
+from viewer.theme.events import EventKind
 
 
 @dataclass(frozen=True)
@@ -28,43 +28,43 @@ class Palette:
     ring: str
     tube: str
     route: str
-    flown: str
+    actual: str
     sky: tuple[str, str]
 
-    def state(self, state: State) -> str:
+    def state(self, state: TwinState) -> str:
         """Return the colour of a state."""
         return {
-            State.PREDICTING: self.predicting,
-            State.VERIFIED: self.verified,
-            State.IDENTIFYING: self.identifying,
-            State.LINK_LOST: self.lost,
+            TwinState.PREDICTING: self.predicting,
+            TwinState.VERIFIED: self.verified,
+            TwinState.IDENTIFYING: self.identifying,
+            TwinState.LINK_LOST: self.lost,
         }.get(state, self.muted)
 
-    def looks(self) -> tuple[str, ...]:
+    def status_colours(self) -> tuple[str, ...]:
         """Return the colours of the display statuses, in the order of `STATUS_COLOURS`."""
         return self.muted, self.predicting, self.verified, self.identifying, self.lost, self.mismatch
 
-    def event(self, kind: Kind) -> str:
+    def event(self, kind: EventKind) -> str:
         """Return the colour of an event kind."""
         return {
-            Kind.MODE: self.predicting,
-            Kind.ITEM: self.route,
-            Kind.MISSION: self.route,
-            Kind.ARMED: self.ink,
-            Kind.DISARMED: self.ink,
-            Kind.WARNING: self.mismatch,
-            Kind.ALERT: self.mismatch,
-            Kind.MISMATCH: self.mismatch,
-            Kind.VERIFIED: self.verified,
-            Kind.SOUND: self.verified,
-            Kind.DOUBTED: self.identifying,
-            Kind.NO_MODEL: self.identifying,
-            Kind.PARAMETERS: self.route,
-            Kind.TAKE_OFF: self.ink,
-            Kind.LANDING: self.ink,
-            Kind.GROUND: self.ink,
-            Kind.FRAME: self.mismatch,
-            Kind.END: self.ink,
+            EventKind.MODE: self.predicting,
+            EventKind.ITEM: self.route,
+            EventKind.MISSION: self.route,
+            EventKind.ARMED: self.ink,
+            EventKind.DISARMED: self.ink,
+            EventKind.WARNING: self.mismatch,
+            EventKind.ALERT: self.mismatch,
+            EventKind.MISMATCH: self.mismatch,
+            EventKind.VERIFIED: self.verified,
+            EventKind.ACCEPTED: self.verified,
+            EventKind.UNVERIFIED: self.identifying,
+            EventKind.NO_MODEL: self.identifying,
+            EventKind.PARAMETERS: self.route,
+            EventKind.TAKE_OFF: self.ink,
+            EventKind.LANDING: self.ink,
+            EventKind.GROUND: self.ink,
+            EventKind.FRAME: self.mismatch,
+            EventKind.END: self.ink,
         }.get(kind, self.lost)
 
 
@@ -85,7 +85,7 @@ DARK = Palette(
     ring="#3B4D63",
     tube="#56B4E9",
     route="#9A8FD0",
-    flown="#DCE6F0",
+    actual="#DCE6F0",
     sky=("#0B0F17", "#1A2433"),
 )
 LIGHT = Palette(
@@ -105,44 +105,44 @@ LIGHT = Palette(
     ring="#94A3B8",
     tube="#0072B2",
     route="#7A6BB8",
-    flown="#334155",
+    actual="#334155",
     sky=("#DCE6F0", "#FFFFFF"),
 )
 
 GLYPH = {
-    State.PREDICTING: "➤",
-    State.VERIFIED: "✓",
-    State.IDENTIFYING: "◐",
-    State.LINK_LOST: "✕",
-    State.WAITING: "◌",
-    State.UNCLAIMED: "○",
+    TwinState.PREDICTING: "➤",
+    TwinState.VERIFIED: "✓",
+    TwinState.IDENTIFYING: "◐",
+    TwinState.LINK_LOST: "✕",
+    TwinState.WAITING: "◌",
+    TwinState.UNCLAIMED: "○",
 }
 MARK = {
-    Kind.MODE: "◆",
-    Kind.ITEM: "›",
-    Kind.MISSION: "≡",
-    Kind.ARMED: "●",
-    Kind.DISARMED: "○",
-    Kind.WARNING: "!",
-    Kind.ALERT: "▲",
-    Kind.MISMATCH: "≠",
-    Kind.EASED: "△",
-    Kind.LOST: "✕",
-    Kind.BACK: "↺",
-    Kind.VERIFIED: "✓",
-    Kind.SOUND: "✓",
-    Kind.DOUBTED: "◑",
-    Kind.NO_MODEL: "◌",
-    Kind.PARAMETERS: "≈",
-    Kind.TAKE_OFF: "↗",
-    Kind.LANDING: "↘",
-    Kind.GROUND: "▁",
-    Kind.BLIND: "⊘",
-    Kind.SIGHT: "⊙",
-    Kind.FRAME: "⌖",
-    Kind.END: "■",
+    EventKind.MODE: "◆",
+    EventKind.ITEM: "›",
+    EventKind.MISSION: "≡",
+    EventKind.ARMED: "●",
+    EventKind.DISARMED: "○",
+    EventKind.WARNING: "!",
+    EventKind.ALERT: "▲",
+    EventKind.MISMATCH: "≠",
+    EventKind.CLEARED: "△",
+    EventKind.LINK_LOST: "✕",
+    EventKind.LINK_RESTORED: "↺",
+    EventKind.VERIFIED: "✓",
+    EventKind.ACCEPTED: "✓",
+    EventKind.UNVERIFIED: "◑",
+    EventKind.NO_MODEL: "◌",
+    EventKind.PARAMETERS: "≈",
+    EventKind.TAKE_OFF: "↗",
+    EventKind.LANDING: "↘",
+    EventKind.GROUND: "▁",
+    EventKind.TELEMETRY_LOST: "⊘",
+    EventKind.TELEMETRY_RESTORED: "⊙",
+    EventKind.FRAME: "⌖",
+    EventKind.END: "■",
 }
-WORD = {state: state.value.replace("_", " ") for state in State}
+STATE_TEXT = {state: state.value.replace("_", " ") for state in TwinState}
 
 # ACES filmic fit as the renderer applies it to every line. Source: Hill, "BakingLab" 2016, ACES.hlsl.
 _IN = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]])
@@ -166,27 +166,27 @@ def mix(colour: str, other: str, share: float) -> np.ndarray:
     return rgb(colour) * share + rgb(other) * (1 - share)
 
 
-def line_colour(wanted: np.ndarray) -> np.ndarray:
+def line_colour(displayed: np.ndarray) -> np.ndarray:
     """Return the vertex colour that the renderer shows as `displayed`: (..., 3) sRGB [0..255] -> (..., 3) uint8.
 
     The renderer treats vertex colours as linear and tone-maps them; this inverts both, clipped to its range.
     """
-    y = np.clip(_linear(np.asarray(wanted, float) / 255) @ np.linalg.inv(_OUT).T, 0, 0.98)
+    y = np.clip(_linear(np.asarray(displayed, float) / 255) @ np.linalg.inv(_OUT).T, 0, 0.98)
     a, b, c = 1 - 0.983729 * y, 0.0245786 - 0.432951 * y, -(0.000090537 + 0.238081 * y)
     v = (-b + np.sqrt(b * b - 4 * a * c)) / (2 * a)
     return np.rint(255 * np.clip(_EXPOSURE * v @ np.linalg.inv(_IN).T, 0, 1)).astype(np.uint8)
 
 
-def shown_line(vertex: np.ndarray) -> np.ndarray:
+def displayed_colour(vertex: np.ndarray) -> np.ndarray:
     """Return the displayed colour of a vertex colour: (..., 3) [0..255] -> (..., 3) sRGB [0..255]."""
     v = (np.asarray(vertex, float) / 255 / _EXPOSURE) @ _IN.T
     v = (v * (v + 0.0245786) - 0.000090537) / (v * (0.983729 * v + 0.4329510) + 0.238081)
     return 255 * _companded(np.clip(v @ _OUT.T, 0, 1))
 
 
-def mesh_colour(wanted: np.ndarray) -> np.ndarray:
+def mesh_colour(displayed: np.ndarray) -> np.ndarray:
     """Return linear instance colours of a lit mesh: (n, 3) sRGB [0..255] -> uint8."""
-    return np.rint(255 * _linear(np.clip(np.asarray(wanted, float), 0, 255) / 255)).astype(np.uint8)
+    return np.rint(255 * _linear(np.clip(np.asarray(displayed, float), 0, 255) / 255)).astype(np.uint8)
 
 
 def _linear(s: np.ndarray) -> np.ndarray:

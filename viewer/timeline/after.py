@@ -7,35 +7,35 @@ import numpy as np
 from viewer.scene.strokes import Strokes, chain
 from viewer.theme.palette import Palette, mix, rgb
 from viewer.timeline import compare
-from viewer.timeline.past import Past
+from viewer.timeline.past import PastVehicle
 
-AFTER_S = 60.0  # shortest path drawn after the time shown; at least to the prediction horizon [s]
-NOTHING = np.zeros((0, 2, 3))
+SHOWN_S = 60.0  # shortest path drawn after the time shown; at least to the prediction horizon [s]
+NO_LINES = np.zeros((0, 2, 3))
 
 
-class After:
+class ActualPath:
     """Two nodes: the path flown after the time shown, and error lines to the prediction."""
 
     def __init__(self, scene: Any, palette: Palette) -> None:
         self._palette = palette
-        self._flown = Strokes(scene, "/timeline/flown", 2.2)
-        self._whiskers = Strokes(scene, "/timeline/whiskers", 1.6)
+        self._path = Strokes(scene, "/timeline/flown", 2.2)
+        self._error_lines = Strokes(scene, "/timeline/whiskers", 1.6)
         self._drawn = False
 
-    def draw(self, past: Past | None) -> list[compare.Miss]:
+    def draw(self, past: PastVehicle | None) -> list[compare.LeadTimeError]:
         """Draw the path after the time shown and return the prediction errors; None clears it."""
         if past is None:
             if self._drawn:
-                self._flown.draw(NOTHING)
-                self._whiskers.draw(NOTHING)
+                self._path.draw(NO_LINES)
+                self._error_lines.draw(NO_LINES)
             self._drawn = False
             return []
-        told, self._drawn = past.forecast, True
-        reach = max(told.t + told.until - past.then, 0.0) if told is not None else 0.0
-        path = past.tape.path(past.then, past.then + max(reach, AFTER_S))
-        self._flown.draw(chain(path[:, 1:]), mix(self._palette.verified, self._palette.ground, 0.9))
-        if told is None or not len(path):
-            self._whiskers.draw(NOTHING)
+        forecast, self._drawn = past.forecast, True
+        horizon_s = max(forecast.t + forecast.horizon_s - past.shown_t, 0.0) if forecast is not None else 0.0
+        path = past.recording.path(past.shown_t, past.shown_t + max(horizon_s, SHOWN_S))
+        self._path.draw(chain(path[:, 1:]), mix(self._palette.verified, self._palette.ground, 0.9))
+        if forecast is None or not len(path):
+            self._error_lines.draw(NO_LINES)
             return []
-        self._whiskers.draw(compare.whiskers(told, path, past.then), rgb(self._palette.horizon))
-        return compare.misses(told, path, past.then)
+        self._error_lines.draw(compare.error_lines(forecast, path, past.shown_t), rgb(self._palette.horizon))
+        return compare.lead_time_errors(forecast, path, past.shown_t)

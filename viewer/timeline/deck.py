@@ -7,79 +7,87 @@ from typing import Any
 
 import numpy as np
 
-from viewer.scene.fleet_arrays import Flock
-from viewer.store.received.datatime import stamp
-from viewer.store.store import Feed
+from viewer.scene.fleet_arrays import FleetArrays
+from viewer.store.received.datatime import timestamp
+from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
-from viewer.theme.events import Event
+from viewer.theme.events import TimelineEvent
 from viewer.theme.palette import Palette
 from viewer.timeline import strip
-from viewer.timeline.after import After
+from viewer.timeline.after import ActualPath
 from viewer.timeline.panel import Panel
-from viewer.timeline.past import Past, as_it_was, remember
-from viewer.timeline.player import Player, Span, last_before, next_after
-from viewer.timeline.recordings import Tapes
+from viewer.timeline.past import PastVehicle, update_past_arrays, vehicle_at
+from viewer.timeline.player import Player, TimelineRange, last_before, next_after
+from viewer.timeline.recordings import RecordingStore
 
 SNAP = 0.008  # share of the bar within which a press snaps to an event
-OTHERS = 40  # newest events used of each other UAV
+MAX_OTHER_EVENTS = 40  # newest events used of each other UAV
 
 
 class Timeline:
     """State of one page in time: live, or at a past time."""
 
-    def __init__(self, client: Any, feed: Feed, tapes: Tapes, palette: Palette, changed: Callable[[], None]) -> None:
+    def __init__(
+        self, client: Any, store: FleetStore, recordings: RecordingStore, palette: Palette, changed: Callable[[], None]
+    ) -> None:
         self.player = Player()
-        self._feed, self._tapes, self._palette, self._changed = feed, tapes, palette, changed
+        self._store, self._recordings, self._palette, self._changed = store, recordings, palette, changed
         self._lock = threading.Lock()
-        self._span, self._shift = Span(0.0, 0.0), dict[int, float]()
-        self._lead: int | None = None
-        self._measured = -np.inf  # fleet update for which the range was computed
-        self._then, self._drawn_at = Flock(), (-np.inf, -np.inf)  # past fleet; wall and data time of it
-        self._panel = Panel(client.gui, palette, self.asked)
-        self._after = After(client.scene, palette)
+        self._span, self._shift = TimelineRange(0.0, 0.0), dict[int, float]()
+        self._clock_uav: int | None = None
+        self._range_time = -np.inf  # fleet update for which the range was computed
+        self._past_arrays, self._drawn_at = FleetArrays(), (-np.inf, -np.inf)  # past fleet; wall and data time of it
+        self._panel = Panel(client.gui, palette, self.on_command)
+        self._actual_path = ActualPath(client.scene, palette)
 
     # --- what is shown ---
 
-    def flock(self, flock: Flock, selected: int | None, now: float) -> Flock:
+    def fleet_arrays(self, fleet_arrays: FleetArrays, selected: int | None, now: float) -> FleetArrays:
         """Return the fleet to draw: the given live one, or the fleet at the time shown."""
-        passed = now - self._drawn_at[0]
+        elapsed = now - self._drawn_at[0]
         with self._lock:
-            if flock.now != self._measured or not self.player.live:
-                self._measured = flock.now
-                self._measure(flock.fleet, selected)
-            self.player.advance(passed if isfinite(passed) else 0.0, self._span)
+            if fleet_arrays.now != self._range_time or not self.player.live:
+                self._range_time = fleet_arrays.now
+                self._update_range(fleet_arrays.fleet, selected)
+            self.player.advance(elapsed if isfinite(elapsed) else 0.0, self._span)
             t = self.player.t
-        before, self._drawn_at = self._drawn_at, (now, t or -np.inf)
+        previous, self._drawn_at = self._drawn_at, (now, t or -np.inf)
         if t is None:
-            return flock
-        if self._drawn_at != before:
-            self._remember(flock.fleet, t, now)
-        return self._then
+            return fleet_arrays
+        if self._drawn_at != previous:
+            self._update_past(fleet_arrays.fleet, t, now)
+        return self._past_arrays
 
-    def one(self, uav: int) -> Vehicle | None:
+    def vehicle(self, uav: int) -> Vehicle | None:
         """Return one UAV at the time shown; None when there is none."""
-        vehicle, t = self._feed.one(uav), self.player.t
-        if vehicle is None or t is None or uav not in self._tapes.of:
+        vehicle, t = self._store.get(uav), self.player.t
+        if vehicle is None or t is None or uav not in self._recordings.by_uav:
             return vehicle if t is None else None
-        return self._past(vehicle, t)
+        return self._past_vehicle(vehicle, t)
 
-    def _past(self, vehicle: Vehicle, t: float) -> Past | None:
-        then = t + self._shift.get(vehicle.uav, 0.0)
-        return as_it_was(vehicle, self._tapes.of[vehicle.uav], then, self.player.rate)
+    def _past_vehicle(self, vehicle: Vehicle, t: float) -> PastVehicle | None:
+        shown_t = t + self._shift.get(vehicle.uav, 0.0)
+        return vehicle_at(vehicle, self._recordings.by_uav[vehicle.uav], shown_t, self.player.rate)
 
-    def _remember(self, fleet: list[Vehicle], t: float, now: float) -> None:
+    def _update_past(self, fleet: list[Vehicle], t: float, now: float) -> None:
         """Update the fleet of a past time."""
-        found = [past for one in fleet if one.uav in self._tapes.of and (past := self._past(one, t)) is not None]
-        remember(self._then, found, now)
+        pasts = [
+            past
+            for vehicle in fleet
+            if vehicle.uav in self._recordings.by_uav and (past := self._past_vehicle(vehicle, t)) is not None
+        ]
+        update_past_arrays(self._past_arrays, pasts, now)
 
-    def _measure(self, fleet: list[Vehicle], selected: int | None) -> None:
+    def _update_range(self, fleet: list[Vehicle], selected: int | None) -> None:
         """Update the available time range, on the clock of the selected UAV."""
-        taped = {one.uav: one for one in fleet if len(self._tapes.of.get(one.uav, ()))}
-        if not taped:
-            self._span, self._shift, self._lead = Span(0.0, 0.0), {}, None
+        recorded = {vehicle.uav: vehicle for vehicle in fleet if len(self._recordings.by_uav.get(vehicle.uav, ()))}
+        if not recorded:
+            self._span, self._shift, self._clock_uav = TimelineRange(0.0, 0.0), {}, None
             return self.player.go_live()
-        self._lead = selected if selected in taped else max(taped, key=lambda uav: taped[uav].heard)
-        self._span, self._shift = self._tapes.measure(taped[self._lead], list(taped.values()))
+        self._clock_uav = (
+            selected if selected in recorded else max(recorded, key=lambda uav: recorded[uav].sample_received)
+        )
+        self._span, self._shift = self._recordings.playback_range(recorded[self._clock_uav], list(recorded.values()))
 
     # --- commands ---
 
@@ -87,100 +95,107 @@ class Timeline:
         """Add a tab beside the timeline; use it in a `with` statement."""
         return self._panel.window.add_tab(label, icon)
 
-    def sender(self) -> str:
+    def send_code(self) -> str:
         """Return page code that seeks to the time inserted at `{}`."""
-        return self._panel.sender("at:")
+        return self._panel.send_code("at:")
 
-    def asked(self, what: str) -> None:
+    def on_command(self, command: str) -> None:
         """Execute a command of the page; ignore unknown ones."""
         with self._lock:
-            if self._lead is None:
+            if self._clock_uav is None:
                 return
-            if what == "Pause":
+            if command == "Pause":
                 self.player.pause(self._span)
-            elif what in ("1×", "4×"):
-                self.player.play(float(what[0]), self._span)
-            elif what == "● Live":
+            elif command in ("1×", "4×"):
+                self.player.play(float(command[0]), self._span)
+            elif command == "● Live":
                 self.player.go_live()
-            elif "▸" in what or "◂" in what:
-                self._step(what.strip("◂▸ "), 1 if "▸" in what else -1)
+            elif "▸" in command or "◂" in command:
+                self._step(command.strip("◂▸ "), 1 if "▸" in command else -1)
             else:
-                self._seek(*what.partition(":")[::2])
+                self._seek(*command.partition(":")[::2])
         self._changed()
 
     def show(self, fleet: list[Vehicle], uav: int, t: float) -> None:
         """Show a data time of one UAV [s since 1970]; do nothing without a recording of it."""
         with self._lock:
-            if not len(self._tapes.of.get(uav, ())):
+            if not len(self._recordings.by_uav.get(uav, ())):
                 return
-            self._measure(fleet, uav)
+            self._update_range(fleet, uav)
             self.player.seek(t, self._span)
             self.player.rate = 0.0
         self._changed()
 
-    def _seek(self, how: str, text: str) -> None:
+    def _seek(self, kind: str, text: str) -> None:
         try:
             value = float(text[:20])
         except ValueError:
             return
-        if not isfinite(value) or how not in ("share", "at"):
+        if not isfinite(value) or kind not in ("share", "at"):
             return
         span = self._span
-        if how == "share":
+        if kind == "share":
             value = span.begin + min(max(value, 0.0), 1.0) * (span.end - span.begin)
             near = min((e.t for e in self._events()), key=lambda t: abs(t - value), default=value)
             value = near if abs(near - value) < SNAP * (span.end - span.begin) else value
         self.player.seek(value, span)
         self.player.rate = 0.0
 
-    def _step(self, what: str, way: int) -> None:
+    def _step(self, unit: str, direction: int) -> None:
         self.player.pause(self._span)
         t = self.player.t or 0.0
-        if what == "1 s":
-            found: float | None = t + way
+        if unit == "1 s":
+            target: float | None = t + direction
         else:
-            rows = self._tapes.of[self._lead or 0].t.tolist()
-            times = [event.t for event in self._events()] if what == "event" else rows
-            found = next_after(t, times) if way > 0 else last_before(t, times)
-        if found is not None:
-            self.player.seek(found, self._span)
+            rows = self._recordings.by_uav[self._clock_uav or 0].t.tolist()
+            times = [event.t for event in self._events()] if unit == "event" else rows
+            target = next_after(t, times) if direction > 0 else last_before(t, times)
+        if target is not None:
+            self.player.seek(target, self._span)
 
-    def _events(self) -> list[Event]:
-        tape = self._tapes.of.get(-1 if self._lead is None else self._lead)
-        return list(tape.events) if tape is not None else []
+    def _events(self) -> list[TimelineEvent]:
+        recording = self._recordings.by_uav.get(-1 if self._clock_uav is None else self._clock_uav)
+        return list(recording.events) if recording is not None else []
 
     # --- the panel ---
 
     def draw(self, selected: int | None) -> None:
         """Draw the panel and the path after the time shown; call it about once per second and on changes."""
-        one = self.one(selected) if selected is not None and not self.player.live else None
-        past = one if isinstance(one, Past) else None
-        misses = self._after.draw(past)
+        vehicle = self.vehicle(selected) if selected is not None and not self.player.live else None
+        past = vehicle if isinstance(vehicle, PastVehicle) else None
+        lead_errors = self._actual_path.draw(past)
         t, span = self.player.t, self._span
-        if self._lead is None:
+        if self._clock_uav is None:
             return self._panel.draw("", '<span class="soft">no recording yet</span>', "", "")
-        tapes = [tape for uav, tape in list(self._tapes.of.items()) if uav != self._lead]
-        others = [e for tape in tapes for e in tape.events[-OTHERS:] if span.begin <= e.t <= span.end]
+        recordings = [recording for uav, recording in list(self._recordings.by_uav.items()) if uav != self._clock_uav]
+        others = [
+            e for recording in recordings for e in recording.events[-MAX_OTHER_EVENTS:] if span.begin <= e.t <= span.end
+        ]
         bar = strip.strip(self._events(), others, span, t, self._palette)
-        words = ""
+        comparison = ""
         if past is not None:
-            told = past.forecast
-            reach = told.t + told.until - past.then if told is not None else 0.0
-            words = strip.compared(misses, told.t if told is not None else None, past.then, self._palette, reach)
-        self._panel.draw(bar, self._head(t, span), words, self._banner(t, span))
+            forecast = past.forecast
+            horizon_s = forecast.t + forecast.horizon_s - past.shown_t if forecast is not None else 0.0
+            comparison = strip.comparison_html(
+                lead_errors, forecast.t if forecast is not None else None, past.shown_t, self._palette, horizon_s
+            )
+        self._panel.draw(bar, self._head(t, span), comparison, self._banner(t, span))
 
-    def _head(self, t: float | None, span: Span) -> str:
-        behind = "live" if t is None else f"{strip.length(span.end - t)} ago"
-        pace = "" if t is None else " · paused" if not self.player.rate else f" · playing {self.player.rate:g}×"
-        lasts, n = strip.length(span.end - span.begin), len(self._tapes.of)
-        kept = f"{lasts} of {n} UAVs recorded, {strip.size(self._tapes.nbytes())}"
-        apart = f"one prediction per UAV every {self._tapes.apart_s:.0f} s"
+    def _head(self, t: float | None, span: TimelineRange) -> str:
+        lag_text = "live" if t is None else f"{strip.duration_text(span.end - t)} ago"
+        rate_text = "" if t is None else " · paused" if not self.player.rate else f" · playing {self.player.rate:g}×"
+        duration, n = strip.duration_text(span.end - span.begin), len(self._recordings.by_uav)
+        storage = f"{duration} of {n} aircraft recorded, {strip.size_text(self._recordings.nbytes())}"
+        interval = f"one prediction per UAV every {self._recordings.prediction_step_s:.0f} s"
         return (
-            f'<div class="head"><b class="now">{stamp(span.end if t is None else t)}</b>'
-            f'<span class="soft" title="{apart}">{behind}{pace} · {kept}</span></div>'
+            f'<div class="head"><b class="now">{timestamp(span.end if t is None else t)}</b>'
+            f'<span class="soft" title="{interval}">{lag_text}{rate_text} · {storage}</span></div>'
         )
 
-    def _banner(self, t: float | None, span: Span) -> str:
+    def _banner(self, t: float | None, span: TimelineRange) -> str:
         if t is None:
             return ""
-        return f"Not live: showing {stamp(t)}, {strip.length(span.end - t)} before the newest. Press ● Live to return."
+        return (
+            f"Not live: showing {timestamp(t)}, {strip.duration_text(span.end - t)} before the newest. Press ● "
+            "Live to return."
+        )

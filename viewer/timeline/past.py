@@ -5,23 +5,23 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from fleet.contract import FleetRow, State
-from viewer.scene.fleet_arrays import MINUTE, Flock
-from viewer.store.forecast import Forecast
+from fleet.contract import FleetRow, TwinState
+from viewer.scene.fleet_arrays import TRAIL_AGES_S, FleetArrays
+from viewer.store.forecast import ScenePrediction
 from viewer.store.place import UNIT_M, scene_quat
 from viewer.store.received.datatime import DataTime
-from viewer.store.track import placed
+from viewer.store.track import positions_at
 from viewer.store.vehicle import Vehicle
-from viewer.theme.events import Event
-from viewer.timeline.recording import Tape
-from viewer.timeline.state_at import Stood
+from viewer.theme.events import TimelineEvent
+from viewer.timeline.recording import UavRecording
+from viewer.timeline.state_at import StateRecord
 
 TRAIL_S = 90.0  # length of the fine trail [s]
 PAST_S = 60.0  # age of the past predictions [s]
-UNTOLD = (State.IDENTIFYING, State.WAITING, State.UNCLAIMED)  # states without a predicted path
+NO_PREDICTION = (TwinState.IDENTIFYING, TwinState.WAITING, TwinState.UNCLAIMED)  # states without a predicted path
 
 
-class Flown:
+class PathRows:
     """Path up to the time shown, with the interface of `FlightTrack` and `Trail`."""
 
     def __init__(self, rows: np.ndarray) -> None:
@@ -32,26 +32,26 @@ class Flown:
         return self._rows
 
 
-class Past(Vehicle):
+class PastVehicle(Vehicle):
     """One UAV at a past time; immutable, its histories end there."""
 
-    tape: Tape
-    then: float  # data time shown [s since 1970]
-    stood: Stood
+    recording: UavRecording
+    shown_t: float  # data time shown [s since 1970]
+    state_record: StateRecord
 
-    def clock(self, now: float) -> float:
+    def data_time(self, now: float) -> float:
         """Return the data time shown [s]; ignore `now`."""
-        return self.then
+        return self.shown_t
 
-    def state(self, now: float) -> State:
+    def state(self, now: float) -> TwinState:
         """Return the state at the time shown."""
-        return self.stood.state
+        return self.state_record.state
 
-    def late(self, now: float) -> float:
+    def prediction_lag_s(self, now: float) -> float:
         """Return 0: the lag at a past time is unknown."""
         return 0.0
 
-    def still(self, now: float) -> "Past":
+    def snapshot(self, now: float) -> "PastVehicle":
         """Return itself, as it is immutable."""
         return self
 
@@ -61,32 +61,40 @@ class Past(Vehicle):
         return True
 
     @property
-    def trail(self) -> Flown:  # type: ignore[override]
+    def trail(self) -> PathRows:  # type: ignore[override]
         """Return the fine trail up to the time shown: time [s], scene ENU [10 m], Va [m/s]."""
-        return Flown(self.tape.flown(self.then - TRAIL_S, self.t))
+        return PathRows(self.recording.trail_rows(self.shown_t - TRAIL_S, self.t))
 
     @property
-    def track(self) -> Flown:  # type: ignore[override]
+    def track(self) -> PathRows:  # type: ignore[override]
         """Return the recorded path up to the time shown."""
-        return Flown(self.tape.path(-np.inf, self.t))
+        return PathRows(self.recording.path(-np.inf, self.t))
 
     @property
-    def past(self) -> list[Forecast]:  # type: ignore[override]
+    def past(self) -> list[ScenePrediction]:  # type: ignore[override]
         """Return the predictions of the preceding minute, oldest first."""
-        return [one for one in self.tape.told if self.then - PAST_S <= one.t <= self.then]
+        return [
+            prediction
+            for prediction in self.recording.predictions
+            if self.shown_t - PAST_S <= prediction.t <= self.shown_t
+        ]
 
     @property
     def fits(self) -> list[tuple[float, float]]:  # type: ignore[override]
         """Return the fits up to the time shown: time [s], mean over the states [%]."""
-        return [(one.t, one.fit) for one in self.tape.stood if one.fit is not None and one.t <= self.then]
+        return [
+            (record.t, record.fit)
+            for record in self.recording.states
+            if record.fit is not None and record.t <= self.shown_t
+        ]
 
     @property
-    def events(self) -> tuple[Event, ...]:  # type: ignore[override]
+    def events(self) -> tuple[TimelineEvent, ...]:  # type: ignore[override]
         """Return the events up to the time shown."""
-        return tuple(event for event in self.tape.events if event.t <= self.then)
+        return tuple(event for event in self.recording.events if event.t <= self.shown_t)
 
 
-def as_it_was(vehicle: Vehicle, tape: Tape, then: float, rate: float = 0.0) -> Past | None:
+def vehicle_at(vehicle: Vehicle, recording: UavRecording, shown_t: float, rate: float = 0.0) -> PastVehicle | None:
     """Return a UAV at a past time.
 
     Args:
@@ -97,27 +105,34 @@ def as_it_was(vehicle: Vehicle, tape: Tape, then: float, rate: float = 0.0) -> P
     Returns:
         the UAV; None before its first record
     """
-    how = tape.stood_at(then)
-    if how is None or not len(tape) or then < tape.t[0] - 1.0:
+    record = recording.state_at(shown_t)
+    if record is None or not len(recording) or shown_t < recording.t[0] - 1.0:
         return None
-    row, told = tape.row(then), tape.told_by(then) if how.state not in UNTOLD else None
-    past = object.__new__(Past)
-    past.__dict__.update({name: value for name, value in vehicle.__dict__.items() if name not in _OWN})
-    past.__dict__.update(_figures(vehicle, row, how, told))
-    past.tape, past.then, past.stood = tape, then, how
-    past.t = float(min(then, tape.t[-1]))
-    past.time = DataTime(then, pace=rate)
+    row, forecast = (
+        recording.row_at(shown_t),
+        recording.prediction_at(shown_t) if record.state not in NO_PREDICTION else None,
+    )
+    past = object.__new__(PastVehicle)
+    past.__dict__.update({name: value for name, value in vehicle.__dict__.items() if name not in _OVERRIDDEN})
+    past.__dict__.update(_past_fields(vehicle, row, record, forecast))
+    past.recording, past.shown_t, past.state_record = recording, shown_t, record
+    past.t = float(min(shown_t, recording.t[-1]))
+    past.time = DataTime(shown_t, rate=rate)
     return past
 
 
-_OWN = ("trail", "track", "past", "fits", "events")
+_OVERRIDDEN = ("trail", "track", "past", "fits", "events")
 
 
-def _figures(vehicle: Vehicle, row: np.ndarray, how: Stood, told: Forecast | None) -> dict[str, Any]:
+def _past_fields(
+    vehicle: Vehicle, row: np.ndarray, record: StateRecord, forecast: ScenePrediction | None
+) -> dict[str, Any]:
     """Return the fields of a UAV that differ at a past time."""
     status = vehicle.status
     if status is not None:
-        status = msgspec.structs.replace(status, mode=how.mode, armed=how.armed, link=how.link, sentence=how.sentence)
+        status = msgspec.structs.replace(
+            status, mode=record.mode, armed=record.armed, link=record.link, sentence=record.sentence
+        )
     return {
         "at": row[:3],
         "alt_m": vehicle.alt_m + (row[2] - vehicle.at[2]) * UNIT_M if vehicle.at is not None else np.nan,
@@ -125,24 +140,33 @@ def _figures(vehicle: Vehicle, row: np.ndarray, how: Stood, told: Forecast | Non
         "Va": float(row[6]),
         "status": status,
         "model": None,
-        "prediction": told.message if told is not None else None,
-        "forecast": told,
-        "mismatch": how.mismatch,
-        "alerts": how.alerts,
+        "prediction": forecast.message if forecast is not None else None,
+        "forecast": forecast,
+        "mismatch": record.mismatch,
+        "alerts": record.alerts,
         "row": FleetRow(
-            uav=vehicle.uav, state=how.state, verdict=how.verdict, fit={} if how.fit is None else {"mean": how.fit}
+            uav=vehicle.uav,
+            state=record.state,
+            verdict=record.verdict,
+            fit={} if record.fit is None else {"mean": record.fit},
         ),
         "ended": False,
     }
 
 
-def remember(flock: Flock, pasts: list[Past], now: float) -> None:
+def update_past_arrays(fleet_arrays: FleetArrays, pasts: list[PastVehicle], now: float) -> None:
     """Update fleet arrays to a past time; `now` is monotonic [s]."""
-    flock.meet(list(pasts), now)
-    shown = [past for past in pasts if flock.index(past.uav) is not None]
-    flock.at = np.array([past.where(now) for past in shown]).reshape(-1, 3)
-    flock.quat = scene_quat(*np.array([past.attitude for past in shown]).reshape(-1, 3).T)
-    minute = [placed(past.tape.path(past.then - MINUTE[0], past.t), past.then - MINUTE, np.inf) for past in shown]
-    ring = [np.where(np.isfinite(rows), rows, at) for rows, at in zip(minute, flock.at, strict=True)]
-    flock.ring = np.array(ring).reshape(-1, len(MINUTE), 3)
-    flock.changes, flock.beats = min(flock.changes, 0) - 1, 0  # differs from live revisions and on every call
+    fleet_arrays.update_fleet(list(pasts), now)
+    shown = [past for past in pasts if fleet_arrays.index(past.uav) is not None]
+    fleet_arrays.at = np.array([past.position(now) for past in shown]).reshape(-1, 3)
+    fleet_arrays.quat = scene_quat(*np.array([past.attitude for past in shown]).reshape(-1, 3).T)
+    paths = [
+        positions_at(past.recording.path(past.shown_t - TRAIL_AGES_S[0], past.t), past.shown_t - TRAIL_AGES_S, np.inf)
+        for past in shown
+    ]
+    trails = [np.where(np.isfinite(rows), rows, at) for rows, at in zip(paths, fleet_arrays.at, strict=True)]
+    fleet_arrays.trails = np.array(trails).reshape(-1, len(TRAIL_AGES_S), 3)
+    fleet_arrays.revision, fleet_arrays.trail_steps = (
+        min(fleet_arrays.revision, 0) - 1,
+        0,
+    )  # differs from live revisions and on every call

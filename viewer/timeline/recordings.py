@@ -4,48 +4,50 @@ from collections.abc import Callable
 
 import numpy as np
 
-from viewer.store.place import Place
-from viewer.store.store import Feed
+from viewer.store.place import SceneFrame
+from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
-from viewer.timeline.player import Span
-from viewer.timeline.recording import GAP_S, KEPT_S, TOLD_S, Tape
+from viewer.timeline.player import TimelineRange
+from viewer.timeline.recording import GAP_S, PREDICTION_STEP_S, RETENTION_S, UavRecording
 
-APART_S = 3600.0  # recordings that start farther apart are shown as simultaneous [s]
-FEW, CROWD = 50, 300  # UAVs up to which rows are recorded at 5 Hz; at 1 Hz, with predictions every 5 s
-FEW_S, MANY_S = 0.15, 0.9  # shortest time between two records [s]
+MAX_START_GAP_S = 3600.0  # recordings that start farther apart are shown as simultaneous [s]
+SMALL_FLEET, LARGE_FLEET = 50, 300  # UAVs up to which rows are recorded at 5 Hz; at 1 Hz, with predictions every 5 s
+SMALL_FLEET_STEP_S, STEP_S = 0.15, 0.9  # shortest time between two records [s]
 NO_TRAIL = np.zeros((0, 5))
 
 
-class Tapes:
+class RecordingStore:
     """Recording of every UAV."""
 
     def __init__(self) -> None:
-        self.of: dict[int, Tape] = {}
-        self.place: Place | None = None
-        self.apart_s = TOLD_S  # between two recorded predictions of one UAV [s]
-        self._due, self._turn = -np.inf, False
+        self.by_uav: dict[int, UavRecording] = {}
+        self.scene_frame: SceneFrame | None = None
+        self.prediction_step_s = PREDICTION_STEP_S  # between two recorded predictions of one UAV [s]
+        self._due, self._second_half = -np.inf, False
 
-    def take(self, feed: Feed, copies: Callable[[], list[Vehicle]], now: float) -> None:
+    def record(self, store: FleetStore, copies: Callable[[], list[Vehicle]], now: float) -> None:
         """Record all UAVs at a rate that depends on their number; `copies` returns snapshots."""
-        if feed.place is not self.place:
-            self.place = feed.place
-            self.of.clear()
+        if store.scene_frame is not self.scene_frame:
+            self.scene_frame = store.scene_frame
+            self.by_uav.clear()
         if now < self._due:
             return
         fleet = copies()
-        self._due = now + (FEW_S if len(fleet) <= FEW else MANY_S)
-        self.apart_s = TOLD_S * max(len(fleet) / CROWD, 1.0)  # bounded memory for a large fleet
-        self._turn, crowd = not self._turn, len(fleet) > CROWD
-        for vehicle in fleet[self._turn :: 2] if crowd else fleet:
-            tape = self.of.setdefault(vehicle.uav, Tape())
-            behind = not crowd and (not len(tape) or vehicle.t - tape.t[-1] > GAP_S)
-            tape.take(vehicle, feed.trail(vehicle) if behind else NO_TRAIL, now, self.apart_s)
+        self._due = now + (SMALL_FLEET_STEP_S if len(fleet) <= SMALL_FLEET else STEP_S)
+        self.prediction_step_s = PREDICTION_STEP_S * max(
+            len(fleet) / LARGE_FLEET, 1.0
+        )  # bounded memory for a large fleet
+        self._second_half, large_fleet = not self._second_half, len(fleet) > LARGE_FLEET
+        for vehicle in fleet[self._second_half :: 2] if large_fleet else fleet:
+            recording = self.by_uav.setdefault(vehicle.uav, UavRecording())
+            is_behind = not large_fleet and (not len(recording) or vehicle.t - recording.t[-1] > GAP_S)
+            recording.record(vehicle, store.trail(vehicle) if is_behind else NO_TRAIL, now, self.prediction_step_s)
 
     def nbytes(self) -> int:
         """Return the size of all recordings [bytes]."""
-        return sum(tape.nbytes() for tape in list(self.of.values()))
+        return sum(recording.nbytes() for recording in list(self.by_uav.values()))
 
-    def measure(self, lead: Vehicle, fleet: list[Vehicle]) -> tuple[Span, dict[int, float]]:
+    def playback_range(self, clock_vehicle: Vehicle, fleet: list[Vehicle]) -> tuple[TimelineRange, dict[int, float]]:
         """Compute the available time range on the clock of one UAV.
 
         Args:
@@ -54,10 +56,14 @@ class Tapes:
         Returns:
             the range, and the clock offsets of recordings of other days [s]
         """
-        tapes = {one.uav: self.of[one.uav] for one in fleet}
-        zero = tapes[lead.uav].t[0]
-        ahead = {one.uav: float(tapes[one.uav].t[0] - zero) for one in fleet if one.recorded}
-        shift = {uav: t for uav, t in ahead.items() if abs(t) > APART_S}
-        end = max(tape.t[-1] - shift.get(uav, 0.0) for uav, tape in tapes.items())
-        begin = min(tape.t[0] - shift.get(uav, 0.0) for uav, tape in tapes.items())
-        return Span(float(begin if lead.recorded else max(begin, end - KEPT_S)), float(end)), shift
+        recordings = {vehicle.uav: self.by_uav[vehicle.uav] for vehicle in fleet}
+        reference_t = recordings[clock_vehicle.uav].t[0]
+        ahead = {
+            vehicle.uav: float(recordings[vehicle.uav].t[0] - reference_t) for vehicle in fleet if vehicle.recorded
+        }
+        shift = {uav: t for uav, t in ahead.items() if abs(t) > MAX_START_GAP_S}
+        end = max(recording.t[-1] - shift.get(uav, 0.0) for uav, recording in recordings.items())
+        begin = min(recording.t[0] - shift.get(uav, 0.0) for uav, recording in recordings.items())
+        return TimelineRange(
+            float(begin if clock_vehicle.recorded else max(begin, end - RETENTION_S)), float(end)
+        ), shift

@@ -2,30 +2,30 @@
 
 from typing import NamedTuple
 
-from fleet.contract import About, Alert, Link, Mismatch, State
+from fleet.contract import Alert, AlertKey, Link, Mismatch, TwinState
 from viewer.store.vehicle import Vehicle
 from viewer.text.words import fit
 
 
-class Stood(NamedTuple):
+class StateRecord(NamedTuple):
     """State of a UAV from a time until the next record."""
 
     t: float  # data time [s since 1970]
-    state: State
+    state: TwinState
     link: Link
     mode: str
     armed: bool
     sentence: str  # of its status
     verdict: str  # of its newest identification
     fit: float | None  # mean over the states [%]
-    alerts: dict[About, Alert]
+    alerts: dict[AlertKey, Alert]
     mismatch: Mismatch | None
 
 
-def stood(vehicle: Vehicle, at: float, now: float) -> Stood:
+def state_record(vehicle: Vehicle, at: float, now: float) -> StateRecord:
     """Return the state of a UAV at data time `at` [s since 1970]; `now` is monotonic [s]."""
     status, mean = vehicle.status, fit(vehicle)
-    return Stood(
+    return StateRecord(
         at,
         vehicle.state(now),
         status.link if status is not None else Link.LIVE,

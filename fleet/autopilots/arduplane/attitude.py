@@ -16,7 +16,7 @@ from fleet.autopilots.common import controller_state as S
 from fleet.autopilots.common.kernels import clip, kernel
 from fleet.frames import G
 
-FULL = radians(45.0)  # full throw [rad]
+FULL_THROW = radians(45.0)  # full throw [rad]
 _P, _I, _D, _IMAX, _FLTT, _FLTD = 1, 2, 3, 4, 5, 6  # offsets of the gains from FF in `par`, for roll and pitch
 
 
@@ -30,30 +30,30 @@ def scaler(par: np.ndarray, Va: float) -> float:
 
 
 @kernel
-def _share(hertz: float, dt: float) -> float:
+def _low_pass_gain(hertz: float, dt: float) -> float:
     """Return the gain of a first-order low-pass filter; 0 Hz: no filter."""
     return dt / (dt + 1.0 / (2 * pi * hertz)) if hertz > 0.0 else 1.0
 
 
 @kernel
-def _rate_loop(ctl: np.ndarray, par: np.ndarray, pitch: bool, wanted: float, rate: float, s: float, dt: float) -> float:
+def _rate_loop(ctl: np.ndarray, par: np.ndarray, pitch: bool, rate_c: float, rate: float, s: float, dt: float) -> float:
     """Convert a rate demand [rad/s] to a surface deflection -1..1."""
     t, i, e, d, last = (S.Q_T, S.I_E, S.E_E, S.D_E, S.S_E) if pitch else (S.P_T, S.I_A, S.E_A, S.D_A, S.S_A)
     ff = P.PITCH_FF if pitch else P.ROLL_FF
-    ctl[t] += _share(par[ff + _FLTT], dt) * (wanted - ctl[t])
+    ctl[t] += _low_pass_gain(par[ff + _FLTT], dt) * (rate_c - ctl[t])
     error = (ctl[t] - rate) * s * s
-    ctl[d] += _share(par[ff + _FLTD], dt) * ((error - ctl[e]) / dt - ctl[d])
+    ctl[d] += _low_pass_gain(par[ff + _FLTD], dt) * ((error - ctl[e]) / dt - ctl[d])
     ctl[e] = error
     step = error * par[ff + _I] * dt
     if abs(ctl[last]) < 1.0 or step * ctl[last] < 0.0:  # anti-windup: at full throw integrate only towards zero
         ctl[i] = clip(ctl[i] + step, -par[ff + _IMAX], par[ff + _IMAX])
     total = par[ff] * ctl[t] * s / par[P.EAS2TAS] + par[ff + _P] * error + ctl[i] + par[ff + _D] * ctl[d]
-    ctl[last] = total / FULL
+    ctl[last] = total / FULL_THROW
     return clip(ctl[last], -1.0, 1.0)
 
 
 @kernel
-def _limited(rate: float, down: float, up: float) -> float:
+def _limit_rate(rate: float, down: float, up: float) -> float:
     """Limit a rate; a zero limit is inactive."""
     if up > 0.0 and rate > up:
         return up
@@ -65,8 +65,8 @@ def rate_demands(par: np.ndarray, phi_c: float, theta_c: float, euler: np.ndarra
     """Return the roll and pitch rate demands, including the pitch rate of a turn [rad/s]."""
     V = max(Va if np.isfinite(Va) else par[P.VA_CRUISE], par[P.VA_MIN]) * par[P.EAS2TAS]
     phi = clip(euler[0], -1.396, 1.396)
-    p_d = _limited((phi_c - euler[0]) / par[P.ROLL_TC], par[P.ROLL_RMAX], par[P.ROLL_RMAX])
-    q_d = _limited((theta_c + par[P.PITCH_TRIM] - euler[1]) / par[P.PITCH_TC], par[P.PITCH_DOWN], par[P.PITCH_UP])
+    p_d = _limit_rate((phi_c - euler[0]) / par[P.ROLL_TC], par[P.ROLL_RMAX], par[P.ROLL_RMAX])
+    q_d = _limit_rate((theta_c + par[P.PITCH_TRIM] - euler[1]) / par[P.PITCH_TC], par[P.PITCH_DOWN], par[P.PITCH_UP])
     turn = abs(cos(euler[1]) * G / V * tan(phi) * sin(phi)) * par[P.PITCH_ROLL]
     return p_d, q_d + turn
 

@@ -13,9 +13,9 @@ from fleet.autopilots.common import controller_state as S
 from fleet.autopilots.common.kernels import clip, kernel
 from fleet.frames import G
 
-_W = 2.0  # bandwidth of the airspeed filter [rad/s]
-SLOWEST = 3.0  # lower limit of the airspeed filter [m/s]
-_SMOOTH = 0.2  # time constant for acceleration from velocity differences [s]
+_FILTER_BANDWIDTH = 2.0  # bandwidth of the airspeed filter [rad/s]
+MIN_FILTERED_SPEED = 3.0  # lower limit of the airspeed filter [m/s]
+_ACCEL_LAG = 0.2  # time constant for acceleration from velocity differences [s]
 
 
 @kernel
@@ -32,13 +32,13 @@ def update_speed(
         Va_dot: forward acceleration; nan: derived from `v` [m/s2]
         dt: step [s]
     """
-    sense(ctl, v, euler, Va_dot, dt)
+    update_acceleration(ctl, v, euler, Va_dot, dt)
     ctl[S.ACCEL_LP] += dt / (dt + par[P.TIME_CONST]) * (ctl[S.ACCEL] - ctl[S.ACCEL_LP])
     filter_speed(ctl, Va * par[P.EAS2TAS], par[P.VA_CRUISE] * par[P.EAS2TAS], dt)
 
 
 @kernel
-def sense(ctl: np.ndarray, v: np.ndarray, euler: np.ndarray, Va_dot: float, dt: float) -> None:
+def update_acceleration(ctl: np.ndarray, v: np.ndarray, euler: np.ndarray, Va_dot: float, dt: float) -> None:
     """Update the forward acceleration ctl[S.ACCEL], from `Va_dot` or else from ground velocity differences.
 
     Args:
@@ -47,31 +47,31 @@ def sense(ctl: np.ndarray, v: np.ndarray, euler: np.ndarray, Va_dot: float, dt: 
     """
     if np.isfinite(Va_dot):
         ctl[S.ACCEL] = Va_dot
-    elif ctl[S.SEEN] > 0.0 and dt > 0.0:
+    elif ctl[S.HAS_VELOCITY] > 0.0 and dt > 0.0:
         ct, st = cos(euler[1]), sin(euler[1])
         d_n, d_e, d_d = v[0] - ctl[S.V_N], v[1] - ctl[S.V_E], v[2] - ctl[S.V_E + 1]
         forward = (d_n * ct * cos(euler[2]) + d_e * ct * sin(euler[2]) - d_d * st) / dt
-        ctl[S.ACCEL] += dt / (dt + _SMOOTH) * (clip(forward, -30.0, 30.0) - ctl[S.ACCEL])
+        ctl[S.ACCEL] += dt / (dt + _ACCEL_LAG) * (clip(forward, -30.0, 30.0) - ctl[S.ACCEL])
     for j in range(3):
         ctl[S.V_N + j] = v[j]
-    ctl[S.SEEN] = 1.0
+    ctl[S.HAS_VELOCITY] = 1.0
 
 
 @kernel
-def filter_speed(ctl: np.ndarray, tas: float, otherwise: float, dt: float) -> None:
+def filter_speed(ctl: np.ndarray, tas: float, default: float, dt: float) -> None:
     """Filter a true airspeed [m/s] with the forward acceleration; nan: use `default`."""
     if not np.isfinite(tas):
-        ctl[S.V_HAT], ctl[S.V_DOT_HAT] = otherwise, 0.0
+        ctl[S.V_HAT], ctl[S.V_DOT_HAT] = default, 0.0
         return
     error = tas - ctl[S.V_HAT]
-    ctl[S.V_DOT_HAT] += error * _W * _W * dt
-    ctl[S.V_HAT] += (ctl[S.V_DOT_HAT] + ctl[S.ACCEL] + error * _W * sqrt(2.0)) * dt
-    if ctl[S.V_HAT] < SLOWEST:
-        ctl[S.V_HAT], ctl[S.V_DOT_HAT] = SLOWEST, max(ctl[S.V_DOT_HAT], 0.0)
+    ctl[S.V_DOT_HAT] += error * _FILTER_BANDWIDTH * _FILTER_BANDWIDTH * dt
+    ctl[S.V_HAT] += (ctl[S.V_DOT_HAT] + ctl[S.ACCEL] + error * _FILTER_BANDWIDTH * sqrt(2.0)) * dt
+    if ctl[S.V_HAT] < MIN_FILTERED_SPEED:
+        ctl[S.V_HAT], ctl[S.V_DOT_HAT] = MIN_FILTERED_SPEED, max(ctl[S.V_DOT_HAT], 0.0)
 
 
 @kernel
-def slowest(par: np.ndarray, phi: float) -> float:
+def min_airspeed(par: np.ndarray, phi: float) -> float:
     """Return the minimum true airspeed, increased with the load factor of the bank [m/s]."""
     return par[P.VA_MIN] * par[P.EAS2TAS] / sqrt(max(cos(phi), 0.2))
 
@@ -83,16 +83,16 @@ def demand_speed(ctl: np.ndarray, par: np.ndarray, va_c: float, phi: float, dt: 
     Acceleration uses half the climb power, deceleration 0.9 of the drag (SINK_MIN at cruise, growing with V^2).
     """
     V = ctl[S.V_HAT]
-    fastest = 0.5 * par[P.CLIMB_MAX] * ctl[S.UP] * G / V
-    braking = -0.9 * par[P.SINK_MIN] * G * V * V / (par[P.VA_CRUISE] * par[P.EAS2TAS]) ** 3
-    low, high = slowest(par, phi), par[P.VA_MAX] * par[P.EAS2TAS]
+    max_rate = 0.5 * par[P.CLIMB_MAX] * ctl[S.CLIMB_SHARE] * G / V
+    min_rate = -0.9 * par[P.SINK_MIN] * G * V * V / (par[P.VA_CRUISE] * par[P.EAS2TAS]) ** 3
+    low, high = min_airspeed(par, phi), par[P.VA_MAX] * par[P.EAS2TAS]
     if ctl[S.THR_SAT] > 0.0:  # no power left: lower the upper limit
-        ctl[S.V_TOP] = max(ctl[S.V_TOP] + braking * dt, min(par[P.VA_CRUISE] * par[P.EAS2TAS], high))
+        ctl[S.V_TOP] = max(ctl[S.V_TOP] + min_rate * dt, min(par[P.VA_CRUISE] * par[P.EAS2TAS], high))
     else:
-        ctl[S.V_TOP] = min(ctl[S.V_TOP] + max(fastest, 0.0) * dt, high)
-    wanted = low if ctl[S.SINKING] > 0.0 or ctl[S.SLOW] > 0.0 else va_c * par[P.EAS2TAS]
-    wanted = max(min(wanted, ctl[S.V_TOP]), low)
-    step = clip(wanted - ctl[S.V_DEM], braking * dt, fastest * dt)
+        ctl[S.V_TOP] = min(ctl[S.V_TOP] + max(max_rate, 0.0) * dt, high)
+    V_target = low if ctl[S.BAD_DESCENT] > 0.0 or ctl[S.UNDERSPEED] > 0.0 else va_c * par[P.EAS2TAS]
+    V_target = max(min(V_target, ctl[S.V_TOP]), low)
+    step = clip(V_target - ctl[S.V_DEM], min_rate * dt, max_rate * dt)
     ctl[S.V_DEM] += step
     rate = step / dt
     ctl[S.V_DEM_LP] += dt / (dt + par[P.TIME_CONST]) * (rate - ctl[S.V_DEM_LP])
@@ -104,25 +104,25 @@ def demand_height(ctl: np.ndarray, par: np.ndarray, h_sp: float, dt: float) -> f
     """Rate-limit and lag the height demand; return the climb rate demand [m/s]."""
     mean = 0.5 * (h_sp + ctl[S.H_IN])
     ctl[S.H_IN] = h_sp
-    down, up = par[P.SINK_MAX] * ctl[S.DOWN] * dt, par[P.CLIMB_MAX] * ctl[S.UP] * dt
+    down, up = par[P.SINK_MAX] * ctl[S.SINK_SHARE] * dt, par[P.CLIMB_MAX] * ctl[S.CLIMB_SHARE] * dt
     ctl[S.H_LIMITED] += clip(mean - ctl[S.H_LIMITED], -down, up)
     tau = max(par[P.H_TIME], dt)
     h_dot = (ctl[S.H_LIMITED] - ctl[S.H_DEM]) / tau
     ctl[S.H_DEM] += dt / (dt + tau) * (ctl[S.H_LIMITED] - ctl[S.H_DEM])
-    _yield(ctl, dt / (dt + tau))
+    _adapt_rate_shares(ctl, dt / (dt + tau))
     return h_dot
 
 
 @kernel
-def _yield(ctl: np.ndarray, share: float) -> None:
+def _adapt_rate_shares(ctl: np.ndarray, gain: float) -> None:
     """Reduce the climb or sink limit while throttle or pitch is saturated, else restore it."""
     up = ctl[S.THETA_SAT] > 0.0 or ctl[S.THR_SAT] > 0.0
     down = ctl[S.THETA_SAT] < 0.0 or ctl[S.THR_SAT] < 0.0
     if up and ctl[S.H_DEM] > ctl[S.H_LAST]:
-        ctl[S.UP] *= 1.0 - share
+        ctl[S.CLIMB_SHARE] *= 1.0 - gain
     elif down and ctl[S.H_DEM] < ctl[S.H_LAST]:
-        ctl[S.DOWN] *= 1.0 - share
+        ctl[S.SINK_SHARE] *= 1.0 - gain
     else:
-        ctl[S.UP] += share * (1.0 - ctl[S.UP])
-        ctl[S.DOWN] += share * (1.0 - ctl[S.DOWN])
+        ctl[S.CLIMB_SHARE] += gain * (1.0 - ctl[S.CLIMB_SHARE])
+        ctl[S.SINK_SHARE] += gain * (1.0 - ctl[S.SINK_SHARE])
     ctl[S.H_LAST] = ctl[S.H_DEM]

@@ -5,14 +5,14 @@ import numpy as np
 from fleet.autopilots.arduplane import demand, l1, tecs
 from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane import params as P
-from fleet.autopilots.arduplane.attitude import FULL
+from fleet.autopilots.arduplane.attitude import FULL_THROW
 from fleet.autopilots.common import controller_state as S
-from fleet.autopilots.common.kernels import kernel, making
+from fleet.autopilots.common.kernels import array_kernel, kernel
 from fleet.frames import G
 from fleet.mission import VA_C
 
 
-@making
+@array_kernel
 def init(
     par: np.ndarray,
     legs: np.ndarray,
@@ -42,17 +42,17 @@ def init(
     theta_c = theta_c if np.isfinite(theta_c) else euler[1]
     delta_t = delta_t if np.isfinite(delta_t) else 0.5 * (par[P.THR_MIN] + par[P.THR_MAX])
     ctl = np.zeros(S.N_CTL)
-    known = np.isfinite(start[0]) and np.isfinite(start[1]) and np.isfinite(start[2])
-    leg_rules.set_leg(ctl, par, legs, k, start if known else p)
-    ctl[S.LINE] = 1.0 if known else 0.0
+    has_start = np.isfinite(start[0]) and np.isfinite(start[1]) and np.isfinite(start[2])
+    leg_rules.set_leg(ctl, par, legs, k, start if has_start else p)
+    ctl[S.FOLLOW_LINE] = 1.0 if has_start else 0.0
     tecs.reset(ctl, par, -p[2], -v[2], Va, theta_c, delta_t)
     return ctl
 
 
 @kernel
-def speed(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray) -> float:
+def commanded_airspeed(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray) -> float:
     """Return the commanded equivalent airspeed on the current leg [m/s]."""
-    i = leg_rules.current(ctl, legs)
+    i = leg_rules.current_leg(ctl, legs)
     return legs[i, VA_C] if i >= 0 and legs[i, VA_C] > 0.0 else par[P.VA_CRUISE]
 
 
@@ -70,13 +70,13 @@ def fly(
 ) -> tuple[float, float, float, bool]:
     """Run one guidance step on the current leg; return the result of `guide` and whether the leg is complete."""
     dt = max(dt, 1e-3)
-    a_lat, over = leg_rules.steer(ctl, par, legs, p, v, euler, dt)
+    a_lat, leg_done = leg_rules.steer(ctl, par, legs, p, v, euler, dt)
     phi_c = l1.to_roll(par, a_lat, euler[1])
     h_sp = leg_rules.height_demand(ctl, par, legs, p)
     demand.update_speed(ctl, par, v, euler, Va, Va_dot, dt)
-    va_c, blind = speed(ctl, par, legs), not np.isfinite(Va)
-    theta_c, delta_t = tecs.update(ctl, par, h_sp, va_c, -p[2], -v[2], euler[0], blind, dt)
-    return phi_c, theta_c, delta_t, over
+    va_c, no_airspeed = commanded_airspeed(ctl, par, legs), not np.isfinite(Va)
+    theta_c, delta_t = tecs.update(ctl, par, h_sp, va_c, -p[2], -v[2], euler[0], no_airspeed, dt)
+    return phi_c, theta_c, delta_t, leg_done
 
 
 @kernel
@@ -103,20 +103,20 @@ def guide(
     Returns:
         phi_c, theta_c [rad], delta_t 0..1
     """
-    phi_c, theta_c, delta_t, over = fly(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
-    if over and int(ctl[S.LEG]) + 1 < legs.shape[0]:
+    phi_c, theta_c, delta_t, leg_done = fly(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
+    if leg_done and int(ctl[S.LEG]) + 1 < legs.shape[0]:
         leg_rules.begin(ctl, par, legs, int(ctl[S.LEG]) + 1, p)
     return phi_c, theta_c, delta_t
 
 
 @kernel
-def settle(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray) -> None:
+def assume_commanded_speed(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray) -> None:
     """Set the speed demand to the commanded speed, as in steady flight."""
-    ctl[S.V_DEM] = speed(ctl, par, legs) * par[P.EAS2TAS]
+    ctl[S.V_DEM] = commanded_airspeed(ctl, par, legs) * par[P.EAS2TAS]
 
 
 @kernel
-def shift(ctl: np.ndarray, par: np.ndarray, miss: np.ndarray, told: np.ndarray) -> None:
+def align_integrators(ctl: np.ndarray, par: np.ndarray, residual: np.ndarray, reported: np.ndarray) -> None:
     """Shift the integrators by the output residuals, and set slew-limited outputs to the reported values.
 
     Args:
@@ -124,11 +124,11 @@ def shift(ctl: np.ndarray, par: np.ndarray, miss: np.ndarray, told: np.ndarray) 
         residual: reported minus replayed theta_c, delta_t, delta_a, delta_e, delta_r; 0: unknown, (5,)
         reported: reported phi_c, theta_c, delta_t and airspeed at the end, nan where missing, (4,)
     """
-    room = 0.5 * (par[P.THR_MAX] - par[P.THR_MIN])
-    ctl[S.I_SEB] += miss[0] * ctl[S.V_HAT] * G
-    ctl[S.THETA] = told[1] if np.isfinite(told[1]) else ctl[S.THETA] + miss[0]
-    ctl[S.I_THR] = min(max(ctl[S.I_THR] + miss[1], -room), room)
-    if np.isfinite(told[2]):
-        ctl[S.THR] = told[2] - ctl[S.I_THR]
-    ctl[S.I_A] += miss[2] * FULL
-    ctl[S.I_E] += miss[3] * FULL
+    i_limit = 0.5 * (par[P.THR_MAX] - par[P.THR_MIN])
+    ctl[S.I_SEB] += residual[0] * ctl[S.V_HAT] * G
+    ctl[S.THETA] = reported[1] if np.isfinite(reported[1]) else ctl[S.THETA] + residual[0]
+    ctl[S.I_THR] = min(max(ctl[S.I_THR] + residual[1], -i_limit), i_limit)
+    if np.isfinite(reported[2]):
+        ctl[S.THR] = reported[2] - ctl[S.I_THR]
+    ctl[S.I_A] += residual[2] * FULL_THROW
+    ctl[S.I_E] += residual[3] * FULL_THROW

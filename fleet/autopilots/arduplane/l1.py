@@ -16,9 +16,9 @@ from fleet.autopilots.common.kernels import angle_to, clip, hypot, kernel
 from fleet.frames import G, wrap
 from fleet.mission import P_E, P_N
 
-_SHALLOW = 0.0873  # crosstrack angle below which the integral is active: 5 deg [rad]
-_STEEP = 0.7071  # sine of the maximum intercept angle: 45 deg [-]
-_MOST = 0.1  # limit of the crosstrack integral [rad]
+_XTRACK_I_ANGLE = 0.0873  # crosstrack angle below which the integral is active: 5 deg [rad]
+_MAX_CAPTURE_SIN = 0.7071  # sine of the maximum intercept angle: 45 deg [-]
+_XTRACK_I_MAX = 0.1  # limit of the crosstrack integral [rad]
 
 
 @kernel
@@ -43,12 +43,12 @@ def to_roll(par: np.ndarray, a_lat: float, theta: float) -> float:
 
 
 @kernel
-def decided(ctl: np.ndarray, nu: float, n: float, e: float, psi: float) -> float:
+def keep_turn_direction(ctl: np.ndarray, nu: float, n: float, e: float, psi: float) -> float:
     """Keep the turn direction while the target (n, e) is nearly behind; store and return `nu` [rad]."""
-    before = ctl[S.NU]
-    if abs(nu) > 0.9 * pi and abs(before) > 0.9 * pi and nu * before < 0.0:
+    nu_last = ctl[S.NU]
+    if abs(nu) > 0.9 * pi and abs(nu_last) > 0.9 * pi and nu * nu_last < 0.0:
         behind = abs(wrap(atan2(e, n) - psi)) > 2 * pi / 3
-        nu = before if behind else nu
+        nu = nu_last if behind else nu
     ctl[S.NU] = nu
     return nu
 
@@ -76,21 +76,21 @@ def follow_line(
     length = max(hypot(t_n, t_e), 1e-6)
     t_n, t_e = t_n / length, t_e / length
     a_n, a_e = p[0] - ctl[S.PREV_N], p[1] - ctl[S.PREV_E]
-    along, left = a_n * t_n + a_e * t_e, a_n * t_e - a_e * t_n
-    away = hypot(a_n, a_e)
+    along, crosstrack = a_n * t_n + a_e * t_e, a_n * t_e - a_e * t_n
+    start_distance = hypot(a_n, a_e)
     b_n, b_e = leg[P_N] - p[0], leg[P_E] - p[1]
-    if away > l1 and along < -_STEEP * max(away, 1.0):
+    if start_distance > l1 and along < -_MAX_CAPTURE_SIN * max(start_distance, 1.0):
         nu = angle_to(v_n, v_e, -a_n, -a_e)
     elif along > length + 3.0 * speed:
         nu = angle_to(v_n, v_e, b_n, b_e)
     else:
-        nu1 = asin(clip(left / l1, -_STEEP, _STEEP))
+        nu1 = asin(clip(crosstrack / l1, -_MAX_CAPTURE_SIN, _MAX_CAPTURE_SIN))
         if par[P.XTRACK_I] <= 0.0:
             ctl[S.XTRACK] = 0.0
-        elif abs(nu1) < _SHALLOW:
-            ctl[S.XTRACK] = clip(ctl[S.XTRACK] + nu1 * par[P.XTRACK_I] * dt, -_MOST, _MOST)
+        elif abs(nu1) < _XTRACK_I_ANGLE:
+            ctl[S.XTRACK] = clip(ctl[S.XTRACK] + nu1 * par[P.XTRACK_I] * dt, -_XTRACK_I_MAX, _XTRACK_I_MAX)
         nu = nu1 + ctl[S.XTRACK] + angle_to(v_n, v_e, t_n, t_e)
-    nu = clip(decided(ctl, nu, b_n, b_e, psi), -pi / 2, pi / 2)
+    nu = clip(keep_turn_direction(ctl, nu, b_n, b_e, psi), -pi / 2, pi / 2)
     return 4.0 * par[P.DAMPING] ** 2 * speed * speed / l1 * sin(nu)
 
 
@@ -119,19 +119,19 @@ def follow_circle(
     """
     v_n, v_e, speed = ground_track(v, psi)
     d = 1.0 if radius >= 0.0 else -1.0
-    wide = max(abs(radius), 1.0)
+    R = max(abs(radius), 1.0)
     c_n, c_e = leg[P_N] - p[0], leg[P_E] - p[1]
     r = max(hypot(c_n, c_e), 0.1)
     out_n, out_e = -c_n / r, -c_e / r
-    nu = clip(decided(ctl, angle_to(v_n, v_e, -out_n, -out_e), c_n, c_e, psi), -pi / 2, pi / 2)
-    capture = 4.0 * par[P.DAMPING] ** 2 * speed * speed / distance(par, speed) * sin(nu)
+    nu = clip(keep_turn_direction(ctl, angle_to(v_n, v_e, -out_n, -out_e), c_n, c_e, psi), -pi / 2, pi / 2)
+    a_capture = 4.0 * par[P.DAMPING] ** 2 * speed * speed / distance(par, speed) * sin(nu)
     omega = 2 * pi / par[P.PERIOD]
     v_t = (out_n * v_e - out_e * v_n) * d
     v_r = v_n * out_n + v_e * out_e
-    pull = omega * omega * (r - wide) + 2.0 * par[P.DAMPING] * omega * v_r
+    correction = omega * omega * (r - R) + 2.0 * par[P.DAMPING] * omega * v_r
     if v_r > 0.0 and v_t < 0.0:
-        pull = max(pull, 0.0)
-    hold = d * (pull + v_t * v_t / max(0.5 * wide, r))
-    if r > wide and d * capture < d * hold:
-        return capture, False
-    return hold, True
+        correction = max(correction, 0.0)
+    a_circle = d * (correction + v_t * v_t / max(0.5 * R, r))
+    if r > R and d * a_capture < d * a_circle:
+        return a_capture, False
+    return a_circle, True

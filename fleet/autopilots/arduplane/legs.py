@@ -15,7 +15,7 @@ from fleet.autopilots.common import kernels
 from fleet.autopilots.common.kernels import hypot, kernel
 from fleet.frames import wrap
 from fleet.mission import (
-    ACCEPT,
+    ACCEPT_RADIUS,
     KIND,
     LAND,
     LOITER_TIME,
@@ -33,13 +33,13 @@ from fleet.mission import (
 )  # fmt: skip
 
 _CLIMB_AT_ONCE = 1 << 14  # FLIGHT_OPTIONS: climb to the next altitude at once
-_EXIT = pi / 18  # exit from a circle within 10 deg of the exit course, plus 10 deg per extra turn [rad]
-_FAR = 3.0  # distance in radii beyond which the line to a circle is followed
-_LEVEL = 5.0  # altitude error that ends LOITER_TO_ALT [m]
+_EXIT_SECTOR = pi / 18  # exit from a circle within 10 deg of the exit course, plus 10 deg per extra turn [rad]
+_LINE_RADII = 3.0  # distance in radii beyond which the line to a circle is followed
+_ALT_TOLERANCE = 5.0  # altitude error that ends LOITER_TO_ALT [m]
 
 
 @kernel
-def current(ctl: np.ndarray, legs: np.ndarray) -> int:
+def current_leg(ctl: np.ndarray, legs: np.ndarray) -> int:
     """Return the index of the current leg; -1 if the route is empty."""
     return min(max(int(ctl[S.LEG]), 0), legs.shape[0] - 1)
 
@@ -58,19 +58,19 @@ def along_line(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray) -> tuple[float, 
 def set_leg(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, from_p: np.ndarray) -> None:
     """Start leg `k` (clamped to the route) on the line from `from_p`, NED (3,) [m]; not finite: from its target."""
     ctl[: S.N_LEG] = 0.0
-    ctl[S.READY] = -1.0
+    ctl[S.EXIT_ANGLE] = -1.0
     ctl[S.LEG] = max(k, 0)
-    i = current(ctl, legs)
+    i = current_leg(ctl, legs)
     ctl[S.LEG] = max(i, 0)
-    known = np.isfinite(from_p[0]) and np.isfinite(from_p[1]) and np.isfinite(from_p[2])
+    has_start = np.isfinite(from_p[0]) and np.isfinite(from_p[1]) and np.isfinite(from_p[2])
     for j in range(3):
-        ctl[S.PREV_N + j] = from_p[j] if known else (legs[i, P_N + j] if i >= 0 else 0.0)
+        ctl[S.PREV_N + j] = from_p[j] if has_start else (legs[i, P_N + j] if i >= 0 else 0.0)
     if i < 0:
         return
     ctl[S.TURN] = pi / 2
     if i + 1 < legs.shape[0]:
-        here = atan2(legs[i, P_E] - ctl[S.PREV_E], legs[i, P_N] - ctl[S.PREV_N])
-        ctl[S.TURN] = abs(wrap(atan2(legs[i + 1, P_E] - legs[i, P_E], legs[i + 1, P_N] - legs[i, P_N]) - here))
+        bearing = atan2(legs[i, P_E] - ctl[S.PREV_E], legs[i, P_N] - ctl[S.PREV_N])
+        ctl[S.TURN] = abs(wrap(atan2(legs[i + 1, P_E] - legs[i, P_E], legs[i + 1, P_N] - legs[i, P_N]) - bearing))
 
 
 @kernel
@@ -80,13 +80,13 @@ def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndar
     The new line starts at the end of the previous one, but at the aircraft after a circle, after takeoff, or beyond its
     own end.
     """
-    i = current(ctl, legs)
-    onward = i >= 0 and k == i + 1 and int(legs[i, KIND]) == WAYPOINT
-    if not onward:
+    i = current_leg(ctl, legs)
+    continues = i >= 0 and k == i + 1 and int(legs[i, KIND]) == WAYPOINT
+    if not continues:
         set_leg(ctl, par, legs, k, p)
         return
     set_leg(ctl, par, legs, k, legs[i, P_N : P_D + 1])
-    ctl[S.LINE] = 1.0
+    ctl[S.FOLLOW_LINE] = 1.0
     along, length = along_line(ctl, legs[k], p)
     if along > length:
         set_leg(ctl, par, legs, k, p)
@@ -106,7 +106,7 @@ def steer(
     Returns:
         lateral acceleration, right positive [m/s2]; whether the leg is complete
     """
-    i = current(ctl, legs)
+    i = current_leg(ctl, legs)
     if i < 0:
         return 0.0, False
     leg = legs[i]
@@ -119,18 +119,22 @@ def steer(
         a_lat = l1.follow_line(ctl, par, leg, p, v, euler[2], dt)
         return a_lat, kind == WAYPOINT and _arrived(ctl, par, leg, p, v, euler[2])
     radius = leg[RADIUS] if leg[RADIUS] != 0.0 else par[P.LOITER_RAD]
-    d, wide = 1.0 if radius >= 0.0 else -1.0, l1.circle_radius(par, abs(radius))
-    if ctl[S.ON] == 0.0 and ctl[S.LINE] > 0.0 and hypot(leg[P_N] - p[0], leg[P_E] - p[1]) > _FAR * wide:
+    d, R = 1.0 if radius >= 0.0 else -1.0, l1.circle_radius(par, abs(radius))
+    if (
+        ctl[S.CIRCLE_REACHED] == 0.0
+        and ctl[S.FOLLOW_LINE] > 0.0
+        and hypot(leg[P_N] - p[0], leg[P_E] - p[1]) > _LINE_RADII * R
+    ):
         return l1.follow_line(ctl, par, leg, p, v, euler[2], dt), False
-    a_lat, around = l1.follow_circle(ctl, par, leg, p, v, euler[2], d * wide)
-    _count(ctl, leg, p, around, d, dt)
-    return a_lat, _circled(ctl, legs, i, p, v, euler[2], wide)
+    a_lat, circling = l1.follow_circle(ctl, par, leg, p, v, euler[2], d * R)
+    _update_circle(ctl, leg, p, circling, d, dt)
+    return a_lat, _circle_done(ctl, legs, i, p, v, euler[2], R)
 
 
 @kernel
 def _arrived(ctl: np.ndarray, par: np.ndarray, leg: np.ndarray, p: np.ndarray, v: np.ndarray, psi: float) -> bool:
     to_go = hypot(leg[P_N] - p[0], leg[P_E] - p[1])
-    accept = leg[ACCEPT]
+    accept = leg[ACCEPT_RADIUS]
     if accept == 0.0:
         _, _, speed = l1.ground_track(v, psi)
         reach = min(par[P.WP_RADIUS] * par[P.EAS2TAS] ** 2, l1.distance(par, speed))
@@ -147,45 +151,45 @@ def _arrived(ctl: np.ndarray, par: np.ndarray, leg: np.ndarray, p: np.ndarray, v
 
 
 @kernel
-def _count(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray, around: bool, d: float, dt: float) -> None:
+def _update_circle(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray, circling: bool, d: float, dt: float) -> None:
     """Integrate angle and time since reaching the circle."""
     bearing = atan2(leg[P_E] - p[1], leg[P_N] - p[0])
-    ctl[S.AROUND] = 1.0 if around else 0.0
-    if ctl[S.ON] > 0.0:
+    ctl[S.CIRCLING] = 1.0 if circling else 0.0
+    if ctl[S.CIRCLE_REACHED] > 0.0:
         ctl[S.ANGLE] += wrap(bearing - ctl[S.BEARING]) * d
         ctl[S.TIMER] += dt
     along, length = along_line(ctl, leg, p)
-    if around or along > length:
-        ctl[S.ON] = 1.0
+    if circling or along > length:
+        ctl[S.CIRCLE_REACHED] = 1.0
     ctl[S.BEARING] = bearing
 
 
 @kernel
-def _circled(ctl: np.ndarray, legs: np.ndarray, i: int, p: np.ndarray, v: np.ndarray, psi: float, wide: float) -> bool:
+def _circle_done(ctl: np.ndarray, legs: np.ndarray, i: int, p: np.ndarray, v: np.ndarray, psi: float, R: float) -> bool:
     leg = legs[i]
-    if i + 1 >= legs.shape[0] or int(leg[KIND]) == LOITER_UNLIMITED or ctl[S.ON] == 0.0:
+    if i + 1 >= legs.shape[0] or int(leg[KIND]) == LOITER_UNLIMITED or ctl[S.CIRCLE_REACHED] == 0.0:
         return False
-    if ctl[S.READY] < 0.0:
-        if not ready(ctl, leg, p):
+    if ctl[S.EXIT_ANGLE] < 0.0:
+        if not exit_condition_met(ctl, leg, p):
             return False
-        ctl[S.READY] = max(ctl[S.ANGLE], 0.0)
+        ctl[S.EXIT_ANGLE] = max(ctl[S.ANGLE], 0.0)
     out_n, out_e = legs[i + 1, P_N] - p[0], legs[i + 1, P_E] - p[1]
-    if hypot(legs[i + 1, P_N] - leg[P_N], legs[i + 1, P_E] - leg[P_E]) < wide:  # the next target is inside the circle
+    if hypot(legs[i + 1, P_N] - leg[P_N], legs[i + 1, P_E] - leg[P_E]) < R:  # the next target is inside the circle
         return True
     v_n, v_e, _ = l1.ground_track(v, psi)
-    extra = np.floor(max(ctl[S.ANGLE] - ctl[S.READY], 0.0) / (2 * pi))
-    return abs(kernels.angle_to(v_n, v_e, out_n, out_e)) <= _EXIT * (1.0 + extra)
+    extra = np.floor(max(ctl[S.ANGLE] - ctl[S.EXIT_ANGLE], 0.0) / (2 * pi))
+    return abs(kernels.angle_to(v_n, v_e, out_n, out_e)) <= _EXIT_SECTOR * (1.0 + extra)
 
 
 @kernel
-def ready(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray) -> bool:
+def exit_condition_met(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray) -> bool:
     """Return whether the turns, time or height of a circle are complete; p: NED, (3,) [m]."""
     kind = int(leg[KIND])
     if kind == LOITER_TURNS:
         return ctl[S.ANGLE] >= 2 * pi * leg[TURNS]
     if kind == LOITER_TIME:
         return ctl[S.TIMER] >= leg[TURNS]
-    return kind == LOITER_TO_ALT and abs(p[2] - leg[P_D]) < _LEVEL
+    return kind == LOITER_TO_ALT and abs(p[2] - leg[P_D]) < _ALT_TOLERANCE
 
 
 @kernel
@@ -196,13 +200,18 @@ def height_demand(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndar
         ctl, par, legs: controller state, parameters, route
         p: position, NED, (3,) [m]
     """
-    i = current(ctl, legs)
+    i = current_leg(ctl, legs)
     if i < 0:
         return -ctl[S.PREV_D]
     leg = legs[i]
     h, rise = -leg[P_D], ctl[S.PREV_D] - leg[P_D]
-    at_once = int(par[P.OPTIONS]) & _CLIMB_AT_ONCE != 0 or leg[SEQ] < 0.0
-    if int(leg[KIND]) == TAKEOFF or abs(rise) < par[P.SLOPE_MIN] or (rise > 0.0 and at_once) or ctl[S.ON] > 0.0:
+    immediate = int(par[P.OPTIONS]) & _CLIMB_AT_ONCE != 0 or leg[SEQ] < 0.0
+    if (
+        int(leg[KIND]) == TAKEOFF
+        or abs(rise) < par[P.SLOPE_MIN]
+        or (rise > 0.0 and immediate)
+        or ctl[S.CIRCLE_REACHED] > 0.0
+    ):
         return h
     along, length = along_line(ctl, leg, p)
     if length < 0.1:

@@ -9,28 +9,28 @@ PREV_N, PREV_E, PREV_D = 1, 2, 3  # start of its line, NED [m]
 FROM = slice(1, 4)  # slice of the three above
 TURN = 4  # turn angle at its end [rad]
 ANGLE, BEARING = 5, 6  # angle flown on the circle, last bearing to its centre [rad]
-ON, AROUND = 7, 8  # 1: circle reached before; 1: now on the circle
+CIRCLE_REACHED, CIRCLING = 7, 8  # 1: circle reached before; 1: now on the circle
 TIMER = 9  # time since reaching the circle [s]
-READY = 10  # circle angle when the exit condition became true, -1 before [rad]
-LINE = 11  # 1: the line starts at a waypoint and is followed even to a circle
+EXIT_ANGLE = 10  # circle angle when the exit condition became true, -1 before [rad]
+FOLLOW_LINE = 11  # 1: the line starts at a waypoint and is followed even to a circle
 N_LEG = 12
 # L1
 XTRACK, NU = 12, 13  # crosstrack integral, last course error [rad]
 # airspeed filter
-V_N, V_E, V_D, SEEN = 14, 15, 16, 17  # last ground velocity, NED [m/s]; 1: available
+V_N, V_E, V_D, HAS_VELOCITY = 14, 15, 16, 17  # last ground velocity, NED [m/s]; 1: available
 ACCEL, ACCEL_LP = 18, 19  # forward acceleration, low-passed [m/s2]
 V_HAT, V_DOT_HAT = 20, 21  # filtered true airspeed [m/s], its bias state [m/s2]
 # speed demand
 V_DEM, V_DEM_LP, V_TOP = 22, 23, 24  # demanded true airspeed [m/s], low-passed rate [m/s2], upper limit [m/s]
 # height demand, up is positive
 H_IN, H_LIMITED, H_DEM, H_LAST = 25, 26, 27, 28  # raw, rate-limited, lagged, lagged one step ago [m]
-UP, DOWN = 29, 30  # active fraction of the climb and sink limits, 0..1
+CLIMB_SHARE, SINK_SHARE = 29, 30  # active fraction of the climb and sink limits, 0..1
 # energy
 STE_LP = 31  # filtered error of the total energy rate [m2/s3]
 I_THR, I_SEB, I_KE = 32, 33, 34  # integrators: throttle 0..1, energy balance rate, kinetic energy [m2/s3]
 THR, THR_SAT = 35, 36  # throttle before its integrator 0..1; -1, 0, +1 saturated
 THETA, THETA_SAT = 37, 38  # pitch demand [rad]; -1, 0, +1 saturated
-SLOW, SINKING = 39, 40  # 1: underspeed; 1: bad descent
+UNDERSPEED, BAD_DESCENT = 39, 40  # 1: underspeed; 1: bad descent
 # rate loops
 P_T, Q_T = 41, 42  # filtered rate targets [rad/s]
 I_A, I_E = 43, 44  # integrators [rad of surface]

@@ -17,9 +17,9 @@ ARDUPLANE, PX4, TEXTBOOK = 0.0, -1.0, -2.0
 __all__ = ["ARDUPLANE", "LAW", "N_CTL", "N_PAR", "PX4", "TEXTBOOK", "W_E", "W_N", "padded"]
 
 
-def padded(own: np.ndarray, law: float) -> np.ndarray:
+def padded(law_parameters: np.ndarray, law: float) -> np.ndarray:
     """Pad the parameters of a law (k,) to a parameter vector without wind, (N_PAR,)."""
     par = np.zeros(N_PAR)
-    par[: len(own)] = own
+    par[: len(law_parameters)] = law_parameters
     par[LAW] = law
     return par

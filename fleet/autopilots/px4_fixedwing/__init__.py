@@ -17,7 +17,7 @@ Source: see `npfg`, `tecs`; PX4 1.13 to 1.16 for the implementation.
 """
 
 from fleet.autopilots.px4_fixedwing.attitude import stabilise
-from fleet.autopilots.px4_fixedwing.guide import fly, init, shift
+from fleet.autopilots.px4_fixedwing.guide import align_integrators, fly, init
 from fleet.autopilots.px4_fixedwing.params import DEFAULTS, NAMES, TABLE, parameters
 from fleet.autopilots.px4_fixedwing.path import begin, height_demand
 
@@ -28,11 +28,11 @@ __all__ = [
     "LAW",
     "NAMES",
     "TABLE",
+    "align_integrators",
     "begin",
     "fly",
     "height_demand",
     "init",
     "parameters",
-    "shift",
     "stabilise",
 ]

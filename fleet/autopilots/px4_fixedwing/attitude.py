@@ -18,12 +18,12 @@ from fleet.autopilots.px4_fixedwing import params as P
 from fleet.autopilots.px4_fixedwing import state as X
 from fleet.frames import G
 
-_STEEPEST = 1.4  # limit of roll and pitch in the turn equations [rad]
+_MAX_ANGLE = 1.4  # limit of roll and pitch in the turn equations [rad]
 _P, _I, _IMAX = 1, 2, 3  # offsets of the gains from FF in `par`, for each axis
 
 
 @kernel
-def _known(par: np.ndarray, Va: float) -> float:
+def _limited_airspeed(par: np.ndarray, Va: float) -> float:
     """Return the limited airspeed; nan is replaced by cruise [m/s]."""
     return clip(Va, par[P.VA_MIN], par[P.VA_MAX]) if np.isfinite(Va) else par[P.VA_CRUISE]
 
@@ -31,7 +31,7 @@ def _known(par: np.ndarray, Va: float) -> float:
 @kernel
 def scaler(par: np.ndarray, Va: float) -> float:
     """Return the dynamic-pressure scaler [-]."""
-    return par[P.VA_CRUISE] / _known(par, Va) if par[P.SCALED] > 0.0 else 1.0
+    return par[P.VA_CRUISE] / _limited_airspeed(par, Va) if par[P.SCALED] > 0.0 else 1.0
 
 
 @kernel
@@ -39,9 +39,9 @@ def rate_demands(
     par: np.ndarray, phi_c: float, theta_c: float, euler: np.ndarray, Va: float
 ) -> tuple[float, float, float]:
     """Return the body rate demands [rad/s]."""
-    phi, theta = clip(euler[0], -_STEEPEST, _STEEPEST), clip(euler[1], -_STEEPEST, _STEEPEST)
+    phi, theta = clip(euler[0], -_MAX_ANGLE, _MAX_ANGLE), clip(euler[1], -_MAX_ANGLE, _MAX_ANGLE)
     phi_dot, theta_dot = (phi_c - euler[0]) / par[P.ROLL_TC], (theta_c - euler[1]) / par[P.PITCH_TC]
-    psi_dot = G * tan(phi) * cos(theta) / (_known(par, Va) * par[P.EAS2TAS])
+    psi_dot = G * tan(phi) * cos(theta) / (_limited_airspeed(par, Va) * par[P.EAS2TAS])
     p_d = phi_dot - sin(theta) * psi_dot
     q_d = cos(phi) * theta_dot + cos(theta) * sin(phi) * psi_dot
     r_d = -sin(phi) * theta_dot + cos(theta) * cos(phi) * psi_dot
@@ -54,15 +54,15 @@ def rate_demands(
 
 @kernel
 def _rate_loop(
-    ctl: np.ndarray, par: np.ndarray, slots: tuple[int, int, int], wanted: float, rate: float, s: float, dt: float
+    ctl: np.ndarray, par: np.ndarray, slots: tuple[int, int, int], rate_c: float, rate: float, s: float, dt: float
 ) -> float:
     """Convert a rate demand [rad/s] to a surface -1..1; slots: FF in `par`, integrator and last surface in `ctl`."""
     ff, i, last = slots
-    error = wanted - rate
+    error = rate_c - rate
     step = error * par[ff + _I] * dt
     if abs(ctl[last]) < 1.0 or step * ctl[last] < 0.0:  # anti-windup: at full throw integrate only towards zero
         ctl[i] = clip(ctl[i] + step, -par[ff + _IMAX], par[ff + _IMAX])
-    ctl[last] = par[ff] * wanted * s + s * s * (par[ff + _P] * error + ctl[i])
+    ctl[last] = par[ff] * rate_c * s + s * s * (par[ff + _P] * error + ctl[i])
     return clip(ctl[last], -1.0, 1.0)
 
 

@@ -9,68 +9,68 @@ from math import radians
 import numpy as np
 
 from fleet.autopilots.common.parameter_vector import PX4, padded
-from fleet.autopilots.common.parameters import Row, eas2tas, find
+from fleet.autopilots.common.parameters import ParameterSpec, eas2tas, lookup
 
 _DEG = radians(1.0)
 
 TABLE = (
-    Row("NPFG_PERIOD", 10, 1, 1, 100),
-    Row("NPFG_DAMPING", 0.7071, 1, 0.1, 1),
-    Row("NPFG_ROLL_TC", 0.5, 1, 0.05, 2),
-    Row("NPFG_SW_DST_MLT", 0.32, 1, 0.1, 1),
-    Row("NPFG_PERIOD_SF", 1.5, 1, 1, 3),
-    Row("NPFG_LB_PERIOD", 1, 1, 0, 1),
-    Row("FW_R_LIM", 50, _DEG, 10, 80),
-    Row("FW_PN_R_SLEW_MAX", 90, _DEG, 0, 1000, (("FW_L1_R_SLEW_MAX", 1),)),
-    Row("NAV_ACC_RAD", 10, 1, 0.05, 1e4),
-    Row("NAV_LOITER_RAD", 80, 1, -1e4, 1e4),
-    Row("NAV_FW_ALT_RAD", 10, 1, 0.05, 1e4),
-    Row("FW_T_CLMB_MAX", 5, 1, 0.5, 100),
-    Row("FW_T_SINK_MIN", 2, 1, 0.1, 100),
-    Row("FW_T_SINK_MAX", 5, 1, 0.5, 100),
-    Row("FW_T_CLMB_R_SP", 3, 1, 0.1, 100),
-    Row("FW_T_SINK_R_SP", 2, 1, 0.1, 100),
-    Row("FW_T_ALT_TC", 5, 1, 0.5, 100),
-    Row("FW_T_TAS_TC", 5, 1, 0.5, 100),
-    Row("FW_T_HRATE_FF", 0.3, 1, 0, 1),
-    Row("FW_T_PTCH_DAMP", 0.1, 1, 0, 10),
-    Row("FW_T_THR_DAMPING", 0.05, 1, 0, 10, (("FW_T_THR_DAMP", 1),)),
-    Row("FW_T_I_GAIN_PIT", 0.1, 1, 0, 10, (("FW_T_INTEG_GAIN", 1),)),
-    Row("FW_T_THR_INTEG", 0.02, 1, 0, 10, (("FW_T_I_GAIN_THR", 1), ("FW_T_INTEG_GAIN", 1))),
-    Row("FW_T_SPDWEIGHT", 1, 1, 0, 2),
-    Row("FW_T_VERT_ACC", 7, 1, 0.1, 100),
-    Row("FW_T_RLL2THR", 15, 1, 0, 1000),
-    Row("FW_T_STE_R_TC", 0.4, 1, 0, 10),
-    Row("FW_T_SEB_R_FF", 1, 1, 0, 10),
-    Row("FW_THR_TRIM", 0.6, 1, 0, 1, (("FW_THR_CRUISE", 1),)),
-    Row("FW_THR_MIN", 0, 1, 0, 1),
-    Row("FW_THR_MAX", 1, 1, 0.01, 1),
-    Row("FW_THR_SLEW_MAX", 0, 1, 0, 100),
-    Row("FW_AIRSPD_TRIM", 15, 1, 1, 300),
-    Row("FW_AIRSPD_MIN", 10, 1, 1, 300),
-    Row("FW_AIRSPD_MAX", 20, 1, 1, 300),
-    Row("FW_P_LIM_MAX", 30, _DEG, 1, 90),
-    Row("FW_P_LIM_MIN", -30, _DEG, -90, -1),
-    Row("FW_PSP_OFF", 0, _DEG, -90, 90),
-    Row("FW_R_TC", 0.4, 1, 0.05, 10),
-    Row("FW_P_TC", 0.4, 1, 0.05, 10),
-    Row("FW_R_RMAX", 70, _DEG, 0, 1000),
-    Row("FW_P_RMAX_POS", 60, _DEG, 0, 1000),
-    Row("FW_P_RMAX_NEG", 60, _DEG, 0, 1000),
-    Row("FW_Y_RMAX", 50, _DEG, 0, 1000),
-    Row("FW_ARSP_SCALE_EN", 1, 1, 0, 1),
-    Row("FW_RR_FF", 0.5, 1, 0, 100),
-    Row("FW_RR_P", 0.05, 1, 0, 100),
-    Row("FW_RR_I", 0.1, 1, 0, 100),
-    Row("FW_RR_IMAX", 0.2, 1, 0, 1),
-    Row("FW_PR_FF", 0.5, 1, 0, 100),
-    Row("FW_PR_P", 0.08, 1, 0, 100),
-    Row("FW_PR_I", 0.1, 1, 0, 100),
-    Row("FW_PR_IMAX", 0.4, 1, 0, 1),
-    Row("FW_YR_FF", 0.3, 1, 0, 100),
-    Row("FW_YR_P", 0.05, 1, 0, 100),
-    Row("FW_YR_I", 0.1, 1, 0, 100),
-    Row("FW_YR_IMAX", 0.2, 1, 0, 1),
+    ParameterSpec("NPFG_PERIOD", 10, 1, 1, 100),
+    ParameterSpec("NPFG_DAMPING", 0.7071, 1, 0.1, 1),
+    ParameterSpec("NPFG_ROLL_TC", 0.5, 1, 0.05, 2),
+    ParameterSpec("NPFG_SW_DST_MLT", 0.32, 1, 0.1, 1),
+    ParameterSpec("NPFG_PERIOD_SF", 1.5, 1, 1, 3),
+    ParameterSpec("NPFG_LB_PERIOD", 1, 1, 0, 1),
+    ParameterSpec("FW_R_LIM", 50, _DEG, 10, 80),
+    ParameterSpec("FW_PN_R_SLEW_MAX", 90, _DEG, 0, 1000, (("FW_L1_R_SLEW_MAX", 1),)),
+    ParameterSpec("NAV_ACC_RAD", 10, 1, 0.05, 1e4),
+    ParameterSpec("NAV_LOITER_RAD", 80, 1, -1e4, 1e4),
+    ParameterSpec("NAV_FW_ALT_RAD", 10, 1, 0.05, 1e4),
+    ParameterSpec("FW_T_CLMB_MAX", 5, 1, 0.5, 100),
+    ParameterSpec("FW_T_SINK_MIN", 2, 1, 0.1, 100),
+    ParameterSpec("FW_T_SINK_MAX", 5, 1, 0.5, 100),
+    ParameterSpec("FW_T_CLMB_R_SP", 3, 1, 0.1, 100),
+    ParameterSpec("FW_T_SINK_R_SP", 2, 1, 0.1, 100),
+    ParameterSpec("FW_T_ALT_TC", 5, 1, 0.5, 100),
+    ParameterSpec("FW_T_TAS_TC", 5, 1, 0.5, 100),
+    ParameterSpec("FW_T_HRATE_FF", 0.3, 1, 0, 1),
+    ParameterSpec("FW_T_PTCH_DAMP", 0.1, 1, 0, 10),
+    ParameterSpec("FW_T_THR_DAMPING", 0.05, 1, 0, 10, (("FW_T_THR_DAMP", 1),)),
+    ParameterSpec("FW_T_I_GAIN_PIT", 0.1, 1, 0, 10, (("FW_T_INTEG_GAIN", 1),)),
+    ParameterSpec("FW_T_THR_INTEG", 0.02, 1, 0, 10, (("FW_T_I_GAIN_THR", 1), ("FW_T_INTEG_GAIN", 1))),
+    ParameterSpec("FW_T_SPDWEIGHT", 1, 1, 0, 2),
+    ParameterSpec("FW_T_VERT_ACC", 7, 1, 0.1, 100),
+    ParameterSpec("FW_T_RLL2THR", 15, 1, 0, 1000),
+    ParameterSpec("FW_T_STE_R_TC", 0.4, 1, 0, 10),
+    ParameterSpec("FW_T_SEB_R_FF", 1, 1, 0, 10),
+    ParameterSpec("FW_THR_TRIM", 0.6, 1, 0, 1, (("FW_THR_CRUISE", 1),)),
+    ParameterSpec("FW_THR_MIN", 0, 1, 0, 1),
+    ParameterSpec("FW_THR_MAX", 1, 1, 0.01, 1),
+    ParameterSpec("FW_THR_SLEW_MAX", 0, 1, 0, 100),
+    ParameterSpec("FW_AIRSPD_TRIM", 15, 1, 1, 300),
+    ParameterSpec("FW_AIRSPD_MIN", 10, 1, 1, 300),
+    ParameterSpec("FW_AIRSPD_MAX", 20, 1, 1, 300),
+    ParameterSpec("FW_P_LIM_MAX", 30, _DEG, 1, 90),
+    ParameterSpec("FW_P_LIM_MIN", -30, _DEG, -90, -1),
+    ParameterSpec("FW_PSP_OFF", 0, _DEG, -90, 90),
+    ParameterSpec("FW_R_TC", 0.4, 1, 0.05, 10),
+    ParameterSpec("FW_P_TC", 0.4, 1, 0.05, 10),
+    ParameterSpec("FW_R_RMAX", 70, _DEG, 0, 1000),
+    ParameterSpec("FW_P_RMAX_POS", 60, _DEG, 0, 1000),
+    ParameterSpec("FW_P_RMAX_NEG", 60, _DEG, 0, 1000),
+    ParameterSpec("FW_Y_RMAX", 50, _DEG, 0, 1000),
+    ParameterSpec("FW_ARSP_SCALE_EN", 1, 1, 0, 1),
+    ParameterSpec("FW_RR_FF", 0.5, 1, 0, 100),
+    ParameterSpec("FW_RR_P", 0.05, 1, 0, 100),
+    ParameterSpec("FW_RR_I", 0.1, 1, 0, 100),
+    ParameterSpec("FW_RR_IMAX", 0.2, 1, 0, 1),
+    ParameterSpec("FW_PR_FF", 0.5, 1, 0, 100),
+    ParameterSpec("FW_PR_P", 0.08, 1, 0, 100),
+    ParameterSpec("FW_PR_I", 0.1, 1, 0, 100),
+    ParameterSpec("FW_PR_IMAX", 0.4, 1, 0, 1),
+    ParameterSpec("FW_YR_FF", 0.3, 1, 0, 100),
+    ParameterSpec("FW_YR_P", 0.05, 1, 0, 100),
+    ParameterSpec("FW_YR_I", 0.1, 1, 0, 100),
+    ParameterSpec("FW_YR_IMAX", 0.2, 1, 0, 1),
 )
 
 # Index of each parameter in `par`, in the order of the table.
@@ -86,7 +86,7 @@ EAS2TAS = len(TABLE)  # ratio of true to equivalent airspeed [-]
 
 NAMES = tuple(row.name for row in TABLE)
 DEFAULTS: dict[str, float] = {row.name: float(row.default) for row in TABLE}
-_TOGETHER = (  # lower limit, upper limit, value: all reset to defaults if inconsistent
+_CONSISTENT_GROUPS = (  # lower limit, upper limit, value: all reset to defaults if inconsistent
     (VA_MIN, VA_MAX, VA_CRUISE),
     (THR_MIN, THR_MAX, THR_TRIM),
 )
@@ -102,12 +102,14 @@ def parameters(values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np
         par: SI and rad, throttles 0..1, no wind, (N_PAR,)
         absent: names that are missing, not finite or out of range; `par` contains their defaults
     """
-    given = {name: float(value) for name, value in values.items()}
-    found = [find(row, given) for row in TABLE]
-    absent = [row.name for row, value in zip(TABLE, found, strict=True) if value is None]
-    own = np.array([(row.default if v is None else v) * row.factor for row, v in zip(TABLE, found, strict=True)])
-    for group in _TOGETHER:
-        if not own[group[0]] < own[group[1]]:
-            own[list(group)] = [TABLE[i].default * TABLE[i].factor for i in group]
+    inputs = {name: float(value) for name, value in values.items()}
+    matches = [lookup(row, inputs) for row in TABLE]
+    absent = [row.name for row, value in zip(TABLE, matches, strict=True) if value is None]
+    values_si = np.array(
+        [(row.default if v is None else v) * row.factor for row, v in zip(TABLE, matches, strict=True)]
+    )
+    for group in _CONSISTENT_GROUPS:
+        if not values_si[group[0]] < values_si[group[1]]:
+            values_si[list(group)] = [TABLE[i].default * TABLE[i].factor for i in group]
             absent += [TABLE[i].name for i in group]
-    return padded(np.append(own, eas2tas(altitude_m)), PX4), tuple(dict.fromkeys(absent))
+    return padded(np.append(values_si, eas2tas(altitude_m)), PX4), tuple(dict.fromkeys(absent))

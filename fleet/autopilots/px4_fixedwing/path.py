@@ -15,27 +15,27 @@ from fleet.autopilots.px4_fixedwing import npfg
 from fleet.autopilots.px4_fixedwing import params as P
 from fleet.autopilots.px4_fixedwing import state as X
 from fleet.frames import wrap
-from fleet.mission import ACCEPT, KIND, LAND, LOITER_UNLIMITED, P_D, P_E, P_N, RADIUS, TAKEOFF, WAYPOINT
+from fleet.mission import ACCEPT_RADIUS, KIND, LAND, LOITER_UNLIMITED, P_D, P_E, P_N, RADIUS, TAKEOFF, WAYPOINT
 
-_EXIT = pi / 15  # exit from a circle within 12 deg of the exit course, if required [rad]
-_ON = 1.2  # distance to a circle, in switch distances, that counts as reached [-]
+_EXIT_SECTOR = pi / 15  # exit from a circle within 12 deg of the exit course, if required [rad]
+_CIRCLE_MARGIN = 1.2  # distance to a circle, in switch distances, that counts as reached [-]
 
 
 @kernel
 def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndarray) -> None:
     """Switch to leg `k`; its line starts at the point of the previous leg, else at the aircraft `p`, NED (3,) [m]."""
-    i = leg_rules.current(ctl, legs)
-    onward = i >= 0 and k == i + 1 and int(legs[i, KIND]) != TAKEOFF
-    leg_rules.set_leg(ctl, par, legs, k, legs[i, P_N : P_D + 1] if onward else p)
-    ctl[S.LINE] = 1.0 if onward else 0.0
+    i = leg_rules.current_leg(ctl, legs)
+    continues = i >= 0 and k == i + 1 and int(legs[i, KIND]) != TAKEOFF
+    leg_rules.set_leg(ctl, par, legs, k, legs[i, P_N : P_D + 1] if continues else p)
+    ctl[S.FOLLOW_LINE] = 1.0 if continues else 0.0
 
 
 @kernel
 def _to_point(n: float, e: float, p: np.ndarray) -> tuple[float, float, float]:
     """Return the direction to a point, and zero crosstrack error."""
     d_n, d_e = n - p[0], e - p[1]
-    far = max(hypot(d_n, d_e), 0.1)
-    return d_n / far, d_e / far, 0.0
+    distance = max(hypot(d_n, d_e), 0.1)
+    return d_n / distance, d_e / distance, 0.0
 
 
 @kernel
@@ -84,7 +84,7 @@ def steer(
     Returns:
         lateral acceleration, right positive [m/s2]; whether the leg is complete
     """
-    i = leg_rules.current(ctl, legs)
+    i = leg_rules.current_leg(ctl, legs)
     if i < 0:
         return 0.0, False
     leg, kind = legs[i], int(legs[i, KIND])
@@ -95,9 +95,9 @@ def steer(
     radius = radius if abs(radius) > 1.0 else 1.0
     if kind in (WAYPOINT, LAND):
         return _along_line(par, ctl, leg, p, v, psi, V, reach, radius)
-    _count(ctl, par, leg, p, radius, reach, dt)
+    _update_circle(ctl, par, leg, p, radius, reach, dt)
     t_n, t_e, e, kappa = _circle(leg, p, radius)
-    return npfg.follow(par, t_n, t_e, e, kappa, v, psi, V), _circled(ctl, legs, i, p, v)
+    return npfg.follow(par, t_n, t_e, e, kappa, v, psi, V), _circle_done(ctl, legs, i, p, v)
 
 
 @kernel
@@ -106,46 +106,51 @@ def _along_line(
     reach: float, radius: float,
 ) -> tuple[float, bool]:  # fmt: skip
     """Follow the line to a waypoint; circle there while the height error is large."""
-    to_go, off = hypot(leg[P_N] - p[0], leg[P_E] - p[1]), abs(p[2] - leg[P_D])
+    to_go, alt_error = hypot(leg[P_N] - p[0], leg[P_E] - p[1]), abs(p[2] - leg[P_D])
     waypoint = int(leg[KIND]) == WAYPOINT
-    if waypoint and to_go < 2.0 * abs(radius) and off > 2.0 * par[P.ALT_RAD] and (to_go < reach or ctl[S.AROUND] > 0):
-        ctl[S.AROUND] = 1.0
-    elif off < par[P.ALT_RAD]:
-        ctl[S.AROUND] = 0.0
-    if ctl[S.AROUND] > 0.0:
+    if (
+        waypoint
+        and to_go < 2.0 * abs(radius)
+        and alt_error > 2.0 * par[P.ALT_RAD]
+        and (to_go < reach or ctl[S.CIRCLING] > 0)
+    ):
+        ctl[S.CIRCLING] = 1.0
+    elif alt_error < par[P.ALT_RAD]:
+        ctl[S.CIRCLING] = 0.0
+    if ctl[S.CIRCLING] > 0.0:
         t_n, t_e, e, kappa = _circle(leg, p, radius)
         return npfg.follow(par, t_n, t_e, e, kappa, v, psi, V), False
     t_n, t_e, e = _line(ctl, leg, p, reach)
-    over = waypoint and to_go <= max(reach, leg[ACCEPT]) and off <= par[P.ALT_RAD]
-    return npfg.follow(par, t_n, t_e, e, 0.0, v, psi, V), over
+    leg_done = waypoint and to_go <= max(reach, leg[ACCEPT_RADIUS]) and alt_error <= par[P.ALT_RAD]
+    return npfg.follow(par, t_n, t_e, e, 0.0, v, psi, V), leg_done
 
 
 @kernel
-def _count(
+def _update_circle(
     ctl: np.ndarray, par: np.ndarray, leg: np.ndarray, p: np.ndarray, radius: float, reach: float, dt: float
 ) -> None:
     """Integrate angle and time since reaching the circle at its height."""
     out_n, out_e = leg[P_N] - p[0], leg[P_E] - p[1]
     bearing = atan2(out_e, out_n)
-    if ctl[S.ON] > 0.0:
+    if ctl[S.CIRCLE_REACHED] > 0.0:
         ctl[S.ANGLE] += wrap(bearing - ctl[S.BEARING]) * (1.0 if radius > 0.0 else -1.0)
         ctl[S.TIMER] += dt
-    elif abs(hypot(out_n, out_e) - abs(radius)) < _ON * reach and abs(p[2] - leg[P_D]) < par[P.ALT_RAD]:
-        ctl[S.ON] = 1.0
+    elif abs(hypot(out_n, out_e) - abs(radius)) < _CIRCLE_MARGIN * reach and abs(p[2] - leg[P_D]) < par[P.ALT_RAD]:
+        ctl[S.CIRCLE_REACHED] = 1.0
     ctl[S.BEARING] = bearing
 
 
 @kernel
-def _circled(ctl: np.ndarray, legs: np.ndarray, i: int, p: np.ndarray, v: np.ndarray) -> bool:
+def _circle_done(ctl: np.ndarray, legs: np.ndarray, i: int, p: np.ndarray, v: np.ndarray) -> bool:
     """Return whether a circle is complete: time or height reached, and exit course if required."""
     leg = legs[i]
-    if i + 1 >= legs.shape[0] or int(leg[KIND]) == LOITER_UNLIMITED or ctl[S.ON] == 0.0:
+    if i + 1 >= legs.shape[0] or int(leg[KIND]) == LOITER_UNLIMITED or ctl[S.CIRCLE_REACHED] == 0.0:
         return False
-    if not leg_rules.ready(ctl, leg, p):
+    if not leg_rules.exit_condition_met(ctl, leg, p):
         return False
     out_n, out_e = legs[i + 1, P_N] - p[0], legs[i + 1, P_E] - p[1]
     inside = hypot(legs[i + 1, P_N] - leg[P_N], legs[i + 1, P_E] - leg[P_E]) < abs(leg[RADIUS])
-    return leg[ACCEPT] == 0.0 or inside or abs(angle_to(v[0], v[1], out_n, out_e)) <= _EXIT
+    return leg[ACCEPT_RADIUS] == 0.0 or inside or abs(angle_to(v[0], v[1], out_n, out_e)) <= _EXIT_SECTOR
 
 
 @kernel
@@ -157,15 +162,20 @@ def height_demand(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndar
         p: position, NED, (3,) [m]
         speed: over ground [m/s]
     """
-    i = leg_rules.current(ctl, legs)
+    i = leg_rules.current_leg(ctl, legs)
     if i < 0:
         return -ctl[S.PREV_D]
     leg = legs[i]
     to_go = hypot(leg[P_N] - p[0], leg[P_E] - p[1])
-    ctl[X.NEAREST] = to_go if ctl[X.NEAREST] < 0.0 else min(to_go, ctl[X.NEAREST])
-    near = max(npfg.switch_distance(par, speed), abs(leg[RADIUS]))
+    ctl[X.MIN_DISTANCE] = to_go if ctl[X.MIN_DISTANCE] < 0.0 else min(to_go, ctl[X.MIN_DISTANCE])
+    switch_radius = max(npfg.switch_distance(par, speed), abs(leg[RADIUS]))
     length = hypot(leg[P_N] - ctl[S.PREV_N], leg[P_E] - ctl[S.PREV_E])
-    if ctl[S.LINE] == 0.0 or length <= near or ctl[S.ON] + ctl[S.AROUND] > 0.0 or int(leg[KIND]) == TAKEOFF:
+    if (
+        ctl[S.FOLLOW_LINE] == 0.0
+        or length <= switch_radius
+        or ctl[S.CIRCLE_REACHED] + ctl[S.CIRCLING] > 0.0
+        or int(leg[KIND]) == TAKEOFF
+    ):
         return -leg[P_D]
-    left = clip((ctl[X.NEAREST] - near) / (length - near), 0.0, 1.0)
-    return -leg[P_D] + (leg[P_D] - ctl[S.PREV_D]) * left
+    fraction_left = clip((ctl[X.MIN_DISTANCE] - switch_radius) / (length - switch_radius), 0.0, 1.0)
+    return -leg[P_D] + (leg[P_D] - ctl[S.PREV_D]) * fraction_left

@@ -4,7 +4,7 @@ Leg, airspeed filter, throttle and pitch have the indices of the ArduPlane contr
 that both share code. The indices below have a different meaning here.
 """
 
-NEAREST = 10  # minimum distance to the waypoint so far, -1 before [m]
+MIN_DISTANCE = 10  # minimum distance to the waypoint so far, -1 before [m]
 PHI = 12  # roll demand, slew-limited [rad]
 H_REF, H_DOT_REF = 25, 26  # height reference, up positive [m], and its rate [m/s]
 STE_DOT = 31  # filtered total energy rate [m2/s3]

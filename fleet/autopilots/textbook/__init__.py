@@ -10,7 +10,7 @@ The path changes from a line to the fillet (radius `R_fillet`) and to the next l
 Source: Beard & McLain, "Small Unmanned Aircraft" (2012), chapters 6, 10 and 11; the feed-forward terms are additions.
 """
 
-from fleet.autopilots.textbook.loops import fly, init, shift, stabilise
+from fleet.autopilots.textbook.loops import align_integrators, fly, init, stabilise
 from fleet.autopilots.textbook.params import DEFAULTS, NAMES, TABLE, parameters
 from fleet.autopilots.textbook.path import begin, height_demand
 
@@ -21,11 +21,11 @@ __all__ = [
     "LAW",
     "NAMES",
     "TABLE",
+    "align_integrators",
     "begin",
     "fly",
     "height_demand",
     "init",
     "parameters",
-    "shift",
     "stabilise",
 ]

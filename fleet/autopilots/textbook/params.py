@@ -9,34 +9,34 @@ from math import pi
 import numpy as np
 
 from fleet.autopilots.common.parameter_vector import TEXTBOOK, padded
-from fleet.autopilots.common.parameters import Row, eas2tas, find
+from fleet.autopilots.common.parameters import ParameterSpec, eas2tas, lookup
 
 TABLE = (
-    Row("chi_inf", pi / 3, 1, 0.1, pi / 2),
-    Row("k_path", 0.025, 1, 1e-4, 1),
-    Row("k_orbit", 4.0, 1, 0.1, 100),
-    Row("R_fillet", 75.0, 1, 1, 1e5),
-    Row("R_orbit", 80.0, 1, -1e5, 1e5),
-    Row("omega_chi", 0.6, 1, 0.01, 10),
-    Row("zeta_chi", 1.0, 1, 0.1, 5),
-    Row("k_i_chi", 0.0, 1, 0, 10),
-    Row("phi_max", pi / 4, 1, 0.05, 1.4),
-    Row("k_p_h", 0.012, 1, 0, 1),
-    Row("k_i_h", 0.001, 1, 0, 1),
-    Row("theta_max", 0.35, 1, 0.05, 1.2),
-    Row("climb_max", 4.0, 1, 0.1, 100),
-    Row("sink_max", 3.0, 1, 0.1, 100),
-    Row("Va_c", 15.0, 1, 1, 300),
-    Row("k_p_V", 0.05, 1, 0, 10),
-    Row("k_i_V", 0.01, 1, 0, 10),
-    Row("k_ff_h", 0.08, 1, 0, 10),
-    Row("k_ff_n", 0.05, 1, 0, 10),
-    Row("delta_t_trim", 0.5, 1, 0, 1),
-    Row("k_p_phi", 1.0, 1, 0, 100),
-    Row("k_d_phi", 0.1, 1, 0, 100),
-    Row("k_p_theta", 1.0, 1, 0, 100),
-    Row("k_d_theta", 0.2, 1, 0, 100),
-    Row("k_i_theta", 0.2, 1, 0, 100),
+    ParameterSpec("chi_inf", pi / 3, 1, 0.1, pi / 2),
+    ParameterSpec("k_path", 0.025, 1, 1e-4, 1),
+    ParameterSpec("k_orbit", 4.0, 1, 0.1, 100),
+    ParameterSpec("R_fillet", 75.0, 1, 1, 1e5),
+    ParameterSpec("R_orbit", 80.0, 1, -1e5, 1e5),
+    ParameterSpec("omega_chi", 0.6, 1, 0.01, 10),
+    ParameterSpec("zeta_chi", 1.0, 1, 0.1, 5),
+    ParameterSpec("k_i_chi", 0.0, 1, 0, 10),
+    ParameterSpec("phi_max", pi / 4, 1, 0.05, 1.4),
+    ParameterSpec("k_p_h", 0.012, 1, 0, 1),
+    ParameterSpec("k_i_h", 0.001, 1, 0, 1),
+    ParameterSpec("theta_max", 0.35, 1, 0.05, 1.2),
+    ParameterSpec("climb_max", 4.0, 1, 0.1, 100),
+    ParameterSpec("sink_max", 3.0, 1, 0.1, 100),
+    ParameterSpec("Va_c", 15.0, 1, 1, 300),
+    ParameterSpec("k_p_V", 0.05, 1, 0, 10),
+    ParameterSpec("k_i_V", 0.01, 1, 0, 10),
+    ParameterSpec("k_ff_h", 0.08, 1, 0, 10),
+    ParameterSpec("k_ff_n", 0.05, 1, 0, 10),
+    ParameterSpec("delta_t_trim", 0.5, 1, 0, 1),
+    ParameterSpec("k_p_phi", 1.0, 1, 0, 100),
+    ParameterSpec("k_d_phi", 0.1, 1, 0, 100),
+    ParameterSpec("k_p_theta", 1.0, 1, 0, 100),
+    ParameterSpec("k_d_theta", 0.2, 1, 0, 100),
+    ParameterSpec("k_i_theta", 0.2, 1, 0, 100),
 )
 (
     CHI_INF, K_PATH, K_ORBIT, FILLET, ORBIT, OMEGA, ZETA, K_I_CHI, PHI_MAX, K_P_H, K_I_H, THETA_MAX, CLIMB, SINK,
@@ -50,8 +50,8 @@ DEFAULTS: dict[str, float] = {row.name: float(row.default) for row in TABLE}
 
 def parameters(values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np.ndarray, tuple[str, ...]]:
     """Convert parameters to the vector for the kernels; arguments and result as for PX4."""
-    given = {name: float(value) for name, value in values.items()}
-    found = [find(row, given) for row in TABLE]
-    own = [row.default if value is None else value for row, value in zip(TABLE, found, strict=True)]
-    absent = tuple(row.name for row, value in zip(TABLE, found, strict=True) if value is None)
-    return padded(np.array([*own, eas2tas(altitude_m)], float), TEXTBOOK), absent
+    inputs = {name: float(value) for name, value in values.items()}
+    matches = [lookup(row, inputs) for row in TABLE]
+    resolved = [row.default if value is None else value for row, value in zip(TABLE, matches, strict=True)]
+    absent = tuple(row.name for row, value in zip(TABLE, matches, strict=True) if value is None)
+    return padded(np.array([*resolved, eas2tas(altitude_m)], float), TEXTBOOK), absent

@@ -15,39 +15,42 @@ from fleet.autopilots.textbook import state as X
 from fleet.frames import G, wrap
 from fleet.mission import KIND, LAND, LOITER_UNLIMITED, P_D, P_E, P_N, RADIUS, TAKEOFF, WAYPOINT
 
-_ON = 1.3  # distance to the centre, in radii, that counts as orbit reached [-]
-_SHARPEST = 2.6  # maximum turn angle of a fillet [rad]
+_ORBIT_MARGIN = 1.3  # distance to the centre, in radii, that counts as orbit reached [-]
+_MAX_FILLET_TURN = 2.6  # maximum turn angle of a fillet [rad]
 
 
 @kernel
-def _turn(ctl: np.ndarray, leg: np.ndarray, after: np.ndarray) -> tuple[float, float, float, float, float]:
+def _turn_angle(ctl: np.ndarray, leg: np.ndarray, next_leg: np.ndarray) -> tuple[float, float, float, float, float]:
     """Return the directions of this line and the next, and the turn angle between them, right positive [rad]."""
-    here = atan2(leg[P_E] - ctl[S.PREV_E], leg[P_N] - ctl[S.PREV_N])
-    there = atan2(after[P_E] - leg[P_E], after[P_N] - leg[P_N])
-    return cos(here), sin(here), cos(there), sin(there), wrap(there - here)
+    chi_line = atan2(leg[P_E] - ctl[S.PREV_E], leg[P_N] - ctl[S.PREV_N])
+    chi_next = atan2(next_leg[P_E] - leg[P_E], next_leg[P_N] - leg[P_N])
+    return cos(chi_line), sin(chi_line), cos(chi_next), sin(chi_next), wrap(chi_next - chi_line)
 
 
 @kernel
-def _cut(par: np.ndarray, turn: float) -> float:
+def _fillet_distance(par: np.ndarray, turn: float) -> float:
     """Return the distance from the corner to the tangent points of the fillet [m]."""
-    return par[P.FILLET] * tan(min(abs(turn), _SHARPEST) / 2)
+    return par[P.FILLET] * tan(min(abs(turn), _MAX_FILLET_TURN) / 2)
 
 
 @kernel
 def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndarray) -> None:
     """Switch to leg `k` over a fillet, or from the aircraft `p`, NED (3,) [m], if the lines do not meet."""
-    i = leg_rules.current(ctl, legs)
-    onward = i >= 0 and k == i + 1 and k < legs.shape[0] and int(legs[i, KIND]) == WAYPOINT
-    if not onward:
+    i = leg_rules.current_leg(ctl, legs)
+    continues = i >= 0 and k == i + 1 and k < legs.shape[0] and int(legs[i, KIND]) == WAYPOINT
+    if not continues:
         leg_rules.set_leg(ctl, par, legs, k, p)
-        ctl[X.SIDE] = 0.0
+        ctl[X.FILLET_SIDE] = 0.0
         return
-    q_n, q_e, _, _, turn = _turn(ctl, legs[i], legs[k])
-    side, cut = (1.0 if turn > 0.0 else -1.0), _cut(par, turn)
-    ctl[X.C_N] = legs[i, P_N] - cut * q_n - side * par[P.FILLET] * q_e
-    ctl[X.C_E] = legs[i, P_E] - cut * q_e + side * par[P.FILLET] * q_n
+    q_n, q_e, _, _, turn = _turn_angle(ctl, legs[i], legs[k])
+    side, tangent_distance = (1.0 if turn > 0.0 else -1.0), _fillet_distance(par, turn)
+    ctl[X.C_N] = legs[i, P_N] - tangent_distance * q_n - side * par[P.FILLET] * q_e
+    ctl[X.C_E] = legs[i, P_E] - tangent_distance * q_e + side * par[P.FILLET] * q_n
     leg_rules.set_leg(ctl, par, legs, k, legs[i, P_N : P_D + 1])
-    ctl[S.LINE], ctl[X.SIDE] = 1.0, side if abs(turn) > 0.02 and int(legs[k, KIND]) in (WAYPOINT, LAND) else 0.0
+    ctl[S.FOLLOW_LINE], ctl[X.FILLET_SIDE] = (
+        1.0,
+        side if abs(turn) > 0.02 and int(legs[k, KIND]) in (WAYPOINT, LAND) else 0.0,
+    )
 
 
 @kernel
@@ -64,11 +67,11 @@ def _to_line(ctl: np.ndarray, par: np.ndarray, leg: np.ndarray, p: np.ndarray, c
 @kernel
 def _to_orbit(par: np.ndarray, n: float, e: float, radius: float, p: np.ndarray, v: np.ndarray) -> tuple[float, float]:
     """Return course and bank on an orbit around (n, e), radius positive clockwise [m]. Source: eq. 10.13."""
-    d, wide = 1.0 if radius > 0.0 else -1.0, max(abs(radius), 1.0)
+    d, R = 1.0 if radius > 0.0 else -1.0, max(abs(radius), 1.0)
     out_n, out_e = p[0] - n, p[1] - e
-    chi = atan2(out_e, out_n) + d * (pi / 2 + atan(par[P.K_ORBIT] * (hypot(out_n, out_e) - wide) / wide))
-    near = abs(hypot(out_n, out_e) - wide) < 0.3 * wide
-    return chi, d * atan((v[0] ** 2 + v[1] ** 2) / (G * wide)) if near else 0.0
+    chi = atan2(out_e, out_n) + d * (pi / 2 + atan(par[P.K_ORBIT] * (hypot(out_n, out_e) - R) / R))
+    near_orbit = abs(hypot(out_n, out_e) - R) < 0.3 * R
+    return chi, d * atan((v[0] ** 2 + v[1] ** 2) / (G * R)) if near_orbit else 0.0
 
 
 @kernel
@@ -83,40 +86,42 @@ def course(
         chi: current course [rad]
         dt: step [s]
     """
-    i = leg_rules.current(ctl, legs)
+    i = leg_rules.current_leg(ctl, legs)
     if i < 0 or int(legs[i, KIND]) == TAKEOFF:
         return chi, 0.0, i >= 0 and p[2] <= legs[i, P_D]
-    leg, more = legs[i], i + 1 < legs.shape[0]
+    leg, has_next = legs[i], i + 1 < legs.shape[0]
     if int(leg[KIND]) not in (WAYPOINT, LAND):
         radius = leg[RADIUS] if leg[RADIUS] != 0.0 else par[P.ORBIT]
-        course, bank = _to_orbit(par, leg[P_N], leg[P_E], radius, p, v)
-        return course, bank, _orbited(ctl, leg, p, radius, dt) and more
+        chi_c, bank = _to_orbit(par, leg[P_N], leg[P_E], radius, p, v)
+        return chi_c, bank, _orbit_done(ctl, leg, p, radius, dt) and has_next
     along, length = leg_rules.along_line(ctl, leg, p)
-    if ctl[X.SIDE] != 0.0:
-        course, bank = _to_orbit(par, ctl[X.C_N], ctl[X.C_E], ctl[X.SIDE] * par[P.FILLET], p, v)
+    if ctl[X.FILLET_SIDE] != 0.0:
+        chi_c, bank = _to_orbit(par, ctl[X.C_N], ctl[X.C_E], ctl[X.FILLET_SIDE] * par[P.FILLET], p, v)
         q_n, q_e = (leg[P_N] - ctl[S.PREV_N]) / max(length, 0.1), (leg[P_E] - ctl[S.PREV_E]) / max(length, 0.1)
-        past = (ctl[X.C_N] - ctl[S.PREV_N]) * q_n + (ctl[X.C_E] - ctl[S.PREV_E]) * q_e
-        if along < past and along < length:
-            return course, bank, False
-        ctl[X.SIDE] = 0.0
-    cut = 0.0
-    if more and int(leg[KIND]) == WAYPOINT and int(legs[i + 1, KIND]) in (WAYPOINT, LAND):
-        cut = min(_cut(par, _turn(ctl, leg, legs[i + 1])[4]), 0.5 * length)
-    return _to_line(ctl, par, leg, p, chi), 0.0, int(leg[KIND]) == WAYPOINT and along > length - cut
+        fillet_end = (ctl[X.C_N] - ctl[S.PREV_N]) * q_n + (ctl[X.C_E] - ctl[S.PREV_E]) * q_e
+        if along < fillet_end and along < length:
+            return chi_c, bank, False
+        ctl[X.FILLET_SIDE] = 0.0
+    tangent_distance = 0.0
+    if has_next and int(leg[KIND]) == WAYPOINT and int(legs[i + 1, KIND]) in (WAYPOINT, LAND):
+        tangent_distance = min(_fillet_distance(par, _turn_angle(ctl, leg, legs[i + 1])[4]), 0.5 * length)
+    return _to_line(ctl, par, leg, p, chi), 0.0, int(leg[KIND]) == WAYPOINT and along > length - tangent_distance
 
 
 @kernel
-def _orbited(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray, radius: float, dt: float) -> bool:
+def _orbit_done(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray, radius: float, dt: float) -> bool:
     """Integrate angle and time on an orbit; return whether it is complete."""
     n, e = leg[P_N] - p[0], leg[P_E] - p[1]
     bearing = atan2(e, n)
-    if ctl[S.ON] > 0.0:
+    if ctl[S.CIRCLE_REACHED] > 0.0:
         ctl[S.ANGLE] += wrap(bearing - ctl[S.BEARING]) * (1.0 if radius > 0.0 else -1.0)
         ctl[S.TIMER] += dt
-    elif hypot(n, e) < _ON * abs(radius):
-        ctl[S.ON] = 1.0
+    elif hypot(n, e) < _ORBIT_MARGIN * abs(radius):
+        ctl[S.CIRCLE_REACHED] = 1.0
     ctl[S.BEARING] = bearing
-    return ctl[S.ON] > 0.0 and int(leg[KIND]) != LOITER_UNLIMITED and leg_rules.ready(ctl, leg, p)
+    return (
+        ctl[S.CIRCLE_REACHED] > 0.0 and int(leg[KIND]) != LOITER_UNLIMITED and leg_rules.exit_condition_met(ctl, leg, p)
+    )
 
 
 @kernel
@@ -127,10 +132,10 @@ def height_demand(ctl: np.ndarray, legs: np.ndarray, p: np.ndarray) -> float:
         ctl, legs: controller state, route
         p: position, NED, (3,) [m]
     """
-    i = leg_rules.current(ctl, legs)
+    i = leg_rules.current_leg(ctl, legs)
     if i < 0:
         return -ctl[S.PREV_D]
     along, length = leg_rules.along_line(ctl, legs[i], p)
-    if ctl[S.LINE] == 0.0 or length < 1.0 or ctl[S.ON] > 0.0 or int(legs[i, KIND]) == TAKEOFF:
+    if ctl[S.FOLLOW_LINE] == 0.0 or length < 1.0 or ctl[S.CIRCLE_REACHED] > 0.0 or int(legs[i, KIND]) == TAKEOFF:
         return -legs[i, P_D]
     return -ctl[S.PREV_D] + (ctl[S.PREV_D] - legs[i, P_D]) * clip(along / length, 0.0, 1.0)

@@ -10,13 +10,13 @@ import platform
 import sys
 from collections.abc import Iterator
 
-from fleet.access.entry import Entry
+from fleet.access.entry import BusConfig
 from fleet.bus.session import connect
-from fleet.config import entry, router_arguments
-from fleet.contract import Account
+from fleet.config import bus_config_from, router_arguments
+from fleet.contract import GatewayCounters
 from fleet.health import claims, door, machine
-from fleet.health.finding import BAD, Finding
-from fleet.process.sanitise import plain
+from fleet.health.finding import BAD, CheckResult
+from fleet.process.sanitise import printable
 
 EXAMPLES = """
   fleet doctor
@@ -34,30 +34,30 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print every finding; return exit code 1 if one of them is BAD."""
-    found = []
-    for finding in _looked(entry(args)):
-        found.append(finding)
+    findings = []
+    for finding in _checks(bus_config_from(args)):
+        findings.append(finding)
         if not args.json:
-            print(f"{finding.grade:5} {finding.what:14} {plain(finding.sentence)}", flush=True)
+            print(f"{finding.grade:5} {finding.what:14} {printable(finding.sentence)}", flush=True)
     if args.json:
-        json.dump([finding._asdict() for finding in found], sys.stdout, indent=1)
+        json.dump([finding._asdict() for finding in findings], sys.stdout, indent=1)
         print()
-    return int(any(finding.grade == BAD for finding in found))
+    return int(any(finding.grade == BAD for finding in findings))
 
 
-def _looked(at: Entry) -> Iterator[Finding]:
-    yield from machine.look()
-    yield from door.papers(at)
-    there = yield from door.router(at)
-    if not there:
+def _checks(bus_config: BusConfig) -> Iterator[CheckResult]:
+    yield from machine.check_machine()
+    yield from door.check_certificates(bus_config)
+    reachable = yield from door.check_router(bus_config)
+    if not reachable:
         yield machine.mavlink_port()
         return
     try:
-        bus = connect(at)
+        bus = connect(bus_config)
     except ConnectionError as error:
-        yield Finding(BAD, "router", str(error))
+        yield CheckResult(BAD, "router", str(error))
         return
     with bus:
-        here = [account for account, _ in bus.ask(Account) if account.machine == platform.node()]
-        yield machine.mavlink_port([link for account in here for link in account.links])
-        yield from claims.look(bus)
+        local = [counters for counters, _ in bus.get(GatewayCounters) if counters.machine == platform.node()]
+        yield machine.mavlink_port([link for counters in local for link in counters.links])
+        yield from claims.check_fleet(bus)

@@ -7,11 +7,11 @@ from threading import Event
 from typing import TYPE_CHECKING
 
 from fleet.cli import id_range, stop_on_signal
-from fleet.process.logs import say
+from fleet.process.logs import report_status
 
 if TYPE_CHECKING:
     from fleet.simulator.faults.fault import Fault
-    from fleet.simulator.flight.uav import PretendUav
+    from fleet.simulator.flight.uav import SimulatedUav
 
 EXAMPLES = """
   fleet fly --uavs 0-7
@@ -24,7 +24,7 @@ AUTOPILOTS, AIRCRAFT = (
     ("ardupilot", "px4"),
     ("small", "c172p"),
 )  # as in `fleet.simulator.flight.tuning`, which loads slowly
-_RECORDED_S = 300.0  # length of a recording when --for is not given [s]
+_DEFAULT_TLOG_S = 300.0  # length of a recording when --for is not given [s]
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -68,26 +68,27 @@ def run(args: argparse.Namespace) -> int:
         ValueError: when an option is invalid; the text names it.
     """
     from fleet.simulator.flight import drive  # loads JSBSim and the compiler: not for --help
-    from fleet.simulator.flight.uav import PretendUav
+    from fleet.simulator.flight.uav import SimulatedUav
     from fleet.simulator.vehicle.weather import turbulence_level
 
     _check(args)
     stop = stop_on_signal()
     level = turbulence_level(args.turbulence)
     host, port = _address(args.to)
-    kind = {"autopilot": args.autopilot, "aircraft": args.aircraft}
+    options = {"autopilot": args.autopilot, "aircraft": args.aircraft}
     faulty = faults_of(args, args.uavs)
     uavs = [
-        PretendUav(i, args.seed, wind=args.wind, turbulence=level, **kind, faults=faulty.get(i, ())) for i in args.uavs
+        SimulatedUav(i, args.seed, wind=args.wind, turbulence=level, **options, faults=faulty.get(i, ()))
+        for i in args.uavs
     ]
-    say("fly", "compiling the autopilot, first start only")
-    PretendUav(args.uavs[0], args.seed).step(0.2)
+    report_status("fly", "compiling the autopilot, first start only")
+    SimulatedUav(args.uavs[0], args.seed).step(0.2)
     if args.tlog is not None:
         _record(uavs, args, stop)
         return 0
-    say("fly", f"{len(uavs)} aircraft in the air, sending to {host}:{port}")
-    worst = drive.to_udp(uavs, (host, port), seconds=args.seconds, loss=args.loss, seed=args.seed, stop=stop)
-    say("fly", f"stopped; at most {worst * 1e3:.0f} ms behind real time")
+    report_status("fly", f"{len(uavs)} aircraft in the air, sending to {host}:{port}")
+    max_delay = drive.to_udp(uavs, (host, port), seconds=args.seconds, loss=args.loss, seed=args.seed, stop=stop)
+    report_status("fly", f"stopped; at most {max_delay * 1e3:.0f} ms behind real time")
     return 0
 
 
@@ -97,15 +98,15 @@ def faults_of(args: argparse.Namespace, uavs: range) -> "dict[int, tuple[Fault, 
     Raises:
         ValueError: when a fault is not applicable to the aircraft type, or the id is not simulated.
     """
-    from fleet.simulator.faults.kinds import read
+    from fleet.simulator.faults.kinds import parse_fault
 
-    which = uavs[0] if args.fault_uav is None else args.fault_uav
+    uav = uavs[0] if args.fault_uav is None else args.fault_uav
     if args.fault_uav is not None and not args.fault:
-        raise ValueError(f"--fault-uav: found {which} without a fault, expected one; add --fault")
-    if which not in uavs:
-        raise ValueError(f"--fault-uav: found {which}, expected one of {uavs[0]}-{uavs[-1]}; change --fault-uav")
-    faults = tuple(read(text, args.aircraft) for text in args.fault)
-    return {which: faults} if faults else {}
+        raise ValueError(f"--fault-uav: found {uav} without a fault, expected one; add --fault")
+    if uav not in uavs:
+        raise ValueError(f"--fault-uav: found {uav}, expected one of {uavs[0]}-{uavs[-1]}; change --fault-uav")
+    faults = tuple(parse_fault(text, args.aircraft) for text in args.fault)
+    return {uav: faults} if faults else {}
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -131,13 +132,13 @@ def _address(text: str) -> tuple[str, int]:
     return host, int(port)
 
 
-def _record(uavs: "Sequence[PretendUav]", args: argparse.Namespace, stop: Event) -> None:
+def _record(uavs: "Sequence[SimulatedUav]", args: argparse.Namespace, stop: Event) -> None:
     """Write the recording and show a progress bar."""
     from rich.progress import Progress
 
     from fleet.simulator.flight import drive
 
-    seconds = args.seconds or _RECORDED_S
+    seconds = args.seconds or _DEFAULT_TLOG_S
     with Progress(transient=True) as bar:
         task = bar.add_task(f"flying into {args.tlog.name}", total=seconds)
         frames = drive.to_tlog(
@@ -149,4 +150,4 @@ def _record(uavs: "Sequence[PretendUav]", args: argparse.Namespace, stop: Event)
             progress=lambda t: bar.update(task, completed=t),
             stop=stop,
         )
-    say("fly", f"{frames} frames of {len(uavs)} aircraft in {args.tlog}")
+    report_status("fly", f"{frames} frames of {len(uavs)} aircraft in {args.tlog}")

@@ -17,10 +17,10 @@ from fleet.bus.bus_protocol import Bus
 from fleet.bus.codec import Stamp, encode, encoding
 from fleet.bus.session import connect
 from fleet.cli import stop_on_signal
-from fleet.config import entry, router_arguments
+from fleet.config import bus_config_from, router_arguments
 from fleet.contract import TOPICS, Sample
-from fleet.process.logs import tell
-from fleet.telemetry.recording.fleet_log import Record
+from fleet.process.logs import report_progress
+from fleet.telemetry.recording.fleet_log import BusRecord
 
 EXAMPLES = """
   fleet record monday.parauav                  until Ctrl-C
@@ -28,9 +28,9 @@ EXAMPLES = """
   fleet record monday.parauav --overwrite --router tcp/192.168.1.10:7447
 """
 SUFFIX = ".parauav"
-MOST = 64 << 20  # bytes waiting for the disk; beyond, messages are dropped and counted
+MAX_BUFFER_BYTES = 64 << 20  # bytes waiting for the disk; beyond, messages are dropped and counted
 WRITE_S = 0.25  # between two writes: maximum loss in a crash [s]
-_PLAIN_S = 10.0  # between progress lines where the output is not a terminal [s]
+_LOG_PERIOD_S = 10.0  # between progress lines where the output is not a terminal [s]
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,13 +45,13 @@ def run(args: argparse.Namespace) -> int:
     """Record until stopped; return exit code 1 if messages were dropped."""
     _check(args)
     stop = stop_on_signal()
-    with connect(entry(args)) as bus, _opened(args.file, args.overwrite) as file:
-        recorder = Recorder(bus, file)
-        recorder.listen()
+    with connect(bus_config_from(args)) as bus, _open_file(args.file, args.overwrite) as file:
+        recorder = BusRecorder(bus, file)
+        recorder.subscribe()
         _record(recorder, args, stop)
-    tell("fleet record", f"{recorder.words()}; {args.file} is complete")
+    report_progress("fleet record", f"{recorder.summary()}; {args.file} is complete")
     if recorder.dropped:
-        tell("fleet record", f"{recorder.dropped} messages dropped, the disk was too slow")
+        report_progress("fleet record", f"{recorder.dropped} messages dropped, the disk was too slow")
     return 1 if recorder.dropped else 0
 
 
@@ -67,7 +67,7 @@ def _check(args: argparse.Namespace) -> None:
         raise ValueError(f"FILE: found {args.file.name!r}, expected a name that ends in {SUFFIX}; rename it")
 
 
-def _opened(path: Path, overwrite: bool) -> IO[bytes]:
+def _open_file(path: Path, overwrite: bool) -> IO[bytes]:
     try:
         return path.open("wb" if overwrite else "xb", buffering=0)
     except FileExistsError:
@@ -78,7 +78,7 @@ def _opened(path: Path, overwrite: bool) -> IO[bytes]:
         raise OSError(f"FILE: {str(path)!r} cannot be written ({error.strerror}); choose another place") from None
 
 
-class Recorder:
+class BusRecorder:
     """Pack received messages on threads of the bus, write them on the caller's thread.
 
     Args:
@@ -90,31 +90,31 @@ class Recorder:
         self.dropped = 0
         self.counts: Counter[str] = Counter()  # messages written, by topic
         self.size = 0  # bytes written
-        self._begun = time.monotonic()
-        self._zero = time.time() - self._begun  # independent of later changes of the system clock
+        self._started = time.monotonic()
+        self._clock_offset = time.time() - self._started  # independent of later changes of the system clock
         self._bus, self._file = bus, file
         self._lock = threading.Lock()
-        self._waiting = bytearray()
-        self._waiting_counts: Counter[str] = Counter()
+        self._buffer = bytearray()
+        self._buffer_counts: Counter[str] = Counter()
 
-    def listen(self) -> None:
+    def subscribe(self) -> None:
         """Query rarely published messages, so that a recording started in flight has the missions; then subscribe."""
         for kind in TOPICS.values():
             if kind is not Sample:
-                found: list[tuple[Any, Stamp | None]] = self._bus.ask(kind)
-                for message, stamp in found:
-                    self._hear(kind, encode(message), encoding(kind), stamp)
+                replies: list[tuple[Any, Stamp | None]] = self._bus.get(kind)
+                for message, stamp in replies:
+                    self._on_message(kind, encode(message), encoding(kind), stamp)
         for kind in TOPICS.values():
-            self._bus.overhear(kind, partial(self._hear, kind))
+            self._bus.subscribe_raw(kind, partial(self._on_message, kind))
 
-    def _hear(self, kind: type, payload: bytes, named: str, stamp: Stamp | None) -> None:
-        packed = Record(self._zero + time.monotonic(), named, payload, stamp).pack()
+    def _on_message(self, kind: type, payload: bytes, encoding_name: str, stamp: Stamp | None) -> None:
+        packed = BusRecord(self._clock_offset + time.monotonic(), encoding_name, payload, stamp).pack()
         with self._lock:
-            if len(self._waiting) + len(packed) > MOST:
+            if len(self._buffer) + len(packed) > MAX_BUFFER_BYTES:
                 self.dropped += 1
             else:
-                self._waiting += packed
-                self._waiting_counts[kind.topic] += 1  # type: ignore[attr-defined]
+                self._buffer += packed
+                self._buffer_counts[kind.topic] += 1  # type: ignore[attr-defined]
 
     def write(self) -> None:
         """Write the buffered messages.
@@ -123,38 +123,38 @@ class Recorder:
             OSError: when the disk is full or removed; the file is valid up to its last complete record.
         """
         with self._lock:
-            data, self._waiting = self._waiting, bytearray()
-            counts, self._waiting_counts = self._waiting_counts, Counter()
-        left = memoryview(data)
-        while left:
-            left = left[self._file.write(left) :]
+            data, self._buffer = self._buffer, bytearray()
+            counts, self._buffer_counts = self._buffer_counts, Counter()
+        unwritten = memoryview(data)
+        while unwritten:
+            unwritten = unwritten[self._file.write(unwritten) :]
         self.size += len(data)
         self.counts += counts
 
     @property
     def seconds(self) -> float:
         """Return the duration of the recording [s]."""
-        return time.monotonic() - self._begun
+        return time.monotonic() - self._started
 
-    def words(self) -> str:
+    def summary(self) -> str:
         """Describe the recorded amount."""
-        kinds = ", ".join(f"{n:,} {topic.lstrip('@')}" for topic, n in self.counts.most_common())
-        said = f"{self.seconds:.0f} s, {self.counts.total():,} messages, {self.size / 1e6:.1f} MB"
-        return f"{said} ({kinds or 'no messages yet: is a gateway running?'})"
+        by_topic = ", ".join(f"{n:,} {topic.lstrip('@')}" for topic, n in self.counts.most_common())
+        totals = f"{self.seconds:.0f} s, {self.counts.total():,} messages, {self.size / 1e6:.1f} MB"
+        return f"{totals} ({by_topic or 'no messages yet: is a gateway running?'})"
 
 
-def _record(recorder: Recorder, args: argparse.Namespace, stop: threading.Event) -> None:
+def _record(recorder: BusRecorder, args: argparse.Namespace, stop: threading.Event) -> None:
     """Write and show progress until stopped or the duration has elapsed."""
     console = Console(stderr=True)
-    due = _PLAIN_S
+    due = _LOG_PERIOD_S
     with Live(console=console, auto_refresh=False, transient=True) as live:
-        over = False
-        while not over:
-            left = args.seconds - recorder.seconds if args.seconds else WRITE_S
-            over = stop.wait(max(0.0, min(left, WRITE_S))) or (args.seconds and recorder.seconds >= args.seconds)
+        ended = False
+        while not ended:
+            remaining = args.seconds - recorder.seconds if args.seconds else WRITE_S
+            ended = stop.wait(max(0.0, min(remaining, WRITE_S))) or (args.seconds and recorder.seconds >= args.seconds)
             recorder.write()
             if console.is_terminal:
-                live.update(Text(f"recording {args.file.name}: {recorder.words()}"), refresh=True)
-            elif recorder.seconds >= due and not over:
-                due += _PLAIN_S
-                tell("fleet record", recorder.words())
+                live.update(Text(f"recording {args.file.name}: {recorder.summary()}"), refresh=True)
+            elif recorder.seconds >= due and not ended:
+                due += _LOG_PERIOD_S
+                report_progress("fleet record", recorder.summary())

@@ -7,13 +7,13 @@ from pathlib import Path
 from urllib.parse import quote
 
 from fleet.cli import stop_on_signal
-from fleet.config import passed_on, router_arguments
+from fleet.config import router_arguments, router_options
 from fleet.process.children import run_until
-from fleet.process.logs import tell
-from fleet.report.progress import shown
-from fleet.telemetry.recording.ids import Ids
+from fleet.process.logs import report_progress
+from fleet.report.progress import show_progress
+from fleet.telemetry.recording.ids import IdAllocator
 from fleet.telemetry.recording.pace import read_speed
-from fleet.telemetry.replay.broadcaster import MOST_ON_A_LINK, Airing, address, shared
+from fleet.telemetry.replay.broadcaster import MAX_PER_LINK, Broadcaster, loopback_address, share_out
 
 EXAMPLES = """
   fleet replay flight.tlog
@@ -39,7 +39,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         metavar="HOST:PORT",
         help="send a .tlog as MAVLink over UDP to this address of this machine; "
-        f"repeatable: the copies are distributed, at most {MOST_ON_A_LINK} aircraft each",
+        f"repeatable: the copies are distributed, at most {MAX_PER_LINK} aircraft each",
     )
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
     router_arguments(parser)
@@ -47,36 +47,39 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Start a gateway that replays the files and return its exit code; or send the files as datagrams."""
-    check(args)
+    check_arguments(args)
     if args.to:
         return _send(args)
-    options = [f"--link={link(name, args)}" for name in args.file]
-    options += [*passed_on(args), f"--offset={args.offset}", "--listen-only"]
+    options = [f"--link={replay_link(name, args)}" for name in args.file]
+    options += [*router_options(args), f"--offset={args.offset}", "--listen-only"]
     return run_until(stop_on_signal(), "gateway", *options)
 
 
 def _send(args: argparse.Namespace) -> int:
     """Send every file in a thread of its own; return exit code 1 if one was not sent completely."""
-    airings, places = [], []
-    for to, numbers in zip(map(address, args.to), shared(args.copies, len(args.to)), strict=True):
-        ids = Ids(1, MOST_ON_A_LINK)
+    broadcasts, destinations = [], []
+    for destination, numbers in zip(map(loopback_address, args.to), share_out(args.copies, len(args.to)), strict=True):
+        ids = IdAllocator(1, MAX_PER_LINK)
         for name in args.file if numbers else ():
-            airings.append(Airing(Path(name), read_speed(args.speed), numbers, args.copies, ids))
-            places.append(to)
+            broadcasts.append(Broadcaster(Path(name), read_speed(args.speed), numbers, args.copies, ids))
+            destinations.append(destination)
     stop = stop_on_signal()
-    pairs = zip(airings, places, strict=True)
-    threads = [threading.Thread(target=airing.send, args=(to, stop), name=airing.name) for airing, to in pairs]
-    with shown(airings, partial(tell, "fleet replay")):
+    pairs = zip(broadcasts, destinations, strict=True)
+    threads = [
+        threading.Thread(target=broadcast.send, args=(destination, stop), name=broadcast.name)
+        for broadcast, destination in pairs
+    ]
+    with show_progress(broadcasts, partial(report_progress, "fleet replay")):
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
-    for airing in airings:
-        tell("fleet replay", airing.trouble or f"{airing.name}: {airing.words()}")
-    return 1 if any(airing.trouble for airing in airings) else 0
+    for broadcast in broadcasts:
+        report_progress("fleet replay", broadcast.problem or f"{broadcast.name}: {broadcast.progress_text()}")
+    return 1 if any(broadcast.problem for broadcast in broadcasts) else 0
 
 
-def check(args: argparse.Namespace) -> None:
+def check_arguments(args: argparse.Namespace) -> None:
     """Validate the options before anything is opened.
 
     Raises:
@@ -89,7 +92,7 @@ def check(args: argparse.Namespace) -> None:
         raise ValueError("--results: found --copies too, expected only one; recorded results have no copies, drop one")
 
 
-def link(name: str, args: argparse.Namespace) -> str:
+def replay_link(name: str, args: argparse.Namespace) -> str:
     """Return the gateway's `--link` for one recording, from its name and --speed, --copies and --results."""
     path = quote(str(Path(name).resolve()), safe="/ ")
     return f"replay:{path}?speed={args.speed}&copies={args.copies}&results={int(args.results)}"

@@ -10,12 +10,12 @@ from rich.markup import escape
 from rich.table import Table
 
 from fleet.bus.bus_protocol import Bus
-from fleet.bus.codec import timely
+from fleet.bus.codec import is_plausible_epoch
 from fleet.bus.session import connect
-from fleet.config import entry, router_arguments
-from fleet.contract import Account, Claim, FleetRow, FleetState, State, Status
-from fleet.process.sanitise import plain
-from fleet.report.report_text import spans
+from fleet.config import bus_config_from, router_arguments
+from fleet.contract import Claim, FleetRow, FleetState, GatewayCounters, Status, TwinState
+from fleet.process.sanitise import printable
+from fleet.report.report_text import id_ranges
 
 EXAMPLES = """
   fleet status
@@ -32,56 +32,58 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Query the fleet once and print it; return exit code 1 if no UAV is known."""
-    with connect(entry(args)) as bus:
+    with connect(bus_config_from(args)) as bus:
         rows = fleet_rows(bus)
-        on = [] if args.json else processes(bus)
+        running = [] if args.json else processes(bus)
     if args.json:
         json.dump(as_objects(rows), sys.stdout, indent=1)
         print()
     else:
         console = Console()
-        console.print(table(rows) if rows else "no UAV known yet: is a gateway running and an aircraft connected?")
-        if on:
-            console.print("", machines(on), sep="\n")
+        console.print(
+            fleet_table(rows) if rows else "no UAV known yet: is a gateway running and an aircraft connected?"
+        )
+        if running:
+            console.print("", machines(running), sep="\n")
     return 0 if rows else 1
 
 
 def fleet_rows(bus: Bus) -> list[FleetRow]:
     """Query the rows of every worker and add aircraft without a worker as unclaimed."""
     best: dict[int, FleetRow] = {}
-    for state, _ in bus.ask(FleetState):
+    for state, _ in bus.get(FleetState):
         for row in state.rows:
-            held = best.get(row.uav)
-            if not timely(row.epoch):
+            current = best.get(row.uav)
+            if not is_plausible_epoch(row.epoch):
                 continue
-            if held is None or (row.epoch, row.worker) > (held.epoch, held.worker):
+            if current is None or (row.epoch, row.worker) > (current.epoch, current.worker):
                 best[row.uav] = row
-    for status, _ in bus.ask(Status):
+    for status, _ in bus.get(Status):
         sentence = "no worker owns this id: start `twin_worker` with a wider --uavs"
-        best.setdefault(status.uav, FleetRow(uav=status.uav, state=State.UNCLAIMED, verdict=sentence))
+        best.setdefault(status.uav, FleetRow(uav=status.uav, state=TwinState.UNCLAIMED, verdict=sentence))
     return [best[uav] for uav in sorted(best)]
 
 
 def processes(bus: Bus) -> list[tuple[str, str, str, str]]:
     """Query every gateway and worker and return rows of machine, process, aircraft, details."""
-    found = []
-    for account, _ in bus.ask(Account):
-        words = [f"{sum(link.messages_hz for link in account.per_link):.0f} messages/s", account.sentence]
-        words += [f"{link.link}: {link.sentence}" for link in account.per_link if link.sentence]
-        found.append((account.machine, "gateway", spans(account.uavs), "; ".join(filter(None, words))))
-    said = {row.worker: state.sentence for state, _ in bus.ask(FleetState) for row in state.rows}
-    for claim, _ in bus.ask(Claim):
-        words = ["is leaving" if claim.leaving else "", said.get(claim.worker, "")]
-        held = spans(uav for uav, _ in claim.held)
-        found.append((claim.machine, f"worker {claim.worker}", held, "; ".join(filter(None, words))))
-    return sorted(found)
+    rows = []
+    for counters, _ in bus.get(GatewayCounters):
+        details = [f"{sum(link.messages_hz for link in counters.per_link):.0f} messages/s", counters.sentence]
+        details += [f"{link.link}: {link.sentence}" for link in counters.per_link if link.sentence]
+        rows.append((counters.machine, "gateway", id_ranges(counters.uavs), "; ".join(filter(None, details))))
+    worker_texts = {row.worker: state.sentence for state, _ in bus.get(FleetState) for row in state.rows}
+    for claim, _ in bus.get(Claim):
+        details = ["is leaving" if claim.leaving else "", worker_texts.get(claim.worker, "")]
+        uavs = id_ranges(uav for uav, _ in claim.owned)
+        rows.append((claim.machine, f"worker {claim.worker}", uavs, "; ".join(filter(None, details))))
+    return sorted(rows)
 
 
-def machines(found: list[tuple[str, str, str, str]]) -> Table:
+def machines(rows: list[tuple[str, str, str, str]]) -> Table:
     """Format the processes as a table."""
     out = Table("machine", "process", "aircraft", "status", box=None, pad_edge=False)
-    for line in found:
-        out.add_row(*(escape(plain(word)) or "-" for word in line))
+    for row in rows:
+        out.add_row(*(escape(printable(cell)) or "-" for cell in row))
     return out
 
 
@@ -90,7 +92,7 @@ def as_objects(rows: list[FleetRow]) -> list[dict[str, object]]:
     return [msgspec.to_builtins(row) for row in rows]
 
 
-def table(rows: list[FleetRow]) -> Table:
+def fleet_table(rows: list[FleetRow]) -> Table:
     """Format the rows of the fleet as a table."""
     out = Table(box=None, pad_edge=False)
     for heading, justify in (("UAV", "right"), ("state", "left"), ("fit %", "right"), ("horizon s", "right")):
@@ -101,7 +103,9 @@ def table(rows: list[FleetRow]) -> Table:
         fit = f"{sum(row.fit.values()) / len(row.fit):.0f}" if row.fit else "-"
         horizon = f"{row.horizon_s:.0f}" if row.horizon_s else "-"
         age = "-" if row.sample_age_s is None else f"{row.sample_age_s:.1f}"
-        found = [f"▲ mismatch: {escape(plain(row.mismatch))}"] if row.mismatch else []
-        said = "\n".join((*(f"! {escape(plain(alert))}" for alert in row.alerts), *found, escape(plain(row.verdict))))
-        out.add_row(str(row.uav), row.state.value, fit, horizon, age, said)
+        mismatch = [f"▲ mismatch: {escape(printable(row.mismatch))}"] if row.mismatch else []
+        details = "\n".join(
+            (*(f"! {escape(printable(alert))}" for alert in row.alerts), *mismatch, escape(printable(row.verdict)))
+        )
+        out.add_row(str(row.uav), row.state.value, fit, horizon, age, details)
     return out

@@ -12,19 +12,19 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from fleet.access.knock import answers
+from fleet.access.knock import probe_router
 from fleet.bus.bus_protocol import Bus
 from fleet.bus.session import connect, open_router
 from fleet.cli import stop_on_signal
 from fleet.commands.live.fly import AIRCRAFT, AUTOPILOTS, fault_arguments, faults_of
-from fleet.commands.live.replay import check as check_playing
-from fleet.commands.live.replay import link
-from fleet.commands.live.status import as_objects, fleet_rows, table
-from fleet.config import entry, passed_on, router_arguments
-from fleet.contract import FleetRow, FleetState, State
+from fleet.commands.live.replay import check_arguments as check_playing
+from fleet.commands.live.replay import replay_link
+from fleet.commands.live.status import as_objects, fleet_rows, fleet_table
+from fleet.config import bus_config_from, router_arguments, router_options
+from fleet.contract import FleetRow, FleetState, TwinState
 from fleet.process.children import Children
-from fleet.process.logs import tell, timed
-from fleet.process.sanitise import plain
+from fleet.process.logs import add_time, report_progress
+from fleet.process.sanitise import printable
 
 EXAMPLES = """
   fleet up --uavs 8
@@ -38,7 +38,7 @@ EXAMPLES = """
   fleet up --router tcp/127.0.0.1:7448 --mavlink 127.0.0.1:14551 --port 8081      a second fleet
 """
 _MAVLINK = "127.0.0.1:14550"
-_PLAIN_S = 10.0  # between progress lines where the output is not a terminal [s]
+_LOG_PERIOD_S = 10.0  # between progress lines where the output is not a terminal [s]
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -80,10 +80,10 @@ def run(args: argparse.Namespace) -> int:
     """Start, show and stop all processes; return exit code 1 if one failed, 2 if one rejected its options."""
     _check(args)
     stop = stop_on_signal()
-    at = entry(args)
-    router = None if answers(at) else open_router(at)
+    bus_config = bus_config_from(args)
+    router = None if probe_router(bus_config) else open_router(bus_config)
     try:
-        with connect(at) as bus, Children() as children:
+        with connect(bus_config) as bus, Children() as children:
             _start(children, args)
             return _watch(bus, children, args, stop)
     finally:
@@ -129,87 +129,92 @@ def _check_free(mavlink: str) -> None:
 
 
 def _start(children: Children, args: argparse.Namespace) -> None:
-    router = passed_on(args)
+    router = router_options(args)
     if not args.results:
         ids = "0-999999" if args.replay else "0-249"
-        base = [f"--baseline={text}" for text in args.baseline]
-        children.start("twin worker", "twin_worker", "--uavs", ids, *base, *router)
-    passed = [f"--forward={text}" for text in args.forward] + ([f"--keys={args.keys}"] if args.keys else []) + router
+        baselines = [f"--baseline={text}" for text in args.baseline]
+        children.start("twin worker", "twin_worker", "--uavs", ids, *baselines, *router)
+    gateway_options = (
+        [f"--forward={text}" for text in args.forward] + ([f"--keys={args.keys}"] if args.keys else []) + router
+    )
     links = [f"--link={text}" for text in args.link]
-    links += [f"--link={link(file, args)}" for file in args.replay]
+    links += [f"--link={replay_link(file, args)}" for file in args.replay]
     if links:
-        children.start("gateway", "gateway", *links, *passed)
+        children.start("gateway", "gateway", *links, *gateway_options)
     else:
-        children.start("gateway", "gateway", f"--link=udpin:{args.mavlink}", "--offset=-1", *passed)
+        children.start("gateway", "gateway", f"--link=udpin:{args.mavlink}", "--offset=-1", *gateway_options)
         aircraft = ["--uavs", f"0-{args.uavs - 1}", "--to", args.mavlink, "--seed", str(args.seed)]
         aircraft += ["--autopilot", args.autopilot, "--aircraft", args.aircraft]
         aircraft += [f"--fault={text}" for text in args.fault]
         aircraft += [] if args.fault_uav is None else [f"--fault-uav={args.fault_uav}"]
         children.start("aircraft", "fleet.cli", "fly", *aircraft)
     if not args.no_viewer:
-        ground = [f"--{name}={file}" for name in ("terrain", "imagery") if (file := getattr(args, name))]
-        children.start("viewer", "viewer", "--port", str(args.port), *ground, *router)
+        map_options = [f"--{name}={file}" for name in ("terrain", "imagery") if (file := getattr(args, name))]
+        children.start("viewer", "viewer", "--port", str(args.port), *map_options, *router)
 
 
 def _watch(bus: Bus, children: Children, args: argparse.Namespace, stop: threading.Event) -> int:
     """Show the fleet once a second until stopped, a process fails or the duration has elapsed."""
-    said: list[str] = [""]  # texts of the worker, the newest last; none is lost between two polls
+    worker_texts: list[str] = [""]  # texts of the worker, the newest last; none is lost between two polls
     bus.subscribe(
-        FleetState, lambda state, _: said.append(plain(state.sentence)) if plain(state.sentence) != said[-1] else None
+        FleetState,
+        lambda state, _: (
+            worker_texts.append(printable(state.sentence)) if printable(state.sentence) != worker_texts[-1] else None
+        ),
     )
     rows: list[FleetRow] = []
-    first = None
-    show = _Show(Console(stderr=True))
-    with show.live:
+    first_sample_t = None
+    display = _Display(Console(stderr=True))
+    with display.live:
         while not stop.wait(1.0):
             rows = fleet_rows(bus) or rows
-            if first is None and any(row.sample_age_s is not None for row in rows):
-                first = time.monotonic()
-            flown = 0.0 if first is None else time.monotonic() - first
-            show.draw(_lines(rows, children, said[-1], flown, args), rows, said)
-            if children.failed() or (args.seconds and flown >= args.seconds):
+            if first_sample_t is None and any(row.sample_age_s is not None for row in rows):
+                first_sample_t = time.monotonic()
+            elapsed = 0.0 if first_sample_t is None else time.monotonic() - first_sample_t
+            display.draw(_lines(rows, children, worker_texts[-1], elapsed, args), rows, worker_texts)
+            if children.failures() or (args.seconds and elapsed >= args.seconds):
                 break
-    failed = children.failed()
+    failed = children.failures()
     if args.summary:
         args.summary.write_text(json.dumps(as_objects(rows), indent=1) + "\n")
     for _, sentence in failed:
-        tell("fleet up", sentence)
+        report_progress("fleet up", sentence)
     if stop.is_set():
-        tell("fleet up", "stopping")
+        report_progress("fleet up", "stopping")
     return (2 if all(code == 2 for code, _ in failed) else 1) if failed else 0
 
 
-class _Show:
+class _Display:
     """Display: a live table on a terminal, otherwise a line for every new text."""
 
     def __init__(self, console: Console) -> None:
         self.console = console
         self.live = Live(console=console, refresh_per_second=4, transient=not console.is_terminal)
-        self._said: set[str] = set()
+        self._printed: set[str] = set()
         self._due = 0.0
 
-    def draw(self, lines: list[str], rows: list[FleetRow], said: list[str]) -> None:
+    def draw(self, lines: list[str], rows: list[FleetRow], texts: list[str]) -> None:
         if self.console.is_terminal:
-            self.live.update(Group(Text("\n".join(lines)), table(rows[:40])))
+            self.live.update(Group(Text("\n".join(lines)), fleet_table(rows[:40])))
             return
-        news = [line for line in dict.fromkeys([*said, *lines[1:]]) if line and line not in self._said]
+        new_lines = [line for line in dict.fromkeys([*texts, *lines[1:]]) if line and line not in self._printed]
         if time.monotonic() >= self._due:
-            self._due = time.monotonic() + _PLAIN_S
-            news.insert(0, lines[0])
-        self._said.update(news)
-        for line in news:
-            print(timed(plain(line)), file=sys.stderr, flush=True)
+            self._due = time.monotonic() + _LOG_PERIOD_S
+            new_lines.insert(0, lines[0])
+        self._printed.update(new_lines)
+        for line in new_lines:
+            print(add_time(printable(line)), file=sys.stderr, flush=True)
 
 
 def _lines(
-    rows: list[FleetRow], children: Children, sentence: str, flown: float, args: argparse.Namespace
+    rows: list[FleetRow], children: Children, sentence: str, elapsed: float, args: argparse.Namespace
 ) -> list[str]:
-    count = {state: sum(row.state is state for row in rows) for state in State}
-    said = ", ".join(f"{n} {state.value}" for state, n in count.items() if n) or "waiting for the first sample"
-    lines = [f"fleet up · {len(rows)} UAVs · {flown:.0f} s since the first sample · {said}"]
+    count = {state: sum(row.state is state for row in rows) for state in TwinState}
+    states = ", ".join(f"{n} {state.value}" for state, n in count.items() if n) or "waiting for the first sample"
+    lines = [f"fleet up · {len(rows)} UAVs · {elapsed:.0f} s since the first sample · {states}"]
     lines += [sentence] if sentence else []
-    lines += children.words()
-    if args.replay and "gateway" in children.done():
+    lines += children.last_lines()
+    if args.replay and "gateway" in children.finished():
         lines.append("the recording has ended; the twins predict without telemetry until Ctrl-C")
     if not args.no_viewer:
         lines.append(f"viewer: http://127.0.0.1:{args.port}   (Ctrl-C stops everything)")

@@ -11,10 +11,10 @@ import numpy as np
 
 from fleet.bus.bus_protocol import Bus
 from fleet.bus.session import connect
-from fleet.config import entry, router_arguments
+from fleet.config import bus_config_from, router_arguments
 from fleet.contract import Prediction, WhatIf, WhatIfStart
 from fleet.frames import to_geodetic, to_ned
-from fleet.process.sanitise import plain
+from fleet.process.sanitise import printable
 from fleet.telemetry.mavlink.microservices.waypoints import read_waypoints
 
 EXAMPLES = """
@@ -33,9 +33,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seq", type=int, metavar="N", help="item to fly to first")
     parser.add_argument("--speed", type=float, metavar="M/S", help="another airspeed; of a multirotor, ground speed")
     parser.add_argument(
-        "--start", type=_numbers, metavar="LAT,LON,ALT[,DEG[,M/S]]", help="another position; --start=-33,… if south"
+        "--start",
+        type=_read_numbers,
+        metavar="LAT,LON,ALT[,DEG[,M/S]]",
+        help="another position; --start=-33,… if south",
     )
-    parser.add_argument("--wind", type=_numbers, metavar="N,E", help="another wind, the direction it blows to [m/s]")
+    parser.add_argument(
+        "--wind", type=_read_numbers, metavar="N,E", help="another wind, the direction it blows to [m/s]"
+    )
     parser.add_argument("--param", action="append", default=[], metavar="NAME=VALUE", help="a parameter; repeatable")
     parser.add_argument("--json", action="store_true", help="the complete prediction, in degrees and metres")
     router_arguments(parser)
@@ -47,28 +52,31 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         ValueError: when an option is invalid, or the worker rejects the request; with the reason.
     """
-    asked = question(args)
-    with connect(entry(args)) as bus:
-        made, usual = ask(bus, args.uav, asked), next((p for p, _ in bus.ask(Prediction, args.uav)), None)
-    if made is None:
+    request = build_request(args)
+    with connect(bus_config_from(args)) as bus:
+        what_if, reference = (
+            send_request(bus, args.uav, request),
+            next((p for p, _ in bus.get(Prediction, args.uav)), None),
+        )
+    if what_if is None:
         print(f"uav {args.uav}: found no worker that replies, expected one; see `fleet status`", file=sys.stderr)
         return 1
     if args.json:
-        json.dump(as_object(made), sys.stdout, indent=1)
+        json.dump(as_object(what_if), sys.stdout, indent=1)
         print()
     else:
-        print(text(made, usual))
+        print(format_text(what_if, reference))
     return 0
 
 
-def _numbers(words: str) -> tuple[float, ...]:
+def _read_numbers(text: str) -> tuple[float, ...]:
     try:
-        return tuple(float(word) for word in words.split(","))
+        return tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"found {words!r}, expected numbers separated by commas") from None
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected numbers separated by commas") from None
 
 
-def question(args: argparse.Namespace) -> WhatIf:
+def build_request(args: argparse.Namespace) -> WhatIf:
     """Build the request from the options.
 
     Raises:
@@ -107,46 +115,56 @@ def _start(numbers: tuple[float, ...]) -> WhatIfStart:
     )
 
 
-def ask(bus: Bus, uav: int, asked: WhatIf) -> Prediction | None:
+def send_request(bus: Bus, uav: int, request: WhatIf) -> Prediction | None:
     """Send the request; None without a reply."""
-    found = bus.inquire(Prediction, uav, msgspec.msgpack.encode(asked))
-    return found[0] if found else None
+    reply = bus.get_one(Prediction, uav, msgspec.msgpack.encode(request))
+    return reply[0] if reply else None
 
 
-def as_object(made: Prediction) -> dict[str, object]:
+def as_object(prediction: Prediction) -> dict[str, object]:
     """Return a prediction for JSON: lists instead of packed arrays, and geodetic positions."""
-    out = msgspec.to_builtins(made, builtin_types=(bytes,))
-    places = to_geodetic(made.ned_origin(), made.path.numpy())
-    for name in ("ahead", "path", "tube"):
-        out[name] = np.round(getattr(made, name).numpy().astype(float), 3).tolist()
-    out["held"] = made.held if made.held == made.held else None
-    out["places"] = [[lat * 1e-7, lon * 1e-7, alt * 1e-3] for lat, lon, alt in places.tolist()]
+    out = msgspec.to_builtins(prediction, builtin_types=(bytes,))
+    positions = to_geodetic(prediction.ned_origin(), prediction.path.numpy())
+    for name in ("ahead", "path", "prediction_region_half_axes"):
+        out[name] = np.round(getattr(prediction, name).numpy().astype(float), 3).tolist()
+    out["coverage"] = prediction.coverage if prediction.coverage == prediction.coverage else None
+    out["places"] = [[lat * 1e-7, lon * 1e-7, alt * 1e-3] for lat, lon, alt in positions.tolist()]
     return out
 
 
-def text(made: Prediction, usual: Prediction | None) -> str:
+def format_text(prediction: Prediction, reference: Prediction | None) -> str:
     """Format the path as a table, with the deviation from the reference prediction."""
-    ahead, path, tube = (a.numpy().astype(float) for a in (made.ahead, made.path, made.tube))
-    places = to_geodetic(made.ned_origin(), path)
-    flown = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-    off = _apart(made, usual)
-    lines = [plain(made.sentence), f"{plain(made.method)} · {plain(made.law)} · horizon {made.horizon_s:.0f} s"]
+    ahead, path, half_axes = (
+        a.numpy().astype(float) for a in (prediction.ahead, prediction.path, prediction.prediction_region_half_axes)
+    )
+    positions = to_geodetic(prediction.ned_origin(), path)
+    distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    deviations = _deviation(prediction, reference)
+    lines = [
+        printable(prediction.sentence),
+        f"{printable(prediction.method)} · {printable(prediction.law)} · horizon {prediction.horizon_s:.0f} s",
+    ]
     lines.append("   in s    latitude   longitude  alt m  length m  tube m   deviation m")
-    for at in (s for s in _SHOWN_S if s <= ahead[-1]):
-        k = int(np.argmin(np.abs(ahead - at)))
-        lat, lon, alt = places[k] * [1e-7, 1e-7, 1e-3]
-        apart = f"{off[k]:13.0f}" if off is not None else f"{'–':>13}"
-        lines.append(f"{ahead[k]:7.0f} {lat:11.5f} {lon:11.5f} {alt:6.0f} {flown[k]:9.0f} {tube[k].max():7.0f} {apart}")
+    for lead_s in (s for s in _SHOWN_S if s <= ahead[-1]):
+        k = int(np.argmin(np.abs(ahead - lead_s)))
+        lat, lon, alt = positions[k] * [1e-7, 1e-7, 1e-3]
+        deviation = f"{deviations[k]:13.0f}" if deviations is not None else f"{'–':>13}"
+        lines.append(
+            f"{ahead[k]:7.0f} {lat:11.5f} {lon:11.5f} {alt:6.0f} {distance[k]:9.0f} {half_axes[k].max():7.0f} "
+            f"{deviation}"
+        )
     return "\n".join(lines)
 
 
-def _apart(made: Prediction, usual: Prediction | None) -> np.ndarray | None:
+def _deviation(prediction: Prediction, reference: Prediction | None) -> np.ndarray | None:
     """Return the distance to the reference prediction at the same times, (n,) [m]; nan beyond its end."""
-    if usual is None or not usual.path.shape[0]:
+    if reference is None or not reference.path.shape[0]:
         return None
-    t = made.t + made.ahead.numpy().astype(float)
-    then = usual.t + usual.ahead.numpy().astype(float)
-    lat_lon_alt = to_geodetic(usual.ned_origin(), usual.path.numpy())
-    there = to_ned(made.ned_origin(), *lat_lon_alt.T)
-    there = np.column_stack([np.interp(t, then, column, left=np.nan, right=np.nan) for column in there.T])
-    return np.linalg.norm(made.path.numpy() - there, axis=1)
+    t = prediction.t + prediction.ahead.numpy().astype(float)
+    reference_t = reference.t + reference.ahead.numpy().astype(float)
+    lat_lon_alt = to_geodetic(reference.ned_origin(), reference.path.numpy())
+    reference_path = to_ned(prediction.ned_origin(), *lat_lon_alt.T)
+    reference_path = np.column_stack(
+        [np.interp(t, reference_t, column, left=np.nan, right=np.nan) for column in reference_path.T]
+    )
+    return np.linalg.norm(prediction.path.numpy() - reference_path, axis=1)

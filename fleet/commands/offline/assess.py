@@ -6,24 +6,29 @@ from pathlib import Path
 from fleet.cli import stop_on_signal
 from fleet.process.children import run_until
 from fleet.process.interrupt import INTERRUPTED
-from fleet.process.logs import tell
+from fleet.process.logs import report_progress
 
 EXAMPLES = """
   fleet assess flight.tlog
   fleet assess monday/*.tlog.xz --out monday --json monday.json --jobs 2
   fleet assess flight.tlog --methods route_wind --without-params     without autopilot parameters
 """
-OWN = ("auto", "dynamics", "hybrid", "paper")
-METHODS = ("cv", "ct", "imm", "route", "route_wind", "paper", "dynamics")
+OWN_METHODS = ("auto", "dynamics", "hybrid", "paper")
+BASELINE_METHODS = ("cv", "ct", "imm", "route", "route_wind", "paper", "dynamics")
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options; `python -m twin_worker.evaluation` takes the same."""
     parser.add_argument("file", nargs="+", type=Path, metavar="FILE", help="recordings of any kind, also compressed")
     parser.add_argument("--every", type=float, default=5.0, metavar="S", help="interval between starts (5)")
-    parser.add_argument("--method", default=OWN[0], choices=OWN, help="method of the twin (auto: the best available)")
     parser.add_argument(
-        "--methods", default=",".join(METHODS), metavar="A,B", help=f"compare with these ({','.join(METHODS)})"
+        "--method", default=OWN_METHODS[0], choices=OWN_METHODS, help="method of the twin (auto: the best available)"
+    )
+    parser.add_argument(
+        "--methods",
+        default=",".join(BASELINE_METHODS),
+        metavar="A,B",
+        help=f"compare with these ({','.join(BASELINE_METHODS)})",
     )
     parser.add_argument(
         "--without-params", action="store_true", help="withhold the autopilot's parameters from the twins"
@@ -34,7 +39,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
 
 
-def check(args: argparse.Namespace) -> None:
+def check_arguments(args: argparse.Namespace) -> None:
     """Validate the options before anything is read.
 
     Raises:
@@ -42,9 +47,11 @@ def check(args: argparse.Namespace) -> None:
     """
     if not 1.0 <= args.every <= 600.0:
         raise ValueError(f"--every: found {args.every:g} s, expected 1..600; a twin predicts once a second")
-    unknown = [name for name in chosen(args.methods) if name not in METHODS]
+    unknown = [name for name in baseline_methods(args.methods) if name not in BASELINE_METHODS]
     if unknown:
-        raise ValueError(f"--methods: found {', '.join(unknown)}, expected some of {', '.join(METHODS)}; correct it")
+        raise ValueError(
+            f"--methods: found {', '.join(unknown)}, expected some of {', '.join(BASELINE_METHODS)}; correct it"
+        )
     if not 1 <= args.jobs <= 64:
         raise ValueError(f"--jobs: found {args.jobs}, expected 1..64; change it")
     for path in args.file:
@@ -58,20 +65,20 @@ def check(args: argparse.Namespace) -> None:
         raise ValueError(f"--out: found the file {str(args.out)!r}, expected a folder; name another")
 
 
-def chosen(methods: str) -> tuple[str, ...]:
+def baseline_methods(methods: str) -> tuple[str, ...]:
     """Parse the names of methods, without `ours`."""
     return tuple(name for name in dict.fromkeys(methods.split(",")) if name and name != "ours")
 
 
 def run(args: argparse.Namespace) -> int:
     """Start the assessment and return its exit code."""
-    check(args)
+    check_arguments(args)
     stop = stop_on_signal()
     options = [f"--{name}={getattr(args, name)}" for name in ("every", "method", "methods", "jobs", "offset")]
     options += [f"--{name}={value}" for name, value in (("out", args.out), ("json", args.json)) if value]
     options += ["--without-params"] if args.without_params else []
     code = run_until(stop, "twin_worker.evaluation", *options, "--", *map(str, args.file))
     if stop.is_set():
-        tell("assess", "stopped; unfinished results are not written")
+        report_progress("assess", "stopped; unfinished results are not written")
         return INTERRUPTED
     return code

@@ -6,7 +6,7 @@ from pathlib import Path
 from fleet.cli import stop_on_signal
 from fleet.process.children import run_until
 from fleet.process.interrupt import INTERRUPTED
-from fleet.process.logs import tell
+from fleet.process.logs import report_progress
 
 EXAMPLES = """
   fleet calibrate monday/*.tlog --airframe skywalker --out skywalker.json
@@ -37,6 +37,6 @@ def run(args: argparse.Namespace) -> int:
     ]
     code = run_until(stop, "twin_worker.diagnosis.learn", *options, "--", *map(str, args.file))
     if stop.is_set():
-        tell("calibrate", "stopped; no model was written")
+        report_progress("calibrate", "stopped; no model was written")
         return INTERRUPTED
     return code

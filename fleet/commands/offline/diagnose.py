@@ -6,9 +6,9 @@ from pathlib import Path
 from fleet.cli import stop_on_signal
 from fleet.process.children import run_until
 from fleet.process.interrupt import INTERRUPTED
-from fleet.process.logs import tell
+from fleet.process.logs import report_progress
 
-_LONGEST_S = 1e6
+_MAX_PAST_S = 1e6
 
 EXAMPLES = """
   fleet diagnose flight.tlog --model skywalker.json
@@ -47,7 +47,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def check(args: argparse.Namespace) -> None:
+def check_arguments(args: argparse.Namespace) -> None:
     """Validate the options before anything is read.
 
     Raises:
@@ -59,7 +59,7 @@ def check(args: argparse.Namespace) -> None:
         raise ValueError(
             "expected exactly one of --model, --against, --against-own-past; name one reference for the flights"
         )
-    if args.against_own_past is not None and not 0 < args.against_own_past < _LONGEST_S:
+    if args.against_own_past is not None and not 0 < args.against_own_past < _MAX_PAST_S:
         raise ValueError(f"--against-own-past: found {args.against_own_past:g} s, expected more than 0; change it")
     for option, path in (("--json", args.json), ("--report", args.report)):
         if path and not path.absolute().parent.is_dir():
@@ -68,16 +68,16 @@ def check(args: argparse.Namespace) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Start the diagnosis and return its exit code."""
-    check(args)
+    check_arguments(args)
     stop = stop_on_signal()
-    given = {
+    values = {
         name: getattr(args, name)
         for name in ("model", "airframe", "json", "report", "jobs", "against_own_past", "conceal")
     }
-    options = [f"--{name.replace('_', '-')}={value}" for name, value in given.items() if value]
+    options = [f"--{name.replace('_', '-')}={value}" for name, value in values.items() if value]
     simulated = ["--against", *map(str, args.against)] if args.against else []
     code = run_until(stop, "twin_worker.diagnosis", *options, *simulated, "--", *map(str, args.file))
     if stop.is_set():
-        tell("diagnose", "stopped; unfinished results are not written")
+        report_progress("diagnose", "stopped; unfinished results are not written")
         return INTERRUPTED
     return code

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from fleet.effects import FOLDERS, Body, Effect, Parameter, catalogue
+from fleet.effects import FOLDERS_ENV, Body, Effect, Parameter, catalogue
 
 EXAMPLES = """
   fleet effects                       table of all effects
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
         ValueError: when there is no such effect, or a file of effects is invalid.
     """
     known = catalogue()
-    chosen = [_found(known, args.name)] if args.name else list(known.values())
+    chosen = [_lookup(known, args.name)] if args.name else list(known.values())
     if args.json:
         described = msgspec.json.encode({effect.name: as_json(effect) for effect in chosen})
         print(msgspec.json.format(described, indent=2).decode())
@@ -47,12 +47,14 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _found(known: dict[str, Effect], name: str) -> Effect:
+def _lookup(known: dict[str, Effect], name: str) -> Effect:
     if name in known:
         return known[name]
-    near = difflib.get_close_matches(name, known, cutoff=0.4)
-    such = f"such as {', '.join(near)}" if near else f"of the {len(known)} known"
-    raise ValueError(f"found {name!r}, expected an effect {such}; see `fleet effects`, or name its folder in {FOLDERS}")
+    matches = difflib.get_close_matches(name, known, cutoff=0.4)
+    suggestion = f"such as {', '.join(matches)}" if matches else f"of the {len(known)} known"
+    raise ValueError(
+        f"found {name!r}, expected an effect {suggestion}; see `fleet effects`, or name its folder in {FOLDERS_ENV}"
+    )
 
 
 def as_rows(effect: Effect) -> list[str]:
@@ -76,18 +78,20 @@ def as_text(effect: Effect) -> str:
         "equation": effect.equation,
         "source": effect.source,
         "where": f"{effect.stage}, {effect.channel}" + (", visible in the variance only" if effect.variance else ""),
-        "may affect": ", ".join(effect.of) or "the aircraft",
+        "may affect": ", ".join(effect.targets) or "the aircraft",
         "onset": ", ".join(effect.onsets),
-        "reported as": ", ".join(told_names(effect)),
+        "reported as": ", ".join(reported_names(effect)),
         "examples": "; ".join(", ".join(f"{x:g}" for x in example) for example in effect.examples),
-        "search from": "; ".join(", ".join(f"{x:g}" for x in start) for start in effect.starts) or "zero",
+        "search from": "; ".join(", ".join(f"{x:g}" for x in start) for start in effect.initial_guesses) or "zero",
     }
     lines = [*_wrapped(f"{effect.name}   ", summary(effect)), ""]
     lines += [row for name, fact in facts.items() for row in _wrapped(f"  {name:12} ", fact)]
     lines += ["", "  parameters, all zero without the effect:", *map(_parameter, effect.parameters)]
-    if effect.confused:
+    if effect.confusable_with:
         lines += ["", "  confusable with, and distinguished by:"]
-    lines += [row for rival, how in effect.confused.items() for row in _wrapped(f"    {rival:27} ", how)]
+    lines += [
+        row for other, difference in effect.confusable_with.items() for row in _wrapped(f"    {other:27} ", difference)
+    ]
     return "\n".join(lines)
 
 
@@ -101,25 +105,25 @@ def _wrapped(head: str, text: str) -> list[str]:
 
 def summary(effect: Effect) -> str:
     """Return the first line of the docstring of the effect's module."""
-    own = [m for name, m in list(sys.modules.items()) if name.endswith(effect.name)]
-    said = next((m.__doc__ for m in own if getattr(m, "EFFECT", None) is effect), None)
-    return (said or "").strip().partition("\n")[0]
+    modules = [m for name, m in list(sys.modules.items()) if name.endswith(effect.name)]
+    doc = next((m.__doc__ for m in modules if getattr(m, "EFFECT", None) is effect), None)
+    return (doc or "").strip().partition("\n")[0]
 
 
-def told_names(effect: Effect) -> list[str]:
+def reported_names(effect: Effect) -> list[str]:
     """List the names of the reported numbers."""
-    return list(effect.told(effect, np.array(effect.examples[0]), Body()))
+    return list(effect.reported(effect, np.array(effect.examples[0]), Body()))
 
 
 def as_json(effect: Effect) -> dict[str, Any]:
     """Describe one effect as a JSON object."""
-    plain = ("channel", "equation", "source", "examples", "of", "starts", "variance")
+    names = ("channel", "equation", "source", "examples", "targets", "initial_guesses", "variance")
     return {
         "summary": summary(effect),
         "stage": effect.stage.value,
-        **{name: getattr(effect, name) for name in plain},
+        **{name: getattr(effect, name) for name in names},
         "onsets": [onset.value for onset in effect.onsets],
-        "told": told_names(effect),
+        "told": reported_names(effect),
         "parameters": [vars(p) for p in effect.parameters],
-        "confused": dict(effect.confused),
+        "confused": dict(effect.confusable_with),
     }

@@ -14,12 +14,12 @@ from rich.console import Console
 
 from fleet.commands.offline.schema import fields_of, parts_of, summary
 from fleet.process.children import run_to_end
-from fleet.process.interrupt import deferred
-from fleet.process.logs import tell
-from fleet.report.progress import shown
+from fleet.process.interrupt import interrupt_deferred
+from fleet.process.logs import report_progress
+from fleet.report.progress import show_progress
 from fleet.report.report_text import table
-from fleet.telemetry.inspection.findings import Facts, File, Findings, findings
-from fleet.telemetry.inspection.survey import Survey, survey
+from fleet.telemetry.inspection.findings import AircraftFindings, FileFindings, LinkTexts, compute_findings
+from fleet.telemetry.inspection.survey import Survey, survey_recording
 from fleet.telemetry.recording.recordings import Recording
 
 EXAMPLES = """
@@ -32,12 +32,12 @@ EXAMPLES = """
 PLOTS = (".png", ".svg", ".pdf")
 
 
-class Heard(NamedTuple):
+class InspectedFile(NamedTuple):
     """Result of reading one recording."""
 
-    file: File
+    file: FileFindings
     surveys: dict[int, Survey]
-    facts: dict[int, Facts]
+    facts: dict[int, LinkTexts]
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,63 +53,66 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Show every recording; return exit code 1 if anything was skipped, assumed or unusable, 2 for invalid options."""
     if args.keys:
-        print(keys())
+        print(describe_keys())
         return 0
     _check(args)
-    told: list[File] = []
-    sheets: list[tuple[Survey, Findings, Facts, str]] = []
+    files: list[FileFindings] = []
+    pages: list[tuple[Survey, AircraftFindings, LinkTexts, str]] = []
     console = Console()
     for path in args.file:
-        heard = read(path, args.offset)
-        file = msgspec.structs.replace(heard.file, twin=_twin(path)) if args.twin else heard.file
-        told.append(file)
+        inspected = inspect_file(path, args.offset)
+        file = msgspec.structs.replace(inspected.file, twin=_run_twin(path)) if args.twin else inspected.file
+        files.append(file)
         if args.json != "-":
             console.print(table(file))
         if args.plot:
-            known = heard.surveys.values()
-            sheets += [
-                (k, t, heard.facts.get(k.uav, Facts()), path.name) for k, t in zip(known, file.aircraft, strict=True)
+            surveys = inspected.surveys.values()
+            pages += [
+                (k, t, inspected.facts.get(k.uav, LinkTexts()), path.name)
+                for k, t in zip(surveys, file.aircraft, strict=True)
             ]
     if args.json:
-        _write_json(told, args.json)
-    if args.plot and sheets:
-        from fleet.report.inspection_page import Sheet, write  # loads matplotlib: not for --help
+        _write_json(files, args.json)
+    if args.plot and pages:
+        from fleet.report.inspection_page import ReportPage, write  # loads matplotlib: not for --help
 
-        for made in write(args.plot, [Sheet(*sheet) for sheet in sheets]):
-            tell("fleet inspect", f"wrote {made}")
-    return 1 if any(file.sentences or not file.aircraft or "sentence" in (file.twin or {}) for file in told) else 0
+        for page_file in write(args.plot, [ReportPage(*page) for page in pages]):
+            report_progress("fleet inspect", f"wrote {page_file}")
+    return 1 if any(file.sentences or not file.aircraft or "sentence" in (file.twin or {}) for file in files) else 0
 
 
-def keys() -> str:
+def describe_keys() -> str:
     """Describe the keys of the JSON."""
     lines = ['{"files": [File, ...]}']
-    for part in (File, *parts_of(File)):
+    for part in (FileFindings, *parts_of(FileFindings)):
         lines += ["", f"{part.__name__}: {summary(part)}", *fields_of(part)]
     return "\n".join(lines)
 
 
-def read(path: Path, offset: int = 0) -> Heard:
+def inspect_file(path: Path, offset: int = 0) -> InspectedFile:
     """Read one recording; report every error in it as a text."""
     surveys: dict[int, Survey] = {}
-    facts: dict[int, Facts] = {}
-    said: list[str] = []
+    facts: dict[int, LinkTexts] = {}
+    sentences: list[str] = []
     try:
         recording = Recording(path, offset)
-        with shown([recording], _say, Console(stderr=True), leave=False):
-            surveys = survey((news for _, step in recording.steps() for news in step), recording.kind)
-        facts = {uav: Facts(craft.firmware, tuple(craft.texts)) for uav, craft in recording.crafts.items()}
-        said += recording.skipped
+        with show_progress([recording], _report, Console(stderr=True), leave=False):
+            surveys = survey_recording((news for _, step in recording.steps() for news in step), recording.kind)
+        facts = {uav: LinkTexts(link.firmware, tuple(link.texts)) for uav, link in recording.aircraft.items()}
+        sentences += recording.skipped
     except (ValueError, OSError) as error:
-        said.append(str(error))
-    if not surveys and not said:
-        said.append(f"{path.name}: found no aircraft, expected at least one heartbeat of one; check the file")
-    aircraft = tuple(findings(known, facts.get(uav, Facts())) for uav, known in surveys.items())
-    said = [sentence.removeprefix(f"{path.name}: ") for sentence in dict.fromkeys(said)]
-    return Heard(File(file=str(path), bytes=_size(path), sentences=tuple(said), aircraft=aircraft), surveys, facts)
+        sentences.append(str(error))
+    if not surveys and not sentences:
+        sentences.append(f"{path.name}: found no aircraft, expected at least one heartbeat of one; check the file")
+    aircraft = tuple(compute_findings(known, facts.get(uav, LinkTexts())) for uav, known in surveys.items())
+    sentences = [sentence.removeprefix(f"{path.name}: ") for sentence in dict.fromkeys(sentences)]
+    return InspectedFile(
+        FileFindings(file=str(path), bytes=_size(path), sentences=tuple(sentences), aircraft=aircraft), surveys, facts
+    )
 
 
-def _say(line: str) -> None:
-    tell("fleet inspect", line)
+def _report(line: str) -> None:
+    report_progress("fleet inspect", line)
 
 
 def _size(path: Path) -> int:
@@ -139,35 +142,35 @@ def _check(args: argparse.Namespace) -> None:
             raise ValueError(f"{option}: found the recording {str(name)!r} itself, expected another file; rename it")
 
 
-def _twin(path: Path) -> dict[str, Any]:
+def _run_twin(path: Path) -> dict[str, Any]:
     """Replay the recording through a twin in a separate process; return results by UAV id, or `sentence`."""
     with _folder() as folder:
-        answer = folder / "twin.json"
-        code, errors = run_to_end("twin_worker.evaluation.replay", str(path), "--json", str(answer))
+        output = folder / "twin.json"
+        code, errors = run_to_end("twin_worker.evaluation.replay", str(path), "--json", str(output))
         try:
-            told = json.loads(answer.read_text())
+            result = json.loads(output.read_text())
         except (OSError, ValueError):
             last = (errors.strip().splitlines() or ["no reason given"])[-1]
             return {"sentence": f"the twin ended with code {code}: {last}"}
-    return told if isinstance(told, dict) else {"sentence": "the output of the twin is not a JSON object"}
+    return result if isinstance(result, dict) else {"sentence": "the output of the twin is not a JSON object"}
 
 
 @contextlib.contextmanager
 def _folder() -> Iterator[Path]:
     """Create a temporary folder and remove it at the end, also after Ctrl-C during either."""
-    with deferred():
+    with interrupt_deferred():
         folder = tempfile.TemporaryDirectory()
     try:
         yield Path(folder.name)
     finally:
-        with deferred():
+        with interrupt_deferred():
             folder.cleanup()
 
 
-def _write_json(told: list[File], name: str) -> None:
-    text = json.dumps({"files": msgspec.to_builtins(told)}, indent=1) + "\n"
+def _write_json(files: list[FileFindings], name: str) -> None:
+    text = json.dumps({"files": msgspec.to_builtins(files)}, indent=1) + "\n"
     if name == "-":
         sys.stdout.write(text)
     else:
-        with deferred():  # an incomplete file could be taken for a complete one
+        with interrupt_deferred():  # an incomplete file could be taken for a complete one
             Path(name).write_text(text)

@@ -10,7 +10,7 @@ from threading import Event
 from fleet.cli import id_range, stop_on_signal
 from fleet.process.children import run_until
 from fleet.process.interrupt import INTERRUPTED
-from fleet.process.logs import tell
+from fleet.process.logs import report_progress
 
 EXAMPLES = """
   fleet paper identify --out figures --json paper.json
@@ -19,9 +19,9 @@ EXAMPLES = """
   fleet paper predict --out figures --jobs 2   60 s ahead from every start, with the paper's method and the twin's
 """
 _UAVS = {"identify": range(12), "predict": range(16)}
-_LEAST_S = {"identify": (70, "20 + 40 + 8 s"), "predict": (200, "120 + 60 s and some starts")}  # flown time [s]
+_MIN_SECONDS = {"identify": (70, "20 + 40 + 8 s"), "predict": (200, "120 + 60 s and some starts")}  # flown time [s]
 _STARTS, _EVERY_S = 20, 5.0  # predictions in the paper; interval between our starts [s]
-_BESIDE = "paper,route_wind"  # methods compared with the twin's
+_COMPARED_METHODS = "paper,route_wind"  # methods compared with the twin's
 _LOSS = 0.01  # share of frames lost in transit [-]
 
 
@@ -50,9 +50,9 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         ValueError: when an option is invalid; the text names it.
     """
-    least, why = _LEAST_S[args.experiment]
-    if not least <= args.seconds <= 3600:
-        raise ValueError(f"--for: found {args.seconds:.0f} s, expected {least}..3600 ({why} at least); change --for")
+    min_s, reason = _MIN_SECONDS[args.experiment]
+    if not min_s <= args.seconds <= 3600:
+        raise ValueError(f"--for: found {args.seconds:.0f} s, expected {min_s}..3600 ({reason} at least); change --for")
     args.uavs = args.uavs or _UAVS[args.experiment]
     starts = int((args.seconds - 180) / _EVERY_S) * len(args.uavs)
     if args.experiment == "predict" and not args.file and starts < _STARTS:
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
         )
     stop = stop_on_signal()
     with _recordings(args, stop) as files:
-        return INTERRUPTED if stop.is_set() else _judge(args, files, stop)
+        return INTERRUPTED if stop.is_set() else _evaluate(args, files, stop)
 
 
 @contextlib.contextmanager
@@ -81,11 +81,11 @@ def _fly(args: argparse.Namespace, path: Path, stop: Event) -> None:
     from rich.progress import Progress
 
     from fleet.simulator.flight import drive  # loads JSBSim and the compiler: not for --help
-    from fleet.simulator.flight.uav import PretendUav
+    from fleet.simulator.flight.uav import SimulatedUav
     from fleet.simulator.vehicle.weather import turbulence_level
 
     level = turbulence_level(args.turbulence)
-    uavs = [PretendUav(i, args.seed, wind=args.wind, turbulence=level) for i in args.uavs]
+    uavs = [SimulatedUav(i, args.seed, wind=args.wind, turbulence=level) for i in args.uavs]
     with Progress(transient=True) as bar:
         task = bar.add_task(f"flying {len(uavs)} aircraft", total=args.seconds)
         drive.to_tlog(
@@ -99,15 +99,20 @@ def _fly(args: argparse.Namespace, path: Path, stop: Event) -> None:
         )
 
 
-def _judge(args: argparse.Namespace, files: list[Path], stop: Event) -> int:
+def _evaluate(args: argparse.Namespace, files: list[Path], stop: Event) -> int:
     """Identify with the paper's two steps, or predict with its method and the twin's."""
     options = [f"--{name}={value}" for name, value in (("out", args.out), ("json", args.json)) if value]
     if args.experiment == "identify":
         command = ["twin_worker.paper_experiments", args.experiment, f"--first={args.first}"]
     else:
-        command = ["twin_worker.evaluation", f"--methods={_BESIDE}", f"--every={_EVERY_S}", f"--jobs={args.jobs}"]
+        command = [
+            "twin_worker.evaluation",
+            f"--methods={_COMPARED_METHODS}",
+            f"--every={_EVERY_S}",
+            f"--jobs={args.jobs}",
+        ]
     code = run_until(stop, *command, *options, *map(str, files))
     if stop.is_set():
-        tell("paper", "stopped; unfinished results are not written")
+        report_progress("paper", "stopped; unfinished results are not written")
         return INTERRUPTED
     return code

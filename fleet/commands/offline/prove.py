@@ -6,14 +6,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from fleet.cli import stop_on_signal
-from fleet.process.logs import tell
+from fleet.process.logs import report_progress
 
 EXAMPLES = """
   fleet prove --flights 12                                  a demonstration of some minutes
   fleet prove --seed 7 --flights 12 --report proof          store recordings, reports and a page for every flight
   fleet prove --seed 9001 --flights 140 --json proof.json   the complete test
 """
-_FEWEST, _MOST = 6, 2000
+_MIN_FLIGHTS, _MAX_FLIGHTS = 6, 2000
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,40 +32,40 @@ def run(args: argparse.Namespace) -> int:
         ValueError: when an option is invalid; the text names it.
     """
     _check(args)
-    with TemporaryDirectory(prefix="parauav-proof-") as brief:
-        folder = args.report or Path(brief)
+    with TemporaryDirectory(prefix="parauav-proof-") as temporary:
+        folder = args.report or Path(temporary)
         folder.mkdir(exist_ok=True)
-        return _examined(args, folder)
+        return _run_test(args, folder)
 
 
-def _examined(args: argparse.Namespace, folder: Path) -> int:
+def _run_test(args: argparse.Namespace, folder: Path) -> int:
     from rich.console import Console
 
     from fleet.blind_test import page, shown
-    from fleet.blind_test.course import Ended, Paper, examine
+    from fleet.blind_test.course import BlindTestConfig, RunAborted, run_blind_test
     from fleet.blind_test.score import score
 
-    paper = Paper(args.seed, args.flights, folder, args.jobs, pages=args.report is not None)
+    setup = BlindTestConfig(args.seed, args.flights, folder, args.jobs, write_pages=args.report is not None)
     try:
-        marked = examine(paper, stop_on_signal(), _say)
-    except Ended as ended:
+        result = run_blind_test(setup, stop_on_signal(), _report)
+    except RunAborted as ended:
         return ended.code
-    scores = score(marked.marks)
-    Console().print(shown.table(marked.marks, scores))
+    scores = score(result.results)
+    Console().print(shown.table(result.results, scores))
     if args.json:
-        args.json.write_text(json.dumps(shown.written(paper, marked, scores), indent=1) + "\n")
+        args.json.write_text(json.dumps(shown.as_json_values(setup, result, scores), indent=1) + "\n")
     if args.report:
-        _say(f"wrote {page.write(paper, marked, scores)}")
+        _report(f"wrote {page.write(setup, result, scores)}")
     return 0
 
 
-def _say(words: str) -> None:
-    tell("prove", words)
+def _report(text: str) -> None:
+    report_progress("prove", text)
 
 
 def _check(args: argparse.Namespace) -> None:
-    if not _FEWEST <= args.flights <= _MOST:
-        raise ValueError(f"--flights: found {args.flights}, expected {_FEWEST}..{_MOST}; change it")
+    if not _MIN_FLIGHTS <= args.flights <= _MAX_FLIGHTS:
+        raise ValueError(f"--flights: found {args.flights}, expected {_MIN_FLIGHTS}..{_MAX_FLIGHTS}; change it")
     if not 0 <= args.seed < 2**31:
         raise ValueError(f"--seed: found {args.seed}, expected an integer from 0; change it")
     if not 1 <= args.jobs <= 64:

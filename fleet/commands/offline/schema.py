@@ -11,7 +11,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 
-from fleet.bus.bus_protocol import key
+from fleet.bus.bus_protocol import key_of
 from fleet.bus.codec import encoding
 from fleet.contract import COLUMNS, PER_UAV, QUERIES, TOPICS, Sample, meaning
 
@@ -46,12 +46,12 @@ def run(args: argparse.Namespace) -> int:
 
 def topic_of(kind: type) -> str:
     """Return the topic of a message class."""
-    return next(topic for topic, found in TOPICS.items() if found is kind)
+    return next(topic for topic, candidate in TOPICS.items() if candidate is kind)
 
 
 def wire_key(kind: type) -> str:
     """Return the key with its variable chunk in braces."""
-    return key(kind, "{uav}" if kind in PER_UAV else "{writer}")
+    return key_of(kind, "{uav}" if kind in PER_UAV else "{writer}")
 
 
 def summary(kind: type) -> str:
@@ -62,12 +62,12 @@ def summary(kind: type) -> str:
 def as_json(kind: type) -> dict[str, Any]:
     """Describe a class as a JSON object: key, encoding, attachment, schema."""
     payload = QUERIES.get(kind)
-    (schema, *asked), components = msgspec.json.schema_components([kind, *filter(None, [payload])])
+    (schema, *query_schemas), components = msgspec.json.schema_components([kind, *filter(None, [payload])])
     described = {
         "key": wire_key(kind),
         "encoding": encoding(kind),
         "attachment": ATTACHMENT if topic_of(kind) in STAMPED else None,
-        "query": asked[0] if asked else None,
+        "query": query_schemas[0] if query_schemas else None,
         "schema": schema,
         "components": components,
     }
@@ -86,7 +86,7 @@ def as_text(kind: type) -> str:
     lines += fields_of(kind)
     for part in parts_of(kind):
         lines += ["", f"  {part.__name__}: {summary(part)}"]
-        lines += [f"    {word.value}" for word in part] if issubclass(part, enum.Enum) else fields_of(part)
+        lines += [f"    {member.value}" for member in part] if issubclass(part, enum.Enum) else fields_of(part)
     if kind is Sample:
         lines += ["", "  columns of each Rows field, in order:"]
         for name, rows in COLUMNS.items():
@@ -128,17 +128,17 @@ def type_name(hint: Any) -> str:
 
 def parts_of(kind: type) -> list[type]:
     """List the structs and enumerations used by a class, each once, in order of appearance."""
-    found: list[type] = []
+    parts: list[type] = []
 
     def walk(hint: Any) -> None:
         for part in get_args(hint):
             walk(part)
-        if isinstance(hint, type) and issubclass(hint, (msgspec.Struct, enum.Enum)) and hint not in found:
-            found.append(hint)
+        if isinstance(hint, type) and issubclass(hint, (msgspec.Struct, enum.Enum)) and hint not in parts:
+            parts.append(hint)
             if issubclass(hint, msgspec.Struct):
                 for inner in get_type_hints(hint, include_extras=True).values():
                     walk(inner)
 
     walk(kind)
     walk(QUERIES.get(kind))
-    return found[1:]
+    return parts[1:]

@@ -6,16 +6,16 @@ state with and without the effect. The second compares two flights of the same s
 
 import numpy as np
 
-from fleet.simulator.conceal.plan import Planned
-from fleet.simulator.conceal.record import Log, fly
-from fleet.simulator.faults.carried import Carried
+from fleet.simulator.conceal.plan import PlannedFlight
+from fleet.simulator.conceal.record import ExamFlightLog, fly
+from fleet.simulator.faults.carried import FaultSet
 from fleet.simulator.faults.fault import Fault
-from fleet.simulator.faults.oddities import ODD
-from fleet.simulator.faults.physics import CHANGES, WINDS
-from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.faults.oddities import UNCATALOGUED
+from fleet.simulator.faults.physics import PHYSICS_FAULTS, WIND_FAULTS
+from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.jsbsim import DT
 
-_AT_ONCE: dict[str, float] = {  # noise per channel and sample, as in `sensors`
+_NOISE: dict[str, float] = {  # noise per channel and sample, as in `sensors`
     **dict.fromkeys(("aileron", "elevator", "rudder", "throttle"), 0.01),  # fraction of full travel
     **dict.fromkeys(("p", "q", "r"), 0.003),  # [rad/s]
     **dict.fromkeys(("a_x", "a_y", "a_z"), 0.07),  # [m/s2]
@@ -27,21 +27,21 @@ _AT_ONCE: dict[str, float] = {  # noise per channel and sample, as in `sensors`
     **dict.fromkeys(("f_x", "f_y", "f_z"), 0.07),  # [m/s2]
     **dict.fromkeys(("w_n", "w_e", "w_d"), 0.25),  # [m/s]
 }
-_FLOWN: dict[str, float] = {  # columns of `ExamFlightLog.channels`
-    **{name: _AT_ONCE[name] for name in ("p", "q", "r", "a_x", "a_y", "a_z", "phi", "theta", "psi")},
-    **{name: _AT_ONCE[name] for name in ("v_n", "v_e", "v_d")},
+_FLIGHT_NOISE: dict[str, float] = {  # columns of `ExamFlightLog.channels`
+    **{name: _NOISE[name] for name in ("p", "q", "r", "a_x", "a_y", "a_z", "phi", "theta", "psi")},
+    **{name: _NOISE[name] for name in ("v_n", "v_e", "v_d")},
     **dict.fromkeys(("p_n", "p_e", "p_d"), 0.5),  # [m]
     "Va": 0.25,
     "baro": 0.4,
     "satellites": 1.5,  # [m/s], [m], [m]
-    **{name: _AT_ONCE[name] for name in ("aileron", "elevator", "throttle", "rudder")},
+    **{name: _NOISE[name] for name in ("aileron", "elevator", "throttle", "rudder")},
 }
-_LATE = ("turbulence", "flap_deployed", "thrust_loss", "_surging_engine")  # not observable in a single sample
-_SHAKEN = ("p", "q", "r", "a_y", "a_z", "Va")
-LEAST = 2.0  # rms over the noise
+_SLOW_EFFECTS = ("turbulence", "flap_deployed", "thrust_loss", "_surging_engine")  # not observable in a single sample
+_SCATTER_CHANNELS = ("p", "q", "r", "a_y", "a_z", "Va")
+MIN_OVER_NOISE = 2.0  # rms over the noise
 
 
-def acts(planned: Planned, fault: Fault, log: Log) -> dict[str, object]:
+def effect_strength(planned: PlannedFlight, fault: Fault, log: ExamFlightLog) -> dict[str, object]:
     """Compute the strength of one hidden effect while it is active.
 
     Args:
@@ -52,63 +52,67 @@ def acts(planned: Planned, fault: Fault, log: Log) -> dict[str, object]:
         name; over_noise, channel: largest rms over noise and its channel; flown_over_noise, flown_channel: the same for
         the difference of two flights
     """
-    without, _ = fly(planned, tuple(x for x in planned.hidden if x is not fault))
-    there = np.array([fault.share(t) > 0 for t in log.t])
-    flown = _flown(log.seen[there], without.seen[there], shaken=fault.name == "turbulence")
-    late = fault.name in _LATE and not (fault.name == "thrust_loss" and planned.job.airframe == "small")
-    best = flown if late else _at_once(planned, fault, there)
+    reference, _ = fly(planned, tuple(x for x in planned.hidden_faults if x is not fault))
+    active = np.array([fault.intensity(t) > 0 for t in log.t])
+    between_flights = _compare_flights(
+        log.channels[active], reference.channels[active], scatter_only=fault.name == "turbulence"
+    )
+    is_slow = fault.name in _SLOW_EFFECTS and not (fault.name == "thrust_loss" and planned.job.airframe == "small")
+    strongest = between_flights if is_slow else _compare_instants(planned, fault, active)
     return {
         "name": fault.name,
-        "over_noise": round(best[0], 1),
-        "channel": best[1],
-        "flown_over_noise": round(flown[0], 1),
-        "flown_channel": flown[1],
+        "over_noise": round(strongest[0], 1),
+        "channel": strongest[1],
+        "flown_over_noise": round(between_flights[0], 1),
+        "flown_channel": between_flights[1],
     }
 
 
-def _flown(with_it: np.ndarray, without: np.ndarray, shaken: bool) -> tuple[float, str]:
+def _compare_flights(affected: np.ndarray, reference: np.ndarray, scatter_only: bool) -> tuple[float, str]:
     """Compare two flights; turbulence by its variance. Horizontal position and velocity are no evidence."""
-    names = list(_FLOWN)
-    difference = with_it - without
-    turns = [names.index(name) for name in ("phi", "psi")]
-    difference[:, turns] = np.angle(np.exp(1j * difference[:, turns]))
-    size = np.sqrt(np.mean(difference**2, axis=0))
-    if shaken:
-        size = np.sqrt(np.maximum(with_it.var(axis=0) - without.var(axis=0), 0.0))
-    rms = dict(zip(names, size / np.array(list(_FLOWN.values())), strict=True))
-    telling = _SHAKEN if shaken else [x for x in names if x not in ("p_n", "p_e", "v_n", "v_e", "satellites")]
-    return _most(rms, telling)
+    names = list(_FLIGHT_NOISE)
+    difference = affected - reference
+    angles = [names.index(name) for name in ("phi", "psi")]
+    difference[:, angles] = np.angle(np.exp(1j * difference[:, angles]))
+    magnitude = np.sqrt(np.mean(difference**2, axis=0))
+    if scatter_only:
+        magnitude = np.sqrt(np.maximum(affected.var(axis=0) - reference.var(axis=0), 0.0))
+    rms = dict(zip(names, magnitude / np.array(list(_FLIGHT_NOISE.values())), strict=True))
+    channels = (
+        _SCATTER_CHANNELS if scatter_only else [x for x in names if x not in ("p_n", "p_e", "v_n", "v_e", "satellites")]
+    )
+    return _strongest(rms, channels)
 
 
-def _most(rms: dict[str, float], telling: object) -> tuple[float, str]:
-    best = max(telling, key=lambda name: rms[name])  # type: ignore[call-overload]
-    return float(rms[best]), best
+def _strongest(rms: dict[str, float], channels: object) -> tuple[float, str]:
+    strongest = max(channels, key=lambda name: rms[name])  # type: ignore[call-overload]
+    return float(rms[strongest]), strongest
 
 
-def _at_once(planned: Planned, fault: Fault, there: np.ndarray) -> tuple[float, str]:
+def _compare_instants(planned: PlannedFlight, fault: Fault, active: np.ndarray) -> tuple[float, str]:
     """Repeat the flight and compare with and without the fault at each sample."""
     rows: list[np.ndarray] = []
-    fly(planned, planned.hidden, look=lambda uav: rows.append(_changed(uav, fault)))
-    size = np.sqrt(np.mean(np.array(rows)[there] ** 2, axis=0)) / np.array(list(_AT_ONCE.values()))
-    return _most(dict(zip(_AT_ONCE, size, strict=True)), list(_AT_ONCE))
+    fly(planned, planned.hidden_faults, observe=lambda uav: rows.append(_instant_changes(uav, fault)))
+    magnitude = np.sqrt(np.mean(np.array(rows)[active] ** 2, axis=0)) / np.array(list(_NOISE.values()))
+    return _strongest(dict(zip(_NOISE, magnitude, strict=True)), list(_NOISE))
 
 
-def _changed(uav: PretendUav, fault: Fault) -> np.ndarray:
+def _instant_changes(uav: SimulatedUav, fault: Fault) -> np.ndarray:
     """Return the changes by one fault at this instant, columns as in `_NOISE`."""
-    t, carried = uav.tick * DT, uav.carried
-    assert carried is not None
-    felt, blown = np.zeros(6), np.zeros(3)
-    if fault.name in CHANGES or fault.name in ODD:
-        felt = _forces(uav, carried, fault, t)
-    if fault.name in WINDS:
-        blown = fault.share(t) * WINDS[fault.name](fault.values, -float(uav.now.p[2]))
-    return np.concatenate([carried.moved[fault], carried.spoilt[fault], felt, blown])
+    t, fault_set = uav.tick * DT, uav.fault_set
+    assert fault_set is not None
+    reactions, wind = np.zeros(6), np.zeros(3)
+    if fault.name in PHYSICS_FAULTS or fault.name in UNCATALOGUED:
+        reactions = _reaction_changes(uav, fault_set, fault, t)
+    if fault.name in WIND_FAULTS:
+        wind = fault.intensity(t) * WIND_FAULTS[fault.name](fault.values, -float(uav.estimate.p[2]))
+    return np.concatenate([fault_set.command_changes[fault], fault_set.estimate_changes[fault], reactions, wind])
 
 
-def _forces(uav: PretendUav, carried: Carried, fault: Fault, t: float) -> np.ndarray:
+def _reaction_changes(uav: SimulatedUav, fault_set: FaultSet, fault: Fault, t: float) -> np.ndarray:
     """Return the change of moments and forces by a fault; evaluate twice with it, since servos advance each time."""
-    before = uav.aircraft.ponder()
-    carried.press(t, without=fault)
-    without = uav.aircraft.ponder()
-    carried.press(t)
-    return np.asarray((before + uav.aircraft.ponder()) / 2 - without)
+    with_fault = uav.aircraft.evaluate_accelerations()
+    fault_set.apply_to_physics(t, excluding=fault)
+    without_fault = uav.aircraft.evaluate_accelerations()
+    fault_set.apply_to_physics(t)
+    return np.asarray((with_fault + uav.aircraft.evaluate_accelerations()) / 2 - without_fault)

@@ -19,35 +19,35 @@ BOTH, CESSNA, SMALL = ("c172p", "small"), ("c172p",), ("small",)
 SERVO_LAG_S = {"c172p": 0.0, "small": 1 / 22}  # of the healthy servo, from the aircraft file
 
 
-class Hidden(NamedTuple):
+class HiddenEffect(NamedTuple):
     """One effect that can be hidden."""
 
     channel: str  # effects of one channel are not separable
     draw: Draw
-    comes: tuple[str, ...] = ("always", "step")  # time profiles, equally probable
+    profiles: tuple[str, ...] = ("always", "step")  # time profiles, equally probable
     airframes: tuple[str, ...] = BOTH
-    of: tuple[str, ...] = ("",)
-    told: tuple[str, ...] | None = ()  # values that a report should contain; None: all
+    parts: tuple[str, ...] = ("",)
+    reported: tuple[str, ...] | None = ()  # values that a report should contain; None: all
 
 
-def _signed(rng: np.random.Generator, low: float, high: float) -> float:
+def _random_sign(rng: np.random.Generator, low: float, high: float) -> float:
     return float(rng.choice([-1, 1]) * rng.uniform(low, high))
 
 
-def _between(key: str, cessna: tuple[float, float], small: tuple[float, float]) -> Draw:
+def _uniform(key: str, cessna: tuple[float, float], small: tuple[float, float]) -> Draw:
     return lambda rng, is_small: {key: float(rng.uniform(*(small if is_small else cessna)))}
 
 
-def _either(key: str, cessna: tuple[float, float], small: tuple[float, float]) -> Draw:
-    return lambda rng, is_small: {key: _signed(rng, *(small if is_small else cessna))}
+def _uniform_signed(key: str, cessna: tuple[float, float], small: tuple[float, float]) -> Draw:
+    return lambda rng, is_small: {key: _random_sign(rng, *(small if is_small else cessna))}
 
 
 def _fixed(**values: float) -> Draw:
     return lambda rng, is_small: dict(values)
 
 
-def _blown(key: str, cessna: tuple[float, float], small: tuple[float, float]) -> Draw:
-    speed = _between(key, cessna, small)
+def _wind(key: str, cessna: tuple[float, float], small: tuple[float, float]) -> Draw:
+    speed = _uniform(key, cessna, small)
     return lambda rng, is_small: speed(rng, is_small) | {"from_deg": float(rng.uniform(0.0, 360.0))}
 
 
@@ -58,74 +58,92 @@ def _icing(rng: np.random.Generator, is_small: bool) -> Values:
     }
 
 
-def _misaligned(rng: np.random.Generator, is_small: bool) -> Values:
-    return {name: _signed(rng, 1.5, 4.5) for name in ("roll_deg", "pitch_deg", "yaw_deg")}
+def _misalignment(rng: np.random.Generator, is_small: bool) -> Values:
+    return {name: _random_sign(rng, 1.5, 4.5) for name in ("roll_deg", "pitch_deg", "yaw_deg")}
 
 
-def _scaled(rng: np.random.Generator, is_small: bool) -> Values:
+def _airspeed_scale(rng: np.random.Generator, is_small: bool) -> Values:
     return {"scale": float(rng.choice([rng.uniform(0.84, 0.93), rng.uniform(1.07, 1.14)]))}
 
 
-def _dense(rng: np.random.Generator, is_small: bool) -> Values:
+def _density(rng: np.random.Generator, is_small: bool) -> Values:
     return {"density_ratio": float(rng.choice([rng.uniform(0.84, 0.93), rng.uniform(1.06, 1.1)], p=[0.75, 0.25]))}
 
 
-def _same(low: float, high: float) -> tuple[tuple[float, float], tuple[float, float]]:
+def _both(low: float, high: float) -> tuple[tuple[float, float], tuple[float, float]]:
     return (low, high), (low, high)
 
 
 _ALWAYS, _STEPS = ("always",), ("step",)
-HIDDEN: dict[str, Hidden] = {
-    "wind_steady": Hidden("air", _blown("speed_mps", (4.0, 9.0), (2.5, 5.0)), told=None),
-    "wind_shear": Hidden("air", _blown("mps_per_100m", *_same(2.5, 5.0)), _ALWAYS, CESSNA, told=None),
-    "gust_discrete": Hidden("air", _blown("speed_mps", (5.0, 9.0), (3.0, 6.0)), ("pass",), told=None),
-    "updraft": Hidden("air", _either("speed_mps", (2.5, 5.0), (1.5, 3.0)), ("pass",), told=None),
-    "turbulence": Hidden("air", _between("w20_mps", *_same(6.0, 11.0))),
-    "air_density": Hidden("air", _dense, _ALWAYS),
-    "actuator_lag": Hidden("servo", _between("tau_s", (0.15, 0.4), (0.12, 0.3)), of=SURFACES, told=None),
-    "actuator_delay": Hidden("servo", _between("delay_s", (0.12, 0.3), (0.08, 0.2)), of=SURFACES, told=None),
-    "actuator_rate_limit": Hidden("servo", _between("rate_per_s", (0.08, 0.25), (0.2, 0.6)), of=SURFACES, told=None),
-    "actuator_deadband": Hidden("servo", _between("half_width", (0.04, 0.1), (0.04, 0.1)), of=SURFACES, told=None),
-    "actuator_offset": Hidden("servo", _either("offset", (0.08, 0.2), (0.08, 0.2)), of=SURFACES, told=None),
-    "actuator_stuck": Hidden("servo", _either("position", (0.05, 0.25), (0.04, 0.15)), of=("rudder",)),
-    "control_effectiveness_loss": Hidden("servo", _between("loss", *_same(0.3, 0.6)), of=SURFACES, told=None),
-    "prop_torque": Hidden("roll", _fixed(sense=1.0), _ALWAYS, CESSNA),
-    "p_factor": Hidden("yaw", _between("inches_per_rad", *_same(60.0, 140.0)), _ALWAYS, CESSNA),
-    "slipstream_tail": Hidden("pitch", _fixed(share=1.0), _ALWAYS, CESSNA),
-    "thrust_loss": Hidden("force", _between("fraction", (0.15, 0.3), (0.15, 0.35))),
-    "drag_increase": Hidden("force", _between("dCD", (0.015, 0.04), (0.02, 0.05)), told=None),
-    "icing": Hidden("force", _icing, ("ramp",), told=None),
-    "flap_deployed": Hidden("force", lambda rng, _: {"flap_deg": float(rng.choice([10, 20]))}, airframes=CESSNA),
-    "mass_change": Hidden("force", _either("dmass_kg", (55.0, 110.0), (0.9, 1.8)), told=None),
-    "cg_shift": Hidden("pitch", _either("dx_m", (0.04, 0.1), (0.008, 0.02)), told=None),
-    "airspeed_scale": Hidden("airspeed", _scaled, told=None),
-    "airspeed_bias": Hidden("airspeed", _either("bias_mps", (2.5, 5.0), (1.5, 3.0)), told=None),
-    "gps_latency": Hidden("gps", _between("latency_s", *_same(0.2, 0.5)), told=None),
-    "imu_misalignment": Hidden("imu", _misaligned, told=None),
-    "gyro_bias": Hidden("imu", _either("bias_dps", *_same(0.7, 2.0)), of=("p", "q", "r"), told=None),
-    "accel_bias": Hidden("imu", _either("bias_mps2", *_same(0.3, 0.8)), of=("x", "y", "z"), told=None),
-    "heading_bias": Hidden("heading", _either("bias_deg", *_same(6.0, 15.0)), told=None),
+HIDDEN: dict[str, HiddenEffect] = {
+    "wind_steady": HiddenEffect("air", _wind("speed_mps", (4.0, 9.0), (2.5, 5.0)), reported=None),
+    "wind_shear": HiddenEffect("air", _wind("mps_per_100m", *_both(2.5, 5.0)), _ALWAYS, CESSNA, reported=None),
+    "gust_discrete": HiddenEffect("air", _wind("speed_mps", (5.0, 9.0), (3.0, 6.0)), ("pass",), reported=None),
+    "updraft": HiddenEffect("air", _uniform_signed("speed_mps", (2.5, 5.0), (1.5, 3.0)), ("pass",), reported=None),
+    "turbulence": HiddenEffect("air", _uniform("w20_mps", *_both(6.0, 11.0))),
+    "air_density": HiddenEffect("air", _density, _ALWAYS),
+    "actuator_lag": HiddenEffect("servo", _uniform("tau_s", (0.15, 0.4), (0.12, 0.3)), parts=SURFACES, reported=None),
+    "actuator_delay": HiddenEffect(
+        "servo", _uniform("delay_s", (0.12, 0.3), (0.08, 0.2)), parts=SURFACES, reported=None
+    ),
+    "actuator_rate_limit": HiddenEffect(
+        "servo", _uniform("rate_per_s", (0.08, 0.25), (0.2, 0.6)), parts=SURFACES, reported=None
+    ),
+    "actuator_deadband": HiddenEffect(
+        "servo", _uniform("half_width", (0.04, 0.1), (0.04, 0.1)), parts=SURFACES, reported=None
+    ),
+    "actuator_offset": HiddenEffect(
+        "servo", _uniform_signed("offset", (0.08, 0.2), (0.08, 0.2)), parts=SURFACES, reported=None
+    ),
+    "actuator_stuck": HiddenEffect("servo", _uniform_signed("position", (0.05, 0.25), (0.04, 0.15)), parts=("rudder",)),
+    "control_effectiveness_loss": HiddenEffect(
+        "servo", _uniform("loss", *_both(0.3, 0.6)), parts=SURFACES, reported=None
+    ),
+    "prop_torque": HiddenEffect("roll", _fixed(sense=1.0), _ALWAYS, CESSNA),
+    "p_factor": HiddenEffect("yaw", _uniform("inches_per_rad", *_both(60.0, 140.0)), _ALWAYS, CESSNA),
+    "slipstream_tail": HiddenEffect("pitch", _fixed(share=1.0), _ALWAYS, CESSNA),
+    "thrust_loss": HiddenEffect("force", _uniform("fraction", (0.15, 0.3), (0.15, 0.35))),
+    "drag_increase": HiddenEffect("force", _uniform("dCD", (0.015, 0.04), (0.02, 0.05)), reported=None),
+    "icing": HiddenEffect("force", _icing, ("ramp",), reported=None),
+    "flap_deployed": HiddenEffect("force", lambda rng, _: {"flap_deg": float(rng.choice([10, 20]))}, airframes=CESSNA),
+    "mass_change": HiddenEffect("force", _uniform_signed("dmass_kg", (55.0, 110.0), (0.9, 1.8)), reported=None),
+    "cg_shift": HiddenEffect("pitch", _uniform_signed("dx_m", (0.04, 0.1), (0.008, 0.02)), reported=None),
+    "airspeed_scale": HiddenEffect("airspeed", _airspeed_scale, reported=None),
+    "airspeed_bias": HiddenEffect("airspeed", _uniform_signed("bias_mps", (2.5, 5.0), (1.5, 3.0)), reported=None),
+    "gps_latency": HiddenEffect("gps", _uniform("latency_s", *_both(0.2, 0.5)), reported=None),
+    "imu_misalignment": HiddenEffect("imu", _misalignment, reported=None),
+    "gyro_bias": HiddenEffect(
+        "imu", _uniform_signed("bias_dps", *_both(0.7, 2.0)), parts=("p", "q", "r"), reported=None
+    ),
+    "accel_bias": HiddenEffect(
+        "imu", _uniform_signed("bias_mps2", *_both(0.3, 0.8)), parts=("x", "y", "z"), reported=None
+    ),
+    "heading_bias": HiddenEffect("heading", _uniform_signed("bias_deg", *_both(6.0, 15.0)), reported=None),
     # a constant bias is equivalent to a different sea level pressure
-    "baro_bias": Hidden("baro", _either("bias_m", (10.0, 25.0), (8.0, 20.0)), _STEPS, told=None),
+    "baro_bias": HiddenEffect("baro", _uniform_signed("bias_m", (10.0, 25.0), (8.0, 20.0)), _STEPS, reported=None),
 }
-UNKNOWN: dict[str, Hidden] = {
-    "_crossed_linkage": Hidden("", _either("gain", *_same(0.7, 1.2)), _STEPS),
-    "_torn_fin": Hidden("", _fixed(C_n_beta=0.3, C_Y_beta=0.5), _STEPS),
-    "_roll_damping": Hidden("", lambda rng, _: {"C_l_p": float(rng.choice([0.35, 1.9]))}, _STEPS),
-    "_pitch_damping": Hidden("", lambda rng, _: {"C_m_q": float(rng.choice([0.2, 2.2]))}, _STEPS),
-    "_loose_hinge": Hidden("", lambda rng, _: {"half_width": rng.uniform(0.03, 0.05), "hertz": rng.uniform(0.6, 1.2)}),
-    "_surging_engine": Hidden("", lambda rng, _: {"fraction": rng.uniform(0.25, 0.4), "hertz": rng.uniform(0.15, 0.4)}),
-    "_sloshing_tank": Hidden("", _fixed(m_per_mps2=0.35, most_m=0.7, tau_s=1.5), airframes=CESSNA),
-    "_gyro_scale": Hidden("", _either("scale", *_same(0.15, 0.3)), _STEPS),
-    "_pitot_lag": Hidden("", _between("tau_s", *_same(3.0, 6.0)), _STEPS),
+UNKNOWN: dict[str, HiddenEffect] = {
+    "_crossed_linkage": HiddenEffect("", _uniform_signed("gain", *_both(0.7, 1.2)), _STEPS),
+    "_torn_fin": HiddenEffect("", _fixed(C_n_beta=0.3, C_Y_beta=0.5), _STEPS),
+    "_roll_damping": HiddenEffect("", lambda rng, _: {"C_l_p": float(rng.choice([0.35, 1.9]))}, _STEPS),
+    "_pitch_damping": HiddenEffect("", lambda rng, _: {"C_m_q": float(rng.choice([0.2, 2.2]))}, _STEPS),
+    "_loose_hinge": HiddenEffect(
+        "", lambda rng, _: {"half_width": rng.uniform(0.03, 0.05), "hertz": rng.uniform(0.6, 1.2)}
+    ),
+    "_surging_engine": HiddenEffect(
+        "", lambda rng, _: {"fraction": rng.uniform(0.25, 0.4), "hertz": rng.uniform(0.15, 0.4)}
+    ),
+    "_sloshing_tank": HiddenEffect("", _fixed(m_per_mps2=0.35, most_m=0.7, tau_s=1.5), airframes=CESSNA),
+    "_gyro_scale": HiddenEffect("", _uniform_signed("scale", *_both(0.15, 0.3)), _STEPS),
+    "_pitot_lag": HiddenEffect("", _uniform("tau_s", *_both(3.0, 6.0)), _STEPS),
 }
 
 
-def told(name: str, airframe: str, values: Mapping[str, float]) -> Values:
+def reported_values(name: str, airframe: str, values: Mapping[str, float]) -> Values:
     """Return the expected report values known from the draw; a servo lag includes that of the healthy servo."""
     if name == "thrust_loss" and airframe == "small":
         return dict(values)
     if name == "actuator_lag":
         return {"tau_s": values["tau_s"] + SERVO_LAG_S[airframe]}
-    wanted = (HIDDEN | UNKNOWN)[name].told
-    return dict(values) if wanted is None else {key: values[key] for key in wanted}
+    reported_keys = (HIDDEN | UNKNOWN)[name].reported
+    return dict(values) if reported_keys is None else {key: values[key] for key in reported_keys}

@@ -7,34 +7,44 @@ import numpy as np
 
 from fleet.contract import Item
 from fleet.frames import Origin, wrap
-from fleet.simulator.vehicle.missions import ABSOLUTE, DO_CHANGE_SPEED, DO_JUMP, LOITER_TURNS, WAYPOINT, Start, item
+from fleet.simulator.vehicle.missions import (
+    ABSOLUTE,
+    DO_CHANGE_SPEED,
+    DO_JUMP,
+    LOITER_TURNS,
+    WAYPOINT,
+    StartState,
+    mission_item,
+)
 from fleet.simulator.vehicle.situation import Pilot
 
-FIELD = Origin(536_500_000, 80_500_000, 5_000)  # marshland by the sea [1e-7 deg, 1e-7 deg, mm]
+EXAM_HOME = Origin(536_500_000, 80_500_000, 5_000)  # marshland by the sea [1e-7 deg, 1e-7 deg, mm]
 """Near sea level: the turbulence of JSBSim scales with the wind at 20 ft only below 1000 ft above sea level."""
 _LEGS = 14
 _SPEEDS = (0.90, 0.95, 1.0, 1.06, 1.12)  # of cruise
 _TURNS_DEG = (30, 50, 70, 90, 110, 140)
 
 
-class Ground(NamedTuple):
+class MissionLimits(NamedTuple):
     """Limits of the missions of one airframe."""
 
     cruise: float  # [m/s]
     leg: tuple[float, float]  # minimum and maximum length [m]
-    reach: float  # maximum distance of waypoints from home [m]
+    max_range: float  # maximum distance of waypoints from home [m]
     height: tuple[float, float]  # minimum and maximum above home [m]
     slope: tuple[float, float]  # steepest climb and descent [-]
     circle: float  # radius [m]
 
 
-GROUNDS = {
-    "small": Ground(23.0, (260.0, 520.0), 1_000.0, (80.0, 200.0), (0.075, 0.055), 95.0),
-    "c172p": Ground(48.0, (750.0, 1_500.0), 3_500.0, (110.0, 285.0), (0.042, 0.04), 450.0),
+MISSION_LIMITS = {
+    "small": MissionLimits(23.0, (260.0, 520.0), 1_000.0, (80.0, 200.0), (0.075, 0.055), 95.0),
+    "c172p": MissionLimits(48.0, (750.0, 1_500.0), 3_500.0, (110.0, 285.0), (0.042, 0.04), 450.0),
 }
 
 
-def plan(rng: np.random.Generator, airframe: str, steep: bool = False) -> tuple[tuple[Item, ...], Start]:
+def draw_exam_mission(
+    rng: np.random.Generator, airframe: str, steep: bool = False
+) -> tuple[tuple[Item, ...], StartState]:
     """Draw a mission that turns both ways, climbs, descends and changes speed every other leg.
 
     Args:
@@ -42,61 +52,71 @@ def plan(rng: np.random.Generator, airframe: str, steep: bool = False) -> tuple[
         airframe: key of `MISSION_LIMITS`
         steep: climb and descend over the full height range, for effects that depend on height
     """
-    ground = GROUNDS[airframe]
-    spots = _walk(rng, ground, steep)
-    items = [item(0, WAYPOINT, FIELD, (0.0, 0.0, 0.0), frame=ABSOLUTE)]
+    limits = MISSION_LIMITS[airframe]
+    waypoints = _random_walk(rng, limits, steep)
+    items = [mission_item(0, WAYPOINT, EXAM_HOME, (0.0, 0.0, 0.0), frame=ABSOLUTE)]
     circle_at = int(rng.integers(5, 9))
     speed = 1.0
-    for k, spot in enumerate(spots):
+    for k, waypoint in enumerate(waypoints):
         if k % 2 == 0:
             speed = float(rng.choice([x for x in _SPEEDS if abs(x - speed) > 0.04]))
-            items.append(item(len(items), DO_CHANGE_SPEED, FIELD, params=(0.0, round(speed * ground.cruise, 1), -1.0)))
+            items.append(
+                mission_item(
+                    len(items), DO_CHANGE_SPEED, EXAM_HOME, params=(0.0, round(speed * limits.cruise, 1), -1.0)
+                )
+            )
         if k == circle_at:
-            radius = float(rng.choice([-1, 1])) * ground.circle
-            items.append(item(len(items), LOITER_TURNS, FIELD, spot, params=(1.0, 0.0, radius)))
+            radius = float(rng.choice([-1, 1])) * limits.circle
+            items.append(mission_item(len(items), LOITER_TURNS, EXAM_HOME, waypoint, params=(1.0, 0.0, radius)))
         else:
-            items.append(item(len(items), WAYPOINT, FIELD, spot))
+            items.append(mission_item(len(items), WAYPOINT, EXAM_HOME, waypoint))
     first = next(i.seq for i in items[1:] if i.command == WAYPOINT)
-    items.append(item(len(items), DO_JUMP, FIELD, params=(1.0, -1.0)))
-    return tuple(items), _before(rng, spots[0], spots[1], ground, first)
+    items.append(mission_item(len(items), DO_JUMP, EXAM_HOME, params=(1.0, -1.0)))
+    return tuple(items), _start_before(rng, waypoints[0], waypoints[1], limits, first)
 
 
-def _walk(rng: np.random.Generator, ground: Ground, steep: bool) -> list[tuple[float, float, float]]:
+def _random_walk(rng: np.random.Generator, limits: MissionLimits, steep: bool) -> list[tuple[float, float, float]]:
     """Draw waypoints, NED from home [m]; most turns alternate in direction."""
     bearing = rng.uniform(-pi, pi)
-    n, e = 0.4 * ground.reach * cos(bearing), 0.4 * ground.reach * sin(bearing)
-    h, course, side = rng.uniform(*ground.height), rng.uniform(-pi, pi), float(rng.choice([-1, 1]))
-    spots = []
+    n, e = 0.4 * limits.max_range * cos(bearing), 0.4 * limits.max_range * sin(bearing)
+    h, course, side = rng.uniform(*limits.height), rng.uniform(-pi, pi), float(rng.choice([-1, 1]))
+    waypoints = []
     for k in range(_LEGS):
         side *= -1 if rng.random() < 0.65 else 1
-        turn, length = side * radians(float(rng.choice(_TURNS_DEG))), rng.uniform(*ground.leg)
-        if hypot(n + length * cos(course + turn), e + length * sin(course + turn)) > ground.reach:
+        turn, length = side * radians(float(rng.choice(_TURNS_DEG))), rng.uniform(*limits.leg)
+        if hypot(n + length * cos(course + turn), e + length * sin(course + turn)) > limits.max_range:
             turn = float(np.clip(wrap(atan2(-e, -n) - course), -2.4, 2.4)) + rng.uniform(-0.2, 0.2)
         course = wrap(course + turn)
         n, e = n + length * cos(course), e + length * sin(course)
-        climb, sink = ground.slope[0] * length, ground.slope[1] * length
-        middle = sum(ground.height) / 2
-        up = (k // 2) % 2 == 0 if steep else (h < middle) == (rng.random() < 0.7)
-        effort = 1.0 if steep else rng.choice([0.0, 0.6, 1.0])
-        h = float(np.clip(h + effort * (climb if up else -sink), *ground.height))
-        spots.append((n, e, -h))
-    return spots
+        climb, sink = limits.slope[0] * length, limits.slope[1] * length
+        middle = sum(limits.height) / 2
+        climbs = (k // 2) % 2 == 0 if steep else (h < middle) == (rng.random() < 0.7)
+        slope_fraction = 1.0 if steep else rng.choice([0.0, 0.6, 1.0])
+        h = float(np.clip(h + slope_fraction * (climb if climbs else -sink), *limits.height))
+        waypoints.append((n, e, -h))
+    return waypoints
 
 
-def _before(
-    rng: np.random.Generator, spot: tuple[float, ...], then: tuple[float, ...], ground: Ground, seq: int
-) -> Start:
+def _start_before(
+    rng: np.random.Generator,
+    waypoint: tuple[float, ...],
+    next_waypoint: tuple[float, ...],
+    limits: MissionLimits,
+    seq: int,
+) -> StartState:
     """Return a start state before the first waypoint, roughly in the direction of the second."""
-    course = wrap(atan2(then[1] - spot[1], then[0] - spot[0]) + rng.uniform(-0.6, 0.6))
-    back = 10.0 * ground.cruise
-    return Start(seq, np.array([spot[0] - back * cos(course), spot[1] - back * sin(course), spot[2]]), course)
+    course = wrap(atan2(next_waypoint[1] - waypoint[1], next_waypoint[0] - waypoint[0]) + rng.uniform(-0.6, 0.6))
+    distance = 10.0 * limits.cruise
+    return StartState(
+        seq, np.array([waypoint[0] - distance * cos(course), waypoint[1] - distance * sin(course), waypoint[2]]), course
+    )
 
 
 _AMPLITUDES = {  # aileron, elevator, rudder, throttle, fractions of full travel
     "c172p": (0.07, 0.05, 0.2, 0.15),
     "small": (0.06, 0.05, 0.12, 0.12),
 }
-_LINES = 9  # sines of each input
+_N_SINES = 9  # sines of each input
 _SURFACE_HZ, _THROTTLE_HZ = (0.12, 1.6), (0.02, 0.25)
 
 
@@ -108,8 +128,8 @@ def multisine(rng: np.random.Generator, airframe: str, strength: float) -> Pilot
     waves = []
     for i, amplitude in enumerate(_AMPLITUDES[airframe]):
         low, high = _THROTTLE_HZ if i == 3 else _SURFACE_HZ
-        hertz = low * (high / low) ** ((np.arange(_LINES) + i / 4 + 0.1 * rng.random(_LINES)) / _LINES)
-        waves.append((strength * amplitude * np.sqrt(2 / _LINES), 2 * pi * hertz, rng.uniform(-pi, pi, _LINES)))
+        hertz = low * (high / low) ** ((np.arange(_N_SINES) + i / 4 + 0.1 * rng.random(_N_SINES)) / _N_SINES)
+        waves.append((strength * amplitude * np.sqrt(2 / _N_SINES), 2 * pi * hertz, rng.uniform(-pi, pi, _N_SINES)))
 
     def pilot(t: float) -> tuple[float, float, float, float]:
         a, e, r, thrust = (float(scale * np.sin(omega * t + phase).sum()) for scale, omega, phase in waves)

@@ -7,29 +7,34 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.simulator.conceal.plan import SETTLE_S, Planned
+from fleet.simulator.conceal.plan import SETTLE_S, PlannedFlight
 from fleet.simulator.faults.fault import Fault
 from fleet.simulator.flight.drive import TICK_S, write
-from fleet.simulator.flight.link import Link
-from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.flight.link import RadioLink
+from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.jsbsim import Truth
 from fleet.simulator.vehicle.sensors import Estimate, pressure_height
 
 LOG_S = 0.1
 LOSS, FADES_S = 0.02, 45.0  # fraction of frames lost; mean time between two fades [s]
 _ATTITUDE = bytes((30, 0, 0))  # MAVLink message id
-_SANE = {"c172p": 0.20, "small": 0.21}  # maximum angle of attack with attached flow [rad]
-_LOW_M, _BANK, _SLIP, _SPEEDS = 30.0, np.radians(75), np.radians(16), (0.72, 1.4)  # speeds relative to cruise
+_MAX_ALPHA = {"c172p": 0.20, "small": 0.21}  # maximum angle of attack with attached flow [rad]
+_MIN_HEIGHT_M, _MAX_BANK, _MAX_SIDESLIP, _SPEED_RANGE = (
+    30.0,
+    np.radians(75),
+    np.radians(16),
+    (0.72, 1.4),
+)  # speeds relative to cruise
 
 
-_Row = tuple[float, Truth, Estimate, tuple[int, ...]]
+_LogRow = tuple[float, Truth, Estimate, tuple[int, ...]]
 
 
-class Log(NamedTuple):
+class ExamFlightLog(NamedTuple):
     """A flight at 10 Hz."""
 
     t: np.ndarray  # since simulation start, (n,) [s]
-    seen: np.ndarray  # recorded channels, columns as in `acts._FLIGHT_NOISE`, (n, 21)
+    channels: np.ndarray  # recorded channels, columns as in `acts._FLIGHT_NOISE`, (n, 21)
     Va: np.ndarray  # true airspeed, (n,) [m/s]
     alpha: np.ndarray
     beta: np.ndarray
@@ -39,41 +44,41 @@ class Log(NamedTuple):
 
 
 def fly(
-    planned: Planned,
+    planned: PlannedFlight,
     faults: tuple[Fault, ...],
     path: Path | None = None,
-    look: Callable[[PretendUav], None] = lambda _: None,
-) -> tuple[Log, float]:
+    observe: Callable[[SimulatedUav], None] = lambda _: None,
+) -> tuple[ExamFlightLog, float]:
     """Simulate with `faults`, into a recording if a path is given; call `observe` with the aircraft at 10 Hz.
 
     Returns:
         the log, and the time of the first recorded ATTITUDE since simulation start [s]
     """
-    uav = planned.uav(faults)
+    uav = planned.build_uav(faults)
     uav.step(SETTLE_S)
-    link = Link(np.random.default_rng((planned.flight, 6)), LOSS, FADES_S)
-    rows: list[_Row] = []
-    arrived = [(SETTLE_S, frame) for frame in uav.introduce()]
+    link = RadioLink(np.random.default_rng((planned.flight_seed, 6)), LOSS, FADES_S)
+    rows: list[_LogRow] = []
+    arrived = [(SETTLE_S, frame) for frame in uav.initial_frames()]
     for k in range(1, round(planned.seconds / LOG_S) + 1):
         until = SETTLE_S + k * LOG_S
         for tick in range(round((until - LOG_S) / TICK_S) + 1, round(until / TICK_S) + 1):
             link.send(tick * TICK_S, uav.step(tick * TICK_S))
         arrived += link.receive(until)
-        look(uav)
-        rows.append((until, uav.aircraft.truth(), uav.now, uav.pulses))
+        observe(uav)
+        rows.append((until, uav.aircraft.truth(), uav.estimate, uav.pulses))
     if path is not None:
         with path.open("wb") as file:
             write(file, arrived)
-    return _laid(rows), first_attitude(frame for _, frame in arrived) - uav.boot_s
+    return _to_log(rows), first_attitude(frame for _, frame in arrived) - uav.boot_s
 
 
-def _laid(rows: list[_Row]) -> Log:
-    t, truth, now, pulses = zip(*rows, strict=True)
-    heights = [(pressure_height(e.pressure), e.satellites) for e in now]
-    body = [np.concatenate([e.rates, e.force, e.euler, e.v, e.p, [e.Va]]) for e in now]
-    seen = np.column_stack([np.array(body), np.array(heights), (np.array(pulses) - 1500) / 400])
+def _to_log(rows: list[_LogRow]) -> ExamFlightLog:
+    t, truth, estimates, pulses = zip(*rows, strict=True)
+    heights = [(pressure_height(e.pressure), e.gps_height) for e in estimates]
+    body = [np.concatenate([e.rates, e.force, e.euler, e.v, e.p, [e.Va]]) for e in estimates]
+    channels = np.column_stack([np.array(body), np.array(heights), (np.array(pulses) - 1500) / 400])
     columns = np.array([(x.Va, x.alpha, x.beta, x.euler[0], -x.p[2], x.rho) for x in truth]).T
-    return Log(np.array(t), seen, *columns)
+    return ExamFlightLog(np.array(t), channels, *columns)
 
 
 def first_attitude(frames: Iterable[bytes]) -> float:
@@ -82,16 +87,16 @@ def first_attitude(frames: Iterable[bytes]) -> float:
     return next(stamps) * 1e-3
 
 
-def why_not_sane(planned: Planned, log: Log) -> str:
+def rejection_reason(planned: PlannedFlight, log: ExamFlightLog) -> str:
     """Return the reason to reject a flight; empty if it is acceptable."""
     airframe = planned.job.airframe
     speed = log.Va / {"c172p": 48.0, "small": 23.0}[airframe]
     limits = {
         "too short": log.t[-1] < SETTLE_S + planned.seconds - 1,
-        "too low": log.height.min() < _LOW_M,
-        "stalled": log.alpha.max() > _SANE[airframe],
-        "banked": np.abs(log.bank).max() > _BANK,
-        "slipped": np.abs(log.beta).max() > _SLIP,
-        "too slow or too fast": speed.min() < _SPEEDS[0] or speed.max() > _SPEEDS[1],
+        "too low": log.height.min() < _MIN_HEIGHT_M,
+        "stalled": log.alpha.max() > _MAX_ALPHA[airframe],
+        "banked": np.abs(log.bank).max() > _MAX_BANK,
+        "slipped": np.abs(log.beta).max() > _MAX_SIDESLIP,
+        "too slow or too fast": speed.min() < _SPEED_RANGE[0] or speed.max() > _SPEED_RANGE[1],
     }
-    return next((why for why, is_so in limits.items() if is_so), "")
+    return next((reason for reason, violated in limits.items() if violated), "")

@@ -9,7 +9,7 @@ class Fault(NamedTuple):
     """One fault of one aircraft."""
 
     name: str  # in `kinds.KINDS`
-    of: str  # surface or axis; empty if there is only one
+    part: str  # surface or axis; empty if there is only one
     values: Mapping[str, float]  # parameters, units in their names; faults compare by identity
     t0: float = 0.0  # onset [s since simulation start]
     ramp_s: float = 0.0  # ramp duration; edge duration of a transient [s]
@@ -19,7 +19,7 @@ class Fault(NamedTuple):
         """Hash by identity."""
         return id(self)
 
-    def share(self, t: float) -> float:
+    def intensity(self, t: float) -> float:
         """Return the intensity at `t` [s], 0..1.
 
         A step or a linear ramp; a transient rises and falls as (1 - cos) / 2.
@@ -28,6 +28,6 @@ class Fault(NamedTuple):
             return 0.0
         if self.t1 < inf:
             edge = self.ramp_s or (self.t1 - self.t0) / 2
-            near = min(t - self.t0, self.t1 - t) / edge
-            return (1 - cos(pi * min(near, 1.0))) / 2
+            edge_fraction = min(t - self.t0, self.t1 - t) / edge
+            return (1 - cos(pi * min(edge_fraction, 1.0))) / 2
         return min((t - self.t0) / self.ramp_s, 1.0) if self.ramp_s > 0 else 1.0

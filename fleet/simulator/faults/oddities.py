@@ -13,113 +13,113 @@ from fleet.simulator.vehicle.jsbsim import DT, Aircraft
 from fleet.simulator.vehicle.sensors import Estimate
 from fleet.simulator.vehicle.weather import FT
 
-_SENSE_S = 2 * DT  # between two calls of `apply_to_estimate` [s]
+_ESTIMATE_S = 2 * DT  # between two calls of `apply_to_estimate` [s]
 _INCH = 0.0254  # [m]
 
 
-class Oddity:
+class UncataloguedFault:
     """Base class without effect."""
 
     def __init__(self, values: Mapping[str, float], aircraft: Aircraft):
         """Store the values; the aircraft is started already."""
         self._values, self._aircraft = values, aircraft
 
-    def press(self, t: float, share: float) -> None:
+    def apply_to_physics(self, t: float, intensity: float) -> None:
         """Change the physics at `t` [s]."""
 
-    def sense(self, e: Estimate, share: float) -> Estimate:
+    def apply_to_estimate(self, e: Estimate, intensity: float) -> Estimate:
         """Return the estimate with this fault."""
         return e
 
-    def move(self, t: float, share: float, commands: Commands) -> Commands:
+    def apply_to_commands(self, t: float, intensity: float, commands: Commands) -> Commands:
         """Return surface and motor positions with this fault."""
         return commands
 
 
-class _CrossedLinkage(Oddity):
+class _CrossedLinkage(UncataloguedFault):
     """Couple the rudder to the aileron."""
 
-    def move(self, t: float, share: float, commands: Commands) -> Commands:
+    def apply_to_commands(self, t: float, intensity: float, commands: Commands) -> Commands:
         a, e, r, thrust = commands
-        return a, e, min(max(r + share * self._values["gain"] * a, -1.0), 1.0), thrust
+        return a, e, min(max(r + intensity * self._values["gain"] * a, -1.0), 1.0), thrust
 
 
-class _LooseHinge(Oddity):
+class _LooseHinge(UncataloguedFault):
     """Add an elevator oscillation independent of the command."""
 
-    def move(self, t: float, share: float, commands: Commands) -> Commands:
+    def apply_to_commands(self, t: float, intensity: float, commands: Commands) -> Commands:
         a, e, r, thrust = commands
-        return a, e + share * self._values["half_width"] * sin(2 * pi * self._values["hertz"] * t), r, thrust
+        return a, e + intensity * self._values["half_width"] * sin(2 * pi * self._values["hertz"] * t), r, thrust
 
 
-class _SurgingEngine(Oddity):
+class _SurgingEngine(UncataloguedFault):
     """Modulate the thrust with a sine."""
 
     def __init__(self, values: Mapping[str, float], aircraft: Aircraft):
         super().__init__(values, aircraft)
-        self._usual = aircraft[aircraft.kind.strength]
+        self._nominal = aircraft[aircraft.kind.thrust_property]
 
-    def press(self, t: float, share: float) -> None:
-        swing = share * self._values["fraction"] * sin(2 * pi * self._values["hertz"] * t)
-        self._aircraft[self._aircraft.kind.strength] = self._usual * (1 + swing)
+    def apply_to_physics(self, t: float, intensity: float) -> None:
+        modulation = intensity * self._values["fraction"] * sin(2 * pi * self._values["hertz"] * t)
+        self._aircraft[self._aircraft.kind.thrust_property] = self._nominal * (1 + modulation)
 
 
-class _Factors(Oddity):
+class _ScaledDerivatives(UncataloguedFault):
     """Scale derivatives of the airframe."""
 
     def __init__(self, values: Mapping[str, float], aircraft: Aircraft):
         super().__init__(values, aircraft)
-        home = "conceal" if aircraft.kind.shipped else "vary"
-        self._usual = {f"{home}/{name}": (aircraft[f"{home}/{name}"], values[name]) for name in values}
+        prefix = "conceal" if aircraft.kind.from_jsbsim else "vary"
+        self._nominal = {f"{prefix}/{name}": (aircraft[f"{prefix}/{name}"], values[name]) for name in values}
 
-    def press(self, t: float, share: float) -> None:
-        for name, (usual, factor) in self._usual.items():
-            self._aircraft[name] = usual * (1 + share * (factor - 1))
+    def apply_to_physics(self, t: float, intensity: float) -> None:
+        for name, (nominal, factor) in self._nominal.items():
+            self._aircraft[name] = nominal * (1 + intensity * (factor - 1))
 
 
-class _SloshingTank(Oddity):
+class _SloshingTank(UncataloguedFault):
     """Loose payload: it moves aft when the aircraft pitches up or accelerates, with a first-order lag."""
 
     def __init__(self, values: Mapping[str, float], aircraft: Aircraft):
         super().__init__(values, aircraft)
-        self._place = f"inertia/pointmass-location-X-inches{aircraft.kind.load}"
+        self._location = f"inertia/pointmass-location-X-inches{aircraft.kind.sliding_index}"
         self._x = 0.0  # displacement aft [m]
-        self._stowed = aircraft[self._place]
+        self._nominal_x = aircraft[self._location]
 
-    def press(self, t: float, share: float) -> None:
-        felt = self._aircraft["accelerations/a-pilot-x-ft_sec2"] * FT
-        most, per = self._values["most_m"], self._values["m_per_mps2"]
-        rest = min(max(per * felt, -most), most)
-        self._x = rest + (self._x - rest) * exp(-DT / self._values["tau_s"])
-        self._aircraft[self._place] = self._stowed + share * self._x / _INCH
+    def apply_to_physics(self, t: float, intensity: float) -> None:
+        acceleration = self._aircraft["accelerations/a-pilot-x-ft_sec2"] * FT
+        limit, gain = self._values["most_m"], self._values["m_per_mps2"]
+        equilibrium = min(max(gain * acceleration, -limit), limit)
+        self._x = equilibrium + (self._x - equilibrium) * exp(-DT / self._values["tau_s"])
+        self._aircraft[self._location] = self._nominal_x + intensity * self._x / _INCH
 
 
-class _GyroScale(Oddity):
+class _GyroScale(UncataloguedFault):
     """Apply a scale error to all gyros."""
 
-    def sense(self, e: Estimate, share: float) -> Estimate:
-        return e._replace(rates=e.rates * (1 + share * self._values["scale"]))
+    def apply_to_estimate(self, e: Estimate, intensity: float) -> Estimate:
+        return e._replace(rates=e.rates * (1 + intensity * self._values["scale"]))
 
 
-class _PitotLag(Oddity):
+class _PitotLag(UncataloguedFault):
     """Apply a first-order lag to the airspeed, as from water in the pitot line."""
 
     def __init__(self, values: Mapping[str, float], aircraft: Aircraft):
         super().__init__(values, aircraft)
         self._Va = np.nan
 
-    def sense(self, e: Estimate, share: float) -> Estimate:
-        past = self._Va if np.isfinite(self._Va) else e.Va
-        tau = share * self._values["tau_s"]
-        self._Va = e.Va + (past - e.Va) * exp(-_SENSE_S / tau) if tau > 0 else e.Va
+    def apply_to_estimate(self, e: Estimate, intensity: float) -> Estimate:
+        previous = self._Va if np.isfinite(self._Va) else e.Va
+        tau = intensity * self._values["tau_s"]
+        self._Va = e.Va + (previous - e.Va) * exp(-_ESTIMATE_S / tau) if tau > 0 else e.Va
         return e._replace(Va=self._Va)
 
 
-ODD: dict[str, type[Oddity]] = {
+UNCATALOGUED: dict[str, type[UncataloguedFault]] = {
     "_crossed_linkage": _CrossedLinkage,
-    "_torn_fin": _Factors,
-    "_roll_damping": _Factors,
-    "_pitch_damping": _Factors,
+    "_torn_fin": _ScaledDerivatives,
+    "_roll_damping": _ScaledDerivatives,
+    "_pitch_damping": _ScaledDerivatives,
     "_loose_hinge": _LooseHinge,
     "_surging_engine": _SurgingEngine,
     "_sloshing_tank": _SloshingTank,

@@ -17,16 +17,16 @@ _W20 = "atmosphere/turbulence/milspec/windspeed_at_20ft_AGL-fps"
 _FLAP_DEG = 30.0  # full
 
 Increments = dict[str, float]
-Change = Callable[[Aircraft, Mapping[str, float]], Increments]
+PhysicsFault = Callable[[Aircraft, Mapping[str, float]], Increments]
 """Increments of JSBSim properties at full intensity."""
 
 
 def _air_density(aircraft: Aircraft, values: Mapping[str, float]) -> Increments:
     """Change density one third by pressure and two thirds by temperature."""
-    third = cbrt(values["density_ratio"])
+    cube_root = cbrt(values["density_ratio"])
     return {
-        "atmosphere/P-sl-psf": aircraft["atmosphere/P-sl-psf"] * (third - 1),
-        "atmosphere/delta-T": aircraft["atmosphere/T-R"] * (1 / third**2 - 1),
+        "atmosphere/P-sl-psf": aircraft["atmosphere/P-sl-psf"] * (cube_root - 1),
+        "atmosphere/delta-T": aircraft["atmosphere/T-R"] * (1 / cube_root**2 - 1),
     }
 
 
@@ -36,26 +36,28 @@ def _turbulence(aircraft: Aircraft, values: Mapping[str, float]) -> Increments:
 
 def _thrust_loss(aircraft: Aircraft, values: Mapping[str, float]) -> Increments:
     """Reduce propeller thrust (small) or volumetric efficiency (Cessna) by a fraction."""
-    name = aircraft.kind.strength
+    name = aircraft.kind.thrust_property
     return {name: -values["fraction"] * aircraft[name]}
 
 
 def _mass_change(aircraft: Aircraft, values: Mapping[str, float]) -> Increments:
     """Add mass at the centre of gravity."""
-    last = aircraft.kind.extra
-    here = {f"inertia/pointmass-location-{axis}-inches{last}": f"inertia/cg-{axis.lower()}-in" for axis in "XYZ"}
-    moved = {name: aircraft[centre] - aircraft[name] for name, centre in here.items()}
-    return moved | {f"inertia/pointmass-weight-lbs{last}": values["dmass_kg"] * KG_TO_LB}
+    mass_index = aircraft.kind.extra_index
+    cg_properties = {
+        f"inertia/pointmass-location-{axis}-inches{mass_index}": f"inertia/cg-{axis.lower()}-in" for axis in "XYZ"
+    }
+    offsets = {name: aircraft[centre] - aircraft[name] for name, centre in cg_properties.items()}
+    return offsets | {f"inertia/pointmass-weight-lbs{mass_index}": values["dmass_kg"] * KG_TO_LB}
 
 
 def _cg_shift(aircraft: Aircraft, values: Mapping[str, float]) -> Increments:
     """Shift the payload; x points aft in JSBSim."""
-    load = aircraft.kind.load
-    share = aircraft[f"inertia/pointmass-weight-lbs{load}"] / aircraft["inertia/weight-lbs"]
-    return {f"inertia/pointmass-location-X-inches{load}": -values["dx_m"] / share / _INCH}
+    load = aircraft.kind.sliding_index
+    mass_fraction = aircraft[f"inertia/pointmass-weight-lbs{load}"] / aircraft["inertia/weight-lbs"]
+    return {f"inertia/pointmass-location-X-inches{load}": -values["dx_m"] / mass_fraction / _INCH}
 
 
-CHANGES: dict[str, Change] = {
+PHYSICS_FAULTS: dict[str, PhysicsFault] = {
     "air_density": _air_density,
     "turbulence": _turbulence,
     "thrust_loss": _thrust_loss,
@@ -74,43 +76,45 @@ CHANGES: dict[str, Change] = {
 }
 
 
-def _level(values: Mapping[str, float], speed: float) -> np.ndarray:
+def _horizontal_wind(values: Mapping[str, float], speed: float) -> np.ndarray:
     blows_from = radians(values["from_deg"])
     return -speed * np.array([cos(blows_from), sin(blows_from), 0.0])
 
 
-WINDS: dict[str, Callable[[Mapping[str, float], float], np.ndarray]] = {
-    "wind_steady": lambda values, height: _level(values, values["speed_mps"]),
-    "wind_shear": lambda values, height: _level(values, values["mps_per_100m"] * (height - REFERENCE_M) / 100.0),
-    "gust_discrete": lambda values, height: _level(values, values["speed_mps"]),
+WIND_FAULTS: dict[str, Callable[[Mapping[str, float], float], np.ndarray]] = {
+    "wind_steady": lambda values, height: _horizontal_wind(values, values["speed_mps"]),
+    "wind_shear": lambda values, height: _horizontal_wind(
+        values, values["mps_per_100m"] * (height - REFERENCE_M) / 100.0
+    ),
+    "gust_discrete": lambda values, height: _horizontal_wind(values, values["speed_mps"]),
     "updraft": lambda values, height: np.array([0.0, 0.0, -values["speed_mps"]]),
 }
 """(values, height above home [m]) to wind added, NED, (3,) [m/s]."""
 
 
-class World:
+class FaultyPhysics:
     """Physics faults of one aircraft."""
 
     def __init__(self, faults: list[Fault], aircraft: Aircraft):
         """Store the nominal properties; the aircraft is started already."""
         self._aircraft = aircraft
-        self._winds = [fault for fault in faults if fault.name in WINDS]
-        others = [fault for fault in faults if fault.name in CHANGES]
-        self._changes = [(fault, CHANGES[fault.name](aircraft, fault.values)) for fault in others]
-        self._usual = {name: aircraft[name] for _, change in self._changes for name in change}
+        self._winds = [fault for fault in faults if fault.name in WIND_FAULTS]
+        physics_faults = [fault for fault in faults if fault.name in PHYSICS_FAULTS]
+        self._changes = [(fault, PHYSICS_FAULTS[fault.name](aircraft, fault.values)) for fault in physics_faults]
+        self._nominal = {name: aircraft[name] for _, change in self._changes for name in change}
 
-    def press(self, t: float, without: Fault | None = None) -> None:
+    def apply(self, t: float, excluding: Fault | None = None) -> None:
         """Set the JSBSim properties for `t` [s], optionally excluding one fault."""
-        now = dict(self._usual)
+        values = dict(self._nominal)
         for fault, change in self._changes:
-            share = 0.0 if fault is without else fault.share(t)
-            for name, most in change.items():
-                now[name] += share * most
-        for name, value in now.items():
+            intensity = 0.0 if fault is excluding else fault.intensity(t)
+            for name, full_change in change.items():
+                values[name] += intensity * full_change
+        for name, value in values.items():
             if self._aircraft[name] != value:
                 self._aircraft[name] = value
 
     def wind(self, t: float, height: float) -> np.ndarray:
         """Return the wind added at `t` [s] and `height` above home [m], NED, (3,) [m/s]."""
-        blowing = [fault.share(t) * WINDS[fault.name](fault.values, height) for fault in self._winds]
-        return np.sum([np.zeros(3), *blowing], axis=0)
+        winds = [fault.intensity(t) * WIND_FAULTS[fault.name](fault.values, height) for fault in self._winds]
+        return np.sum([np.zeros(3), *winds], axis=0)

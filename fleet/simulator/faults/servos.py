@@ -8,85 +8,85 @@ from collections.abc import Callable, Mapping
 from math import exp
 
 SURFACES = ("aileron", "elevator", "rudder")
-_OLDEST_S = 2.0  # length of the buffer of commands
+_BUFFER_S = 2.0  # length of the buffer of commands
 
-Move = Callable[[float, float], float]
+ServoFault = Callable[[float, float], float]
 """(command, intensity of the fault) to surface; may have state."""
 
 
-def _lag(values: Mapping[str, float], dt: float) -> Move:
-    at: list[float] = []
+def _lag(values: Mapping[str, float], dt: float) -> ServoFault:
+    state: list[float] = []
 
-    def move(u: float, share: float) -> float:
-        tau = share * values["tau_s"]
-        past = at[0] if at else u
-        at[:] = [u + (past - u) * exp(-dt / tau) if tau > 0 else u]
-        return at[0]
+    def apply(u: float, intensity: float) -> float:
+        tau = intensity * values["tau_s"]
+        previous = state[0] if state else u
+        state[:] = [u + (previous - u) * exp(-dt / tau) if tau > 0 else u]
+        return state[0]
 
-    return move
-
-
-def _delay(values: Mapping[str, float], dt: float) -> Move:
-    said: deque[float] = deque(maxlen=round(_OLDEST_S / dt))
-
-    def move(u: float, share: float) -> float:
-        said.appendleft(u)
-        return said[min(round(share * values["delay_s"] / dt), len(said) - 1)]
-
-    return move
+    return apply
 
 
-def _rate_limit(values: Mapping[str, float], dt: float) -> Move:
-    at: list[float] = []
+def _delay(values: Mapping[str, float], dt: float) -> ServoFault:
+    history: deque[float] = deque(maxlen=round(_BUFFER_S / dt))
 
-    def move(u: float, share: float) -> float:
-        past = at[0] if at else u
-        most = values["rate_per_s"] * dt / share if share > 0 else 2.0
-        at[:] = [past + min(max(u - past, -most), most)]
-        return at[0]
+    def apply(u: float, intensity: float) -> float:
+        history.appendleft(u)
+        return history[min(round(intensity * values["delay_s"] / dt), len(history) - 1)]
 
-    return move
+    return apply
 
 
-def _deadband(values: Mapping[str, float], dt: float) -> Move:
-    at: list[float] = []
+def _rate_limit(values: Mapping[str, float], dt: float) -> ServoFault:
+    state: list[float] = []
 
-    def move(u: float, share: float) -> float:
-        half, past = share * values["half_width"], at[0] if at else u
-        at[:] = [min(max(past, u - half), u + half)]  # backlash
-        return at[0]
+    def apply(u: float, intensity: float) -> float:
+        previous = state[0] if state else u
+        max_step = values["rate_per_s"] * dt / intensity if intensity > 0 else 2.0
+        state[:] = [previous + min(max(u - previous, -max_step), max_step)]
+        return state[0]
 
-    return move
-
-
-def _saturation(values: Mapping[str, float], dt: float) -> Move:
-    def move(u: float, share: float) -> float:
-        most = 1 - share * (1 - values["limit"])
-        return min(max(u, -most), most)
-
-    return move
+    return apply
 
 
-def _offset(values: Mapping[str, float], dt: float) -> Move:
+def _deadband(values: Mapping[str, float], dt: float) -> ServoFault:
+    state: list[float] = []
+
+    def apply(u: float, intensity: float) -> float:
+        half_width, previous = intensity * values["half_width"], state[0] if state else u
+        state[:] = [min(max(previous, u - half_width), u + half_width)]  # backlash
+        return state[0]
+
+    return apply
+
+
+def _saturation(values: Mapping[str, float], dt: float) -> ServoFault:
+    def apply(u: float, intensity: float) -> float:
+        limit = 1 - intensity * (1 - values["limit"])
+        return min(max(u, -limit), limit)
+
+    return apply
+
+
+def _offset(values: Mapping[str, float], dt: float) -> ServoFault:
     return lambda u, share: min(max(u + share * values["offset"], -1.0), 1.0)
 
 
-def _stuck(values: Mapping[str, float], dt: float) -> Move:
-    at: list[float] = [values["position"]] if "position" in values else []
+def _stuck(values: Mapping[str, float], dt: float) -> ServoFault:
+    state: list[float] = [values["position"]] if "position" in values else []
 
-    def move(u: float, share: float) -> float:
-        if share > 0 and not at:
-            at.append(u)
-        return u + share * (at[0] - u) if at else u
+    def apply(u: float, intensity: float) -> float:
+        if intensity > 0 and not state:
+            state.append(u)
+        return u + intensity * (state[0] - u) if state else u
 
-    return move
+    return apply
 
 
-def _loss(values: Mapping[str, float], dt: float) -> Move:
+def _loss(values: Mapping[str, float], dt: float) -> ServoFault:
     return lambda u, share: (1 - share * values["loss"]) * u
 
 
-MOVES: dict[str, Callable[[Mapping[str, float], float], Move]] = {
+SERVO_FAULTS: dict[str, Callable[[Mapping[str, float], float], ServoFault]] = {
     "actuator_lag": _lag,
     "actuator_delay": _delay,
     "actuator_rate_limit": _rate_limit,

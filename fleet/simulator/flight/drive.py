@@ -10,19 +10,19 @@ from typing import BinaryIO
 
 import numpy as np
 
-from fleet.simulator.flight.link import Link
-from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.flight.link import RadioLink
+from fleet.simulator.flight.uav import SimulatedUav
 
 TICK_S = 0.01
 EPOCH_US = 1_700_000_000_000_000  # fixed start of recordings, for reproducible files [us since 1970]
-_LATE_S = 0.5  # maximum lag behind real time before simulated time slows down [s]
-_STEP_S = 0.1  # maximum simulated time per round, which spreads a backlog evenly [s]
-_RATIO_S = 5.0  # real time to measure the achieved speed before logging it [s]
+_MAX_LAG_S = 0.5  # maximum lag behind real time before simulated time slows down [s]
+_MAX_STEP_S = 0.1  # maximum simulated time per round, which spreads a backlog evenly [s]
+_SPEED_WINDOW_S = 5.0  # real time to measure the achieved speed before logging it [s]
 
 
 def to_tlog(
     path: Path,
-    uavs: Sequence[PretendUav],
+    uavs: Sequence[SimulatedUav],
     *,
     seconds: float,
     loss: float,
@@ -45,22 +45,22 @@ def to_tlog(
     Returns:
         number of frames written
     """
-    links = [Link(np.random.default_rng((seed, 6, uav.uav_id)), loss) for uav in uavs]
+    links = [RadioLink(np.random.default_rng((seed, 6, uav.uav_id)), loss) for uav in uavs]
     written = 0
     with path.open("wb") as file:
-        written += write(file, [(0.0, frame) for uav in uavs for frame in uav.introduce()])
+        written += write(file, [(0.0, frame) for uav in uavs for frame in uav.initial_frames()])
         for k in range(1, int(seconds) + 1):
-            arrived: list[tuple[float, bytes]] = []
+            received: list[tuple[float, bytes]] = []
             for uav, link in zip(uavs, links, strict=True):
-                arrived += _second(uav, link, float(k))
-            written += write(file, arrived)
+                received += _fly_until(uav, link, float(k))
+            written += write(file, received)
             progress(float(k))
             if stop is not None and stop.is_set():
                 break
     return written
 
 
-def _second(uav: PretendUav, link: Link, until: float) -> list[tuple[float, bytes]]:
+def _fly_until(uav: SimulatedUav, link: RadioLink, until: float) -> list[tuple[float, bytes]]:
     """Simulate to `until` [s] tick by tick and return the frames received on the ground."""
     t = uav.tick * TICK_S
     while t < until - TICK_S / 2:
@@ -69,22 +69,22 @@ def _second(uav: PretendUav, link: Link, until: float) -> list[tuple[float, byte
     return link.receive(until)
 
 
-def write(file: BinaryIO, pairs: list[tuple[float, bytes]]) -> int:
+def write(file: BinaryIO, stamped_frames: list[tuple[float, bytes]]) -> int:
     """Append frames with their times [s] to a .tlog; return their number."""
-    for t, frame in sorted(pairs, key=lambda pair: pair[0]):
+    for t, frame in sorted(stamped_frames, key=lambda pair: pair[0]):
         file.write(struct.pack(">Q", EPOCH_US + round(t * 1e6)) + frame)
-    return len(pairs)
+    return len(stamped_frames)
 
 
 def to_udp(
-    uavs: Sequence[PretendUav],
-    to: tuple[str, int],
+    uavs: Sequence[SimulatedUav],
+    address: tuple[str, int],
     *,
     seconds: float | None,
     loss: float,
     seed: int,
     stop: Event,
-    say: Callable[[str], None] = print,
+    log: Callable[[str], None] = print,
 ) -> float:
     """Simulate in real time with one UDP socket per aircraft, and reply to requests.
 
@@ -103,26 +103,26 @@ def to_udp(
         maximum lag of a round behind real time [s]
     """
     rng = np.random.default_rng((seed, 7))
-    links = [Link(np.random.default_rng((seed, 6, uav.uav_id)), loss) for uav in uavs]
-    sockets = [_socket(to) for _ in uavs]
-    pace, worst = _Pace(time.monotonic(), say), 0.0
+    links = [RadioLink(np.random.default_rng((seed, 6, uav.uav_id)), loss) for uav in uavs]
+    sockets = [_socket(address) for _ in uavs]
+    clock, max_delay = _SimulationClock(time.monotonic(), log), 0.0
     try:
         while not stop.is_set():
-            t = pace.next(time.monotonic())
+            t = clock.advance(time.monotonic())
             if seconds is not None and t >= seconds:
                 break
             for uav, link, sock in zip(uavs, links, sockets, strict=True):
                 _serve(uav, link, sock, t, bool(rng.random() < loss))
-            behind = pace.due(time.monotonic()) - t
-            worst = max(worst, behind)
-            stop.wait(max(0.0, TICK_S - behind))
+            lag = clock.due(time.monotonic()) - t
+            max_delay = max(max_delay, lag)
+            stop.wait(max(0.0, TICK_S - lag))
     finally:
         for sock in sockets:
             sock.close()
-    return worst
+    return max_delay
 
 
-class _Pace:
+class _SimulationClock:
     """Simulated time: equal to real time, or slower on a machine that is too slow.
 
     Args:
@@ -130,51 +130,53 @@ class _Pace:
         log: receives the achieved speed once
     """
 
-    def __init__(self, begun: float, say: Callable[[str], None]) -> None:
+    def __init__(self, start: float, log: Callable[[str], None]) -> None:
         self.t = 0.0  # simulated time [s]
-        self._begun, self._say = begun, say
-        self._slow: tuple[float, float] | None = None  # simulated and real time at the start of slow operation [s]
-        self._told = False
+        self._start, self._log = start, log
+        self._slow_since: tuple[float, float] | None = (
+            None  # simulated and real time at the start of slow operation [s]
+        )
+        self._reported = False
 
     def due(self, now: float) -> float:
         """Return the target simulated time at `now` [s, monotonic]."""
-        return now - self._begun
+        return now - self._start
 
-    def next(self, now: float) -> float:
+    def advance(self, now: float) -> float:
         """Advance and return the simulated time at `now` [s, monotonic]."""
-        late = self.due(now) - self.t - _LATE_S
-        if late > 0:
-            self._begun += late
+        excess_lag = self.due(now) - self.t - _MAX_LAG_S
+        if excess_lag > 0:
+            self._start += excess_lag
             self._measure(now)
         else:
-            self._slow = None
-        self.t = max(self.t, min(self.due(now), self.t + _STEP_S))
+            self._slow_since = None
+        self.t = max(self.t, min(self.due(now), self.t + _MAX_STEP_S))
         return self.t
 
     def _measure(self, now: float) -> None:
-        t, since = self._slow = self._slow or (self.t, now)
-        if not self._told and now - since >= _RATIO_S:
-            self._told = True
+        t, since = self._slow_since = self._slow_since or (self.t, now)
+        if not self._reported and now - since >= _SPEED_WINDOW_S:
+            self._reported = True
             ratio = (self.t - t) / (now - since)
-            self._say(
+            self._log(
                 f"fly: found {ratio:.2f} times real time, expected 1; simulated time slows down: fly fewer aircraft"
             )
 
 
-def _socket(to: tuple[str, int]) -> socket.socket:
+def _socket(address: tuple[str, int]) -> socket.socket:
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.setblocking(False)
-    sock.connect(to)
+    sock.connect(address)
     return sock
 
 
-def _serve(uav: PretendUav, link: Link, sock: socket.socket, t: float, deaf: bool) -> None:
+def _serve(uav: SimulatedUav, link: RadioLink, sock: socket.socket, t: float, drop_uplink: bool) -> None:
     """Simulate one aircraft to `t` [s], receive requests, send frames."""
     link.send(t, uav.step(t))
     try:
         while data := sock.recv(65_535):
-            if not deaf:
-                link.send(t, uav.hear(data))
+            if not drop_uplink:
+                link.send(t, uav.receive(data))
     except OSError:  # no more data, or no receiver yet
         pass
     for _, frame in link.receive(t):

@@ -11,11 +11,11 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from fleet.contract import Item
-from fleet.simulator.flight.mavlink_messages import DIALECTS, Dialect, Flight, value_message
+from fleet.simulator.flight.mavlink_messages import DIALECTS, MavlinkDialect, TelemetryState, param_value_message
 
 TICK_HZ = 100
 COMPONENT = mav.MAV_COMP_ID_AUTOPILOT1
-MOST_AIRCRAFT = 250  # system ids 1..250 belong to vehicles
+MAX_AIRCRAFT = 250  # system ids 1..250 belong to vehicles
 _CAPABILITIES = (
     mav.MAV_PROTOCOL_CAPABILITY_MISSION_FLOAT
     | mav.MAV_PROTOCOL_CAPABILITY_MISSION_INT
@@ -23,10 +23,10 @@ _CAPABILITIES = (
     | mav.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
     | mav.MAV_PROTOCOL_CAPABILITY_MAVLINK2
 )
-_ANSWERS_PER_TICK = 2  # rate limit of the parameter stream
+_PARAMS_PER_TICK = 2  # rate limit of the parameter stream
 
 
-class Voice:
+class MavlinkEndpoint:
     """One MAVLink system with mission and parameters, which sends telemetry and replies to requests."""
 
     def __init__(
@@ -34,7 +34,7 @@ class Voice:
         system: int,
         items: tuple[Item, ...],
         params: Mapping[str, float],
-        dialect: Dialect = DIALECTS["ardupilot"],
+        dialect: MavlinkDialect = DIALECTS["ardupilot"],
     ):
         """Create a MAVLink system.
 
@@ -50,46 +50,46 @@ class Voice:
         self._items = items
         self._names = sorted(params)
         self._params, self._dialect = params, dialect
-        self._waiting: deque[int] = deque()  # indices of parameters to send
+        self._pending_params: deque[int] = deque()  # indices of parameters to send
 
-    def _frame(self, message: Any) -> bytes:
+    def _pack(self, message: Any) -> bytes:
         packed = bytes(message.pack(self._out))
         self._out.seq = (self._out.seq + 1) % 256
         return packed
 
-    def telemetry(self, tick: int, flight: Callable[[], Flight]) -> list[bytes]:
+    def telemetry(self, tick: int, state: Callable[[], TelemetryState]) -> list[bytes]:
         """Return the frames due at this tick of 10 ms; `state` is called only if one is due."""
-        due = [make for rate, phase, make in self._dialect.telemetry if (tick - phase) % round(TICK_HZ / rate) == 0]
-        now = flight() if due else None
-        frames = [self._frame(make(now)) for make in due if now is not None]
-        return frames + self.stream(_ANSWERS_PER_TICK)
+        due = [build for rate, phase, build in self._dialect.telemetry if (tick - phase) % round(TICK_HZ / rate) == 0]
+        snapshot = state() if due else None
+        frames = [self._pack(make(snapshot)) for make in due if snapshot is not None]
+        return frames + self.stream_parameters(_PARAMS_PER_TICK)
 
-    def stream(self, most: int) -> list[bytes]:
+    def stream_parameters(self, limit: int) -> list[bytes]:
         """Return up to `limit` requested parameters as frames."""
-        count = min(most, len(self._waiting))
-        return [self._frame(self._param(self._waiting.popleft())) for _ in range(count)]
+        count = min(limit, len(self._pending_params))
+        return [self._pack(self._param(self._pending_params.popleft())) for _ in range(count)]
 
-    def hear(self, data: bytes, t: float) -> list[bytes]:
+    def receive(self, data: bytes, t: float) -> list[bytes]:
         """Process bytes from the ground at `t` since boot [s] and return the replies; ignore invalid data."""
         try:
             messages: Iterable[Any] = self._in.parse_buffer(data) or ()
         except (mav.MAVError, ValueError):  # wrong checksum or invalid text
             return []
-        answers: list[Any] = []
+        replies: list[Any] = []
         for message in messages:
-            answer = _ANSWERS.get(message.get_type())
-            if answer is not None and getattr(message, "target_system", 0) in (0, self._out.srcSystem):
-                answers += answer(self, message, t)
-        return [self._frame(answer) for answer in answers]
+            handler = _HANDLERS.get(message.get_type())
+            if handler is not None and getattr(message, "target_system", 0) in (0, self._out.srcSystem):
+                replies += handler(self, message, t)
+        return [self._pack(answer) for answer in replies]
 
-    def _param(self, index: int, asked_by_name: bool = False) -> Any:
+    def _param(self, index: int, by_name: bool = False) -> Any:
         name = self._names[index]
-        shown = 65_535 if asked_by_name else index
-        return value_message(name, self._params[name], (len(self._names), shown), self._dialect)
+        index_field = 65_535 if by_name else index
+        return param_value_message(name, self._params[name], (len(self._names), index_field), self._dialect)
 
     def _param_list(self, message: Any, t: float) -> list[Any]:
         del message, t
-        self._waiting = deque(range(len(self._names)))
+        self._pending_params = deque(range(len(self._names)))
         return []
 
     def _param_read(self, message: Any, t: float) -> list[Any]:
@@ -97,7 +97,7 @@ class Voice:
         if message.param_index >= 0:
             return [self._param(message.param_index)] if message.param_index < len(self._names) else []
         name = message.param_id
-        return [self._param(self._names.index(name), asked_by_name=True)] if name in self._params else []
+        return [self._param(self._names.index(name), by_name=True)] if name in self._params else []
 
     def _mission_list(self, message: Any, t: float) -> list[Any]:
         del t
@@ -107,30 +107,41 @@ class Voice:
     def _mission_item(self, message: Any, t: float) -> list[Any]:
         del t
         if message.mission_type != 0 or message.seq >= len(self._items):
-            kind = mav.MAV_MISSION_INVALID_SEQUENCE
-            return [mav.MAVLink_mission_ack_message(*_sender(message), kind, message.mission_type)]
-        i = self._items[message.seq]
-        head = (*_sender(message), i.seq, i.frame, i.command, 0, 1, i.param1, i.param2, i.param3, i.param4)
+            result = mav.MAV_MISSION_INVALID_SEQUENCE
+            return [mav.MAVLink_mission_ack_message(*_sender(message), result, message.mission_type)]
+        item = self._items[message.seq]
+        head = (
+            *_sender(message),
+            item.seq,
+            item.frame,
+            item.command,
+            0,
+            1,
+            item.param1,
+            item.param2,
+            item.param3,
+            item.param4,
+        )
         if message.get_type() == "MISSION_REQUEST_INT":
-            return [mav.MAVLink_mission_item_int_message(*head, i.lat_e7, i.lon_e7, i.alt_m)]
-        return [mav.MAVLink_mission_item_message(*head, i.lat_e7 * 1e-7, i.lon_e7 * 1e-7, i.alt_m)]
+            return [mav.MAVLink_mission_item_int_message(*head, item.lat_e7, item.lon_e7, item.alt_m)]
+        return [mav.MAVLink_mission_item_message(*head, item.lat_e7 * 1e-7, item.lon_e7 * 1e-7, item.alt_m)]
 
     def _command(self, message: Any, t: float) -> list[Any]:
         del t
-        wanted = mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION
-        asks_version = message.command == mav.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES or (
-            message.command == mav.MAV_CMD_REQUEST_MESSAGE and message.param1 == wanted  # may be nan
+        version_id = mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION
+        is_version_request = message.command == mav.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES or (
+            message.command == mav.MAV_CMD_REQUEST_MESSAGE and message.param1 == version_id  # may be nan
         )
-        fine = asks_version or message.command == mav.MAV_CMD_SET_MESSAGE_INTERVAL  # rates are fixed
-        result = mav.MAV_RESULT_ACCEPTED if fine else mav.MAV_RESULT_UNSUPPORTED
+        accepted = is_version_request or message.command == mav.MAV_CMD_SET_MESSAGE_INTERVAL  # rates are fixed
+        result = mav.MAV_RESULT_ACCEPTED if accepted else mav.MAV_RESULT_UNSUPPORTED
         ack = mav.MAVLink_command_ack_message(message.command, result, 0, 0, *_sender(message))
-        return [ack, self._version()] if asks_version else [ack]
+        return [ack, self._version()] if is_version_request else [ack]
 
     def _version(self) -> Any:
-        none = [0] * 8
+        zeros = [0] * 8
         uid = self._out.srcSystem
         return mav.MAVLink_autopilot_version_message(
-            _CAPABILITIES, self._dialect.version, 0, 0, 0, none, none, none, 0, 0, uid
+            _CAPABILITIES, self._dialect.version, 0, 0, 0, zeros, zeros, zeros, 0, 0, uid
         )
 
     def _timesync(self, message: Any, t: float) -> list[Any]:
@@ -141,32 +152,32 @@ def _sender(message: Any) -> tuple[int, int]:
     return message.get_srcSystem(), message.get_srcComponent()
 
 
-_ANSWERS: dict[str, Callable[[Voice, Any, float], list[Any]]] = {
-    "PARAM_REQUEST_LIST": Voice._param_list,
-    "PARAM_REQUEST_READ": Voice._param_read,
-    "MISSION_REQUEST_LIST": Voice._mission_list,
-    "MISSION_REQUEST_INT": Voice._mission_item,
-    "MISSION_REQUEST": Voice._mission_item,
-    "COMMAND_LONG": Voice._command,
-    "TIMESYNC": Voice._timesync,
+_HANDLERS: dict[str, Callable[[MavlinkEndpoint, Any, float], list[Any]]] = {
+    "PARAM_REQUEST_LIST": MavlinkEndpoint._param_list,
+    "PARAM_REQUEST_READ": MavlinkEndpoint._param_read,
+    "MISSION_REQUEST_LIST": MavlinkEndpoint._mission_list,
+    "MISSION_REQUEST_INT": MavlinkEndpoint._mission_item,
+    "MISSION_REQUEST": MavlinkEndpoint._mission_item,
+    "COMMAND_LONG": MavlinkEndpoint._command,
+    "TIMESYNC": MavlinkEndpoint._timesync,
 }
 
 
-class Ground:
+class MavlinkGroundStation:
     """Requests at the start of a recording, so that it contains mission and parameters."""
 
     def __init__(self, system: int):
         """Create a ground station that addresses `system`."""
         self._mav = mav.MAVLink(None, srcSystem=255, srcComponent=mav.MAV_COMP_ID_MISSIONPLANNER)
-        self._to = (system, COMPONENT)
+        self._target = (system, COMPONENT)
 
-    def questions(self, items: int) -> list[bytes]:
+    def requests(self, items: int) -> list[bytes]:
         """Return requests for the version, every mission item and the parameter list, in this order."""
         version = (mav.MAV_CMD_REQUEST_MESSAGE, 0, mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION, 0, 0, 0, 0, 0, 0)
-        asked = [
-            mav.MAVLink_command_long_message(*self._to, *version),
-            mav.MAVLink_mission_request_list_message(*self._to),
-            *(mav.MAVLink_mission_request_int_message(*self._to, seq) for seq in range(items)),
-            mav.MAVLink_param_request_list_message(*self._to),
+        messages = [
+            mav.MAVLink_command_long_message(*self._target, *version),
+            mav.MAVLink_mission_request_list_message(*self._target),
+            *(mav.MAVLink_mission_request_int_message(*self._target, seq) for seq in range(items)),
+            mav.MAVLink_param_request_list_message(*self._target),
         ]
-        return [bytes(message.pack(self._mav)) for message in asked]
+        return [bytes(message.pack(self._mav)) for message in messages]

@@ -177,7 +177,7 @@ _PX4_OUTPUTS = {1: (201, 2), 2: (202, 3), 3: (101, 0), 4: (203, 4)}  # PWM_MAIN_
 _FUNCTIONS = {1: 4, 2: 19, 3: 70, 4: 21}  # SERVOn_FUNCTION: aileron, elevator, throttle, rudder
 
 
-def tuned(seed: int, autopilot: str = "ardupilot", aircraft: str = "small") -> dict[str, float]:
+def tuned_parameters(seed: int, autopilot: str = "ardupilot", aircraft: str = "small") -> dict[str, float]:
     """Return the parameters of one aircraft in the names and units of its autopilot.
 
     Args:

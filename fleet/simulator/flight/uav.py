@@ -12,16 +12,16 @@ from fleet.autopilots.common import controller_state as memory
 from fleet.autopilots.common.parameter_vector import W_E, W_N
 from fleet.contract import Item
 from fleet.frames import G, Origin, to_geodetic
-from fleet.simulator.faults.carried import Carried
+from fleet.simulator.faults.carried import FaultSet
 from fleet.simulator.faults.fault import Fault
-from fleet.simulator.flight.mavlink import MOST_AIRCRAFT, TICK_HZ, Ground, Voice
-from fleet.simulator.flight.mavlink_messages import DIALECTS, RECORDED, Flight
-from fleet.simulator.flight.tuning import tuned
-from fleet.simulator.vehicle.altered import altered
+from fleet.simulator.flight.mavlink import MAX_AIRCRAFT, TICK_HZ, MavlinkEndpoint, MavlinkGroundStation
+from fleet.simulator.flight.mavlink_messages import DIALECTS, ONBOARD_DIALECT, TelemetryState
+from fleet.simulator.flight.tuning import tuned_parameters
+from fleet.simulator.vehicle.altered import instrumented_type
 from fleet.simulator.vehicle.jsbsim import Aircraft, Gusts
-from fleet.simulator.vehicle.missions import HOME, Start, mission
-from fleet.simulator.vehicle.sensors import Estimate, Heights, Sensors, Servos, WindEstimate
-from fleet.simulator.vehicle.situation import Situation, Weather
+from fleet.simulator.vehicle.missions import HOME, StartState, draw_mission
+from fleet.simulator.vehicle.sensors import AltitudeSensors, Estimate, Sensors, Servos, WindEstimator
+from fleet.simulator.vehicle.situation import FlightSetup, Weather
 from fleet.simulator.vehicle.types import TYPES
 
 DT = 1 / TICK_HZ
@@ -29,10 +29,10 @@ _INNER, _OUTER = 2, 10  # attitude loop at 50 Hz, guidance at 10 Hz [ticks]
 _LEGS_AHEAD = 200
 _LAWS = {"ardupilot": "arduplane", "px4": "px4"}
 JITTER_S = 0.001  # jitter of onboard time stamps [s]
-_GROUND_M = 3.0  # height above home below which the flight ends
+_MIN_HEIGHT_M = 3.0  # height above home below which the flight ends
 
 
-class PretendUav:
+class SimulatedUav:
     """Simulated aircraft on a mission; `step` advances it and returns telemetry, `receive` returns replies."""
 
     def __init__(
@@ -45,10 +45,10 @@ class PretendUav:
         origin: Origin = HOME,
         autopilot: str = "ardupilot",
         aircraft: str = "small",
-        plan: tuple[tuple[Item, ...], Start] | None = None,
-        more: Mapping[str, float] = MappingProxyType({}),
+        plan: tuple[tuple[Item, ...], StartState] | None = None,
+        extra_params: Mapping[str, float] = MappingProxyType({}),
         faults: Sequence[Fault] = (),
-        situation: Situation | None = None,
+        setup: FlightSetup | None = None,
     ):
         """Initialise one aircraft in flight.
 
@@ -67,72 +67,76 @@ class PretendUav:
         Raises:
             ValueError: when `uav_id` is outside the MAVLink range.
         """
-        if not 0 <= uav_id < MOST_AIRCRAFT:
-            most = MOST_AIRCRAFT - 1
-            raise ValueError(f"uav-{uav_id}: found id {uav_id}, expected 0..{most} (MAVLink ids); fly fewer aircraft")
-        own = int(np.random.SeedSequence((seed, uav_id)).generate_state(1)[0])
-        if situation is None:
-            kind = altered(aircraft) if faults else TYPES[aircraft]
+        if not 0 <= uav_id < MAX_AIRCRAFT:
+            max_id = MAX_AIRCRAFT - 1
+            raise ValueError(f"uav-{uav_id}: found id {uav_id}, expected 0..{max_id} (MAVLink ids); fly fewer aircraft")
+        aircraft_seed = int(np.random.SeedSequence((seed, uav_id)).generate_state(1)[0])
+        if setup is None:
+            kind = instrumented_type(aircraft) if faults else TYPES[aircraft]
             weather = Weather(wind, np.random.default_rng((seed, 5)).uniform(-pi, pi), turbulence)
-            plan = plan or mission(own, kind.cruise, origin, kind.field, autopilot)
-            situation = Situation(own, kind, plan, weather)
-        rng = np.random.default_rng((situation.flight, 4))
-        self.uav_id, self.origin, self.situation = uav_id, origin, situation
+            plan = plan or draw_mission(aircraft_seed, kind.cruise, origin, kind.geometry, autopilot)
+            setup = FlightSetup(aircraft_seed, kind, plan, weather)
+        rng = np.random.default_rng((setup.flight_seed, 4))
+        self.uav_id, self.origin, self.setup = uav_id, origin, setup
         self._law = _LAWS[autopilot]
-        self._first = legs_of.FIRST.get(autopilot, 1)
-        self.items, start = situation.plan
-        self.params = {**tuned(own, autopilot, aircraft), **more}
+        self._first_item = legs_of.FIRST_ITEM.get(autopilot, 1)
+        self.items, start = setup.mission
+        self.params = {**tuned_parameters(aircraft_seed, autopilot, aircraft), **extra_params}
         self.boot_s = float(rng.uniform(60, 600))  # time since boot at simulation start [s]
         self.tick = 0
-        self.down = False  # reached the ground
-        self._wind = situation.weather.wind(rng, DT * _OUTER)
-        examined = situation.examined
-        self._sensors = Sensors(rng, DT * _INNER, np.random.default_rng((own, 9)) if examined else None)
-        self._wind_hat = WindEstimate(np.random.default_rng((situation.flight, 8)), DT * _OUTER)
-        self._heights = Heights(np.random.default_rng((situation.flight, 10)), DT * _INNER) if examined else None
-        self._jitter = np.random.default_rng((situation.flight, 11)) if examined else None
-        self._voice = Voice(uav_id + 1, self.items, self.params, RECORDED if examined else DIALECTS[autopilot])
-        gusts = Gusts(situation.flight, situation.weather.w20_fps)
-        self.aircraft = Aircraft(origin, own, situation.weather.severity, situation.kind, gusts)
-        blowing = self._wind.step(-start.p[2])
-        self._believed = self._wind_hat.measure(blowing)
+        self.crashed = False  # reached the ground
+        self._wind = setup.weather.wind(rng, DT * _OUTER)
+        is_exam = setup.is_exam
+        self._sensors = Sensors(rng, DT * _INNER, np.random.default_rng((aircraft_seed, 9)) if is_exam else None)
+        self._wind_estimator = WindEstimator(np.random.default_rng((setup.flight_seed, 8)), DT * _OUTER)
+        self._altitude_sensors = (
+            AltitudeSensors(np.random.default_rng((setup.flight_seed, 10)), DT * _INNER) if is_exam else None
+        )
+        self._jitter = np.random.default_rng((setup.flight_seed, 11)) if is_exam else None
+        self._endpoint = MavlinkEndpoint(
+            uav_id + 1, self.items, self.params, ONBOARD_DIALECT if is_exam else DIALECTS[autopilot]
+        )
+        gusts = Gusts(setup.flight_seed, setup.weather.w20_fps)
+        self.aircraft = Aircraft(origin, aircraft_seed, setup.weather.severity, setup.kind, gusts)
+        mean_wind = self._wind.step(-start.p[2])
+        self._wind_estimate = self._wind_estimator.measure(mean_wind)
         self._phi_c = 0.0
-        self._theta_c, delta_e, self._delta_t = self.aircraft.start(start.p, start.psi, situation.kind.cruise, blowing)
-        self.carried = Carried(faults, self.aircraft, DT, DT * _INNER) if faults else None
+        self._theta_c, delta_e, self._delta_t = self.aircraft.start(start.p, start.psi, setup.kind.cruise, mean_wind)
+        self.fault_set = FaultSet(faults, self.aircraft, DT, DT * _INNER) if faults else None
         self.pulses = Servos.pulses(0.0, delta_e, 0.0, self._delta_t)
-        self.now: Estimate = self._measure()
+        self.estimate: Estimate = self._measure()
         self._engage(start.seq)
 
     def _engage(self, seq: int) -> None:
         """Initialise the autopilot on item `seq`."""
-        par, _ = laws.parameters(self._law, self.params, self.origin.alt_mm * 1e-3 - self.now.p[2])
-        self._par = laws.blown(par, *self._believed)
+        par, _ = laws.parameters(self._law, self.params, self.origin.alt_mm * 1e-3 - self.estimate.p[2])
+        self._par = laws.with_wind(par, *self._wind_estimate)
         self._legs, start = self._route(seq)
-        e = self.now
+        e = self.estimate
         self._ctl = laws.init(self._par, self._legs, 0, start, e.p, e.v, e.euler, e.Va, self._theta_c, self._delta_t)
 
     def _route(self, seq: int) -> tuple[np.ndarray, np.ndarray]:
         """Convert the mission from item `seq` to legs; return them and the start of the first."""
-        more = {"params": self.params, "limit": _LEGS_AHEAD, "first": self._first}
-        way = legs_of.route(self.items, seq=seq, origin=self.origin, **more)  # type: ignore[arg-type]
-        return way.legs, way.start
+        options = {"params": self.params, "limit": _LEGS_AHEAD, "first": self._first_item}
+        route = legs_of.unroll_route(self.items, seq=seq, origin=self.origin, **options)  # type: ignore[arg-type]
+        return route.legs, route.start
 
     def step(self, t: float) -> list[bytes]:
         """Advance to `t` [s] since simulation start and return the frames sent meanwhile."""
         frames: list[bytes] = []
-        while self.tick < round(t * TICK_HZ) and not self.down:
+        while self.tick < round(t * TICK_HZ) and not self.crashed:
             frames += self._tick()
         return frames
 
-    def hear(self, data: bytes) -> list[bytes]:
+    def receive(self, data: bytes) -> list[bytes]:
         """Process bytes from the ground and return the replies."""
-        return self._voice.hear(data, self.boot_s + self.tick * DT)
+        return self._endpoint.receive(data, self.boot_s + self.tick * DT)
 
-    def introduce(self) -> list[bytes]:
+    def initial_frames(self) -> list[bytes]:
         """Return the frames for the start of a recording: version, mission, parameters."""
-        questions = Ground(self.uav_id + 1).questions(len(self.items))
-        answers = [frame for question in questions for frame in self.hear(question)]
-        return answers + self._voice.stream(len(self.params))
+        requests = MavlinkGroundStation(self.uav_id + 1).requests(len(self.items))
+        replies = [frame for request in requests for frame in self.receive(request)]
+        return replies + self._endpoint.stream_parameters(len(self.params))
 
     @property
     def leg(self) -> np.ndarray:
@@ -141,72 +145,77 @@ class PretendUav:
 
     def _tick(self) -> list[bytes]:
         if self.tick % _OUTER == 0:
-            self._weather()
+            self._update_wind()
         if self.tick % _INNER == 0:
             self._control()
-        if self.carried is not None:
-            self.carried.press(self.tick * DT)
-            self.aircraft.drive(*self.carried.move(self.tick * DT, Servos.commands(self.pulses)))
-        frames = self._voice.telemetry(self.tick, self._flight)
+        if self.fault_set is not None:
+            self.fault_set.apply_to_physics(self.tick * DT)
+            self.aircraft.set_controls(*self.fault_set.apply_to_commands(self.tick * DT, Servos.commands(self.pulses)))
+        frames = self._endpoint.telemetry(self.tick, self._telemetry_state)
         self.aircraft.step()
         self.tick += 1
         return frames
 
-    def _weather(self) -> None:
+    def _update_wind(self) -> None:
         """Update the wind and its estimate."""
-        height = -float(self.now.p[2])
-        blowing = (*self._wind.step(height), 0.0)
-        if self.carried is not None:
-            w_n, w_e, w_d = blowing + self.carried.wind(self.tick * DT, height)
-            blowing = float(w_n), float(w_e), float(w_d)
-        self._believed = self._wind_hat.measure(blowing[:2])
-        self.aircraft.blow(*blowing)
+        height = -float(self.estimate.p[2])
+        wind = (*self._wind.step(height), 0.0)
+        if self.fault_set is not None:
+            w_n, w_e, w_d = wind + self.fault_set.wind(self.tick * DT, height)
+            wind = float(w_n), float(w_e), float(w_d)
+        self._wind_estimate = self._wind_estimator.measure(wind[:2])
+        self.aircraft.set_wind(*wind)
 
     def _measure(self) -> Estimate:
         """Return the state estimate including faults."""
         truth = self.aircraft.truth()
         e = self._sensors.measure(truth)
-        if self._heights is not None:
-            e = self._heights.measure(e, truth)
-        return e if self.carried is None else self.carried.sense(self.tick * DT, e)
+        if self._altitude_sensors is not None:
+            e = self._altitude_sensors.measure(e, truth)
+        return e if self.fault_set is None else self.fault_set.apply_to_estimate(self.tick * DT, e)
 
     def _control(self) -> None:
         """Measure, run the autopilot, set the servos."""
-        e = self.now = self._measure()
-        self.down = not -e.p[2] > _GROUND_M
+        e = self.estimate = self._measure()
+        self.crashed = not -e.p[2] > _MIN_HEIGHT_M
         if self.tick % _OUTER == 0:
             Va_dot = float(e.force[0]) - G * sin(e.euler[1])
-            self._par[[W_N, W_E]] = self._believed
+            self._par[[W_N, W_E]] = self._wind_estimate
             self._phi_c, self._theta_c, self._delta_t = laws.guide(
                 self._ctl, self._par, self._legs, e.p, e.v, e.euler, e.Va, Va_dot, DT * _OUTER
             )
             if self._ctl[memory.LEG] >= len(self._legs) - 2:
-                self._renew()
+                self._extend_route()
         delta_a, delta_e, delta_r = laws.stabilise(
             self._ctl, self._par, self._phi_c, self._theta_c, e.euler, e.rates, e.Va, DT * _INNER
         )
         commands = (delta_a, delta_e, delta_r, self._delta_t)
-        if self.situation.pilot is not None:
-            more = self.situation.pilot(self.tick * DT)
-            commands = (delta_a + more[0], delta_e + more[1], delta_r + more[2], self._delta_t + more[3])
+        if self.setup.pilot is not None:
+            pilot_deltas = self.setup.pilot(self.tick * DT)
+            commands = (
+                delta_a + pilot_deltas[0],
+                delta_e + pilot_deltas[1],
+                delta_r + pilot_deltas[2],
+                self._delta_t + pilot_deltas[3],
+            )
         self.pulses = Servos.pulses(*commands)
-        self.aircraft.drive(*Servos.commands(self.pulses))
+        self.aircraft.set_controls(*Servos.commands(self.pulses))
 
-    def _renew(self) -> None:
+    def _extend_route(self) -> None:
         """Extend the legs of the endless mission without changing the controller state."""
         self._legs, _ = self._route(int(self.leg[legs_of.SEQ]))
         self._ctl[memory.LEG] = 0
 
-    def _flight(self) -> Flight:
-        e, leg = self.now, self.leg
+    def _telemetry_state(self) -> TelemetryState:
+        e, leg = self.estimate, self.leg
         target = leg[legs_of.P_N : legs_of.P_D + 1] - e.p
-        commanded = leg[legs_of.VA_C] if leg[legs_of.VA_C] > 0 else self.situation.kind.cruise
-        place = to_geodetic(self.origin, e.p)
-        late = 0.0 if self._jitter is None else float(self._jitter.uniform(-JITTER_S, JITTER_S))
-        return Flight(
-            t=self.boot_s + self.tick * DT + late,
-            now=e,
-            place=(int(place[0]), int(place[1]), int(place[2])),
+        commanded = leg[legs_of.VA_C] if leg[legs_of.VA_C] > 0 else self.setup.kind.cruise
+        position = to_geodetic(self.origin, e.p)
+        time_jitter = 0.0 if self._jitter is None else float(self._jitter.uniform(-JITTER_S, JITTER_S))
+        return TelemetryState(
+            t=self.boot_s + self.tick * DT + time_jitter,
+            estimate=e,
+            position=(int(position[0]), int(position[1]), int(position[2])),
             height=float(-e.p[2]),
             pulses=self.pulses,
             delta_t=self._delta_t,
@@ -217,18 +226,18 @@ class PretendUav:
             Va_error=float(commanded - e.Va),
             xtrack_error=self._xtrack(),
             seq=int(leg[legs_of.SEQ]),
-            total=len(self.items),
+            n_items=len(self.items),
             home=(self.origin.lat_e7, self.origin.lon_e7, self.origin.alt_mm),
-            wind=self._believed,
+            wind=self._wind_estimate,
         )
 
     def _xtrack(self) -> float:
         """Return the distance to the right of the line, or outside the circle [m]."""
-        e, leg, ctl = self.now, self.leg, self._ctl
+        e, leg, ctl = self.estimate, self.leg, self._ctl
         centre = leg[legs_of.P_N : legs_of.P_D]
         if leg[legs_of.KIND] != legs_of.WAYPOINT:
             radius = abs(leg[legs_of.RADIUS])
             return float(np.hypot(*(e.p[:2] - centre)) - radius)
         a = ctl[[memory.PREV_N, memory.PREV_E]]
-        line, way = centre - a, e.p[:2] - a
-        return float((line[0] * way[1] - line[1] * way[0]) / max(np.hypot(*line), 1e-3))
+        line, offset = centre - a, e.p[:2] - a
+        return float((line[0] * offset[1] - line[1] * offset[0]) / max(np.hypot(*line), 1e-3))

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 from fleet.simulator.vehicle.jsbsim import model_file
-from fleet.simulator.vehicle.types import TYPES, Type
+from fleet.simulator.vehicle.types import TYPES, AircraftType
 
 _FACTORS = {  # property: functions it multiplies
     "conceal/C_n_beta": ("aero/coefficient/Cnb",),
@@ -23,93 +23,93 @@ _FACTORS = {  # property: functions it multiplies
     "conceal/C_l_p": ("aero/coefficient/Clp",),
     "conceal/C_m_q": ("aero/coefficient/Cmq", "aero/coefficient/Cmadot"),
 }
-_UNIT_IN = (41.9, -0.7, 37.3)
-_WASH = "aero/function/qbar-induced-psf"
-_TAIL = ("aero/coefficient/Cmde", "aero/coefficient/Cndr")
+_IMU_POSITION_IN = (41.9, -0.7, 37.3)
+_INDUCED_PRESSURE = "aero/function/qbar-induced-psf"
+_TAIL_FUNCTIONS = ("aero/coefficient/Cmde", "aero/coefficient/Cndr")
 _P_FACTOR = {"z": ("-1", "aero/alpha-rad"), "y": ("1", "aero/beta-rad")}  # thrust line to the right: nose left
 
 
-def altered(name: str) -> Type:
+def instrumented_type(name: str) -> AircraftType:
     """Return the type `name` of `types.TYPES` with its instrumented aircraft file."""
-    return TYPES[name]._replace(file=_file(name))
+    return TYPES[name]._replace(xml=_aircraft_xml(name))
 
 
 @cache
-def _file(name: str) -> str:
+def _aircraft_xml(name: str) -> str:
     """Return the instrumented aircraft file of one type."""
     kind = TYPES[name]
     root = ElementTree.parse(model_file(kind)).getroot()
-    _knob_forces(root)
-    if kind.shipped:
-        _measure_in_the_middle(root)
-        _knob_derivatives(root)
-        _knob_propeller(root)
+    _add_force_knobs(root)
+    if kind.from_jsbsim:
+        _move_imu_to_cg(root)
+        _add_derivative_knobs(root)
+        _add_propeller_knobs(root)
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def _knob_forces(root: Element) -> None:
+def _add_force_knobs(root: Element) -> None:
     """Add properties for drag, lift and mass."""
-    air = _one(root, "aerodynamics")
+    air = _find_one(root, "aerodynamics")
     for knob, value in (("conceal/C_D", "0"), ("conceal/lift", "1")):
         air.insert(0, _property(knob, value))
-    for function in _one(air, "axis[@name='LIFT']").findall("function"):
-        SubElement(_one(function, "product"), "property").text = "conceal/lift"
-    drag = SubElement(_one(air, "axis[@name='DRAG']"), "function", name="conceal/drag")
+    for function in _find_one(air, "axis[@name='LIFT']").findall("function"):
+        SubElement(_find_one(function, "product"), "property").text = "conceal/lift"
+    drag = SubElement(_find_one(air, "axis[@name='DRAG']"), "function", name="conceal/drag")
     _product(drag, "aero/qbar-psf", "metrics/Sw-sqft", "conceal/C_D")
-    balance = _one(root, "mass_balance")
+    balance = _find_one(root, "mass_balance")
     mass = SubElement(balance, "pointmass", name="concealed")
     SubElement(mass, "weight", unit="LBS").text = "0"
-    mass.append(_one(balance, "location[@name='CG']"))
+    mass.append(_find_one(balance, "location[@name='CG']"))
 
 
-def _measure_in_the_middle(root: Element) -> None:
+def _move_imu_to_cg(root: Element) -> None:
     """Move the eye point, where JSBSim computes accelerations, to the centre of gravity of the loaded Cessna."""
-    eyes = _one(root, "metrics/location[@name='EYEPOINT']")
-    for axis, inches in zip("xyz", _UNIT_IN, strict=True):
-        _one(eyes, axis).text = str(inches)
+    eyepoint = _find_one(root, "metrics/location[@name='EYEPOINT']")
+    for axis, inches in zip("xyz", _IMU_POSITION_IN, strict=True):
+        _find_one(eyepoint, axis).text = str(inches)
 
 
-def _knob_derivatives(root: Element) -> None:
-    air = _one(root, "aerodynamics")
+def _add_derivative_knobs(root: Element) -> None:
+    air = _find_one(root, "aerodynamics")
     for knob, names in _FACTORS.items():
         air.insert(0, _property(knob, "1"))
         for name in names:
-            SubElement(_one(air, f".//function[@name='{name}']/product"), "property").text = knob
+            SubElement(_find_one(air, f".//function[@name='{name}']/product"), "property").text = knob
 
 
-def _knob_propeller(root: Element) -> None:
+def _add_propeller_knobs(root: Element) -> None:
     """Add properties for the slipstream on the tail and for the shift of the thrust line."""
-    air = _one(root, "aerodynamics")
-    felt = Element("function", name="conceal/qbar-tail-psf")
-    whole = SubElement(felt, "sum")
-    SubElement(whole, "property").text = "aero/qbar-psf"
-    more = SubElement(whole, "product")
-    SubElement(more, "property").text = "conceal/slipstream"
-    difference = SubElement(more, "difference")
-    for name in (_WASH, "aero/qbar-psf"):
+    air = _find_one(root, "aerodynamics")
+    tail_pressure = Element("function", name="conceal/qbar-tail-psf")
+    total = SubElement(tail_pressure, "sum")
+    SubElement(total, "property").text = "aero/qbar-psf"
+    induced = SubElement(total, "product")
+    SubElement(induced, "property").text = "conceal/slipstream"
+    difference = SubElement(induced, "difference")
+    for name in (_INDUCED_PRESSURE, "aero/qbar-psf"):
         SubElement(difference, "property").text = name
-    air.insert(list(air).index(_one(air, f"function[@name='{_WASH}']")) + 1, felt)
+    air.insert(list(air).index(_find_one(air, f"function[@name='{_INDUCED_PRESSURE}']")) + 1, tail_pressure)
     air.insert(0, _property("conceal/slipstream", "1"))
-    for name in _TAIL:
-        for found in air.findall(f".//function[@name='{name}']/product/property"):
-            found.text = "conceal/qbar-tail-psf" if found.text == _WASH else found.text
-    outside = Element("external_reactions")
-    outside.append(_property("conceal/p_factor", "0"))
+    for name in _TAIL_FUNCTIONS:
+        for element in air.findall(f".//function[@name='{name}']/product/property"):
+            element.text = "conceal/qbar-tail-psf" if element.text == _INDUCED_PRESSURE else element.text
+    reactions = Element("external_reactions")
+    reactions.append(_property("conceal/p_factor", "0"))
     for axis, (sign, angle) in _P_FACTOR.items():
-        moment = SubElement(outside, "moment", name=f"p-factor-{axis}", frame="BODY")
+        moment = SubElement(reactions, "moment", name=f"p-factor-{axis}", frame="BODY")
         arm = _product(SubElement(moment, "function"), "propulsion/engine/thrust-lbs", "conceal/p_factor", angle)
         SubElement(arm, "value").text = str(1 / 12)
-        way = SubElement(moment, "direction")
+        direction = SubElement(moment, "direction")
         for name in "xyz":
-            SubElement(way, name).text = sign if name == axis else "0"
-    root.insert(list(root).index(air), outside)
+            SubElement(direction, name).text = sign if name == axis else "0"
+    root.insert(list(root).index(air), reactions)
 
 
-def _one(root: Element, path: str) -> Element:
-    found = root.find(path)
-    if found is None:
+def _find_one(root: Element, path: str) -> Element:
+    element = root.find(path)
+    if element is None:
         raise RuntimeError(f"jsbsim: found no {path} in its aircraft file, expected one; install JSBSim 1.3")
-    return found
+    return element
 
 
 def _property(name: str, value: str) -> Element:

@@ -12,13 +12,13 @@ import jsbsim
 import numpy as np
 
 from fleet.frames import Origin, to_ned
-from fleet.simulator.vehicle.types import CRUISE, TYPES, Type
+from fleet.simulator.vehicle.types import CRUISE, TYPES, AircraftType
 from fleet.simulator.vehicle.weather import FT, wind_at_20ft
 
 DT = 0.01  # physics step [s]
 KG_TO_LB = 2.2046226218
 _SLUG_FT3, _PSF = 515.378819, 47.880259  # [kg/m3], [Pa]
-_READ = (
+_READ_PROPERTIES = (
     *("position/lat-geod-rad", "position/long-gc-rad", "position/geod-alt-ft"),
     *("velocities/v-north-fps", "velocities/v-east-fps", "velocities/v-down-fps"),
     *("attitude/phi-rad", "attitude/theta-rad", "attitude/psi-rad"),
@@ -60,7 +60,12 @@ class Aircraft:
     """One JSBSim aircraft with random variations of its parameters."""
 
     def __init__(
-        self, origin: Origin, seed: int, turbulence: int = 0, kind: Type = TYPES["small"], gusts: Gusts | None = None
+        self,
+        origin: Origin,
+        seed: int,
+        turbulence: int = 0,
+        kind: AircraftType = TYPES["small"],
+        gusts: Gusts | None = None,
     ):
         """Load the model and draw its variations.
 
@@ -73,23 +78,25 @@ class Aircraft:
         Raises:
             RuntimeError: when JSBSim cannot load its aircraft file; reinstall the package.
         """
-        self._fdm, self.kind = _executive(kind), kind
-        self._driven = (*_SURFACES, kind.motor)
-        self._nodes = {name: self._fdm.get_property_manager().get_node(name) for name in (*_READ, *self._driven)}
-        self._read = [self._nodes[name].get_double_value for name in _READ]
+        self._fdm, self.kind = _create_executive(kind), kind
+        self._control_names = (*_SURFACES, kind.throttle_property)
+        self._nodes = {
+            name: self._fdm.get_property_manager().get_node(name) for name in (*_READ_PROPERTIES, *self._control_names)
+        }
+        self._getters = [self._nodes[name].get_double_value for name in _READ_PROPERTIES]
         self._origin = origin
         corner = np.array([[origin.lat_e7 + 10_000, origin.lon_e7 + 10_000, origin.alt_mm]])  # to_ned is linear
         north, east, _ = to_ned(origin, *corner.T)[0]
         self._per_rad = north / np.radians(1e-3), east / np.radians(1e-3)  # [m/rad]
         for name, value in kind.settings.items():
             self._fdm[name] = value
-        self._vary(np.random.default_rng((seed, 1)))
+        self._draw_variations(np.random.default_rng((seed, 1)))
         self._turbulence = turbulence
         self._gusts = gusts or Gusts(seed, wind_at_20ft(turbulence))
 
-    def _vary(self, rng: np.random.Generator) -> None:
+    def _draw_variations(self, rng: np.random.Generator) -> None:
         self.payload_kg = rng.uniform(*self.kind.payload_kg)
-        self._fdm[f"inertia/pointmass-weight-lbs{self.kind.varied}"] = self.payload_kg * KG_TO_LB
+        self._fdm[f"inertia/pointmass-weight-lbs{self.kind.payload_index}"] = self.payload_kg * KG_TO_LB
         for name, spread in self.kind.spread.items():
             self._fdm[f"vary/{name}"] = 1 + spread * float(np.clip(rng.standard_normal(), -2, 2))
         for name, spread in self.kind.offsets.items():
@@ -114,7 +121,7 @@ class Aircraft:
         fdm["ic/h-sl-ft"] = (self._origin.alt_mm * 1e-3 - p[2]) / FT
         fdm["ic/psi-true-rad"] = psi
         fdm["ic/phi-rad"] = 0.0
-        trim = self._trim_engine(Va) if self.kind.shipped else self._trim(Va)
+        trim = self._trim_engine(Va) if self.kind.from_jsbsim else self._trim(Va)
         fdm["ic/vw-mag-fps"] = hypot(*wind) / FT
         fdm["ic/vw-dir-deg"] = degrees(atan2(wind[1], wind[0])) % 360
         fdm["ic/vn-fps"] = (Va * cos(psi) + wind[0]) / FT
@@ -125,9 +132,9 @@ class Aircraft:
         fdm["atmosphere/turbulence/milspec/severity"] = float(self._turbulence)
         fdm.run_ic()
         fdm.set_trim_status(False)
-        if self.kind.shipped:
+        if self.kind.from_jsbsim:
             fdm["propulsion/set-running"] = -1
-        self.blow(*wind)
+        self.set_wind(*wind)
         return trim
 
     def _trim_engine(self, Va: float) -> tuple[float, float, float]:
@@ -135,14 +142,18 @@ class Aircraft:
         fdm = self._fdm
         fdm["ic/vt-fps"], fdm["ic/gamma-deg"] = Va / FT, 0.0
         fdm["propulsion/magneto_cmd"], fdm["fcs/mixture-cmd-norm"] = 3, _MIXTURE
-        fdm[self.kind.motor] = 0.6
+        fdm[self.kind.throttle_property] = 0.6
         fdm.run_ic()
         fdm["propulsion/set-running"] = -1
         fdm["simulation/do_simple_trim"] = 0  # longitudinal
-        theta, delta_e, delta_t = fdm["attitude/theta-rad"], -fdm["fcs/pitch-trim-cmd-norm"], fdm[self.kind.motor]
+        theta, delta_e, delta_t = (
+            fdm["attitude/theta-rad"],
+            -fdm["fcs/pitch-trim-cmd-norm"],
+            fdm[self.kind.throttle_property],
+        )
         fdm["fcs/pitch-trim-cmd-norm"] = 0.0
         fdm["ic/alpha-rad"] = fdm["ic/theta-rad"] = theta
-        self.drive(0.0, delta_e, 0.0, delta_t)
+        self.set_controls(0.0, delta_e, 0.0, delta_t)
         return float(theta), float(delta_e), float(delta_t)
 
     def _trim(self, Va: float) -> tuple[float, float, float]:
@@ -161,17 +172,17 @@ class Aircraft:
         fdm = self._fdm
         fdm["ic/vt-fps"] = Va / FT
         fdm["ic/alpha-rad"] = fdm["ic/theta-rad"] = float(z[0])
-        self.drive(0.0, float(z[1]), 0.0, float(z[2]))
+        self.set_controls(0.0, float(z[1]), 0.0, float(z[2]))
         fdm.run_ic()
         names = ("accelerations/udot-ft_sec2", "accelerations/wdot-ft_sec2", "accelerations/qdot-rad_sec2")
         return np.array([fdm[name] for name in names])
 
-    def drive(self, delta_a: float, delta_e: float, delta_r: float, delta_t: float) -> None:
+    def set_controls(self, delta_a: float, delta_e: float, delta_r: float, delta_t: float) -> None:
         """Set the commands of servos, -1..1 (+ rolls right, pitches up, yaws right), and motor, 0..1."""
-        for name, value in zip(self._driven, (delta_a, -delta_e, -delta_r, delta_t), strict=True):
+        for name, value in zip(self._control_names, (delta_a, -delta_e, -delta_r, delta_t), strict=True):
             self._nodes[name].set_double_value(value)
 
-    def blow(self, w_n: float, w_e: float, w_d: float = 0.0) -> None:
+    def set_wind(self, w_n: float, w_e: float, w_d: float = 0.0) -> None:
         """Set the mean wind, NED, direction it blows to [m/s]; turbulence is added."""
         self._fdm["atmosphere/wind-north-fps"] = w_n / FT
         self._fdm["atmosphere/wind-east-fps"] = w_e / FT
@@ -181,18 +192,18 @@ class Aircraft:
         """Advance by DT."""
         self._fdm.run()
 
-    def ponder(self) -> np.ndarray:
+    def evaluate_accelerations(self) -> np.ndarray:
         """Evaluate pdot qdot rdot [rad/s2] and specific force, FRD [m/s2], without advancing time, (6,)."""
         self._fdm.suspend_integration()
         self._fdm.run()
         self._fdm.resume_integration()
-        turning = [self._fdm[f"accelerations/{name}dot-rad_sec2"] for name in "pqr"]
+        angular = [self._fdm[f"accelerations/{name}dot-rad_sec2"] for name in "pqr"]
         force = [self._fdm[f"forces/fb{axis}-total-lbs"] / self._fdm["inertia/mass-slugs"] * FT for axis in "xyz"]
-        return np.array([*turning, *force])
+        return np.array([*angular, *force])
 
     def truth(self) -> Truth:
         """Return the state in SI, NED and FRD."""
-        x = np.array([read() for read in self._read])
+        x = np.array([getter() for getter in self._getters])
         origin = self._origin
         p = np.array(
             [
@@ -201,7 +212,7 @@ class Aircraft:
                 origin.alt_mm * 1e-3 - x[2] * FT,
             ]
         )
-        air = (
+        air_data = (
             float(x[15] * FT),
             float(x[16]),
             float(x[17]),
@@ -209,7 +220,7 @@ class Aircraft:
             float(x[19] * _PSF),
             float(x[20] / 1.8),
         )
-        return Truth(p, x[3:6] * FT, x[6:9], x[9:12], x[12:15] * FT, *air)
+        return Truth(p, x[3:6] * FT, x[6:9], x[9:12], x[12:15] * FT, *air_data)
 
     def __getitem__(self, name: str) -> float:
         """Return a JSBSim property by its name, in its unit."""
@@ -220,31 +231,31 @@ class Aircraft:
         self._fdm[name] = value
 
 
-def model_file(kind: Type) -> Path:
+def model_file(kind: AircraftType) -> Path:
     """Return the path of the aircraft file of a type, in the jsbsim package or beside this file."""
-    root = Path(jsbsim.get_default_root_dir()) if kind.shipped else _HERE
+    root = Path(jsbsim.get_default_root_dir()) if kind.from_jsbsim else _HERE
     return root / "aircraft" / kind.model / f"{kind.model}.xml"
 
 
-def _load(fdm: Any, kind: Type) -> bool:
+def _load(fdm: Any, kind: AircraftType) -> bool:
     """Load a model; JSBSim reads files only, so a changed one goes through a temporary file."""
-    if kind.file is None:
+    if kind.xml is None:
         return bool(fdm.load_model(kind.model))
     with TemporaryDirectory(prefix="parauav-") as folder:
-        place = Path(folder, kind.model, f"{kind.model}.xml")
-        place.parent.mkdir()
-        place.write_text(kind.file)
+        xml_path = Path(folder, kind.model, f"{kind.model}.xml")
+        xml_path.parent.mkdir()
+        xml_path.write_text(kind.xml)
         fdm.set_aircraft_path(folder)
         return bool(fdm.load_model(kind.model))
 
 
-def _executive(kind: Type) -> Any:
+def _create_executive(kind: AircraftType) -> Any:
     """Create a JSBSim executive without log output and load an aircraft."""
     jsbsim.set_logger(jsbsim.DefaultLogger(jsbsim.LogLevel.ERROR))
-    fdm = jsbsim.FGFDMExec(None if kind.shipped else str(_HERE))
+    fdm = jsbsim.FGFDMExec(None if kind.from_jsbsim else str(_HERE))
     fdm.set_debug_level(0)
     if not _load(fdm, kind):
-        place = "in the jsbsim package" if kind.shipped else "beside this file"
-        raise RuntimeError(f"jsbsim: found no loadable {kind.model!r}, expected it {place}; reinstall the package")
+        location = "in the jsbsim package" if kind.from_jsbsim else "beside this file"
+        raise RuntimeError(f"jsbsim: found no loadable {kind.model!r}, expected it {location}; reinstall the package")
     fdm.set_dt(DT)
     return fdm

@@ -17,13 +17,13 @@ from fleet.frames import Origin, to_geodetic, wrap
 HOME = Origin(474_000_000, 85_000_000, 450_000)  # over open country [1e-7 deg, 1e-7 deg, mm]
 WAYPOINT, LOITER_TURNS, LOITER_TIME, DO_JUMP, DO_CHANGE_SPEED = 16, 18, 19, 177, 178
 ABSOLUTE, RELATIVE_ALT = 0, 3
-REACH_M = 1_300.0  # maximum distance of waypoints from home
+MAX_RANGE_M = 1_300.0  # maximum distance of waypoints from home
 LEGS = 10
 TURNS_DEG = (25, 45, 60, 75, 90, 90, 110, 130, 150)
-LOW_M, HIGH_M = 80.0, 200.0  # above home
+MIN_HEIGHT_M, MAX_HEIGHT_M = 80.0, 200.0  # above home
 
 
-class Field(NamedTuple):
+class MissionGeometry(NamedTuple):
     """Geometry of the missions of an aircraft type."""
 
     scale: float = 1.0  # factor of horizontal lengths
@@ -33,10 +33,10 @@ class Field(NamedTuple):
     sink: float = 0.055  # maximum descent slope at idle [-]
 
 
-SMALL = Field()
+SMALL_GEOMETRY = MissionGeometry()
 
 
-class Start(NamedTuple):
+class StartState(NamedTuple):
     """State of an aircraft at simulation start."""
 
     seq: int  # current mission item
@@ -44,43 +44,49 @@ class Start(NamedTuple):
     psi: float  # heading, along the leg [rad]
 
 
-class _Walk:
+class _WaypointWalk:
     """A random walk of waypoints, NED from home."""
 
-    def __init__(self, rng: np.random.Generator, field: Field):
-        self._rng, self._field = rng, field
+    def __init__(self, rng: np.random.Generator, geometry: MissionGeometry):
+        self._rng, self._geometry = rng, geometry
         self.course = rng.uniform(-pi, pi)
-        radius = rng.uniform(200, 700) * field.scale
+        radius = rng.uniform(200, 700) * geometry.scale
         bearing = rng.uniform(-pi, pi)
         self.n, self.e = radius * cos(bearing), radius * sin(bearing)
-        self.h = rng.uniform(100, 180) * field.height
+        self.h = rng.uniform(100, 180) * geometry.height
 
     def advance(self, turn: float, length: float, climb: float) -> None:
         """Turn by `turn` [rad], fly `length` [m], climb by `climb` [m]; beyond the maximum distance turn home."""
         if (
             hypot(self.n + length * cos(self.course + turn), self.e + length * sin(self.course + turn))
-            > REACH_M * self._field.scale
+            > MAX_RANGE_M * self._geometry.scale
         ):
-            home = wrap(atan2(-self.e, -self.n) - self.course)
-            turn = float(np.clip(home, -2.4, 2.4)) + self._rng.uniform(-0.3, 0.3)
+            home_turn = wrap(atan2(-self.e, -self.n) - self.course)
+            turn = float(np.clip(home_turn, -2.4, 2.4)) + self._rng.uniform(-0.3, 0.3)
         self.course = wrap(self.course + turn)
         self.n += length * cos(self.course)
         self.e += length * sin(self.course)
-        self.h = float(np.clip(self.h + climb, LOW_M * self._field.height, HIGH_M * self._field.height))
+        self.h = float(
+            np.clip(self.h + climb, MIN_HEIGHT_M * self._geometry.height, MAX_HEIGHT_M * self._geometry.height)
+        )
 
-    def spot(self) -> tuple[float, float, float]:
+    def position(self) -> tuple[float, float, float]:
         """Return the current position, NED from home [m]."""
         return self.n, self.e, -self.h
 
 
-def _turn(rng: np.random.Generator, at_least: float = 0.0) -> float:
+def _draw_turn(rng: np.random.Generator, min_deg: float = 0.0) -> float:
     """Draw a turn, left or right [rad]."""
-    return radians(rng.choice([t for t in TURNS_DEG if t >= at_least])) * rng.choice([-1, 1])
+    return radians(rng.choice([t for t in TURNS_DEG if t >= min_deg])) * rng.choice([-1, 1])
 
 
-def mission(
-    seed: int, cruise: float, origin: Origin = HOME, field: Field = SMALL, autopilot: str = "ardupilot"
-) -> tuple[tuple[Item, ...], Start]:
+def draw_mission(
+    seed: int,
+    cruise: float,
+    origin: Origin = HOME,
+    geometry: MissionGeometry = SMALL_GEOMETRY,
+    autopilot: str = "ardupilot",
+) -> tuple[tuple[Item, ...], StartState]:
     """Draw the endless mission of one aircraft and its start state before a turn.
 
     Args:
@@ -91,49 +97,49 @@ def mission(
         autopilot: ardupilot or px4, which interpret some items differently
     """
     rng = np.random.default_rng((seed, 2))
-    walk, px4 = _Walk(rng, field), autopilot == "px4"
-    items = [item(0, WAYPOINT, origin, (0.0, 0.0, 0.0), frame=ABSOLUTE)]
+    walk, px4 = _WaypointWalk(rng, geometry), autopilot == "px4"
+    items = [mission_item(0, WAYPOINT, origin, (0.0, 0.0, 0.0), frame=ABSOLUTE)]
     loiter_at = int(rng.integers(3, LEGS))
-    before = walk.spot()
+    previous = walk.position()
     for leg in range(LEGS):
-        turn = _turn(rng, at_least=60) if leg == 2 else _turn(rng)
-        length = rng.uniform(350, 750) * field.scale
-        slope = float(rng.choice([0, 0, field.climb, -field.sink, field.climb, -field.sink]))
+        turn = _draw_turn(rng, min_deg=60) if leg == 2 else _draw_turn(rng)
+        length = rng.uniform(350, 750) * geometry.scale
+        slope = float(rng.choice([0, 0, geometry.climb, -geometry.sink, geometry.climb, -geometry.sink]))
         climb = slope * rng.uniform(0.5, 1.0) * length
         walk.advance(turn, length, climb)
         if leg == 1:
-            start = _before_turn(rng, (before, walk.spot()), len(items), field.scale)
+            start = _start_before_turn(rng, (previous, walk.position()), len(items), geometry.scale)
         if leg == loiter_at:
-            radius = float(rng.choice([-1, 1])) * rng.uniform(80, 120) * field.circle
+            radius = float(rng.choice([-1, 1])) * rng.uniform(80, 120) * geometry.circle
             turn_s = round(2 * pi * abs(radius) / cruise)
             command, params = (LOITER_TIME, (turn_s, 1.0, radius)) if px4 else (LOITER_TURNS, (1.0, 0.0, radius))
-            items.append(item(len(items), command, origin, walk.spot(), params=params))
+            items.append(mission_item(len(items), command, origin, walk.position(), params=params))
         else:
-            items.append(item(len(items), WAYPOINT, origin, walk.spot()))
+            items.append(mission_item(len(items), WAYPOINT, origin, walk.position()))
         if leg in (3, 7):
             speed = cruise * float(rng.choice([0.9, 1.0, 1.12]))
-            items.append(item(len(items), DO_CHANGE_SPEED, origin, params=(0.0, round(speed, 1), -1.0)))
-        before = walk.spot()
-    items.append(item(len(items), DO_JUMP, origin, params=(1.0, -1.0)))
-    return (tuple(_from_zero(items[1:])), start._replace(seq=start.seq - 1)) if px4 else (tuple(items), start)
+            items.append(mission_item(len(items), DO_CHANGE_SPEED, origin, params=(0.0, round(speed, 1), -1.0)))
+        previous = walk.position()
+    items.append(mission_item(len(items), DO_JUMP, origin, params=(1.0, -1.0)))
+    return (tuple(_renumber_from_zero(items[1:])), start._replace(seq=start.seq - 1)) if px4 else (tuple(items), start)
 
 
-def _from_zero(items: list[Item]) -> Iterator[Item]:
+def _renumber_from_zero(items: list[Item]) -> Iterator[Item]:
     """Renumber items from zero, including the jump target."""
-    for item in items:
-        first = item.param1 - 1 if item.command == DO_JUMP else item.param1
-        yield msgspec.structs.replace(item, seq=item.seq - 1, param1=first)
+    for entry in items:
+        first = entry.param1 - 1 if entry.command == DO_JUMP else entry.param1
+        yield msgspec.structs.replace(entry, seq=entry.seq - 1, param1=first)
 
 
-def _before_turn(rng: np.random.Generator, leg: tuple[tuple, tuple], seq: int, scale: float) -> Start:
+def _start_before_turn(rng: np.random.Generator, leg: tuple[tuple, tuple], seq: int, scale: float) -> StartState:
     """Return a start state on the leg, about ten seconds before the next turn."""
     p, q = np.array(leg[0]), np.array(leg[1])
     length = hypot(q[0] - p[0], q[1] - p[1])
-    share = 1 - rng.uniform(120, 280) * scale / max(length, 300.0 * scale)
-    return Start(seq, p + (q - p) * max(share, 0.05), atan2(q[1] - p[1], q[0] - p[0]))
+    fraction = 1 - rng.uniform(120, 280) * scale / max(length, 300.0 * scale)
+    return StartState(seq, p + (q - p) * max(fraction, 0.05), atan2(q[1] - p[1], q[0] - p[0]))
 
 
-def item(
+def mission_item(
     seq: int,
     command: int,
     origin: Origin,

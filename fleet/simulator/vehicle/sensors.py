@@ -31,7 +31,7 @@ AIRSPEED_SCALE = 0.02  # standard deviation of the pitot tube's scale error [-]
 SEA_LEVEL_RHO = 1.225  # [kg/m3]
 _SEA_LEVEL_PA, _LAPSE, _POWER = 101_325.0, 2.25577e-5, 5.25588  # ICAO standard atmosphere [Pa, 1/m, -]
 BOARD_K = 14.0  # excess of board temperature over outside air [K]
-_HEIGHTS = {  # standard deviation, correlation time [s]
+_ALTITUDE_ERRORS = {  # standard deviation, correlation time [s]
     "pressure": (2.0, 0.0),  # [Pa]
     "pressure_wander": (3.0, 60.0),  # [Pa]
     "satellites": (1.5, 100.0),  # [m]
@@ -48,19 +48,19 @@ class Estimate(NamedTuple):
     force: np.ndarray
     Va: float  # equivalent airspeed of a pitot tube: Va_true sqrt(rho / 1.225) [m/s]
     pressure: float = nan  # static [Pa]; this and the following only for onboard recordings
-    warmth: float = nan  # of the board [K]
-    satellites: float = nan  # height above home from satellites only [m]
+    board_temperature: float = nan  # of the board [K]
+    gps_height: float = nan  # height above home from satellites only [m]
 
 
 class Sensors:
     """Sensors and estimator of one aircraft."""
 
-    def __init__(self, rng: np.random.Generator, dt: float, own: np.random.Generator | None = None):
+    def __init__(self, rng: np.random.Generator, dt: float, scale_rng: np.random.Generator | None = None):
         """Draw biases, and the airspeed scale from `scale_rng` if given; `dt`: time between `measure` calls [s]."""
         sigma = np.concatenate([np.full(n, s) for _, s, _, n in _ERRORS])
         tau = np.concatenate([np.full(n, t) for _, _, t, n in _ERRORS])
         self._noise = GaussMarkov(rng, sigma, tau, dt)
-        self.airspeed_scale = 1 + AIRSPEED_SCALE * float(np.clip((own or rng).standard_normal(), -2, 2))
+        self.airspeed_scale = 1 + AIRSPEED_SCALE * float(np.clip((scale_rng or rng).standard_normal(), -2, 2))
 
     def measure(self, truth: Truth) -> Estimate:
         """Return the true state plus errors."""
@@ -75,19 +75,21 @@ class Sensors:
         )
 
 
-class Heights:
+class AltitudeSensors:
     """Barometer and satellite height with independent errors."""
 
     def __init__(self, rng: np.random.Generator, dt: float):
         """Draw the first errors; `dt` is the time between two calls of `measure` [s]."""
-        sigma, tau = zip(*_HEIGHTS.values(), strict=True)
+        sigma, tau = zip(*_ALTITUDE_ERRORS.values(), strict=True)
         self._noise = GaussMarkov(rng, np.array(sigma), np.array(tau), dt)
 
     def measure(self, e: Estimate, truth: Truth) -> Estimate:
         """Return an estimate with the readings of both sensors."""
-        white, wander, up = map(float, self._noise.step())
+        white, wander, gps_error = map(float, self._noise.step())
         return e._replace(
-            pressure=truth.P + white + wander, warmth=truth.T + BOARD_K, satellites=up - float(truth.p[2])
+            pressure=truth.P + white + wander,
+            board_temperature=truth.T + BOARD_K,
+            gps_height=gps_error - float(truth.p[2]),
         )
 
 
@@ -101,7 +103,7 @@ def pressure_at(height: float) -> float:
     return float(_SEA_LEVEL_PA * (1 - _LAPSE * height) ** _POWER)
 
 
-class WindEstimate:
+class WindEstimator:
     """Wind estimate of the autopilot: mean wind plus an error of 0.4 m/s with a correlation time of 60 s."""
 
     def __init__(self, rng: np.random.Generator, dt: float):
@@ -110,8 +112,8 @@ class WindEstimate:
 
     def measure(self, wind: tuple[float, float]) -> tuple[float, float]:
         """Return the mean wind plus the error, NED [m/s]."""
-        off = self._error.step()
-        return wind[0] + float(off[0]), wind[1] + float(off[1])
+        error = self._error.step()
+        return wind[0] + float(error[0]), wind[1] + float(error[1])
 
 
 class Servos:

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fleet.contract import Item
-from fleet.simulator.vehicle.missions import Start
-from fleet.simulator.vehicle.types import Type
-from fleet.simulator.vehicle.weather import FT, HELLMANN, Wind, wind_at_20ft
+from fleet.simulator.vehicle.missions import StartState
+from fleet.simulator.vehicle.types import AircraftType
+from fleet.simulator.vehicle.weather import FT, HELLMANN, MeanWind, wind_at_20ft
 
 Pilot = Callable[[float], tuple[float, float, float, float]]
 """Time [s] to the test pilot increments of delta_a, delta_e, delta_r, delta_t."""
@@ -24,9 +24,9 @@ class Weather(NamedTuple):
     drift: float = 1.0  # factor of the drift of `weather.MeanWind`
     w20_mps: float | None = None  # wind at 20 ft for turbulence; None: that of the severity
 
-    def wind(self, rng: np.random.Generator, dt: float) -> Wind:
+    def wind(self, rng: np.random.Generator, dt: float) -> MeanWind:
         """Create the wind model; `rng` draws its drift."""
-        return Wind(self.mean, rng, dt, self.towards, exponent=self.exponent, drift=self.drift)
+        return MeanWind(self.mean, rng, dt, self.towards, exponent=self.exponent, drift=self.drift)
 
     @property
     def w20_fps(self) -> float:
@@ -34,12 +34,12 @@ class Weather(NamedTuple):
         return wind_at_20ft(self.severity) if self.w20_mps is None else self.w20_mps / FT
 
 
-class Situation(NamedTuple):
+class FlightSetup(NamedTuple):
     """Conditions of one flight."""
 
-    flight: int  # seed of sensor errors, drift and turbulence
-    kind: Type  # aircraft type
-    plan: tuple[tuple[Item, ...], Start]
+    flight_seed: int  # seed of sensor errors, drift and turbulence
+    kind: AircraftType  # aircraft type
+    mission: tuple[tuple[Item, ...], StartState]
     weather: Weather
     pilot: Pilot | None = None  # inputs that excite more than the autopilot does
-    examined: bool = False  # onboard recording for a blind test; the pitot scale is then fixed per aircraft
+    is_exam: bool = False  # onboard recording for a blind test; the pitot scale is then fixed per aircraft

@@ -4,27 +4,27 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
-from fleet.simulator.vehicle.missions import SMALL, Field
+from fleet.simulator.vehicle.missions import SMALL_GEOMETRY, MissionGeometry
 
 CRUISE = 23.0  # of the small aircraft [m/s]
 
 
-class Type(NamedTuple):
+class AircraftType(NamedTuple):
     """One type of aircraft."""
 
     model: str  # name in JSBSim
-    shipped: bool  # part of the jsbsim package, with an engine to start
+    from_jsbsim: bool  # part of the jsbsim package, with an engine to start
     cruise: float  # [m/s]
-    motor: str  # JSBSim property of the throttle, 0..1
-    field: Field  # mission geometry
+    throttle_property: str  # JSBSim property of the throttle, 0..1
+    geometry: MissionGeometry  # mission geometry
     payload_kg: tuple[float, float]  # minimum, maximum
     spread: dict[str, float]  # standard deviation of each factor vary/* between aircraft of one type [-]
     offsets: dict[str, float]  # standard deviation of each offset vary/*: manufacturing asymmetry [-]
-    strength: str  # JSBSim property proportional to thrust
-    varied: str  # index of the point mass with random payload
-    load: str  # index of the point mass that can shift
-    extra: str  # index of the point mass that `altered` adds
-    file: str | None = None  # content of the aircraft file; None: installed file
+    thrust_property: str  # JSBSim property proportional to thrust
+    payload_index: str  # index of the point mass with random payload
+    sliding_index: str  # index of the point mass that can shift
+    extra_index: str  # index of the point mass that `altered` adds
+    xml: str | None = None  # content of the aircraft file; None: installed file
     settings: Mapping[str, float] = MappingProxyType({})  # JSBSim properties different from the file
 
 
@@ -47,14 +47,14 @@ _OFFSETS = {"C_l_0": 0.001, "C_m_0": 0.004, "C_n_0": 0.0004}
 
 TYPES = {
     # 9.5 kg empty, span 2.9 m, electric; after Beard & McLain's Aerosonde
-    "small": Type(
-        *("aerosonde", False, CRUISE, "fcs/motor-cmd-norm", SMALL, (0.5, 2.5), _SPREAD, _OFFSETS),
+    "small": AircraftType(
+        *("aerosonde", False, CRUISE, "fcs/motor-cmd-norm", SMALL_GEOMETRY, (0.5, 2.5), _SPREAD, _OFFSETS),
         *("vary/thrust", "", "", "[1]"),
     ),
     # Cessna 172P, a ton and a piston engine, part of JSBSim; only the payload varies
-    "c172p": Type(
+    "c172p": AircraftType(
         *("c172p", True, 48.0, "fcs/throttle-cmd-norm"),
-        Field(scale=5.0, circle=4.5, height=2.0, climb=0.045, sink=0.04),
+        MissionGeometry(scale=5.0, circle=4.5, height=2.0, climb=0.045, sink=0.04),
         *((0.0, 90.0), {}, {}),
         *("propulsion/engine/volumetric-efficiency", "[1]", "", "[5]"),
     ),

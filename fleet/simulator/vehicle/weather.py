@@ -24,16 +24,16 @@ class GaussMarkov:
         """
         self._rng = rng
         decay = np.where(tau > 0, np.exp(-dt / np.where(tau > 0, tau, 1.0)), 0.0)
-        self._decay, self._kick = decay, sigma * np.sqrt(1 - decay**2)
+        self._decay, self._noise_std = decay, sigma * np.sqrt(1 - decay**2)
         self.x = sigma * rng.standard_normal(len(sigma))
 
     def step(self) -> np.ndarray:
         """Advance by dt; return the new values (n,)."""
-        self.x = self._decay * self.x + self._kick * self._rng.standard_normal(len(self._kick))
+        self.x = self._decay * self.x + self._noise_std * self._rng.standard_normal(len(self._noise_std))
         return self.x
 
 
-class Wind:
+class MeanWind:
     """Mean wind over height plus a slow horizontal drift.
 
     w(h) = w_100 (h / 100)^0.143, drift std 0.12 w_100 + 0.1 m/s with a correlation time of 90 s.
@@ -79,8 +79,8 @@ def turbulence_level(text: str) -> int:
     Raises:
         ValueError: when it is none of these.
     """
-    words = {"none": 0, "light": 3, "moderate": 4, "severe": 6}
-    level = words.get(text, int(text) if text.isdecimal() else -1)
+    levels = {"none": 0, "light": 3, "moderate": 4, "severe": 6}
+    level = levels.get(text, int(text) if text.isdecimal() else -1)
     if not 0 <= level <= 7:
         raise ValueError(f"turbulence: found {text!r}, expected 0..7 or none, light, moderate, severe; choose one")
     return level

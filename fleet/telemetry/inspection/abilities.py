@@ -9,40 +9,48 @@ import numpy as np
 
 from fleet.airframes.airframe import ServoMap, servo_map
 from fleet.contract import COLUMNS
-from fleet.mission import FIRST, route
-from fleet.process.sanitise import below
-from fleet.telemetry.inspection.survey import FAST, LONGEST_S, ROTORS, ROTORS_FAST, Survey, airborne, spells
-from fleet.telemetry.inspection.thinned import Span, inside, overlap, seconds
+from fleet.mission import FIRST_ITEM, unroll_route
+from fleet.process.sanitise import format_below
+from fleet.telemetry.inspection.survey import (
+    AIRBORNE_SPEED,
+    MAX_INTERVAL_S,
+    ROTOR_AIRBORNE_SPEED,
+    VERTICAL_TAKEOFF,
+    Survey,
+    airborne,
+    mode_spans,
+)
+from fleet.telemetry.inspection.thinned import TimeInterval, inside, overlap, seconds
 from fleet.window import INPUTS
 
-NEEDED = tuple(LONGEST_S)
-LEAST_S = 30.0  # minimum data for an identification [s]
-WINDOW_S = 140.0  # window of one identification [s]
-UNBROKEN_S = 4.0  # shortest continuous stretch for model verification [s]
-RECENT_S = 2.0  # recent data that a turn-rate prediction requires [s]
-ROUTE_S = 5.0  # time on a route that a route prediction requires [s]
-QUIET = {"phi": 0.04, "theta": 0.04, "q": 0.05}  # standard deviations [rad, rad, rad/s]
-LEAST_VA, PAIRED_S = 3.0, 0.5  # airspeed [m/s], age of rows paired with a ground velocity [s]
-PAIRS = 50  # wind triangles that a wind estimate requires
+REQUIRED_FIELDS = tuple(MAX_INTERVAL_S)
+MIN_IDENTIFY_S = 30.0  # minimum data for an identification [s]
+MAX_IDENTIFY_S = 140.0  # window of one identification [s]
+MIN_STRETCH_S = 4.0  # shortest continuous stretch for model verification [s]
+TURN_RATE_S = 2.0  # recent data that a turn-rate prediction requires [s]
+MIN_ROUTE_S = 5.0  # time on a route that a route prediction requires [s]
+MIN_EXCITATION = {"phi": 0.04, "theta": 0.04, "q": 0.05}  # standard deviations [rad, rad, rad/s]
+MIN_AIRSPEED, MAX_PAIR_AGE_S = 3.0, 0.5  # airspeed [m/s], age of rows paired with a ground velocity [s]
+MIN_WIND_TRIANGLES = 50  # wind triangles that a wind estimate requires
 ROUTE_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
-NO_WINGS = ("multirotor", "helicopter")
-WINGS = ("fixed_wing", "quadplane")
-DIAGNOSE_S, DIAGNOSE_ROWS = 25.0, 50  # gap-free flight, and rows of each required field, for a diagnosis
-OWN_PAST_S = 50.0  # gap-free flight for a comparison with earlier flight data [s]
-VANE_HZ = 18.0  # accelerometer rate for gust estimation [Hz]
-_BEGIN_S, _END_S = 5.0, 1.5  # start and end of a recording excluded from a diagnosis [s]
-_ITEMS_IN = {  # how to record mission items, by kind of recording
+WINGLESS = ("multirotor", "helicopter")
+WINGED = ("fixed_wing", "quadplane")
+MIN_DIAGNOSE_S, MIN_DIAGNOSE_ROWS = 25.0, 50  # gap-free flight, and rows of each required field, for a diagnosis
+MIN_OWN_PAST_S = 50.0  # gap-free flight for a comparison with earlier flight data [s]
+GUST_SENSING_HZ = 18.0  # accelerometer rate for gust estimation [Hz]
+_SKIP_BEGIN_S, _SKIP_END_S = 5.0, 1.5  # start and end of a recording excluded from a diagnosis [s]
+_ITEMS_REMEDY = {  # how to record mission items, by kind of recording
     "ULog": "PX4 logs no mission items; record telemetry instead (.tlog), with the mission downloaded while recording",
     "DataFlash log": "the autopilot logs them as CMD messages (ArduPilot); keep the log from its beginning",
     "DataFlash text log": "the autopilot logs them as CMD messages (ArduPilot); keep the log from its beginning",
     "fleet recording": "the gateway downloads it unless --listen-only is set; record with it connected",
 }
 _GOOD_HZ = 10.0  # below this rate fast motion is poorly resolved [Hz]
-_STILL = 0.005  # standard deviation below which an input is constant, fraction of its range [-]
-_WORD = {"delta_a": "aileron", "delta_e": "elevator", "delta_r": "rudder", "delta_t": "throttle"}
+_MIN_INPUT_STD = 0.005  # standard deviation below which an input is constant, fraction of its range [-]
+_SURFACE_NAME = {"delta_a": "aileron", "delta_e": "elevator", "delta_r": "rudder", "delta_t": "throttle"}
 
 
-class Ability(NamedTuple):
+class AbilityCheck(NamedTuple):
     """One function of the twin, whether this recording supports it, and the reason with values found and required."""
 
     name: str
@@ -50,227 +58,262 @@ class Ability(NamedTuple):
     why: str
 
 
-def abilities(known: Survey) -> list[Ability]:
+def abilities(survey: Survey) -> list[AbilityCheck]:
     """Check all functions of the twin in processing order."""
-    flown = airborne(known)
-    whole = whole_spans(known)
-    starved = _wings(known) or _starved(known, flown, whole)
-    swing = swings(known, overlap(whole, flown))
+    in_air = airborne(survey)
+    complete = complete_spans(survey)
+    obstacle = _model_obstacle(survey) or _data_obstacle(survey, in_air, complete)
+    input_std = input_variation(survey, overlap(complete, in_air))
     axes = (
-        _identify("identify longitudinal", known, starved, swing, ("delta_e", "delta_t")),
-        _identify("identify lateral", known, starved, swing, ("delta_a", "delta_r")),
+        _identify_axis("identify longitudinal", survey, obstacle, input_std, ("delta_e", "delta_t")),
+        _identify_axis("identify lateral", survey, obstacle, input_std, ("delta_a", "delta_r")),
     )
     unidentified = _unidentified(axes)
-    verified = _verify(known, unidentified, overlap(whole, flown))
-    wind = _wind(known)
+    verified = _check_verify(survey, unidentified, overlap(complete, in_air))
+    wind = _check_wind(survey)
     return [
         *axes,
         verified,
-        _on_route(known, unidentified, flown),
-        _by_turn_rate(known, whole),
+        _check_route(survey, unidentified, in_air),
+        _check_turn_rate(survey, complete),
         wind,
-        _diagnose(known, flown),
+        _check_diagnose(survey, in_air),
     ]
 
 
-def _unidentified(axes: tuple[Ability, Ability]) -> str:
+def _unidentified(axes: tuple[AbilityCheck, AbilityCheck]) -> str:
     """Return which axis cannot be identified, or an empty string."""
-    broken = [axis.name.split()[-1] for axis in axes if not axis.can]
-    if not broken:
+    failed = [axis.name.split()[-1] for axis in axes if not axis.can]
+    if not failed:
         return ""
-    return "neither axis can be identified" if len(broken) == 2 else f"the {broken[0]} axis cannot be identified"
+    return "neither axis can be identified" if len(failed) == 2 else f"the {failed[0]} axis cannot be identified"
 
 
-def whole_spans(known: Survey) -> list[Span]:
+def complete_spans(survey: Survey) -> list[TimeInterval]:
     """Return the stretches in which all required fields are continuous."""
-    whole = [Span(-np.inf, np.inf)]
-    for name in NEEDED:
-        whole = overlap(whole, known.rows[name].stretches())
-    return whole
+    complete = [TimeInterval(-np.inf, np.inf)]
+    for name in REQUIRED_FIELDS:
+        complete = overlap(complete, survey.rows[name].stretches())
+    return complete
 
 
-def swings(known: Survey, spans: list[Span]) -> dict[str, float]:
+def input_variation(survey: Survey, spans: list[TimeInterval]) -> dict[str, float]:
     """Return the standard deviation of each input in the intervals, fraction of its range [-]."""
-    t, pulses = known.rows["servo"].rows()
-    there = inside(t, spans)
-    if there.sum() < 2:
+    t, pulses = survey.rows["servo"].rows()
+    selected = inside(t, spans)
+    if selected.sum() < 2:
         return dict.fromkeys(INPUTS, 0.0)
-    u = servo_map(known.values).inputs(pulses[there])
+    u = servo_map(survey.values).inputs(pulses[selected])
     return dict(zip(INPUTS, u.std(axis=0).tolist(), strict=True))
 
 
-def most_within(spans: list[Span], length: float) -> float:
+def max_coverage(spans: list[TimeInterval], window_s: float) -> float:
     """Return the maximum coverage by the intervals of any window of `window_s` [s]."""
     best = 0.0
     for last in spans:
-        start = last.stop - length
-        best = max(best, seconds(overlap(spans, [Span(start, last.stop)])))
+        start = last.stop - window_s
+        best = max(best, seconds(overlap(spans, [TimeInterval(start, last.stop)])))
     return best
 
 
-def _wings(known: Survey) -> str:
-    return f"a {known.vehicle} is not modelled, turn-rate prediction only" if known.vehicle in NO_WINGS else ""
+def _model_obstacle(survey: Survey) -> str:
+    return f"a {survey.vehicle} is not modelled, turn-rate prediction only" if survey.vehicle in WINGLESS else ""
 
 
-def _starved(known: Survey, flown: list[Span], whole: list[Span]) -> str:
+def _data_obstacle(survey: Survey, in_air: list[TimeInterval], complete: list[TimeInterval]) -> str:
     """Return what prevents an identification, or an empty string."""
-    if lack := _lacking(known):
-        return lack
-    if not flown:
-        fast = ROTORS_FAST if known.vehicle in ROTORS else FAST
+    if missing := _missing_fields(survey):
+        return missing
+    if not in_air:
+        fast = ROTOR_AIRBORNE_SPEED if survey.vehicle in VERTICAL_TAKEOFF else AIRBORNE_SPEED
         return f"never in flight: no 5 s faster than {fast:.0f} m/s"
-    for name in NEEDED:
-        covered = seconds(overlap(known.rows[name].stretches(), flown))
-        if covered < 0.5 * seconds(flown):
+    for name in REQUIRED_FIELDS:
+        covered = seconds(overlap(survey.rows[name].stretches(), in_air))
+        if covered < 0.5 * seconds(in_air):
             return (
-                f"{name} at {known.rows[name].rate_hz:.1f} Hz is continuous for {covered:.0f} of {seconds(flown):.0f}"
-                f" s in flight; required: no interval over {LONGEST_S[name]:g} s, recommended: {_GOOD_HZ:.0f} Hz"
+                f"{name} at {survey.rows[name].rate_hz:.1f} Hz is continuous for {covered:.0f} of {seconds(in_air):.0f}"
+                f" s in flight; required: no interval over {MAX_INTERVAL_S[name]:g} s, recommended: {_GOOD_HZ:.0f} Hz"
             )
-    parts = overlap(whole, flown)
-    have = most_within(parts, WINDOW_S)
-    if have < LEAST_S:
-        return f"{below(have, LEAST_S)} s of complete data in flight, {LEAST_S:.0f} s are required"
+    parts = overlap(complete, in_air)
+    available_s = max_coverage(parts, MAX_IDENTIFY_S)
+    if available_s < MIN_IDENTIFY_S:
+        return (
+            f"{format_below(available_s, MIN_IDENTIFY_S)} s of complete data in flight, {MIN_IDENTIFY_S:.0f} s "
+            "are required"
+        )
     longest = max(part.seconds for part in parts)
-    if longest < UNBROKEN_S:
-        return f"the longest continuous stretch is {longest:.1f} s, {UNBROKEN_S:.0f} s are required"
+    if longest < MIN_STRETCH_S:
+        return f"the longest continuous stretch is {longest:.1f} s, {MIN_STRETCH_S:.0f} s are required"
     return ""
 
 
-def _lacking(known: Survey) -> str:
+def _missing_fields(survey: Survey) -> str:
     """Return which required fields have no rows, or an empty string."""
-    none = [name for name in NEEDED if known.rows[name].count < 8]
-    return f"no {', '.join(none)} rows in the recording" if none else ""
+    missing = [name for name in REQUIRED_FIELDS if survey.rows[name].count < 8]
+    return f"no {', '.join(missing)} rows in the recording" if missing else ""
 
 
-def _identify(name: str, known: Survey, starved: str, swing: dict[str, float], needed: tuple[str, ...]) -> Ability:
-    if starved:
-        return Ability(name, False, starved)
-    still = [_WORD[each] for each in needed if swing[each] < _STILL]
-    servos = servo_map(known.values)
-    if len(still) == len(needed):
-        return Ability(name, False, f"{' and '.join(still)} constant in flight{_assumed(servos)}")
-    said = ", ".join(
-        f"{_WORD[each]} varies by {swing[each]:.0%} of its range" for each in needed if swing[each] >= _STILL
+def _identify_axis(
+    name: str, survey: Survey, obstacle: str, input_std: dict[str, float], inputs: tuple[str, ...]
+) -> AbilityCheck:
+    if obstacle:
+        return AbilityCheck(name, False, obstacle)
+    constant = [_SURFACE_NAME[channel] for channel in inputs if input_std[channel] < _MIN_INPUT_STD]
+    servos = servo_map(survey.values)
+    if len(constant) == len(inputs):
+        return AbilityCheck(name, False, f"{' and '.join(constant)} constant in flight{_assumption_note(servos)}")
+    reason = ", ".join(
+        f"{_SURFACE_NAME[each]} varies by {input_std[each]:.0%} of its range"
+        for each in inputs
+        if input_std[each] >= _MIN_INPUT_STD
     )
-    said += f"; {still[0]} constant" if still else ""
-    slow = [f"{kind} at {hz:.1f} Hz" for kind in ("attitude", "servo") if (hz := known.rows[kind].rate_hz) < _GOOD_HZ]
+    reason += f"; {constant[0]} constant" if constant else ""
+    slow = [f"{kind} at {hz:.1f} Hz" for kind in ("attitude", "servo") if (hz := survey.rows[kind].rate_hz) < _GOOD_HZ]
     if slow:
-        said += f"; {' and '.join(slow)} resolves fast motion poorly, {_GOOD_HZ:.0f} Hz or more is recommended"
-    if known.rows["air"].count == 0:
-        said += "; no airspeed rows: zero wind assumed"
-    return Ability(name, True, said + _assumed(servos))
+        reason += f"; {' and '.join(slow)} resolves fast motion poorly, {_GOOD_HZ:.0f} Hz or more is recommended"
+    if survey.rows["air"].count == 0:
+        reason += "; no airspeed rows: zero wind assumed"
+    return AbilityCheck(name, True, reason + _assumption_note(servos))
 
 
-def _assumed(servos: ServoMap) -> str:
+def _assumption_note(servos: ServoMap) -> str:
     return " (servo map assumed)" if servos.sentence else ""
 
 
-def _verify(known: Survey, unidentified: str, spans: list[Span]) -> Ability:
+def _check_verify(survey: Survey, unidentified: str, spans: list[TimeInterval]) -> AbilityCheck:
     if unidentified:
-        return Ability("verify", False, unidentified)
-    t, x = known.rows["attitude"].rows()
-    there = x[inside(t, spans)]
+        return AbilityCheck("verify", False, unidentified)
+    t, x = survey.rows["attitude"].rows()
+    selected = x[inside(t, spans)]
     columns = [name for name, _ in COLUMNS["attitude"]]
-    moved = {name: float(there[:, columns.index(name)].std()) for name in QUIET}
-    phi, theta, q = np.degrees(list(moved.values()))
-    found = f"bank varies by {phi:.1f} deg, pitch by {theta:.1f} deg, pitch rate by {q:.1f} deg/s"
-    if all(moved[name] < least for name, least in QUIET.items()):
-        need = "{:.1f} deg, {:.1f} deg or {:.1f} deg/s are required".format(*np.degrees(list(QUIET.values())))
-        return Ability("verify", False, f"steady flight, too little excitation: {found}, {need}")
-    return Ability("verify", True, found)
+    std = {name: float(selected[:, columns.index(name)].std()) for name in MIN_EXCITATION}
+    phi, theta, q = np.degrees(list(std.values()))
+    variation = f"bank varies by {phi:.1f} deg, pitch by {theta:.1f} deg, pitch rate by {q:.1f} deg/s"
+    if all(std[name] < limit for name, limit in MIN_EXCITATION.items()):
+        required = "{:.1f} deg, {:.1f} deg or {:.1f} deg/s are required".format(
+            *np.degrees(list(MIN_EXCITATION.values()))
+        )
+        return AbilityCheck("verify", False, f"steady flight, too little excitation: {variation}, {required}")
+    return AbilityCheck("verify", True, variation)
 
 
-def _on_route(known: Survey, unidentified: str, flown: list[Span]) -> Ability:
+def _check_route(survey: Survey, unidentified: str, in_air: list[TimeInterval]) -> AbilityCheck:
     """Check route prediction with an identified model, else with the kinematic model of the vehicle type."""
     name = "predict on the route"
-    if unidentified and known.vehicle not in (*WINGS, *NO_WINGS):
-        return Ability(name, False, f"{unidentified}, and a vehicle of kind {known.vehicle} has no kinematic model")
-    if none := [kind for kind in ("attitude", "velocity", "position") if known.rows[kind].count < 8]:
-        return Ability(name, False, f"no {', '.join(none)} rows in the recording")
-    following = overlap([span for span, mode in spells(known) if mode in ROUTE_MODES], flown)
-    flew = seconds(following)
-    if flew < ROUTE_S:
-        modes = ", ".join(dict.fromkeys(mode for _, mode in spells(known))) or "no mode"
-        return Ability(
+    if unidentified and survey.vehicle not in (*WINGED, *WINGLESS):
+        return AbilityCheck(
+            name, False, f"{unidentified}, and a vehicle of kind {survey.vehicle} has no kinematic model"
+        )
+    if missing := [kind for kind in ("attitude", "velocity", "position") if survey.rows[kind].count < 8]:
+        return AbilityCheck(name, False, f"no {', '.join(missing)} rows in the recording")
+    following = overlap([span for span, mode in mode_spans(survey) if mode in ROUTE_MODES], in_air)
+    on_route_s = seconds(following)
+    if on_route_s < MIN_ROUTE_S:
+        modes = ", ".join(dict.fromkeys(mode for _, mode in mode_spans(survey))) or "no mode"
+        return AbilityCheck(
             name,
             False,
-            f"{below(flew, ROUTE_S)} s in a mode that follows a mission, {ROUTE_S:.0f} s are required ({modes})",
+            f"{format_below(on_route_s, MIN_ROUTE_S)} s in a mode that follows a mission, {MIN_ROUTE_S:.0f} s "
+            f"are required ({modes})",
         )
-    origin = known.origin()
-    if not known.items or origin is None:
-        remedy = _ITEMS_IN.get(known.kind, "let the ground station download it while recording")
-        return Ability(name, False, f"no mission list in the recording; {remedy}")
-    autopilot = known.status.autopilot if known.status else "unknown"
-    first = FIRST.get(autopilot, 1)
-    if not len(route(known.items, seq=first, origin=origin, params=known.values, first=first).legs):
-        return Ability(name, False, f"the mission of {len(known.items)} items has no legs")
-    if not known.rows["leg"].count:
-        return Ability(name, False, "the current mission item is not in the recording (MISSION_CURRENT)")
-    told = autopilot in ("ardupilot", "px4")
-    law = "" if told else f"; guidance law of autopilot {autopilot} is identified from its bank commands, if any"
-    items = f"{len(known.items)} mission items" + ("" if known.mission and known.mission.complete else ", not all")
-    if known.vehicle in NO_WINGS:
-        return Ability(name, True, f"{flew:.0f} s on the route, {items}; from speed and acceleration limits")
-    how = f"kinematic fixed-wing model, since {unidentified}" if unidentified else "take-off and landing not modelled"
-    return Ability(name, True, f"{flew:.0f} s on the route, {items}; {how}{law}")
+    origin = survey.origin()
+    if not survey.items or origin is None:
+        remedy = _ITEMS_REMEDY.get(survey.kind, "let the ground station download it while recording")
+        return AbilityCheck(name, False, f"no mission list in the recording; {remedy}")
+    autopilot = survey.status.autopilot if survey.status else "unknown"
+    first = FIRST_ITEM.get(autopilot, 1)
+    if not len(unroll_route(survey.items, seq=first, origin=origin, params=survey.values, first=first).legs):
+        return AbilityCheck(name, False, f"the mission of {len(survey.items)} items has no legs")
+    if not survey.rows["leg"].count:
+        return AbilityCheck(name, False, "the current mission item is not in the recording (MISSION_CURRENT)")
+    supported = autopilot in ("ardupilot", "px4")
+    law_note = (
+        "" if supported else f"; guidance law of autopilot {autopilot} is identified from its bank commands, if any"
+    )
+    items = f"{len(survey.items)} mission items" + ("" if survey.mission and survey.mission.complete else ", not all")
+    if survey.vehicle in WINGLESS:
+        return AbilityCheck(name, True, f"{on_route_s:.0f} s on the route, {items}; from speed and acceleration limits")
+    method = (
+        f"kinematic fixed-wing model, since {unidentified}" if unidentified else "take-off and landing not modelled"
+    )
+    return AbilityCheck(name, True, f"{on_route_s:.0f} s on the route, {items}; {method}{law_note}")
 
 
-def _by_turn_rate(known: Survey, whole: list[Span]) -> Ability:
+def _check_turn_rate(survey: Survey, complete: list[TimeInterval]) -> AbilityCheck:
     name = "predict by turn rate"
-    if lack := _lacking(known):
-        return Ability(name, False, lack)
-    longest = max((span.seconds for span in whole), default=0.0)
-    if longest < RECENT_S:
-        rates = ", ".join(f"{kind} {known.rows[kind].rate_hz:.1f} Hz" for kind in NEEDED)
-        return Ability(name, False, f"never {RECENT_S:.0f} s of complete data: {rates}; 2 Hz without gaps is required")
-    return Ability(name, True, f"{seconds([s for s in whole if s.seconds >= RECENT_S]):.0f} s of complete data")
+    if missing := _missing_fields(survey):
+        return AbilityCheck(name, False, missing)
+    longest = max((span.seconds for span in complete), default=0.0)
+    if longest < TURN_RATE_S:
+        rates = ", ".join(f"{kind} {survey.rows[kind].rate_hz:.1f} Hz" for kind in REQUIRED_FIELDS)
+        return AbilityCheck(
+            name, False, f"never {TURN_RATE_S:.0f} s of complete data: {rates}; 2 Hz without gaps is required"
+        )
+    return AbilityCheck(
+        name,
+        True,
+        f"{seconds([stretch for stretch in complete if stretch.seconds >= TURN_RATE_S]):.0f} s of complete data",
+    )
 
 
-def _wind(known: Survey) -> Ability:
+def _check_wind(survey: Survey) -> AbilityCheck:
     name = "estimate wind"
-    none = [kind for kind in ("velocity", "air", "attitude") if not known.rows[kind].count]
-    if none:
-        return Ability(name, False, f"no {', '.join(none)} rows in the recording")
-    t, fresh = known.rows["velocity"].rows()[0], []
-    t_air, air = known.rows["air"].rows()
+    missing = [kind for kind in ("velocity", "air", "attitude") if not survey.rows[kind].count]
+    if missing:
+        return AbilityCheck(name, False, f"no {', '.join(missing)} rows in the recording")
+    t, fresh = survey.rows["velocity"].rows()[0], []
+    air_t, air = survey.rows["air"].rows()
     for kind in ("air", "attitude"):
-        rows = known.rows[kind]
+        rows = survey.rows[kind]
         other = rows.rows()[0]
-        before = np.searchsorted(other, t) - 1
-        limit = max(PAIRED_S, 1.5 * rows.stride / max(rows.rate_hz, 1e-3)) if rows.stride > 1 else PAIRED_S
-        fresh.append((before >= 0) & (t - other[np.clip(before, 0, None)] < limit))
-    fast = air[np.clip(np.searchsorted(t_air, t) - 1, 0, None), 0] >= LEAST_VA
+        previous = np.searchsorted(other, t) - 1
+        limit = max(MAX_PAIR_AGE_S, 1.5 * rows.stride / max(rows.rate_hz, 1e-3)) if rows.stride > 1 else MAX_PAIR_AGE_S
+        fresh.append((previous >= 0) & (t - other[np.clip(previous, 0, None)] < limit))
+    fast = air[np.clip(np.searchsorted(air_t, t) - 1, 0, None), 0] >= MIN_AIRSPEED
     pairs = int((fresh[0] & fresh[1] & fast).sum())
-    if pairs < PAIRS:
-        most = float(air[:, 0].max())
-        return Ability(name, False, f"{pairs} wind triangles, {PAIRS} are required; airspeed reaches {most:.1f} m/s")
-    return Ability(name, True, f"{pairs} wind triangles of ground velocity, airspeed and heading")
+    if pairs < MIN_WIND_TRIANGLES:
+        max_airspeed = float(air[:, 0].max())
+        return AbilityCheck(
+            name,
+            False,
+            f"{pairs} wind triangles, {MIN_WIND_TRIANGLES} are required; airspeed reaches {max_airspeed:.1f} m/s",
+        )
+    return AbilityCheck(name, True, f"{pairs} wind triangles of ground velocity, airspeed and heading")
 
 
-def _diagnose(known: Survey, flown: list[Span]) -> Ability:
+def _check_diagnose(survey: Survey, in_air: list[TimeInterval]) -> AbilityCheck:
     """Check the requirements of `fleet diagnose`."""
     name = "diagnose"
-    if known.vehicle in NO_WINGS:
-        return Ability(name, False, f"no diagnosis of a {known.vehicle}: the reference simulation is a fixed wing")
-    if few := [kind for kind in NEEDED if known.rows[kind].count < DIAGNOSE_ROWS]:
-        return Ability(name, False, f"fewer than {DIAGNOSE_ROWS} {', '.join(few)} rows in the recording")
-    trusted = seconds(_without_gaps(known, flown))
-    if trusted < DIAGNOSE_S:
-        found = below(trusted, DIAGNOSE_S)
-        return Ability(name, False, f"{found} s in flight without gaps, {DIAGNOSE_S:.0f} s are required")
-    said = f"{trusted:.0f} s in flight without gaps, compared with a model of `fleet calibrate`"
-    said += " or earlier flight data" if trusted >= OWN_PAST_S else f"; {OWN_PAST_S:.0f} s for earlier flight data"
-    lacks = [] if known.rows["imu"].rate_hz >= VANE_HZ else [f"accelerometer at {VANE_HZ:.0f} Hz"]
-    lacks += [word for kind, word in (("air", "airspeed"), ("pressure", "pressure")) if not known.rows[kind].count]
-    return Ability(name, True, said + (f"; reduced sensitivity without {', '.join(lacks)}" if lacks else ""))
+    if survey.vehicle in WINGLESS:
+        return AbilityCheck(
+            name, False, f"no diagnosis of a {survey.vehicle}: the reference simulation is a fixed wing"
+        )
+    if sparse := [kind for kind in REQUIRED_FIELDS if survey.rows[kind].count < MIN_DIAGNOSE_ROWS]:
+        return AbilityCheck(name, False, f"fewer than {MIN_DIAGNOSE_ROWS} {', '.join(sparse)} rows in the recording")
+    gap_free_s = seconds(_gap_free_spans(survey, in_air))
+    if gap_free_s < MIN_DIAGNOSE_S:
+        available = format_below(gap_free_s, MIN_DIAGNOSE_S)
+        return AbilityCheck(name, False, f"{available} s in flight without gaps, {MIN_DIAGNOSE_S:.0f} s are required")
+    reason = f"{gap_free_s:.0f} s in flight without gaps, compared with a model of `fleet calibrate`"
+    reason += (
+        " or earlier flight data"
+        if gap_free_s >= MIN_OWN_PAST_S
+        else f"; {MIN_OWN_PAST_S:.0f} s for earlier flight data"
+    )
+    missing = [] if survey.rows["imu"].rate_hz >= GUST_SENSING_HZ else [f"accelerometer at {GUST_SENSING_HZ:.0f} Hz"]
+    missing += [label for kind, label in (("air", "airspeed"), ("pressure", "pressure")) if not survey.rows[kind].count]
+    return AbilityCheck(name, True, reason + (f"; reduced sensitivity without {', '.join(missing)}" if missing else ""))
 
 
-def _without_gaps(known: Survey, flown: list[Span]) -> list[Span]:
+def _gap_free_spans(survey: Survey, in_air: list[TimeInterval]) -> list[TimeInterval]:
     """Return the flight intervals without gaps in required fields, start and end of the rows excluded."""
-    ends = [known.rows[kind].rows()[0][[0, -1]] for kind in NEEDED]
-    parts = overlap(flown, [Span(max(a for a, _ in ends) + _BEGIN_S, min(b for _, b in ends) - _END_S)])
-    for kind in NEEDED:
-        gaps = known.rows[kind].gaps()
+    ends = [survey.rows[kind].rows()[0][[0, -1]] for kind in REQUIRED_FIELDS]
+    parts = overlap(
+        in_air,
+        [TimeInterval(max(start for start, _ in ends) + _SKIP_BEGIN_S, min(stop for _, stop in ends) - _SKIP_END_S)],
+    )
+    for kind in REQUIRED_FIELDS:
+        gaps = survey.rows[kind].gaps()
         starts, stops = [-np.inf, *(gap.stop for gap in gaps)], [*(gap.start for gap in gaps), np.inf]
-        parts = overlap(parts, [Span(a, b) for a, b in zip(starts, stops, strict=True)])
+        parts = overlap(parts, [TimeInterval(a, b) for a, b in zip(starts, stops, strict=True)])
     return parts

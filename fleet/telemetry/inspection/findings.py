@@ -11,27 +11,27 @@ from fleet.airframes.airframe import servo_map
 from fleet.contract import COLUMNS
 from fleet.frames import to_ned
 from fleet.telemetry.inspection.abilities import abilities
-from fleet.telemetry.inspection.survey import Event, Survey, airborne, spells
+from fleet.telemetry.inspection.survey import Survey, SurveyEvent, airborne, mode_spans
 from fleet.telemetry.inspection.thinned import inside, seconds
 
 _SURFACES = {4: "aileron", 19: "elevator", 21: "rudder", 70: "throttle", 77: "left elevon", 78: "right elevon"}
-_ASSUMED = {1: "aileron", 2: "elevator", 3: "throttle", 4: "rudder"}
-_MOVES_US = 5.0  # standard deviation below which a channel is constant [us]
-_AT_END_US = 1.0  # distance from SERVOn_MIN or _MAX below which a channel is saturated [us]
-_CONSTANT = 0.05  # standard deviation below which airspeed is constant [m/s]
-_SEVERE = 3  # MAV_SEVERITY_ERROR; a lower number is more severe
-_SENSOR = ("ARSPD_TYPE", "ARSPD_ENABLE", "SYS_HAS_NUM_ASPD")  # parameters that configure an airspeed sensor
-_SPOKEN = ("AIRSPEED", "AIRSPEED_AUTOCAL")  # messages that an autopilot sends only with an airspeed sensor
+_DEFAULT_SURFACES = {1: "aileron", 2: "elevator", 3: "throttle", 4: "rudder"}
+_MIN_STD_US = 5.0  # standard deviation below which a channel is constant [us]
+_SATURATION_US = 1.0  # distance from SERVOn_MIN or _MAX below which a channel is saturated [us]
+_MIN_AIRSPEED_STD = 0.05  # standard deviation below which airspeed is constant [m/s]
+_MAX_SEVERITY = 3  # MAV_SEVERITY_ERROR; a lower number is more severe
+_SENSOR_PARAMS = ("ARSPD_TYPE", "ARSPD_ENABLE", "SYS_HAS_NUM_ASPD")  # parameters that configure an airspeed sensor
+_SENSOR_MESSAGES = ("AIRSPEED", "AIRSPEED_AUTOCAL")  # messages that an autopilot sends only with an airspeed sensor
 
 
-class Facts(NamedTuple):
+class LinkTexts(NamedTuple):
     """Data outside contract messages: firmware, and texts with time [s since 1970] and severity."""
 
     firmware: str = ""
     texts: tuple[tuple[float, int, str], ...] = ()
 
 
-class Mode(msgspec.Struct, frozen=True):
+class ModeInterval(msgspec.Struct, frozen=True):
     """One interval of one flight mode."""
 
     mode: str
@@ -39,24 +39,24 @@ class Mode(msgspec.Struct, frozen=True):
     seconds: Annotated[float, Meta(description="duration [s]")]
 
 
-class Gap(msgspec.Struct, frozen=True):
+class GapInterval(msgspec.Struct, frozen=True):
     """One interval without rows."""
 
     start_s: Annotated[float, Meta(description="start, since the start of the recording [s]")]
     seconds: Annotated[float, Meta(description="duration [s]")]
 
 
-class Kind(msgspec.Struct, frozen=True):
+class RowStatistics(msgspec.Struct, frozen=True):
     """Statistics of the rows of one field."""
 
     rows: Annotated[int, Meta(description="number of rows")]
     rate_hz: Annotated[float, Meta(description="mean rate outside gaps [Hz]")]
     gaps: Annotated[int, Meta(description="intervals over 3 times the median, too long to interpolate; at most 1,000")]
     gap_s: Annotated[float, Meta(description="total duration of the gaps [s]")]
-    longest: Annotated[Gap | None, Meta(description="the longest gap")] = None
+    longest: Annotated[GapInterval | None, Meta(description="the longest gap")] = None
 
 
-class Servo(msgspec.Struct, frozen=True):
+class ServoStatistics(msgspec.Struct, frozen=True):
     """One output channel, in flight if the aircraft flew, else over the whole recording."""
 
     channel: int
@@ -67,7 +67,7 @@ class Servo(msgspec.Struct, frozen=True):
     saturated: Annotated[float, Meta(description="fraction of the time at SERVOn_MIN or _MAX, 0..1")]
 
 
-class Airspeed(msgspec.Struct, frozen=True):
+class AirspeedStatistics(msgspec.Struct, frozen=True):
     """Airspeed reported by the autopilot, in flight if the aircraft flew."""
 
     sensor: Annotated[str, Meta(description="yes, no or unknown")]
@@ -78,7 +78,7 @@ class Airspeed(msgspec.Struct, frozen=True):
     constant: Annotated[bool, Meta(description="standard deviation below 0.05 m/s")] = False
 
 
-class Wind(msgspec.Struct, frozen=True):
+class WindStatistics(msgspec.Struct, frozen=True):
     """Wind reported by the autopilot, in flight if the aircraft flew."""
 
     speed: Annotated[float, Meta(description="speed of the mean wind [m/s]")]
@@ -87,7 +87,7 @@ class Wind(msgspec.Struct, frozen=True):
     high: Annotated[float, Meta(description="95th percentile of the speed [m/s]")]
 
 
-class Route(msgspec.Struct, frozen=True):
+class MissionStatistics(msgspec.Struct, frozen=True):
     """The last mission of the recording."""
 
     items: int = 0
@@ -97,7 +97,7 @@ class Route(msgspec.Struct, frozen=True):
     sentence: Annotated[str, Meta(description="problem with the mission, or empty")] = ""
 
 
-class Happened(msgspec.Struct, frozen=True):
+class TimedEvent(msgspec.Struct, frozen=True):
     """One event."""
 
     t_s: Annotated[float, Meta(description="time since the start of the recording [s]")]
@@ -105,7 +105,7 @@ class Happened(msgspec.Struct, frozen=True):
     text: str
 
 
-class Can(msgspec.Struct, frozen=True):
+class AbilityResult(msgspec.Struct, frozen=True):
     """One function of the twin and whether this recording supports it."""
 
     name: str
@@ -113,7 +113,7 @@ class Can(msgspec.Struct, frozen=True):
     why: Annotated[str, Meta(description="values found and required")]
 
 
-class Findings(msgspec.Struct, frozen=True, kw_only=True):
+class AircraftFindings(msgspec.Struct, frozen=True, kw_only=True):
     """One aircraft of one recording; fields may be added, existing fields keep their meaning."""
 
     uav: Annotated[int, Meta(description="UAV id")]
@@ -131,174 +131,190 @@ class Findings(msgspec.Struct, frozen=True, kw_only=True):
     missed: Annotated[int, Meta(description="messages lost, from gaps in the sequence number")] = 0
     rejected: Annotated[int, Meta(description="messages or fields rejected")] = 0
     clock_jumps: int = 0
-    modes: tuple[Mode, ...] = ()
-    rows: Annotated[dict[str, Kind], Meta(description="by field, as in `fleet schema sample`")] = {}
-    mission: Route = Route()
+    modes: tuple[ModeInterval, ...] = ()
+    rows: Annotated[dict[str, RowStatistics], Meta(description="by field, as in `fleet schema sample`")] = {}
+    mission: MissionStatistics = MissionStatistics()
     params: Annotated[int, Meta(description="parameters received")] = 0
     params_complete: bool = False
     servo_map: Annotated[str, Meta(description="assignment of output channels to control surfaces")] = ""
-    servos: tuple[Servo, ...] = ()
-    airspeed: Airspeed = Airspeed("unknown", "")
-    wind: Annotated[Wind | None, Meta(description="null if the autopilot reports no wind")] = None
-    events: tuple[Happened, ...] = ()
+    servos: tuple[ServoStatistics, ...] = ()
+    airspeed: AirspeedStatistics = AirspeedStatistics("unknown", "")
+    wind: Annotated[WindStatistics | None, Meta(description="null if the autopilot reports no wind")] = None
+    events: tuple[TimedEvent, ...] = ()
     events_lost: Annotated[int, Meta(description="events beyond the maximum number")] = 0
-    abilities: tuple[Can, ...] = ()
+    abilities: tuple[AbilityResult, ...] = ()
 
 
-class File(msgspec.Struct, frozen=True, kw_only=True):
+class FileFindings(msgspec.Struct, frozen=True, kw_only=True):
     """One recording; `fleet inspect --json` writes a list of these under the key `files`."""
 
     file: str
     bytes: int = 0
     sentences: Annotated[tuple[str, ...], Meta(description="data that was skipped, damaged or unreadable")] = ()
-    aircraft: tuple[Findings, ...] = ()
+    aircraft: tuple[AircraftFindings, ...] = ()
     twin: Annotated[dict[str, Any] | None, Meta(description="with --twin: results of a twin, by UAV id")] = None
 
 
-def findings(known: Survey, facts: Facts) -> Findings:
+def compute_findings(survey: Survey, link_texts: LinkTexts) -> AircraftFindings:
     """Compute the figures of one aircraft from its survey."""
-    status, flown = known.status, airborne(known)
-    return Findings(
-        uav=known.uav,
-        vehicle=known.vehicle,
+    status, in_air = survey.status, airborne(survey)
+    return AircraftFindings(
+        uav=survey.uav,
+        vehicle=survey.vehicle,
         autopilot=status.autopilot if status else "generic",
-        firmware=facts.firmware,
-        begun=known.begun,
-        seconds=round(known.newest - known.begun, 1),
-        airborne_s=round(seconds(flown), 1),
-        distance_m=_distance(known),
-        altitude_m=_altitude(known),
+        firmware=link_texts.firmware,
+        begun=survey.start_t,
+        seconds=round(survey.newest_t - survey.start_t, 1),
+        airborne_s=round(seconds(in_air), 1),
+        distance_m=_distance(survey),
+        altitude_m=_altitude(survey),
         received=status.received if status else 0,
         missed=status.missed if status else 0,
-        rejected=(status.rejected if status else 0) + known.refused,
+        rejected=(status.rejected if status else 0) + survey.rejected_fields,
         clock_jumps=status.clock_jumps if status else 0,
-        modes=tuple(Mode(mode, _since(known, span.start), round(span.seconds, 1)) for span, mode in spells(known)),
-        rows={name: _kind(known, name) for name in COLUMNS},
-        mission=_mission(known),
-        params=len(known.values),
-        params_complete=known.params.complete if known.params else False,
-        servo_map=_servo_words(known),
-        servos=_servos(known),
-        airspeed=_airspeed(known),
-        wind=_wind(known),
-        events=tuple(Happened(_since(known, e.t), e.kind, e.text) for e in happened(known, facts)),
-        events_lost=known.lost_events,
-        abilities=tuple(Can(*each) for each in abilities(known)),
+        modes=tuple(
+            ModeInterval(mode, _relative_s(survey, span.start), round(span.seconds, 1))
+            for span, mode in mode_spans(survey)
+        ),
+        rows={name: _row_statistics(survey, name) for name in COLUMNS},
+        mission=_mission(survey),
+        params=len(survey.values),
+        params_complete=survey.params.complete if survey.params else False,
+        servo_map=_servo_map_text(survey),
+        servos=_servos(survey),
+        airspeed=_airspeed(survey),
+        wind=_wind(survey),
+        events=tuple(
+            TimedEvent(_relative_s(survey, event.t), event.kind, event.text)
+            for event in merged_events(survey, link_texts)
+        ),
+        events_lost=survey.dropped_events,
+        abilities=tuple(AbilityResult(*check) for check in abilities(survey)),
     )
 
 
-def happened(known: Survey, facts: Facts) -> list[Event]:
+def merged_events(survey: Survey, link_texts: LinkTexts) -> list[SurveyEvent]:
     """Return the events and severe texts in time order, without duplicate texts."""
-    texts = {text.strip(): t for t, severity, text in reversed(facts.texts) if severity <= _SEVERE}
-    kept = [event for event in known.events if event.kind != "text" or event.text.strip() not in texts]
-    severe = [Event(t, "text", text.strip()) for t, severity, text in facts.texts if severity <= _SEVERE]
-    return sorted(kept + severe)
+    severe_texts = {text.strip(): t for t, severity, text in reversed(link_texts.texts) if severity <= _MAX_SEVERITY}
+    other = [event for event in survey.events if event.kind != "text" or event.text.strip() not in severe_texts]
+    severe = [
+        SurveyEvent(t, "text", text.strip()) for t, severity, text in link_texts.texts if severity <= _MAX_SEVERITY
+    ]
+    return sorted(other + severe)
 
 
-def _since(known: Survey, t: float) -> float:
-    return max(round(t - known.begun, 1), 0.0)
+def _relative_s(survey: Survey, t: float) -> float:
+    return max(round(t - survey.start_t, 1), 0.0)
 
 
-def _in_air(known: Survey, name: str) -> np.ndarray:
+def _rows_in_air(survey: Survey, name: str) -> np.ndarray:
     """Return the rows of one field in flight, or all rows if the aircraft never flew."""
-    t, x = known.rows[name].rows()
-    there = inside(t, airborne(known))
-    return x[there] if there.any() else x
+    t, x = survey.rows[name].rows()
+    selected = inside(t, airborne(survey))
+    return x[selected] if selected.any() else x
 
 
-def _distance(known: Survey) -> float:
-    t, x = known.rows["position"].rows()
-    origin, total = known.origin(), 0.0
-    for span in airborne(known):
-        there = x[(t >= span.start) & (t <= span.stop)]
-        if origin is not None and len(there) > 1:
-            total += float(np.linalg.norm(np.diff(to_ned(origin, *there.T)[:, :2], axis=0), axis=1).sum())
+def _distance(survey: Survey) -> float:
+    t, x = survey.rows["position"].rows()
+    origin, total = survey.origin(), 0.0
+    for span in airborne(survey):
+        path = x[(t >= span.start) & (t <= span.stop)]
+        if origin is not None and len(path) > 1:
+            total += float(np.linalg.norm(np.diff(to_ned(origin, *path.T)[:, :2], axis=0), axis=1).sum())
     return round(total)
 
 
-def _altitude(known: Survey) -> tuple[float, float] | None:
-    x = _in_air(known, "position")
+def _altitude(survey: Survey) -> tuple[float, float] | None:
+    x = _rows_in_air(survey, "position")
     return (round(float(x[:, 2].min()) * 1e-3, 1), round(float(x[:, 2].max()) * 1e-3, 1)) if len(x) else None
 
 
-def _kind(known: Survey, name: str) -> Kind:
-    rows = known.rows[name]
+def _row_statistics(survey: Survey, name: str) -> RowStatistics:
+    rows = survey.rows[name]
     gaps = rows.gaps()
-    longest = max(gaps, key=lambda gap: gap.seconds, default=None)
-    worst = Gap(_since(known, longest.start), round(longest.seconds, 2)) if longest else None
-    return Kind(rows.count, round(rows.rate_hz, 2), len(gaps), round(seconds(gaps), 1), worst)
+    longest_span = max(gaps, key=lambda gap: gap.seconds, default=None)
+    longest_gap = (
+        GapInterval(_relative_s(survey, longest_span.start), round(longest_span.seconds, 2)) if longest_span else None
+    )
+    return RowStatistics(rows.count, round(rows.rate_hz, 2), len(gaps), round(seconds(gaps), 1), longest_gap)
 
 
-def _mission(known: Survey) -> Route:
-    if known.mission is None:
-        return Route(sentence="no mission list in the recording", flown=_flown_items(known))
-    said = known.mission.sentence
-    return Route(len(known.items), known.mission.complete, known.missions, _flown_items(known), said)
+def _mission(survey: Survey) -> MissionStatistics:
+    if survey.mission is None:
+        return MissionStatistics(sentence="no mission list in the recording", flown=_executed_items(survey))
+    problem = survey.mission.sentence
+    return MissionStatistics(
+        len(survey.items), survey.mission.complete, survey.mission_count, _executed_items(survey), problem
+    )
 
 
-def _flown_items(known: Survey) -> tuple[int, ...]:
-    return tuple(int(event.text.split()[1]) for event in known.events if event.kind == "item")
+def _executed_items(survey: Survey) -> tuple[int, ...]:
+    return tuple(int(event.text.split()[1]) for event in survey.events if event.kind == "item")
 
 
-def _surface(known: Survey, channel: int) -> str:
-    functions = {n: int(known.values.get(f"SERVO{n}_FUNCTION", -1)) for n in range(1, 9)}
+def _surface(survey: Survey, channel: int) -> str:
+    functions = {n: int(survey.values.get(f"SERVO{n}_FUNCTION", -1)) for n in range(1, 9)}
     if not any(function in _SURFACES for function in functions.values()):
-        return _ASSUMED.get(channel, "")
+        return _DEFAULT_SURFACES.get(channel, "")
     return _SURFACES.get(functions[channel], "")
 
 
-def _servo_words(known: Survey) -> str:
-    named = [f"{n} {word}" for n in range(1, 9) if (word := _surface(known, n))]
-    return servo_map(known.values).sentence or ", ".join(named)
+def _servo_map_text(survey: Survey) -> str:
+    entries = [f"{n} {surface}" for n in range(1, 9) if (surface := _surface(survey, n))]
+    return servo_map(survey.values).sentence or ", ".join(entries)
 
 
-def _servos(known: Survey) -> tuple[Servo, ...]:
+def _servos(survey: Survey) -> tuple[ServoStatistics, ...]:
     """Describe the channels that carry pulses."""
-    pulses = _in_air(known, "servo")
-    found = []
+    pulses = _rows_in_air(survey, "servo")
+    servos = []
     for n in range(1, pulses.shape[1] + 1 if len(pulses) else 1):
         us = pulses[:, n - 1]
         if us.max() < 500:  # not a servo pulse
             continue
-        low, high = (known.values.get(f"SERVO{n}_{end}", np.nan) for end in ("MIN", "MAX"))
-        at_end = (us <= low + _AT_END_US) | (us >= high - _AT_END_US)
+        low, high = (survey.values.get(f"SERVO{n}_{end}", np.nan) for end in ("MIN", "MAX"))
+        at_end = (us <= low + _SATURATION_US) | (us >= high - _SATURATION_US)
         low_us, high_us = float(us.min()), float(us.max())
-        moves = bool(us.std() > _MOVES_US)
-        found.append(Servo(n, _surface(known, n), low_us, high_us, moves, round(float(at_end.mean()), 4)))
-    return tuple(found)
+        moves = bool(us.std() > _MIN_STD_US)
+        servos.append(ServoStatistics(n, _surface(survey, n), low_us, high_us, moves, round(float(at_end.mean()), 4)))
+    return tuple(servos)
 
 
-def _sensor(known: Survey) -> tuple[str, str]:
+def _sensor(survey: Survey) -> tuple[str, str]:
     """Return whether there is an airspeed sensor, and the evidence."""
-    for name in _SENSOR:
-        if name in known.values:
-            return "yes" if known.values[name] > 0 else "no", f"{name} is {known.values[name]:g}"
-    spoken = [name for name in _SPOKEN if known.status and name in known.status.rates_hz]
-    return ("yes", f"{spoken[0]} is sent") if spoken else ("unknown", "no evidence in parameters or messages")
+    for name in _SENSOR_PARAMS:
+        if name in survey.values:
+            return "yes" if survey.values[name] > 0 else "no", f"{name} is {survey.values[name]:g}"
+    sensor_messages = [name for name in _SENSOR_MESSAGES if survey.status and name in survey.status.rates_hz]
+    return (
+        ("yes", f"{sensor_messages[0]} is sent")
+        if sensor_messages
+        else ("unknown", "no evidence in parameters or messages")
+    )
 
 
-def _airspeed(known: Survey) -> Airspeed:
-    sensor, how = _sensor(known)
-    air = _in_air(known, "air")
+def _airspeed(survey: Survey) -> AirspeedStatistics:
+    sensor, evidence = _sensor(survey)
+    air = _rows_in_air(survey, "air")
     if not len(air):
-        return Airspeed(sensor, how)
+        return AirspeedStatistics(sensor, evidence)
     low, median, high = (round(float(v), 1) for v in np.percentile(air[:, 0], (5, 50, 95)))
-    return Airspeed(sensor, how, low, median, high, bool(air[:, 0].std() < _CONSTANT))
+    return AirspeedStatistics(sensor, evidence, low, median, high, bool(air[:, 0].std() < _MIN_AIRSPEED_STD))
 
 
-def _wind(known: Survey) -> Wind | None:
-    w = _in_air(known, "wind")
+def _wind(survey: Survey) -> WindStatistics | None:
+    w = _rows_in_air(survey, "wind")
     if not len(w):
         return None
     mean = w.mean(axis=0)
     low, high = (round(float(v), 1) for v in np.percentile(np.hypot(*w.T), (5, 95)))
-    blows_from = np.degrees(np.arctan2(-mean[1], -mean[0])) % 360
-    return Wind(round(float(np.hypot(*mean)), 1), round(float(blows_from)), low, high)
+    from_deg = np.degrees(np.arctan2(-mean[1], -mean[0])) % 360
+    return WindStatistics(round(float(np.hypot(*mean)), 1), round(float(from_deg)), low, high)
 
 
-def mode_seconds(told: Findings) -> dict[str, float]:
+def mode_seconds(aircraft: AircraftFindings) -> dict[str, float]:
     """Return the total duration of each mode [s], the longest first."""
     total: Counter[str] = Counter()
-    for mode in told.modes:
+    for mode in aircraft.modes:
         total[mode.mode] += mode.seconds  # type: ignore[assignment]
     return dict(total.most_common())

@@ -8,26 +8,26 @@ import numpy as np
 
 from fleet.contract import COLUMNS, Item, Link, Message, Mission, Params, Rows, Sample, Status
 from fleet.frames import Origin
-from fleet.telemetry.inspection.thinned import MOST, Span, Thinned, inside
+from fleet.telemetry.inspection.thinned import MAX_ROWS, DecimatedRows, TimeInterval, inside
 
-LONGEST_S = {
+MAX_INTERVAL_S = {
     "attitude": 0.5,
     "velocity": 1.0,
     "servo": 0.5,
     "position": 1.0,
 }  # longest interval that the twin interpolates [s]
-SILENT_S = 3.0  # interval without any row that counts as a link gap [s]
-MOST_EVENTS = 2_000
-BUDGET = 5_000_000  # rows stored for all aircraft and fields
-FAST = 6.0  # a small fixed wing above this speed is in flight [m/s]
-_HIGH = 5.0  # an armed aircraft this far above the lowest point is in flight [m]
-ROTORS = ("multirotor", "helicopter", "quadplane")
-ROTORS_FAST, ROTORS_HIGH = 2.0, 1.5  # the same for aircraft that take off vertically [m/s, m]
-_BRIDGE_S, _HOP_S = 10.0, 5.0  # shorter landings and flights are ignored [s]
-_BY_ITSELF = ("STAT_", "BARO1_GND_", "BARO2_GND_", "BARO3_GND_", "GND_ABS_")  # set by the autopilot
+LINK_GAP_S = 3.0  # interval without any row that counts as a link gap [s]
+MAX_EVENTS = 2_000
+ROW_BUDGET = 5_000_000  # rows stored for all aircraft and fields
+AIRBORNE_SPEED = 6.0  # a small fixed wing above this speed is in flight [m/s]
+_AIRBORNE_HEIGHT = 5.0  # an armed aircraft this far above the lowest point is in flight [m]
+VERTICAL_TAKEOFF = ("multirotor", "helicopter", "quadplane")
+ROTOR_AIRBORNE_SPEED, ROTOR_AIRBORNE_HEIGHT = 2.0, 1.5  # the same for aircraft that take off vertically [m/s, m]
+_MIN_LANDING_S, _MIN_FLIGHT_S = 10.0, 5.0  # shorter landings and flights are ignored [s]
+_AUTOMATIC_PARAMS = ("STAT_", "BARO1_GND_", "BARO2_GND_", "BARO3_GND_", "GND_ABS_")  # set by the autopilot
 
 
-class Event(NamedTuple):
+class SurveyEvent(NamedTuple):
     """One event: time [s since 1970], kind, text."""
 
     t: float
@@ -35,8 +35,10 @@ class Event(NamedTuple):
     text: str
 
 
-def _thinned(name: str) -> Thinned:
-    return Thinned(LONGEST_S.get(name, 1.0), MOST, "<f8" if name in ("position", "target", "gnss") else "<f4")
+def _decimated_rows(name: str) -> DecimatedRows:
+    return DecimatedRows(
+        MAX_INTERVAL_S.get(name, 1.0), MAX_ROWS, "<f8" if name in ("position", "target", "gnss") else "<f4"
+    )
 
 
 @dataclass
@@ -56,22 +58,22 @@ class Survey:
     """
 
     uav: int
-    begun: float
+    start_t: float
     kind: str = ""
-    rows: dict[str, Thinned] = field(default_factory=lambda: {name: _thinned(name) for name in COLUMNS})
-    newest: float = -np.inf
-    refused: int = 0
-    modes: list[tuple[float, str]] = field(default_factory=list)
-    armings: list[tuple[float, bool]] = field(default_factory=list)
+    rows: dict[str, DecimatedRows] = field(default_factory=lambda: {name: _decimated_rows(name) for name in COLUMNS})
+    newest_t: float = -np.inf
+    rejected_fields: int = 0
+    mode_changes: list[tuple[float, str]] = field(default_factory=list)
+    arming_changes: list[tuple[float, bool]] = field(default_factory=list)
     status: Status | None = None
     mission: Mission | None = None
-    missions: int = 0
+    mission_count: int = 0
     params: Params | None = None
-    events: list[Event] = field(default_factory=list)
-    lost_events: int = 0  # beyond `MAX_EVENTS`
-    _seq: int = -1
-    _sentence: str = ""
-    _heard: float = np.nan  # time of the newest sample [s since 1970]
+    events: list[SurveyEvent] = field(default_factory=list)
+    dropped_events: int = 0  # beyond `MAX_EVENTS`
+    _current_item: int = -1
+    _latest_text: str = ""
+    _newest_sample_t: float = np.nan  # time of the newest sample [s since 1970]
 
     @property
     def vehicle(self) -> str:
@@ -93,15 +95,15 @@ class Survey:
         _, x = self.rows["position"].rows()
         return Origin(*(int(v) for v in x[0])) if len(x) else None
 
-    def note(self, t: float, kind: str, text: str) -> None:
+    def add_event(self, t: float, kind: str, text: str) -> None:
         """Append an event, or count it as dropped beyond `MAX_EVENTS`."""
-        if len(self.events) < MOST_EVENTS:
-            self.events.append(Event(t, kind, text))
+        if len(self.events) < MAX_EVENTS:
+            self.events.append(SurveyEvent(t, kind, text))
         else:
-            self.lost_events += 1
+            self.dropped_events += 1
 
 
-def survey(messages: Iterable[Message], kind: str = "") -> dict[int, Survey]:
+def survey_recording(messages: Iterable[Message], kind: str = "") -> dict[int, Survey]:
     """Survey a complete recording.
 
     Args:
@@ -110,149 +112,157 @@ def survey(messages: Iterable[Message], kind: str = "") -> dict[int, Survey]:
     Returns:
         survey of each aircraft, by UAV id
     """
-    found: dict[int, Survey] = {}
-    begun = np.nan
+    surveys: dict[int, Survey] = {}
+    start_t = np.nan
     for message in messages:
         if not np.isfinite(message.t):
             continue
-        begun = message.t if np.isnan(begun) else begun
-        if message.uav not in found:
-            found[message.uav] = Survey(message.uav, begun, kind)
-            _share(found)
-        hear(found[message.uav], message)
-    for each in found.values():
-        each.events.sort()
-    return dict(sorted(found.items()))
+        start_t = message.t if np.isnan(start_t) else start_t
+        if message.uav not in surveys:
+            surveys[message.uav] = Survey(message.uav, start_t, kind)
+            _distribute_budget(surveys)
+        update(surveys[message.uav], message)
+    for aircraft in surveys.values():
+        aircraft.events.sort()
+    return dict(sorted(surveys.items()))
 
 
-def hear(known: Survey, message: Message) -> None:
+def update(survey: Survey, message: Message) -> None:
     """Add one message of this aircraft."""
-    known.newest = max(known.newest, message.t)
+    survey.newest_t = max(survey.newest_t, message.t)
     if isinstance(message, Sample):
-        _hear_sample(known, message)
+        _update_samples(survey, message)
     elif isinstance(message, Status):
-        _hear_status(known, message)
+        _update_status(survey, message)
     elif isinstance(message, Mission):
-        if _course(message) != _course(known.mission) or not known.missions:
-            known.missions += bool(message.items)
-            known.note(message.t, "mission", f"{len(message.items)} items" + ("" if message.complete else ", not all"))
-        known.mission = message
+        if _mission_path(message) != _mission_path(survey.mission) or not survey.mission_count:
+            survey.mission_count += bool(message.items)
+            survey.add_event(
+                message.t, "mission", f"{len(message.items)} items" + ("" if message.complete else ", not all")
+            )
+        survey.mission = message
     elif isinstance(message, Params):
-        _hear_params(known, message)
+        _update_params(survey, message)
 
 
-def _course(mission: Mission | None) -> list[tuple[int, int, int, float]]:
+def _mission_path(mission: Mission | None) -> list[tuple[int, int, int, float]]:
     """Return command and position of all items but home; autopilots may change home, frames and unused parameters."""
     return [(i.command, i.lat_e7, i.lon_e7, i.alt_m) for i in (mission.items[1:] if mission else ())]
 
 
-def _share(found: dict[int, Survey]) -> None:
+def _distribute_budget(surveys: dict[int, Survey]) -> None:
     """Distribute the row budget equally over the aircraft."""
-    most = max(min(MOST, BUDGET // (len(COLUMNS) * len(found))), 1_000)
-    for each in found.values():
-        for kind in each.rows.values():
-            kind.most = most
+    max_rows = max(min(MAX_ROWS, ROW_BUDGET // (len(COLUMNS) * len(surveys))), 1_000)
+    for survey in surveys.values():
+        for rows in survey.rows.values():
+            rows.max_rows = max_rows
 
 
-def _hear_sample(known: Survey, sample: Sample) -> None:
-    if sample.t - known._heard > SILENT_S:
-        known.note(known._heard, "gap", f"no row for {sample.t - known._heard:.1f} s")
-    known._heard = sample.t
-    for name, kind in known.rows.items():
+def _update_samples(survey: Survey, sample: Sample) -> None:
+    if sample.t - survey._newest_sample_t > LINK_GAP_S:
+        survey.add_event(survey._newest_sample_t, "gap", f"no row for {sample.t - survey._newest_sample_t:.1f} s")
+    survey._newest_sample_t = sample.t
+    for name, decimated in survey.rows.items():
         rows: Rows | None = getattr(sample, name)
         if rows is None:
             continue
         try:
             t, x = rows.t.numpy(), rows.x.numpy()
         except ValueError:
-            known.refused += 1
+            survey.rejected_fields += 1
             continue
         if x.ndim != 2 or t.shape != x.shape[:1] or x.shape[1] != len(COLUMNS[name]):
-            known.refused += 1
+            survey.rejected_fields += 1
             continue
-        kind.add(t, x)
+        decimated.add(t, x)
         if name == "leg":
-            _follow(known, t, x[:, 0])
+            _update_item(survey, t, x[:, 0])
 
 
-def _follow(known: Survey, t: np.ndarray, seq: np.ndarray) -> None:
-    for at, number in zip(t.tolist(), seq.tolist(), strict=True):
-        if number >= 0 and number != known._seq:
-            known._seq = int(number)
-            known.note(at, "item", f"item {known._seq}")
+def _update_item(survey: Survey, t: np.ndarray, seq: np.ndarray) -> None:
+    for item_t, item_seq in zip(t.tolist(), seq.tolist(), strict=True):
+        if item_seq >= 0 and item_seq != survey._current_item:
+            survey._current_item = int(item_seq)
+            survey.add_event(item_t, "item", f"item {survey._current_item}")
 
 
-def _hear_status(known: Survey, status: Status) -> None:
-    before, known.status = known.status, status
-    if status.mode and (not known.modes or known.modes[-1][1] != status.mode):
-        known.modes.append((status.t, status.mode))
-        known.note(status.t, "mode", status.mode)
-    if not known.armings or known.armings[-1][1] != status.armed:
-        if known.armings or status.armed:
-            known.note(status.t, "armed" if status.armed else "disarmed", "armed" if status.armed else "disarmed")
-        known.armings.append((status.t, status.armed))
-    if status.clock_jumps > (before.clock_jumps if before else 0):
-        known.note(status.t, "clock", "the aircraft's clock jumped")
-    if before and status.link is not before.link:
-        known.note(status.t, "link", "link lost" if status.link is Link.LOST else "link back")
-    if status.sentence != known._sentence and status.link is Link.LIVE:
-        known._sentence = status.sentence
+def _update_status(survey: Survey, status: Status) -> None:
+    previous, survey.status = survey.status, status
+    if status.mode and (not survey.mode_changes or survey.mode_changes[-1][1] != status.mode):
+        survey.mode_changes.append((status.t, status.mode))
+        survey.add_event(status.t, "mode", status.mode)
+    if not survey.arming_changes or survey.arming_changes[-1][1] != status.armed:
+        if survey.arming_changes or status.armed:
+            survey.add_event(status.t, "armed" if status.armed else "disarmed", "armed" if status.armed else "disarmed")
+        survey.arming_changes.append((status.t, status.armed))
+    if status.clock_jumps > (previous.clock_jumps if previous else 0):
+        survey.add_event(status.t, "clock", "the aircraft's clock jumped")
+    if previous and status.link is not previous.link:
+        survey.add_event(status.t, "link", "link lost" if status.link is Link.LOST else "link back")
+    if status.sentence != survey._latest_text and status.link is Link.LIVE:
+        survey._latest_text = status.sentence
         if status.sentence:
-            known.note(status.t, "text", status.sentence.removeprefix(f"uav-{known.uav}: "))
+            survey.add_event(status.t, "text", status.sentence.removeprefix(f"uav-{survey.uav}: "))
 
 
-def _hear_params(known: Survey, params: Params) -> None:
-    before = known.values
-    changed = {n: v for n, v in params.values.items() if before.get(n, v) != v and not n.startswith(_BY_ITSELF)}
-    if changed and known.armings and known.armings[-1][1]:
-        said = [f"{name} {before[name]:g} to {value:g}" for name, value in list(changed.items())[:3]]
-        more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
-        known.note(params.t, "parameter", ", ".join(said) + more)
-    known.params = params
+def _update_params(survey: Survey, params: Params) -> None:
+    previous = survey.values
+    changed = {
+        key: new_value
+        for key, new_value in params.values.items()
+        if previous.get(key, new_value) != new_value and not key.startswith(_AUTOMATIC_PARAMS)
+    }
+    if changed and survey.arming_changes and survey.arming_changes[-1][1]:
+        changes = [f"{name} {previous[name]:g} to {value:g}" for name, value in list(changed.items())[:3]]
+        remainder = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
+        survey.add_event(params.t, "parameter", ", ".join(changes) + remainder)
+    survey.params = params
 
 
-def armed_spans(known: Survey) -> list[Span]:
+def armed_spans(survey: Survey) -> list[TimeInterval]:
     """Return the armed intervals, or the complete recording if the arming state is unknown."""
-    if not any(armed for _, armed in known.armings):
-        return [Span(known.begun, known.newest)]
-    ends = [*(t for t, _ in known.armings[1:]), known.newest]
-    return [Span(t, stop) for (t, armed), stop in zip(known.armings, ends, strict=True) if armed]
+    if not any(armed for _, armed in survey.arming_changes):
+        return [TimeInterval(survey.start_t, survey.newest_t)]
+    ends = [*(t for t, _ in survey.arming_changes[1:]), survey.newest_t]
+    return [TimeInterval(t, stop) for (t, armed), stop in zip(survey.arming_changes, ends, strict=True) if armed]
 
 
-def airborne(known: Survey) -> list[Span]:
+def airborne(survey: Survey) -> list[TimeInterval]:
     """Return the flight intervals, derived from speed and height."""
-    t_v, v = known.rows["velocity"].rows()
-    t_p, p = known.rows["position"].rows()
-    if not len(t_v) or not len(t_p):
+    velocity_t, velocity = survey.rows["velocity"].rows()
+    position_t, position = survey.rows["position"].rows()
+    if not len(velocity_t) or not len(position_t):
         return []
-    rotors = known.vehicle in ROTORS
-    fast, high = (ROTORS_FAST, ROTORS_HIGH) if rotors else (FAST, _HIGH)
-    armed = inside(t_v, armed_spans(known))
-    flying = armed & (np.linalg.norm(v, axis=1) > fast)
-    if armed.any() and any(on for _, on in known.armings):
-        height = np.interp(t_v, t_p, p[:, 2]) * 1e-3
-        flying |= armed & (height - np.percentile(height[armed], 1) > high)
-        t_h, above_home = known.rows["height"].rows()
-        if rotors and len(t_h):  # covers a recording that is one long hover
-            flying |= armed & (np.interp(t_v, t_h, above_home[:, 0]) > high)
-    return _bridged(t_v, flying)
+    vertical_takeoff = survey.vehicle in VERTICAL_TAKEOFF
+    min_speed, min_height = (
+        (ROTOR_AIRBORNE_SPEED, ROTOR_AIRBORNE_HEIGHT) if vertical_takeoff else (AIRBORNE_SPEED, _AIRBORNE_HEIGHT)
+    )
+    armed = inside(velocity_t, armed_spans(survey))
+    flying = armed & (np.linalg.norm(velocity, axis=1) > min_speed)
+    if armed.any() and any(is_armed for _, is_armed in survey.arming_changes):
+        height = np.interp(velocity_t, position_t, position[:, 2]) * 1e-3
+        flying |= armed & (height - np.percentile(height[armed], 1) > min_height)
+        height_t, above_home = survey.rows["height"].rows()
+        if vertical_takeoff and len(height_t):  # covers a recording that is one long hover
+            flying |= armed & (np.interp(velocity_t, height_t, above_home[:, 0]) > min_height)
+    return _merge_spans(velocity_t, flying)
 
 
-def _bridged(t: np.ndarray, on: np.ndarray) -> list[Span]:
+def _merge_spans(t: np.ndarray, mask: np.ndarray) -> list[TimeInterval]:
     """Merge intervals separated by short pauses, and drop short intervals."""
-    spans: list[Span] = []
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(int)))
+    spans: list[TimeInterval] = []
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
     for start, stop in zip(t[edges[::2]].tolist(), t[edges[1::2] - 1].tolist(), strict=True):
-        if spans and start - spans[-1].stop < _BRIDGE_S:
-            spans[-1] = Span(spans[-1].start, stop)
+        if spans and start - spans[-1].stop < _MIN_LANDING_S:
+            spans[-1] = TimeInterval(spans[-1].start, stop)
         else:
-            spans.append(Span(start, stop))
-    return [span for span in spans if span.seconds >= _HOP_S]
+            spans.append(TimeInterval(start, stop))
+    return [span for span in spans if span.seconds >= _MIN_FLIGHT_S]
 
 
-def spells(known: Survey) -> list[tuple[Span, str]]:
+def mode_spans(survey: Survey) -> list[tuple[TimeInterval, str]]:
     """Return each mode with its interval."""
-    if not known.modes:
+    if not survey.mode_changes:
         return []
-    ends = [*(t for t, _ in known.modes[1:]), known.newest]
-    return [(Span(t, stop), mode) for (t, mode), stop in zip(known.modes, ends, strict=True)]
+    ends = [*(t for t, _ in survey.mode_changes[1:]), survey.newest_t]
+    return [(TimeInterval(t, stop), mode) for (t, mode), stop in zip(survey.mode_changes, ends, strict=True)]

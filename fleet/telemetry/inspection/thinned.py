@@ -5,14 +5,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-MOST = 200_000  # stored rows of one field [-]
-_BLOCK = 4_096  # rows processed at once
-_WIDEST = 1_000  # wide intervals stored with their start
-_SHORTEST_S = 1.0  # shorter continuous stretches are ignored [s]
-_BINS, _PER_DECADE, _LOWEST = 180, 20, -5  # interval histogram: 10 us to 10,000 s
+MAX_ROWS = 200_000  # stored rows of one field [-]
+_BLOCK_ROWS = 4_096  # rows processed at once
+_MAX_WIDE_INTERVALS = 1_000  # wide intervals stored with their start
+_MIN_STRETCH_S = 1.0  # shorter continuous stretches are ignored [s]
+_BINS, _PER_DECADE, _LOWEST_DECADE = 180, 20, -5  # interval histogram: 10 us to 10,000 s
 
 
-class Span(NamedTuple):
+class TimeInterval(NamedTuple):
     """A time interval [s since 1970]."""
 
     start: float
@@ -24,7 +24,7 @@ class Span(NamedTuple):
         return self.stop - self.start
 
 
-class Thinned:
+class DecimatedRows:
     """Store rows in order; beyond `max_rows`, halve the stored rows and double the stride.
 
     Args:
@@ -33,138 +33,140 @@ class Thinned:
         dtype: type of the stored values; positions need double precision
     """
 
-    def __init__(self, longest: float, most: int = MOST, dtype: str = "<f4") -> None:
-        self.longest, self.most, self.dtype = longest, most, dtype
+    def __init__(self, max_interval_s: float, max_rows: int = MAX_ROWS, dtype: str = "<f4") -> None:
+        self.max_interval_s, self.max_rows, self.dtype = max_interval_s, max_rows, dtype
         self._count, self._stride = 0, 1
         self._pending: list[tuple[np.ndarray, np.ndarray]] = []
-        self._waiting = 0
-        self._kept: list[tuple[np.ndarray, np.ndarray]] = []
-        self._last = self._open = np.nan
-        self._intervals, self._seconds = np.zeros(_BINS), np.zeros(_BINS)
-        self._wide: list[tuple[float, float]] = []  # (length, start)
-        self._stretches: list[Span] = []
+        self._pending_count = 0
+        self._stored: list[tuple[np.ndarray, np.ndarray]] = []
+        self._newest_t = self._stretch_start = np.nan
+        self._interval_counts, self._interval_seconds = np.zeros(_BINS), np.zeros(_BINS)
+        self._wide_intervals: list[tuple[float, float]] = []  # (length, start)
+        self._stretches: list[TimeInterval] = []
 
     def add(self, t: np.ndarray, x: np.ndarray) -> None:
         """Add rows: times (n,) [s since 1970] and values (n, k)."""
         self._pending.append((t, x))
-        self._waiting += len(t)
-        if self._waiting >= _BLOCK:
-            self._settle()
+        self._pending_count += len(t)
+        if self._pending_count >= _BLOCK_ROWS:
+            self._process_pending()
 
     def rows(self) -> tuple[np.ndarray, np.ndarray]:
         """Return times and values of the stored rows, (m,) and (m, k)."""
-        self._settle()
-        if not self._kept:
+        self._process_pending()
+        if not self._stored:
             return np.zeros(0), np.zeros((0, 0), self.dtype)
-        if len(self._kept) > 1:
-            self._kept = [(np.concatenate([t for t, _ in self._kept]), np.concatenate([x for _, x in self._kept]))]
-        return self._kept[0]
+        if len(self._stored) > 1:
+            self._stored = [
+                (np.concatenate([t for t, _ in self._stored]), np.concatenate([x for _, x in self._stored]))
+            ]
+        return self._stored[0]
 
     @property
     def count(self) -> int:
         """Return the number of rows added."""
-        self._settle()
+        self._process_pending()
         return self._count
 
     @property
     def stride(self) -> int:
         """Return the decimation stride: one row in `stride` is stored."""
-        self._settle()
+        self._process_pending()
         return self._stride
 
     @property
     def rate_hz(self) -> float:
         """Return rows per second outside gaps; 0 with fewer than two rows."""
-        self._settle()
+        self._process_pending()
         usual = _edges() <= self._gap_s()
-        seconds = float(self._seconds[usual].sum())
-        return float(self._intervals[usual].sum()) / seconds if seconds else 0.0
+        seconds = float(self._interval_seconds[usual].sum())
+        return float(self._interval_counts[usual].sum()) / seconds if seconds else 0.0
 
-    def gaps(self) -> list[Span]:
+    def gaps(self) -> list[TimeInterval]:
         """Return at most 1,000 gaps in time order.
 
         A gap is longer than `max_interval_s` and than three times the median interval.
         """
-        self._settle()
+        self._process_pending()
         limit = self._gap_s()
-        return sorted(Span(start, start + length) for length, start in self._wide if length > limit)
+        return sorted(TimeInterval(start, start + length) for length, start in self._wide_intervals if length > limit)
 
-    def stretches(self) -> list[Span]:
+    def stretches(self) -> list[TimeInterval]:
         """Return the stretches of at least 1 s without an interval longer than `max_interval_s`."""
-        self._settle()
-        last = Span(float(self._open), float(self._last))
-        return [*self._stretches, last] if last.seconds >= _SHORTEST_S else list(self._stretches)
+        self._process_pending()
+        current = TimeInterval(float(self._stretch_start), float(self._newest_t))
+        return [*self._stretches, current] if current.seconds >= _MIN_STRETCH_S else list(self._stretches)
 
     def _gap_s(self) -> float:
         """Return the interval above which there is a gap [s]."""
-        n = self._intervals.sum()
-        usual = _edges()[np.searchsorted(np.cumsum(self._intervals), 0.5 * n)] if n else 0.0
-        return float(max(self.longest, 3 * usual))
+        n = self._interval_counts.sum()
+        usual = _edges()[np.searchsorted(np.cumsum(self._interval_counts), 0.5 * n)] if n else 0.0
+        return float(max(self.max_interval_s, 3 * usual))
 
-    def _settle(self) -> None:
+    def _process_pending(self) -> None:
         if not self._pending:
             return
         t = np.concatenate([t for t, _ in self._pending])
         x = np.concatenate([x for _, x in self._pending])
-        self._pending, self._waiting = [], 0
+        self._pending, self._pending_count = [], 0
         good = np.isfinite(t) & np.isfinite(x).all(axis=1)
         t, x = t[good], x[good].astype(self.dtype)
         if not len(t):
             return
         if not self._count:
-            self._last = self._open = t[0]
-        self._look(t)
-        self._keep(t, x)
-        self._last = t[-1]
+            self._newest_t = self._stretch_start = t[0]
+        self._measure_intervals(t)
+        self._store(t, x)
+        self._newest_t = t[-1]
 
-    def _look(self, t: np.ndarray) -> None:
+    def _measure_intervals(self, t: np.ndarray) -> None:
         """Add all intervals up to the last of these times to the statistics."""
-        before = np.concatenate([[self._last], t[:-1]])
-        dt = t - before
-        real = dt[dt > 0]
-        place = np.clip(((np.log10(real) - _LOWEST) * _PER_DECADE).astype(int), 0, _BINS - 1)
-        self._intervals += np.bincount(place, minlength=_BINS)
-        self._seconds += np.bincount(place, real, minlength=_BINS)
-        wide = np.flatnonzero(dt > self.longest)
+        previous = np.concatenate([[self._newest_t], t[:-1]])
+        dt = t - previous
+        positive = dt[dt > 0]
+        bin_index = np.clip(((np.log10(positive) - _LOWEST_DECADE) * _PER_DECADE).astype(int), 0, _BINS - 1)
+        self._interval_counts += np.bincount(bin_index, minlength=_BINS)
+        self._interval_seconds += np.bincount(bin_index, positive, minlength=_BINS)
+        wide = np.flatnonzero(dt > self.max_interval_s)
         if len(wide):
-            found = zip(dt[wide].tolist(), before[wide].tolist(), strict=True)
-            self._wide = nlargest(_WIDEST, [*self._wide, *found])
-        broken = np.flatnonzero((dt > self.longest) | (dt < 0))
-        starts = np.concatenate([[self._open], t[broken]])
-        long = before[broken] - starts[:-1] >= _SHORTEST_S
-        self._stretches += map(Span, starts[:-1][long].tolist(), before[broken][long].tolist())
-        self._open = starts[-1]
+            intervals = zip(dt[wide].tolist(), previous[wide].tolist(), strict=True)
+            self._wide_intervals = nlargest(_MAX_WIDE_INTERVALS, [*self._wide_intervals, *intervals])
+        breaks = np.flatnonzero((dt > self.max_interval_s) | (dt < 0))
+        starts = np.concatenate([[self._stretch_start], t[breaks]])
+        long_enough = previous[breaks] - starts[:-1] >= _MIN_STRETCH_S
+        self._stretches += map(TimeInterval, starts[:-1][long_enough].tolist(), previous[breaks][long_enough].tolist())
+        self._stretch_start = starts[-1]
 
-    def _keep(self, t: np.ndarray, x: np.ndarray) -> None:
-        taken = slice(-self._count % self._stride, None, self._stride)
-        self._kept.append((t[taken].copy(), x[taken].copy()))  # a view would hold the full array in memory
+    def _store(self, t: np.ndarray, x: np.ndarray) -> None:
+        selection = slice(-self._count % self._stride, None, self._stride)
+        self._stored.append((t[selection].copy(), x[selection].copy()))  # a view would hold the full array in memory
         self._count += len(t)
-        while sum(len(kept) for kept, _ in self._kept) > self.most:
-            whole_t, whole_x = (np.concatenate([pair[i] for pair in self._kept]) for i in (0, 1))
-            self._kept = [(whole_t[::2].copy(), whole_x[::2].copy())]
+        while sum(len(stored_t) for stored_t, _ in self._stored) > self.max_rows:
+            all_t, all_x = (np.concatenate([pair[i] for pair in self._stored]) for i in (0, 1))
+            self._stored = [(all_t[::2].copy(), all_x[::2].copy())]
             self._stride *= 2
 
 
 def _edges() -> np.ndarray:
     """Return the upper edge of each histogram bin, (n,) [s]."""
-    return 10.0 ** (_LOWEST + (np.arange(_BINS) + 1) / _PER_DECADE)
+    return 10.0 ** (_LOWEST_DECADE + (np.arange(_BINS) + 1) / _PER_DECADE)
 
 
-def overlap(one: list[Span], other: list[Span]) -> list[Span]:
+def overlap(first: list[TimeInterval], second: list[TimeInterval]) -> list[TimeInterval]:
     """Return the intersection of two lists of intervals, each in time order."""
     out, i, j = [], 0, 0
-    while i < len(one) and j < len(other):
-        both = Span(max(one[i].start, other[j].start), min(one[i].stop, other[j].stop))
-        if both.seconds > 0:
-            out.append(both)
-        if one[i].stop < other[j].stop:
+    while i < len(first) and j < len(second):
+        common = TimeInterval(max(first[i].start, second[j].start), min(first[i].stop, second[j].stop))
+        if common.seconds > 0:
+            out.append(common)
+        if first[i].stop < second[j].stop:
             i += 1
         else:
             j += 1
     return out
 
 
-def inside(t: np.ndarray, spans: list[Span]) -> np.ndarray:
+def inside(t: np.ndarray, spans: list[TimeInterval]) -> np.ndarray:
     """Return a mask of the times inside any interval, (n,) bool."""
     out = np.zeros(len(t), bool)
     for span in spans:
@@ -172,6 +174,6 @@ def inside(t: np.ndarray, spans: list[Span]) -> np.ndarray:
     return out
 
 
-def seconds(spans: list[Span]) -> float:
+def seconds(spans: list[TimeInterval]) -> float:
     """Return the total length [s]."""
     return float(sum(span.seconds for span in spans))

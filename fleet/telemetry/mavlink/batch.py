@@ -5,21 +5,23 @@ from collections.abc import Sequence
 import numpy as np
 
 from fleet.contract import COLUMNS
-from fleet.telemetry.mavlink.aircraft_link import Craft
-from fleet.telemetry.mavlink.arrays.fleet_arrays import Flock, Laid
+from fleet.telemetry.mavlink.aircraft_link import AircraftLink
+from fleet.telemetry.mavlink.arrays.fleet_arrays import AircraftArrays, RowBatch
 from fleet.telemetry.mavlink.arrays.row_arbiter import FIELDS, NO_FIELD
-from fleet.telemetry.mavlink.arrays.rows import WIDEST
-from fleet.telemetry.mavlink.parsing.decode import Dealt, Fields, Frames
+from fleet.telemetry.mavlink.arrays.rows import MAX_COLUMNS
+from fleet.telemetry.mavlink.parsing.decode import Fields, Frames, GroupedFrames
 from fleet.telemetry.tables.mavlink import TABLE, own_seconds
-from fleet.telemetry.tables.row import Row, believable
+from fleet.telemetry.tables.row import FieldSource, is_plausible
 
 _TICK = np.array([row.tick for row in TABLE])
 _FIELD = np.array([FIELDS.index(row.field) for row in TABLE])
 _RANK = np.array([row.rank for row in TABLE])
-_GIVEN = np.array([FIELDS.index(row.given) if row.given else NO_FIELD for row in TABLE])
+_REQUIRES = np.array([FIELDS.index(row.requires) if row.requires else NO_FIELD for row in TABLE])
 
 
-def lay(frames: Frames, owner: np.ndarray, crafts: Sequence[Craft], flock: Flock) -> None:
+def process_table_rows(
+    frames: Frames, owner: np.ndarray, aircraft: Sequence[AircraftLink], arrays: AircraftArrays
+) -> None:
     """Convert frames to telemetry rows and add them to the arrays.
 
     Args:
@@ -28,33 +30,42 @@ def lay(frames: Frames, owner: np.ndarray, crafts: Sequence[Craft], flock: Flock
         aircraft: the aircraft on this link
         arrays: their state
     """
-    dealt, said = Dealt(frames), Said(frames, owner, crafts)
-    names = set(dealt.names())
-    rows = ((number, row) for number, row in enumerate(TABLE) if row.message in names)
-    heard = [(number, *found) for number, row in rows if (found := said.rows(row, *dealt.fields(row.message)))]
-    if not heard:
+    grouped, reader = GroupedFrames(frames), BatchReader(frames, owner, aircraft)
+    names = set(grouped.names())
+    rows = ((row_number, row) for row_number, row in enumerate(TABLE) if row.message in names)
+    results = [(number, *result) for number, row in rows if (result := reader.rows(row, *grouped.fields(row.message)))]
+    if not results:
         return
-    which, raw_s, values = (np.concatenate([found[k] for found in heard]) for k in (1, 2, 3))
-    order = np.argsort(which, kind="stable")
-    number, which = np.repeat([found[0] for found in heard], [len(found[1]) for found in heard])[order], which[order]
-    codes = (_TICK[number], _FIELD[number], _RANK[number], _GIVEN[number])
-    judged = flock.judge(Laid(owner[which], frames.arrival[which], raw_s[order], values[order], *codes))
-    for k in np.flatnonzero(~np.isnan(judged.jumped)).tolist():
-        crafts[k].jumped(float(judged.jumped[k]))
-    for i in np.flatnonzero(judged.advanced).tolist():
-        crafts[owner[which[i]]].reanchored(float(frames.arrival[which[i]]), float(judged.advanced[i]))
-    for k in np.flatnonzero(judged.refused).tolist():
-        crafts[k].doubted(float(judged.newest[k]), int(judged.refused[k]))
+    frame_numbers, raw_s, values = (np.concatenate([result[k] for result in results]) for k in (1, 2, 3))
+    order = np.argsort(frame_numbers, kind="stable")
+    number, frame_numbers = (
+        np.repeat([result[0] for result in results], [len(result[1]) for result in results])[order],
+        frame_numbers[order],
+    )
+    codes = (_TICK[number], _FIELD[number], _RANK[number], _REQUIRES[number])
+    outcome = arrays.arbitrate(
+        RowBatch(owner[frame_numbers], frames.arrival[frame_numbers], raw_s[order], values[order], *codes)
+    )
+    for k in np.flatnonzero(~np.isnan(outcome.jumped)).tolist():
+        aircraft[k].queue_clock_jump(float(outcome.jumped[k]))
+    for i in np.flatnonzero(outcome.advanced).tolist():
+        aircraft[owner[frame_numbers[i]]].queue_reanchor(
+            float(frames.arrival[frame_numbers[i]]), float(outcome.advanced[i])
+        )
+    for k in np.flatnonzero(outcome.rejected).tolist():
+        aircraft[k].queue_rejected(float(outcome.newest[k]), int(outcome.rejected[k]))
 
 
-class Said:
+class BatchReader:
     """Read a batch of frames by the rows of the table."""
 
-    def __init__(self, frames: Frames, owner: np.ndarray, crafts: Sequence[Craft]) -> None:
-        self._frames, self._owner, self._crafts = frames, owner, crafts
-        self._autopilot = np.array([craft.autopilot for craft in crafts])
+    def __init__(self, frames: Frames, owner: np.ndarray, aircraft: Sequence[AircraftLink]) -> None:
+        self._frames, self._owner, self._aircraft = frames, owner, aircraft
+        self._autopilot = np.array([link.autopilot for link in aircraft])
 
-    def rows(self, row: Row, which: np.ndarray, fields: Fields) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    def rows(
+        self, row: FieldSource, frame_numbers: np.ndarray, fields: Fields
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Apply one table row: frame numbers (n,), time stamps (n,) [s], values (n, 8); None without valid frames.
 
         Args:
@@ -62,30 +73,30 @@ class Said:
             frame_numbers: frames of its message, (m,)
             fields: fields of these frames
         """
-        meant = self._owner[which] >= 0
-        if row.autopilots and meant.any():
-            meant[meant] = np.isin(self._autopilot, row.autopilots)[self._owner[which[meant]]]
+        applicable = self._owner[frame_numbers] >= 0
+        if row.autopilots and applicable.any():
+            applicable[applicable] = np.isin(self._autopilot, row.autopilots)[self._owner[frame_numbers[applicable]]]
         if row.when is not None:
             with np.errstate(all="ignore"):
-                meant &= row.when(fields)
-        if not meant.all():
-            which, fields = which[meant], Fields(fields.rows[meant])
-        if not len(which):
+                applicable &= row.when(fields)
+        if not applicable.all():
+            frame_numbers, fields = frame_numbers[applicable], Fields(fields.rows[applicable])
+        if not len(frame_numbers):
             return None
-        values = np.zeros((len(which), WIDEST))
+        values = np.zeros((len(frame_numbers), MAX_COLUMNS))
         with np.errstate(all="ignore"):  # NaN propagates and is rejected below
             for k, column in enumerate(row.columns(fields)):
                 values[:, k] = column
-            good = believable(row.field, values[:, : len(COLUMNS[row.field])])
-        raw_s = np.broadcast_to(own_seconds(row, fields), len(which))
-        if good.all():
-            return which, raw_s, values
-        self._refuse(row.message, which[~good])
-        return which[good], raw_s[good], values[good]
+            valid = is_plausible(row.field, values[:, : len(COLUMNS[row.field])])
+        raw_s = np.broadcast_to(own_seconds(row, fields), len(frame_numbers))
+        if valid.all():
+            return frame_numbers, raw_s, values
+        self._reject(row.message, frame_numbers[~valid])
+        return frame_numbers[valid], raw_s[valid], values[valid]
 
-    def _refuse(self, message: str, which: np.ndarray) -> None:
+    def _reject(self, message: str, frame_numbers: np.ndarray) -> None:
         """Report frames with implausible values to their aircraft."""
-        owner = self._owner[which]
+        owner = self._owner[frame_numbers]
         for number in np.unique(owner).tolist():
-            mine, craft = which[owner == number], self._crafts[number]
-            craft.queue(float(self._frames.arrival[mine[-1]]), craft.refuse, message, len(mine))
+            own_frames, link = frame_numbers[owner == number], self._aircraft[number]
+            link.queue(float(self._frames.arrival[own_frames[-1]]), link.reject_values, message, len(own_frames))

@@ -64,12 +64,12 @@ def firmware(version: Any) -> str:
     return f"{number >> 24}.{number >> 16 & 0xFF}.{number >> 8 & 0xFF}"
 
 
-def board(version: Any) -> str:
+def board_id(version: Any) -> str:
     """Return hardware id and firmware version of AUTOPILOT_VERSION, or an empty string."""
     number = bytes(version.uid2).hex().strip("0") or (f"{version.uid:x}" if version.uid else "")
     return f"{number}-{version.flight_sw_version:08x}" if number else ""
 
 
-def names_firmware(words: str) -> bool:
+def names_firmware(text: str) -> bool:
     """Return whether a text contains autopilot and version, e.g. ArduPlane V4.7.0-dev (d55cb382)."""
-    return words.startswith(("ArduPlane V", "ArduCopter V", "APM:", "PX4 v", "Blimp V", "ArduRover V"))
+    return text.startswith(("ArduPlane V", "ArduCopter V", "APM:", "PX4 v", "Blimp V", "ArduRover V"))

@@ -7,41 +7,41 @@ from typing import Any
 
 import numpy as np
 
-from fleet.bus.codec import Wire
+from fleet.bus.codec import EncodedMessage
 from fleet.contract import Alert, Mission, Params, Sample, Status
-from fleet.telemetry.mavlink.aircraft_link import LOST_S, Craft
-from fleet.telemetry.mavlink.arrays.counts import HEARD
-from fleet.telemetry.mavlink.arrays.fleet_arrays import Flock
-from fleet.telemetry.mavlink.batch import lay
-from fleet.telemetry.mavlink.collision import Collision
+from fleet.telemetry.mavlink.aircraft_link import LINK_LOST_S, AircraftLink
+from fleet.telemetry.mavlink.arrays.counts import LAST_ARRIVAL
+from fleet.telemetry.mavlink.arrays.fleet_arrays import AircraftArrays
+from fleet.telemetry.mavlink.batch import process_table_rows
+from fleet.telemetry.mavlink.collision import SenderConflict
 from fleet.telemetry.mavlink.heartbeat import is_aircraft
-from fleet.telemetry.mavlink.microservices.route import MESSAGES
-from fleet.telemetry.mavlink.parsing.decode import IDS, KINDS, Decoder, Frames, joined, kinds
-from fleet.telemetry.mavlink.parsing.received import Heard, merged
+from fleet.telemetry.mavlink.microservices.route import MISSION_MESSAGES
+from fleet.telemetry.mavlink.parsing.decode import IDS, MESSAGE_NAMES, Decoder, Frames, joined_frames, message_kinds
+from fleet.telemetry.mavlink.parsing.received import ReceivedBytes, merge_received
 from fleet.telemetry.mavlink.parsing.scan import COMPONENT, EXTRA, ID, SEQ, SYSTEM
-from fleet.telemetry.mavlink.timing import time
+from fleet.telemetry.mavlink.timing import update_timings
 
-MOST_UAVS = 2_000  # over all links
-SECOND = "second sender for a live id"
-NOT_YET = "no aircraft heartbeat yet"
-MOST_EARLY = 4096  # messages of one system buffered until its first heartbeat
-MOST_EARLY_ALL = 32_768  # the same for all systems of a link, about 25 MB
+MAX_UAVS = 2_000  # over all links
+SECOND_SENDER = "second sender for a live id"
+NO_HEARTBEAT = "no aircraft heartbeat yet"
+MAX_EARLY = 4096  # messages of one system buffered until its first heartbeat
+MAX_EARLY_TOTAL = 32_768  # the same for all systems of a link, about 25 MB
 EARLY_S = 15.0  # maximum age of buffered messages; heartbeats arrive every second [s]
-FORGET_S = 30.0  # silence after which an aircraft may be removed [s]
-KNOWN_S = 30.0  # an aircraft received for this long is only removed for a new aircraft [s]
+SILENCE_LIMIT_S = 30.0  # silence after which an aircraft may be removed [s]
+PROBATION_S = 30.0  # an aircraft received for this long is only removed for a new aircraft [s]
 
-News = Sample | Status | Mission | Params | Alert
-EARLY = MESSAGES | {"PARAM_VALUE", "HOME_POSITION"}  # sent once, therefore buffered; rows are repeated
-SINGLE = np.zeros(len(EXTRA), bool)  # by message id: processed individually, not as table rows
-SINGLE[[IDS[name] for name in (*EARLY, "HEARTBEAT", "STATUSTEXT", "AUTOPILOT_VERSION")]] = True
-SINGLE[IDS["MISSION_CURRENT"]] = True  # also a table row
-Claims = dict[int, Craft]
+TelemetryMessage = Sample | Status | Mission | Params | Alert
+EARLY_MESSAGES = MISSION_MESSAGES | {"PARAM_VALUE", "HOME_POSITION"}  # sent once, therefore buffered; rows are repeated
+IS_SINGLE = np.zeros(len(EXTRA), bool)  # by message id: processed individually, not as table rows
+IS_SINGLE[[IDS[name] for name in (*EARLY_MESSAGES, "HEARTBEAT", "STATUSTEXT", "AUTOPILOT_VERSION")]] = True
+IS_SINGLE[IDS["MISSION_CURRENT"]] = True  # also a table row
+IdOwners = dict[int, AircraftLink]
 """Aircraft that owns a UAV id, over all links of a gateway."""
-Admit = Callable[[Frames, Counter[str]], Frames]
+AdmissionFilter = Callable[[Frames, Counter[str]], Frames]
 """Remove frames that are not admitted, and count them by reason."""
 
 
-class Intake:
+class MavlinkReceiver:
     """Convert the bytes received on one link to contract messages.
 
     Args:
@@ -52,27 +52,31 @@ class Intake:
     """
 
     def __init__(
-        self, offset: int = 0, claims: Claims | None = None, most: int = MOST_UAVS, admit: Admit | None = None
+        self,
+        offset: int = 0,
+        id_owners: IdOwners | None = None,
+        max_uavs: int = MAX_UAVS,
+        admit: AdmissionFilter | None = None,
     ) -> None:
         self.offset = offset
-        self.refused: Counter[str] = Counter()  # valid frames rejected, by reason
-        self.crafts: dict[int, Craft] = {}  # by MAVLink system id
+        self.rejected: Counter[str] = Counter()  # valid frames rejected, by reason
+        self.aircraft: dict[int, AircraftLink] = {}  # by MAVLink system id
         self.decoder = Decoder()
-        self.flock = Flock(KINDS)
-        self._claims: Claims = {} if claims is None else claims
-        self._speakers = np.full(1 << 16, -1)  # aircraft number by system and component
-        self._most, self._admit = most, admit
-        self._heard: list[Heard] = []
-        self._sorted: list[Frames] = []  # admitted, not yet processed
-        self._collisions: dict[int, Collision] = {}  # by UAV id
-        self._born: dict[int, int] = {}  # in this batch: frame number of the first heartbeat, by system
-        self._rivals: set[int] = set()  # systems whose UAV id another link owns
+        self.arrays = AircraftArrays(MESSAGE_NAMES)
+        self._id_owners: IdOwners = {} if id_owners is None else id_owners
+        self._number_by_address = np.full(1 << 16, -1)  # aircraft number by system and component
+        self._max_uavs, self._admit = max_uavs, admit
+        self._received: list[ReceivedBytes] = []
+        self._pending_frames: list[Frames] = []  # admitted, not yet processed
+        self._conflicts: dict[int, SenderConflict] = {}  # by UAV id
+        self._first_heartbeat: dict[int, int] = {}  # in this batch: frame number of the first heartbeat, by system
+        self._conflicting_systems: set[int] = set()  # systems whose UAV id another link owns
         self._early: dict[int, list[tuple[float, Any]]] = {}  # messages before the first heartbeat, by system id
-        self._early_n = 0  # number of these messages
-        self._numbered: list[Craft] = []  # by number in the arrays, including removed aircraft
-        self._met: dict[int, float] = {}  # registration time by system id [s since 1970]
+        self._early_count = 0  # number of these messages
+        self._aircraft_by_number: list[AircraftLink] = []  # by number in the arrays, including removed aircraft
+        self._registered_t: dict[int, float] = {}  # registration time by system id [s since 1970]
 
-    def hear(self, arrival: float, data: bytes, source: Hashable = None) -> None:
+    def receive(self, arrival: float, data: bytes, source: Hashable = None) -> None:
         """Receive bytes that arrived together; the next `flush` processes them.
 
         Args:
@@ -80,275 +84,291 @@ class Intake:
             data: any bytes
             source: the sender, e.g. its UDP address; None on a stream with a single remote end
         """
-        self.listen(Heard.of([(arrival, source, data)]))
+        self.receive_batch(ReceivedBytes.from_pieces([(arrival, source, data)]))
 
-    def listen(self, heard: Heard) -> None:
+    def receive_batch(self, received: ReceivedBytes) -> None:
         """Receive many pieces of bytes; the next `flush` processes them."""
-        self._heard.append(heard)
+        self._received.append(received)
 
-    def flush(self, now: float) -> list[News]:
+    def flush(self, now: float) -> list[TelemetryMessage]:
         """Return the new messages; `now` is fleet time [s since 1970]."""
-        return unpacked(self.pack(now))
+        return unpacked(self.flush_packed(now))
 
-    def pack(self, now: float) -> list[News | Wire]:
+    def flush_packed(self, now: float) -> list[TelemetryMessage | EncodedMessage]:
         """Return the new messages with encoded samples; `now` is fleet time [s since 1970]."""
-        self.sort()
-        self._digest_sorted()
-        return self._take(now)
+        self.decode()
+        self._process_pending()
+        return self._collect_packed(now)
 
-    def sort(self, keep: bool = True) -> Frames | None:
+    def decode(self, process_later: bool = True) -> Frames | None:
         """Decode the bytes received since the last call and return the admitted frames; None if there are none.
 
         Args:
             process_later: process them at the next `flush`
         """
-        if not self._heard:
+        if not self._received:
             return None
-        frames = self.decoder.feed(merged(self._heard))
-        self._heard.clear()
+        frames = self.decoder.decode(merge_received(self._received))
+        self._received.clear()
         if self._admit is not None:
-            frames = self._admit(frames, self.refused)
-        if not len(frames.at):
+            frames = self._admit(frames, self.rejected)
+        if not len(frames.headers):
             return None
-        if keep:
-            self._sorted.append(frames)
+        if process_later:
+            self._pending_frames.append(frames)
         return frames
 
-    def overhear(self, frames: Frames) -> None:
+    def process_uplink(self, frames: Frames) -> None:
         """Process frames from ground stations to the aircraft of this link, without registering aircraft or senders."""
-        which = np.flatnonzero(SINGLE[frames.at[:, ID]])
-        if len(which):
-            self._digest_sorted()  # the target may be registered by a pending frame
-        for i, message in zip(which.tolist(), frames.messages(which), strict=True):
-            craft, arrival = self.crafts.get(message.get_srcSystem()), float(frames.arrival[i])
-            if craft is not None and craft.component == message.get_srcComponent():
-                self._alarm(craft, arrival, frames.senders[frames.sender[i]])
-            elif message.get_type() in MESSAGES:
-                target = self.crafts.get(getattr(message, "target_system", 0))
+        frame_numbers = np.flatnonzero(IS_SINGLE[frames.headers[:, ID]])
+        if len(frame_numbers):
+            self._process_pending()  # the target may be registered by a pending frame
+        for i, message in zip(frame_numbers.tolist(), frames.messages(frame_numbers), strict=True):
+            link, arrival = self.aircraft.get(message.get_srcSystem()), float(frames.arrival[i])
+            if link is not None and link.component == message.get_srcComponent():
+                self._report_conflict(link, arrival, frames.senders[frames.sender[i]])
+            elif message.get_type() in MISSION_MESSAGES:
+                target = self.aircraft.get(getattr(message, "target_system", 0))
                 if target is not None:
-                    target.queue(arrival, target.overhear, message)
+                    target.queue(arrival, target.process_uplink, message)
 
-    def part(self, source: Hashable) -> None:
+    def release_sender(self, source: Hashable) -> None:
         """Release the aircraft of a sender that disconnected: the next sender of their ids takes over."""
-        self.sort()
-        self._digest_sorted()
-        for craft in self.crafts.values():
-            if craft.source == source:
-                craft.source = None
+        self.decode()
+        self._process_pending()
+        for link in self.aircraft.values():
+            if link.source == source:
+                link.source = None
 
-    def _digest_sorted(self) -> None:
-        if self._sorted:
-            self.digest(joined(self._sorted))
-            self._sorted.clear()
+    def _process_pending(self) -> None:
+        if self._pending_frames:
+            self.process(joined_frames(self._pending_frames))
+            self._pending_frames.clear()
 
-    def forget(self, now: float) -> list[int]:
+    def remove_silent(self, now: float) -> list[int]:
         """Remove silent aircraft at `now` [s since 1970]; return their UAV ids.
 
         An aircraft received for less than `PROBATION_S` is removed after `SILENCE_LIMIT_S` of silence, any other when a
         new aircraft replaces it.
         """
-        for system in [system for system, kept in self._early.items() if now - kept[0][0] > EARLY_S]:
-            self.refused[NOT_YET] += len(self._pop_early(system))
-        gone = []
-        for system, craft in list(self.crafts.items()):
-            brief = craft.heard - self._met[system] < KNOWN_S and now - craft.heard > FORGET_S
-            if brief or self._claims.get(craft.uav) is None:
-                self._drop(system, craft)
-                gone.append(craft.uav)
-        return gone
+        for system in [system for system, buffered in self._early.items() if now - buffered[0][0] > EARLY_S]:
+            self.rejected[NO_HEARTBEAT] += len(self._pop_early(system))
+        removed = []
+        for system, link in list(self.aircraft.items()):
+            is_transient = (
+                link.last_arrival - self._registered_t[system] < PROBATION_S
+                and now - link.last_arrival > SILENCE_LIMIT_S
+            )
+            if is_transient or self._id_owners.get(link.uav) is None:
+                self._remove(system, link)
+                removed.append(link.uav)
+        return removed
 
-    def _drop(self, system: int, craft: Craft) -> None:
+    def _remove(self, system: int, link: AircraftLink) -> None:
         """Remove one aircraft; its number stays reserved for its system id."""
-        del self.crafts[system], self._met[system]
-        if self._claims.get(craft.uav) is craft:
-            del self._claims[craft.uav]
-        self._collisions.pop(craft.uav, None)
-        self._rivals.discard(system)
-        self._speakers[(system << 8) + craft.component] = -1
-        self.flock.reset(craft.number)
-        self._numbered[craft.number] = Craft(self.flock, craft.uav, system, craft.component, number=craft.number)
+        del self.aircraft[system], self._registered_t[system]
+        if self._id_owners.get(link.uav) is link:
+            del self._id_owners[link.uav]
+        self._conflicts.pop(link.uav, None)
+        self._conflicting_systems.discard(system)
+        self._number_by_address[(system << 8) + link.component] = -1
+        self.arrays.reset_aircraft(link.number)
+        self._aircraft_by_number[link.number] = AircraftLink(
+            self.arrays, link.uav, system, link.component, number=link.number
+        )
 
-    def take(self, now: float) -> list[News]:
+    def collect(self, now: float) -> list[TelemetryMessage]:
         """Return the messages of processed frames that arrived up to `now` [s since 1970]."""
-        return unpacked(self._take(now))
+        return unpacked(self._collect_packed(now))
 
-    def _take(self, now: float) -> list[News | Wire]:
-        news: list[News | Wire] = [alert for one in self._collisions.values() for alert in one.take(now)]
-        samples, crafts, due = self.flock.take(now), self._numbered, set(self.flock.due(now))
+    def _collect_packed(self, now: float) -> list[TelemetryMessage | EncodedMessage]:
+        messages: list[TelemetryMessage | EncodedMessage] = [
+            alert for conflict in self._conflicts.values() for alert in conflict.take_alerts(now)
+        ]
+        samples, links, due = self.arrays.take_samples(now), self._aircraft_by_number, set(self.arrays.due(now))
         for number in sorted(due.union(samples)):
-            craft = crafts[number]
-            if self._claims.get(craft.uav) is craft:
+            link = links[number]
+            if self._id_owners.get(link.uav) is link:
                 if number in samples:
-                    news.append(samples[number])
+                    messages.append(samples[number])
                 if number in due:
-                    news += craft.take(now)
-        return news
+                    messages += link.collect(now)
+        return messages
 
-    def digest(self, frames: Frames) -> None:
+    def process(self, frames: Frames) -> None:
         """Process a batch of frames; `collect` returns the resulting messages."""
-        if not len(frames.at):
+        if not len(frames.headers):
             return
-        which = np.flatnonzero(SINGLE[frames.at[:, ID]])
-        said = (which.tolist(), frames.arrival[which].tolist(), frames.messages(which), frames.sender[which].tolist())
-        for i, arrival, message, sender in zip(*said, strict=True):
-            self._route(i, arrival, message, frames.senders[sender])
-        owner = self._owners(frames)
-        self._born.clear()
-        mine = np.flatnonzero(owner >= 0)
-        if len(mine):
-            self.flock.counts.note(owner[mine], kinds(frames)[mine], frames.arrival[mine], frames.at[mine, SEQ])
-            lay(frames, owner, self._numbered, self.flock)
-            time(frames, owner, [craft.timing for craft in self._numbered])
+        frame_numbers = np.flatnonzero(IS_SINGLE[frames.headers[:, ID]])
+        columns = (
+            frame_numbers.tolist(),
+            frames.arrival[frame_numbers].tolist(),
+            frames.messages(frame_numbers),
+            frames.sender[frame_numbers].tolist(),
+        )
+        for i, arrival, message, sender in zip(*columns, strict=True):
+            self._dispatch(i, arrival, message, frames.senders[sender])
+        owner = self._frame_owners(frames)
+        self._first_heartbeat.clear()
+        owned = np.flatnonzero(owner >= 0)
+        if len(owned):
+            self.arrays.counts.add_messages(
+                owner[owned], message_kinds(frames)[owned], frames.arrival[owned], frames.headers[owned, SEQ]
+            )
+            process_table_rows(frames, owner, self._aircraft_by_number, self.arrays)
+            update_timings(frames, owner, [link.timing for link in self._aircraft_by_number])
 
-    def _owners(self, frames: Frames) -> np.ndarray:
+    def _frame_owners(self, frames: Frames) -> np.ndarray:
         """Return the aircraft number of each frame, -1 without owner, (n,)."""
-        crafts = self._numbered
-        number = {sender: k for k, sender in enumerate(frames.senders)}
-        rightful = [self._claims.get(craft.uav, craft) is craft for craft in crafts]
-        pairs = zip(crafts, rightful, strict=True)
-        expected = np.array([number.get(craft.source, -1) if holds else -1 for craft, holds in pairs] + [-1])
-        owner = self._speakers[(frames.at[:, SYSTEM] << 8) + frames.at[:, COMPONENT]]
+        links = self._aircraft_by_number
+        sender_index = {sender: index for index, sender in enumerate(frames.senders)}
+        is_owner = [self._id_owners.get(link.uav, link) is link for link in links]
+        pairs = zip(links, is_owner, strict=True)
+        expected = np.array([sender_index.get(craft.source, -1) if owns else -1 for craft, owns in pairs] + [-1])
+        owner = self._number_by_address[(frames.headers[:, SYSTEM] << 8) + frames.headers[:, COMPONENT]]
         owner[(owner >= 0) & (expected[owner] != frames.sender)] = -1
-        heard, known = self.flock.counts.state, np.flatnonzero(owner >= 0)
-        heard[owner[known], HEARD] = frames.arrival[known]
-        for which in _by_speaker(frames, np.flatnonzero(owner < 0)):
-            craft = self._speaker(frames, which)
+        counters, owned = self.arrays.counts.state, np.flatnonzero(owner >= 0)
+        counters[owner[owned], LAST_ARRIVAL] = frames.arrival[owned]
+        for group in _group_by_sender(frames, np.flatnonzero(owner < 0)):
+            craft = self._group_owner(frames, group)
             if craft is not None:
-                owner[which] = craft.number
-                heard[craft.number, HEARD] = frames.arrival[which[-1]]
-        for system, i in self._born.items():
-            owner[:i][frames.at[:i, SYSTEM] == system] = -1
+                owner[group] = craft.number
+                counters[craft.number, LAST_ARRIVAL] = frames.arrival[group[-1]]
+        for system, i in self._first_heartbeat.items():
+            owner[:i][frames.headers[:i, SYSTEM] == system] = -1
         return owner
 
     def counters(self) -> Counter[str]:
         """Return messages, bad_bytes and bad_frames over all senders."""
         return self.decoder.counters()
 
-    def _speaker(self, frames: Frames, which: np.ndarray) -> Craft | None:
+    def _group_owner(self, frames: Frames, frame_numbers: np.ndarray) -> AircraftLink | None:
         """Return the owner of frames from one component of one sender; count them as rejected without owner."""
-        system, component = frames.at[which[0], (SYSTEM, COMPONENT)].tolist()
-        source, arrival = frames.senders[frames.sender[which[0]]], float(frames.arrival[which[-1]])
-        craft = self.crafts.get(system)
-        rows = int((~SINGLE[frames.at[which, ID]]).sum())
-        if craft is not None and craft.component == component:
-            return craft if self._may_speak(craft, source, arrival, rows) else None
-        if rows:
-            self.refused[SECOND if system in self._rivals else "not an autopilot" if craft else NOT_YET] += rows
+        system, component = frames.headers[frame_numbers[0], (SYSTEM, COMPONENT)].tolist()
+        source, arrival = frames.senders[frames.sender[frame_numbers[0]]], float(frames.arrival[frame_numbers[-1]])
+        link = self.aircraft.get(system)
+        row_count = int((~IS_SINGLE[frames.headers[frame_numbers, ID]]).sum())
+        if link is not None and link.component == component:
+            return link if self._accept_sender(link, source, arrival, row_count) else None
+        if row_count:
+            self.rejected[
+                SECOND_SENDER if system in self._conflicting_systems else "not an autopilot" if link else NO_HEARTBEAT
+            ] += row_count
         return None
 
-    def _route(self, i: int, arrival: float, message: Any, source: Hashable) -> None:
+    def _dispatch(self, i: int, arrival: float, message: Any, source: Hashable) -> None:
         system, component = message.get_srcSystem(), message.get_srcComponent()
-        craft = self.crafts.get(system)
-        if craft is not None and craft.component == component:
-            if self._may_speak(craft, source, arrival):
-                craft.queue(arrival, craft.hear, message)
-        elif craft is None and message.get_type() == "HEARTBEAT" and is_aircraft(message):
-            self._meet(i, arrival, message, source)
+        link = self.aircraft.get(system)
+        if link is not None and link.component == component:
+            if self._accept_sender(link, source, arrival):
+                link.queue(arrival, link.process, message)
+        elif link is None and message.get_type() == "HEARTBEAT" and is_aircraft(message):
+            self._register(i, arrival, message, source)
         else:
-            self._overhear(arrival, message)
+            self._process_foreign(arrival, message)
 
-    def _meet(self, i: int, arrival: float, message: Any, source: Hashable) -> None:
+    def _register(self, i: int, arrival: float, message: Any, source: Hashable) -> None:
         system = message.get_srcSystem()
         uav = system + self.offset
-        holder = self._claims.get(uav)
+        owner = self._id_owners.get(uav)
         if system == 0 or uav < 0:
-            self.refused["id out of range"] += 1
-        elif holder is None and len(self._claims) >= self._most and not self._make_room(arrival):
-            self.refused[f"more than {self._most} aircraft; raise --most-uavs"] += 1
-        elif holder is not None and arrival - holder.heard < LOST_S:
-            self._rivals.add(system)
-            self._alarm(holder, arrival, source)
+            self.rejected["id out of range"] += 1
+        elif owner is None and len(self._id_owners) >= self._max_uavs and not self._evict_oldest(arrival):
+            self.rejected[f"more than {self._max_uavs} aircraft; raise --most-uavs"] += 1
+        elif owner is not None and arrival - owner.last_arrival < LINK_LOST_S:
+            self._conflicting_systems.add(system)
+            self._report_conflict(owner, arrival, source)
         else:
-            self._rivals.discard(system)
-            craft = self._take_in(uav, system, message.get_srcComponent(), source)
-            self.crafts[system] = self._claims[uav] = craft
-            self._met[system] = self.flock.counts.state[craft.number, HEARD] = arrival
-            self._speakers[(system << 8) + craft.component] = craft.number
-            self._born[system] = i
-            craft.meet(message)
+            self._conflicting_systems.discard(system)
+            link = self._create_aircraft(uav, system, message.get_srcComponent(), source)
+            self.aircraft[system] = self._id_owners[uav] = link
+            self._registered_t[system] = self.arrays.counts.state[link.number, LAST_ARRIVAL] = arrival
+            self._number_by_address[(system << 8) + link.component] = link.number
+            self._first_heartbeat[system] = i
+            link.update_identity(message)
             for early_arrival, early in self._pop_early(system):
-                if early.get_srcComponent() == craft.component:
-                    craft.queue(early_arrival, craft.hear, early)
-            craft.queue(arrival, craft.hear, message)
+                if early.get_srcComponent() == link.component:
+                    link.queue(early_arrival, link.process, early)
+            link.queue(arrival, link.process, message)
 
-    def _take_in(self, uav: int, system: int, component: int, source: Hashable) -> Craft:
+    def _create_aircraft(self, uav: int, system: int, component: int, source: Hashable) -> AircraftLink:
         """Create an aircraft; reuse the previous number of its system id, if any."""
-        number = next((one.number for one in self._numbered if one.system == system), None)
-        craft = Craft(self.flock, uav, system, component, source, number=number)
+        number = next((link.number for link in self._aircraft_by_number if link.system == system), None)
+        created = AircraftLink(self.arrays, uav, system, component, source, number=number)
         if number is None:
-            self._numbered.append(craft)
+            self._aircraft_by_number.append(created)
         else:
-            self._numbered[number] = craft
-            self.flock.look[number] = -np.inf
-        return craft
+            self._aircraft_by_number[number] = created
+            self.arrays.next_due_t[number] = -np.inf
+        return created
 
-    def _make_room(self, arrival: float) -> bool:
+    def _evict_oldest(self, arrival: float) -> bool:
         """Evict the aircraft silent for longest on any link, if silent for more than `SILENCE_LIMIT_S`."""
-        longest = min(self._claims.values(), key=lambda craft: craft.heard)
-        if arrival - longest.heard <= FORGET_S:
+        oldest = min(self._id_owners.values(), key=lambda link: link.last_arrival)
+        if arrival - oldest.last_arrival <= SILENCE_LIMIT_S:
             return False
-        del self._claims[longest.uav]  # the receiver of its link removes it
+        del self._id_owners[oldest.uav]  # the receiver of its link removes it
         return True
 
-    def _may_speak(self, craft: Craft, source: Hashable, arrival: float, count: int = 1) -> bool:
+    def _accept_sender(self, link: AircraftLink, source: Hashable, arrival: float, count: int = 1) -> bool:
         """Return whether this sender owns its id; a second sender takes over when the first is silent."""
-        holder = self._claims.get(craft.uav, craft)
-        if holder is craft and craft.source == source:
+        owner = self._id_owners.get(link.uav, link)
+        if owner is link and link.source == source:
             return True
-        freed = holder is craft and craft.source is None  # its sender disconnected
-        if arrival - holder.heard < LOST_S and not freed:
-            self._alarm(holder, arrival, source, count)
+        is_released = owner is link and link.source is None  # its sender disconnected
+        if arrival - owner.last_arrival < LINK_LOST_S and not is_released:
+            self._report_conflict(owner, arrival, source, count)
             return False
-        self._claims[craft.uav], craft.source = craft, source
+        self._id_owners[link.uav], link.source = link, source
         return True
 
-    def _alarm(self, craft: Craft, arrival: float, source: Hashable, count: int = 1) -> None:
-        self.refused[SECOND] += count
-        self._collisions.setdefault(craft.uav, Collision(craft.uav)).note(arrival, craft.source, source)
-        words = "a second sender uses this id and is rejected; give every aircraft its own MAVLink system id"
-        craft.queue(arrival, partial(craft.say, words))
+    def _report_conflict(self, link: AircraftLink, arrival: float, source: Hashable, count: int = 1) -> None:
+        self.rejected[SECOND_SENDER] += count
+        self._conflicts.setdefault(link.uav, SenderConflict(link.uav)).record_conflict(arrival, link.source, source)
+        text = "a second sender uses this id and is rejected; give every aircraft its own MAVLink system id"
+        link.queue(arrival, partial(link.set_operator_text, text))
 
-    def _overhear(self, arrival: float, message: Any) -> None:
+    def _process_foreign(self, arrival: float, message: Any) -> None:
         name = message.get_type()
-        target = self.crafts.get(getattr(message, "target_system", 0))
-        if name in MESSAGES and target is not None:
-            target.queue(arrival, target.overhear, message)
+        target = self.aircraft.get(getattr(message, "target_system", 0))
+        if name in MISSION_MESSAGES and target is not None:
+            target.queue(arrival, target.process_uplink, message)
         elif name == "HEARTBEAT":
             reason = "a second autopilot on one system id" if is_aircraft(message) else "not an aircraft"
-            self.refused[reason] += 1
-        elif message.get_srcSystem() in self._rivals:
-            self.refused[SECOND] += 1
-        elif message.get_srcSystem() in self.crafts:
-            self.refused["not an autopilot"] += 1
+            self.rejected[reason] += 1
+        elif message.get_srcSystem() in self._conflicting_systems:
+            self.rejected[SECOND_SENDER] += 1
+        elif message.get_srcSystem() in self.aircraft:
+            self.rejected["not an autopilot"] += 1
         else:
-            self._keep_early(arrival, message)
+            self._buffer_early(arrival, message)
 
-    def _keep_early(self, arrival: float, message: Any) -> None:
+    def _buffer_early(self, arrival: float, message: Any) -> None:
         """Buffer messages of a system until its heartbeat identifies it."""
         system = message.get_srcSystem()
-        room = len(self._early.get(system, ())) < MOST_EARLY and self._early_n < MOST_EARLY_ALL
-        if room and message.get_type() in EARLY:
+        has_room = len(self._early.get(system, ())) < MAX_EARLY and self._early_count < MAX_EARLY_TOTAL
+        if has_room and message.get_type() in EARLY_MESSAGES:
             self._early.setdefault(system, []).append((arrival, message))
-            self._early_n += 1
+            self._early_count += 1
         else:
-            self.refused[NOT_YET] += 1
+            self.rejected[NO_HEARTBEAT] += 1
 
     def _pop_early(self, system: int) -> list[tuple[float, Any]]:
-        kept = self._early.pop(system, [])
-        self._early_n -= len(kept)
-        return kept
+        buffered = self._early.pop(system, [])
+        self._early_count -= len(buffered)
+        return buffered
 
 
-def unpacked(news: list[News | Wire]) -> list[News]:
+def unpacked(messages: list[TelemetryMessage | EncodedMessage]) -> list[TelemetryMessage]:
     """Decode the encoded messages."""
-    return [one.message() if isinstance(one, Wire) else one for one in news]
+    return [message.message() if isinstance(message, EncodedMessage) else message for message in messages]
 
 
-def _by_speaker(frames: Frames, which: np.ndarray) -> list[np.ndarray]:
+def _group_by_sender(frames: Frames, frame_numbers: np.ndarray) -> list[np.ndarray]:
     """Group frame numbers by sender, system and component, in order."""
-    if not len(which):
+    if not len(frame_numbers):
         return []
-    at = frames.at[which]
-    key = (frames.sender[which] << 16) + (at[:, SYSTEM] << 8) + at[:, COMPONENT]
+    headers = frames.headers[frame_numbers]
+    key = (frames.sender[frame_numbers] << 16) + (headers[:, SYSTEM] << 8) + headers[:, COMPONENT]
     order = np.argsort(key, kind="stable")
-    return np.split(which[order], np.flatnonzero(np.diff(key[order])) + 1)
+    return np.split(frame_numbers[order], np.flatnonzero(np.diff(key[order])) + 1)

@@ -5,23 +5,23 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-Table = dict[str, tuple[np.ndarray, np.ndarray]]
+FieldRows = dict[str, tuple[np.ndarray, np.ndarray]]
 """`Sample` field -> (times (n,) [s], rising; values (n, k) in the units of `contract.COLUMNS`)."""
 
 
-class Said(NamedTuple):
+class OnboardEvent(NamedTuple):
     """Log entry that is not a telemetry row."""
 
     t: float  # log time [s]
-    what: str  # mode: name · armed: bool · param: (name, value) · mission: tuple[Item, ...] · text: (severity, text)
+    kind: str  # mode: name · armed: bool · param: (name, value) · mission: tuple[Item, ...] · text: (severity, text)
     value: Any
 
 
 class Chunk(NamedTuple):
     """A time range of a log; consecutive chunks may overlap by about 1 s."""
 
-    rows: Table
-    said: list[Said]  # in time order
+    rows: FieldRows
+    events: list[OnboardEvent]  # in time order
     counts: dict[str, int]  # messages of each name
 
 

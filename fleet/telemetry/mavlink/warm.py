@@ -2,14 +2,16 @@
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from fleet.telemetry.mavlink.intake import Intake
+from fleet.telemetry.mavlink.intake import MavlinkReceiver
 
 
 def warm_up() -> None:
     """Receive whole and split messages, so that all decoder paths are compiled."""
-    voice, intake = dialect.MAVLink(None, srcSystem=1, srcComponent=1), Intake()
-    beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_GENERIC, 0, 0, 0, 3)
-    told = bytes(beat.pack(voice)) + bytes(dialect.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0).pack(voice))
-    for t, data in ((0.0, told), (1.0, told[:20]), (2.0, told[20:])):
-        intake.hear(t, data)
-        intake.pack(t)
+    encoder, receiver = dialect.MAVLink(None, srcSystem=1, srcComponent=1), MavlinkReceiver()
+    heartbeat = dialect.MAVLink_heartbeat_message(
+        dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_GENERIC, 0, 0, 0, 3
+    )
+    packet = bytes(heartbeat.pack(encoder)) + bytes(dialect.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0).pack(encoder))
+    for t, data in ((0.0, packet), (1.0, packet[:20]), (2.0, packet[20:])):
+        receiver.receive(t, data)
+        receiver.flush_packed(t)

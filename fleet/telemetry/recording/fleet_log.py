@@ -16,31 +16,31 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from fleet.bus.codec import Stamp
-from fleet.telemetry.recording.opening import Source
+from fleet.telemetry.recording.opening import RecordingFile
 
 MAGIC = b"\xc1UV1"  # msgpack never uses the byte C1
-MOST = 1 << 22  # maximum body size [bytes]; the longest message, a mission of 1,000 items, has 200 kB
+MAX_BODY = 1 << 22  # maximum body size [bytes]; the longest message, a mission of 1,000 items, has 200 kB
 CHUNK = 1 << 20
-HOPELESS = 1 << 26  # bytes without a record after which reading ends
-SEARCHED = 8  # search budget [bytes summed]: this times the bytes read, plus `MAX_UNRECOGNISED`
+MAX_UNRECOGNISED = 1 << 26  # bytes without a record after which reading ends
+SEARCH_FACTOR = 8  # search budget [bytes summed]: this times the bytes read, plus `MAX_UNRECOGNISED`
 _PREFIX = "application/msgpack;"
 _HEAD = struct.Struct("<4sII")
 _BODY = struct.Struct("<dQQB")
 
 
-class Record(NamedTuple):
+class BusRecord(NamedTuple):
     """One recorded message."""
 
-    heard: float  # reception by the recorder [s since 1970]
+    received_t: float  # reception by the recorder [s since 1970]
     encoding: str  # as on the bus
     payload: bytes
     stamp: Stamp | None = None
 
     def pack(self) -> bytes:
         """Encode the record for the file."""
-        named = self.encoding.removeprefix(_PREFIX).encode("ascii", "replace")[:255]
+        encoding_name = self.encoding.removeprefix(_PREFIX).encode("ascii", "replace")[:255]
         epoch, writer = self.stamp or (0, 0)
-        body = _BODY.pack(self.heard, epoch, writer, len(named)) + named + self.payload
+        body = _BODY.pack(self.received_t, epoch, writer, len(encoding_name)) + encoding_name + self.payload
         return _HEAD.pack(MAGIC, len(body), zlib.crc32(body)) + body
 
 
@@ -51,46 +51,46 @@ class FleetLog:
         source: the file
     """
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: RecordingFile) -> None:
         self._source = source
-        self.read = 0  # number of records read
-        self.bad = 0  # bytes outside valid records
-        self.first_bad: int | None = None  # position of the first of them
-        self.tangled = False  # reading ended: too many invalid record headers
+        self.record_count = 0  # number of records read
+        self.damaged_bytes = 0  # bytes outside valid records
+        self.first_damage: int | None = None  # position of the first of them
+        self.search_aborted = False  # reading ended: too many invalid record headers
 
-    def records(self) -> Iterator[tuple[int, Record]]:
+    def records(self) -> Iterator[tuple[int, BusRecord]]:
         """Return the valid records: (file offset [bytes], record)."""
-        rest, place, vain = b"", 0, Vain(HOPELESS)
+        rest, place, budget = b"", 0, SearchBudget(MAX_UNRECOGNISED)
         with self._source.open() as stream:
             while True:
                 chunk = stream.read(CHUNK) or b""
-                told, at = rest + chunk, 0
-                vain.left += SEARCHED * len(chunk)
-                for start, stop in sound(told, not chunk, vain):
-                    self._skip(place + at, start - at)
-                    at = stop
+                data, position = rest + chunk, 0
+                budget.remaining += SEARCH_FACTOR * len(chunk)
+                for start, stop in find_records(data, not chunk, budget):
+                    self._skip(place + position, start - position)
+                    position = stop
                     if start < stop:
-                        self.read += 1
-                        yield place + start, _unpack(told[start:stop])
-                rest, place = told[at:], place + at
-                self.tangled = vain.left < 0
-                if not chunk or self.tangled or (not self.read and place > HOPELESS):
+                        self.record_count += 1
+                        yield place + start, _unpack(data[start:stop])
+                rest, place = data[position:], place + position
+                self.search_aborted = budget.remaining < 0
+                if not chunk or self.search_aborted or (not self.record_count and place > MAX_UNRECOGNISED):
                     return
 
     def _skip(self, place: int, count: int) -> None:
-        if count and self.first_bad is None:
-            self.first_bad = place
-        self.bad += count
+        if count and self.first_damage is None:
+            self.first_damage = place
+        self.damaged_bytes += count
 
 
-class Vain:
+class SearchBudget:
     """Number of bytes that may still be summed for invalid records."""
 
-    def __init__(self, left: int) -> None:
-        self.left = left
+    def __init__(self, remaining: int) -> None:
+        self.remaining = remaining
 
 
-def sound(told: bytes, last: bool = True, vain: Vain | None = None) -> Iterator[tuple[int, int]]:
+def find_records(data: bytes, last: bool = True, budget: SearchBudget | None = None) -> Iterator[tuple[int, int]]:
     """Find the valid records in bytes; the last pair is empty and marks where to continue.
 
     Args:
@@ -98,42 +98,44 @@ def sound(told: bytes, last: bool = True, vain: Vain | None = None) -> Iterator[
         last: whether no bytes follow, so that incomplete records are invalid
         budget: reduced by the bytes summed for invalid records; below 0 the search ends
     """
-    at, vain = 0, Vain(HOPELESS) if vain is None else vain
-    while vain.left >= 0 and (start := told.find(MAGIC, at)) >= 0:
-        stop = _stop(told, start)
-        if stop > len(told) and not last:
+    position, budget = 0, SearchBudget(MAX_UNRECOGNISED) if budget is None else budget
+    while budget.remaining >= 0 and (start := data.find(MAGIC, position)) >= 0:
+        stop = _record_end(data, start)
+        if stop > len(data) and not last:
             yield start, start
             return
-        if start < stop <= len(told):
+        if start < stop <= len(data):
             yield start, stop
-            at = stop
+            position = stop
         else:
-            at = start + 1
-            vain.left -= max(-stop, 0)
-    kept = len(told) if last else max(at, len(told) - len(MAGIC) + 1)  # may contain the start of a magic
-    yield kept, kept
+            position = start + 1
+            budget.remaining -= max(-stop, 0)
+    resume = len(data) if last else max(position, len(data) - len(MAGIC) + 1)  # may contain the start of a magic
+    yield resume, resume
 
 
-def _stop(told: bytes, start: int) -> int:
+def _record_end(data: bytes, start: int) -> int:
     """Return the end of the record at `start`; beyond the bytes if incomplete.
 
     0: invalid; negative: invalid, after a checksum over this number of bytes.
     """
     after = start + _HEAD.size
-    if after > len(told):
+    if after > len(data):
         return after
-    _, size, crc = _HEAD.unpack_from(told, start)
-    if not _BODY.size <= size <= MOST:
+    _, size, crc = _HEAD.unpack_from(data, start)
+    if not _BODY.size <= size <= MAX_BODY:
         return 0
     stop = after + int(size)
-    if stop <= len(told) and zlib.crc32(memoryview(told)[after:stop]) != crc:
+    if stop <= len(data) and zlib.crc32(memoryview(data)[after:stop]) != crc:
         return after - stop
     return stop
 
 
-def _unpack(told: bytes) -> Record:
-    heard, epoch, writer, n = _BODY.unpack_from(told, _HEAD.size)
+def _unpack(data: bytes) -> BusRecord:
+    received_t, epoch, writer, name_size = _BODY.unpack_from(data, _HEAD.size)
     begin = _HEAD.size + _BODY.size
-    named = told[begin : begin + n].decode("ascii", "replace")
+    encoding_name = data[begin : begin + name_size].decode("ascii", "replace")
     stamp = Stamp(epoch, writer) if epoch or writer else None
-    return Record(heard if math.isfinite(heard) else 0.0, _PREFIX + named, told[begin + n :], stamp)
+    return BusRecord(
+        received_t if math.isfinite(received_t) else 0.0, _PREFIX + encoding_name, data[begin + name_size :], stamp
+    )

@@ -3,33 +3,33 @@
 from collections.abc import Hashable
 
 
-class Ids:
+class IdAllocator:
     """Allocator of ids.
 
     Args:
         min_id, max_id: range of ids
     """
 
-    def __init__(self, least: int = 0, most: int = 999_999) -> None:
-        self._least, self._most = least, most
-        self._of: dict[Hashable, int] = {}
-        self._held: set[int] = set()
+    def __init__(self, min_id: int = 0, max_id: int = 999_999) -> None:
+        self._min, self._max = min_id, max_id
+        self._by_key: dict[Hashable, int] = {}
+        self._allocated: set[int] = set()
 
-    def give(self, who: Hashable, wanted: int) -> int:
+    def allocate(self, key: Hashable, preferred: int) -> int:
         """Return the id of `key`: the allocated one, else `preferred`, else the next free one above, else any free one.
 
         Raises:
             ValueError: if no id is free; replay fewer aircraft or copies.
         """
-        if who in self._of:
-            return self._of[who]
-        after = max(wanted, self._least)
-        free = next((i for i in range(after, self._most + 1) if i not in self._held), None)
+        if key in self._by_key:
+            return self._by_key[key]
+        after = max(preferred, self._min)
+        free = next((candidate for candidate in range(after, self._max + 1) if candidate not in self._allocated), None)
         if free is None:
-            free = next((i for i in range(self._least, after) if i not in self._held), None)
+            free = next((i for i in range(self._min, after) if i not in self._allocated), None)
         if free is None:
-            count = self._most - self._least + 1
+            count = self._max - self._min + 1
             raise ValueError(f"ids: found all {count} taken, expected a free one; replay fewer aircraft or copies")
-        self._of[who] = free
-        self._held.add(free)
+        self._by_key[key] = free
+        self._allocated.add(free)
         return free

@@ -5,7 +5,7 @@ import threading
 import time
 
 
-class Pace:
+class ReplayPace:
     """Replay at a multiple of real time.
 
     Args:
@@ -15,34 +15,34 @@ class Pace:
     def __init__(self, speed: float) -> None:
         self.speed = speed
         self.passed_s = 0.0  # recorded time replayed [s]
-        self._first: float | None = None
-        self._begun = self._newest = 0.0
+        self._first_t: float | None = None
+        self._started = self._newest = 0.0
 
     def wait(self, now: float, stop: threading.Event) -> bool:
         """Wait until recorded time `now` [s since 1970] is due; return True if stopped meanwhile."""
-        if self._first is None:
-            self._first, self._begun = now, time.monotonic()
-        due = self._begun + (now - self._first) / self.speed - time.monotonic()
+        if self._first_t is None:
+            self._first_t, self._started = now, time.monotonic()
+        due = self._started + (now - self._first_t) / self.speed - time.monotonic()
         stopped = stop.wait(due) if due > 0 else stop.is_set()
-        self.passed_s, self._newest = now - self._first, time.monotonic()
+        self.passed_s, self._newest = now - self._first_t, time.monotonic()
         return stopped
 
     @property
-    def took_s(self) -> float:
+    def elapsed_s(self) -> float:
         """Return the elapsed wall time [s]."""
-        return self._newest - self._begun
+        return self._newest - self._started
 
     @property
-    def reached(self) -> float:
+    def speed_reached(self) -> float:
         """Return the mean replay speed, recorded seconds per second; nan before the start."""
-        return self.passed_s / self.took_s if self.took_s > 0 else math.nan
+        return self.passed_s / self.elapsed_s if self.elapsed_s > 0 else math.nan
 
-    def words(self) -> str:
+    def progress_text(self) -> str:
         """Return progress and speed as text."""
         minutes, seconds = divmod(int(self.passed_s), 60)
         hours, minutes = divmod(minutes, 60)
-        fast = "" if math.isnan(self.reached) else f", {self.reached:.1f} times real time"
-        return (f"{hours}:" if hours else "") + f"{minutes:02}:{seconds:02} recorded{fast}"
+        speed_text = "" if math.isnan(self.speed_reached) else f", {self.speed_reached:.1f} times real time"
+        return (f"{hours}:" if hours else "") + f"{minutes:02}:{seconds:02} recorded{speed_text}"
 
 
 def read_speed(text: str) -> float:

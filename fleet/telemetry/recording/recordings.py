@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from fleet.telemetry.mavlink.aircraft_link import Craft
-from fleet.telemetry.mavlink.intake import Intake, News
+from fleet.telemetry.mavlink.aircraft_link import AircraftLink
+from fleet.telemetry.mavlink.intake import MavlinkReceiver, TelemetryMessage
 from fleet.telemetry.mavlink.onboard_log import OnboardLog
-from fleet.telemetry.mavlink.parsing.decode import frames_of
-from fleet.telemetry.mavlink.parsing.scan import COUNTS, STAMP, START, STOP
-from fleet.telemetry.mavlink.steps import MOST_GAPS, SILENT_STEPS, STEP_S, Steps
+from fleet.telemetry.mavlink.parsing.decode import find_frames
+from fleet.telemetry.mavlink.parsing.scan import COUNTER_COUNT, STAMP_SIZE, START, STOP
+from fleet.telemetry.mavlink.steps import MAX_GAPS, SILENT_STEPS, STEP_S, ReplaySteps
 from fleet.telemetry.onboard_logs.dataflash.reader import DataflashLog
-from fleet.telemetry.onboard_logs.onboard_news import UNDATED_S, craft_of, log_steps
+from fleet.telemetry.onboard_logs.onboard_news import DEFAULT_EPOCH_S, aircraft_of, log_steps
 from fleet.telemetry.onboard_logs.ulog.reader import UlogLog
-from fleet.telemetry.recording.fleet_log import MAGIC, sound
-from fleet.telemetry.recording.fleet_news import FleetNews
-from fleet.telemetry.recording.opening import COMPRESSED, Source
+from fleet.telemetry.recording.fleet_log import MAGIC, find_records
+from fleet.telemetry.recording.fleet_news import BusMessageReader
+from fleet.telemetry.recording.opening import COMPRESSED, RecordingFile
 from fleet.telemetry.recording.tlog import Tlog
 
 KINDS = {
@@ -28,10 +28,10 @@ KINDS = {
     ".ulg": "ULog",
     ".parauav": "fleet recording",
 }
-_HEAD = 1 << 16  # bytes examined to detect the kind
-_MOST_AT_ONCE = 500_000  # maximum frames at one recorded time
+_HEAD_BYTES = 1 << 16  # bytes examined to detect the kind
+_MAX_AT_ONCE = 500_000  # maximum frames at one recorded time
 
-_log = logging.getLogger("parauav.recordings")
+_logger = logging.getLogger("parauav.recordings")
 
 
 class Recording:
@@ -46,12 +46,12 @@ class Recording:
     """
 
     def __init__(self, path: Path | str, offset: int = 0) -> None:
-        self.source = Source(path)
+        self.source = RecordingFile(path)
         self.name, self.offset = self.source.name, offset
-        self._told: list[str] = []
-        self.suffix = self._recognise()
-        self.crafts: dict[int, Craft] = {}  # by UAV id, filled while reading
-        self._opened: OnboardLog | Tlog | FleetNews | None = None
+        self._notes: list[str] = []
+        self.suffix = self._detect_suffix()
+        self.aircraft: dict[int, AircraftLink] = {}  # by UAV id, filled while reading
+        self._reader: OnboardLog | Tlog | BusMessageReader | None = None
 
     @property
     def kind(self) -> str:
@@ -61,17 +61,17 @@ class Recording:
     @property
     def share(self) -> float:
         """Return the read progress, 0..1."""
-        return self._opened.share if isinstance(self._opened, Tlog) else self.source.share
+        return self._reader.share if isinstance(self._reader, Tlog) else self.source.share
 
-    def words(self) -> str:
+    def progress_text(self) -> str:
         """Return the current activity."""
         return "reading"
 
     @property
     def skipped(self) -> list[str]:
         """Return messages on skipped parts and assumptions; complete after reading to the end."""
-        found = [*self._told, *(self._opened.skipped if self._opened else ()), self.source.trouble]
-        return [f"{self.name}: {sentence.removeprefix(f'{self.name}: ')}" for sentence in found if sentence]
+        problems = [*self._notes, *(self._reader.skipped if self._reader else ()), self.source.problem]
+        return [f"{self.name}: {sentence.removeprefix(f'{self.name}: ')}" for sentence in problems if sentence]
 
     def steps(self, results: bool = False) -> Iterator[tuple[float, list[Any]]]:
         """Return the recording in steps of 0.1 s: (end of the step [s since 1970], messages).
@@ -83,8 +83,8 @@ class Recording:
         """
         steps: Iterator[tuple[float, list[Any]]]
         if self.suffix == ".parauav":
-            self._opened = FleetNews(self.source, self.offset)
-            steps = self._opened.steps(results)
+            self._reader = BusMessageReader(self.source, self.offset)
+            steps = self._reader.steps(results)
         else:
             steps = self._mavlink() if self.suffix == ".tlog" else self._onboard()
         count = 0
@@ -92,84 +92,84 @@ class Recording:
             count += len(news)
             yield now, news
         if not count:
-            said = "; ".join(self.skipped) or f"{self.name}: found no aircraft in it"
-            raise ValueError(f"{said}; expected the {self.kind} of a flight; check the file")
+            problems = "; ".join(self.skipped) or f"{self.name}: found no aircraft in it"
+            raise ValueError(f"{problems}; expected the {self.kind} of a flight; check the file")
 
-    def _mavlink(self) -> Iterator[tuple[float, list[News]]]:
-        self._opened = tlog = Tlog(self.source)
-        intake = Intake(self.offset)
-        steps = Steps(intake.take)
-        waiting = left_out = 0  # frames at the current time, and frames beyond the limit
+    def _mavlink(self) -> Iterator[tuple[float, list[TelemetryMessage]]]:
+        self._reader = tlog = Tlog(self.source)
+        receiver = MavlinkReceiver(self.offset)
+        steps = ReplaySteps(receiver.collect)
+        frames_at_once = left_out = 0  # frames at the current time, and frames beyond the limit
         for frames in tlog.batches():
-            waiting += len(frames.at)
-            if waiting > _MOST_AT_ONCE:
-                left_out += len(frames.at)
+            frames_at_once += len(frames.headers)
+            if frames_at_once > _MAX_AT_ONCE:
+                left_out += len(frames.headers)
             else:
-                intake.digest(frames)
-            self.crafts.update((craft.uav, craft) for craft in intake.crafts.values())
-            for step in steps.upto(frames.arrival):
-                waiting = 0
+                receiver.process(frames)
+            self.aircraft.update((link.uav, link) for link in receiver.aircraft.values())
+            for step in steps.until(frames.arrival):
+                frames_at_once = 0
                 yield step
-        if steps.gaps > MOST_GAPS:
-            self._told.append(
-                f"{steps.gaps} silences of over {SILENT_STEPS * STEP_S:.0f} s, more than {MOST_GAPS}: "
+        if steps.gaps > MAX_GAPS:
+            self._notes.append(
+                f"{steps.gaps} silences of over {SILENT_STEPS * STEP_S:.0f} s, more than {MAX_GAPS}: "
                 "the later ones are skipped"
             )
         if left_out:
-            self._told.append(
-                f"{left_out} frames skipped: over {_MOST_AT_ONCE:,} in {STEP_S} s, more than any radio carries"
+            self._notes.append(
+                f"{left_out} frames skipped: over {_MAX_AT_ONCE:,} in {STEP_S} s, more than any radio carries"
             )
-        yield from steps.last()
+        yield from steps.remaining()
 
-    def _onboard(self) -> Iterator[tuple[float, list[News]]]:
-        self._opened = log = _READERS[self.suffix](self.source.open, self.name)
-        craft = craft_of(log, self.offset)
-        self.crafts[craft.uav] = craft
+    def _onboard(self) -> Iterator[tuple[float, list[TelemetryMessage]]]:
+        self._reader = log = _READERS[self.suffix](self.source.open, self.name)
+        link = aircraft_of(log, self.offset)
+        self.aircraft[link.uav] = link
         if log.epoch_s is None:
-            self._told.append(f"no date in it: times count from {UNDATED_S:.0f} s since 1970, the year 2000")
-        yield from log_steps(log, craft)
+            self._notes.append(f"no date in it: times count from {DEFAULT_EPOCH_S:.0f} s since 1970, the year 2000")
+        yield from log_steps(log, link)
 
-    def _recognise(self) -> str:
+    def _detect_suffix(self) -> str:
         """Detect the kind by the content, else by the file name."""
         with self.source.open() as stream:
-            head = stream.read(_HEAD) or b""
+            head = stream.read(_HEAD_BYTES) or b""
         path = self.source.path
-        named = (path.with_suffix("") if path.suffix in COMPRESSED else path).suffix.lower()
+        by_name = (path.with_suffix("") if path.suffix in COMPRESSED else path).suffix.lower()
         if not head:
-            raise ValueError(f"{self.name}: {self.source.trouble or 'is empty'}; expected a recording; check the file")
-        found = _by_content(head)
-        if found and named in KINDS and found != named:
-            self._told.append(f"is a {KINDS[found]} by its content, in spite of its name; read as such")
-        if not found and named not in KINDS:
+            raise ValueError(f"{self.name}: {self.source.problem or 'is empty'}; expected a recording; check the file")
+        by_content = _suffix_by_content(head)
+        if by_content and by_name in KINDS and by_content != by_name:
+            self._notes.append(f"is a {KINDS[by_content]} by its content, in spite of its name; read as such")
+        if not by_content and by_name not in KINDS:
             kinds = ", ".join(f"{KINDS[suffix]} ({suffix})" for suffix in KINDS)
             raise ValueError(f"{self.name}: found no recording in it, expected one of {kinds}; convert it")
-        return found or named
+        return by_content or by_name
 
 
-def _by_content(head: bytes) -> str:
+def _suffix_by_content(head: bytes) -> str:
     """Return the suffix that matches the content, or an empty string."""
     if head.startswith(b"ULog\x01\x12"):
         return ".ulg"
     if head.startswith(MAGIC):
         return ".parauav"
     buf = np.frombuffer(head, np.uint8)
-    at, _, _ = frames_of(buf, np.array([[0, len(head), 0]]), np.zeros(COUNTS, np.int64), STAMP)
-    found = {
-        ".tlog": int((at[:, STOP] - at[:, START]).sum()) + STAMP * len(at),
+    headers, _, _ = find_frames(buf, np.array([[0, len(head), 0]]), np.zeros(COUNTER_COUNT, np.int64), STAMP_SIZE)
+    matched_bytes = {
+        ".tlog": int((headers[:, STOP] - headers[:, START]).sum()) + STAMP_SIZE * len(headers),
         ".bin": 89 * head.count(b"\xa3\x95\x80"),
-        ".parauav": sum(stop - start for start, stop in sound(head)),
+        ".parauav": sum(stop - start for start, stop in find_records(head)),
         ".log": sum(map(len, [line for line in head.split(b"\n") if line.startswith((b"FMT,", b"PARM,"))])),
     }
-    best = max(found, key=lambda suffix: found[suffix])
-    return best if found[best] else ""
+    best = max(matched_bytes, key=lambda suffix: matched_bytes[suffix])
+    return best if matched_bytes[best] else ""
 
 
 _READERS: dict[str, Callable[..., OnboardLog]] = {".bin": DataflashLog, ".log": DataflashLog, ".ulg": UlogLog}
 
 
 def replay_messages(
-    path: Path | str, offset: int = 0, crafts: dict[int, Craft] | None = None, skipped: list[str] | None = None
-) -> Iterator[News]:
+    path: Path | str, offset: int = 0, aircraft: dict[int, AircraftLink] | None = None, skipped: list[str] | None = None
+) -> Iterator[TelemetryMessage]:
     """Read a recording as the gateway would receive it, in time order; fleet time is recorded time.
 
     Args:
@@ -182,11 +182,11 @@ def replay_messages(
         OSError: if it cannot be opened; check the path.
     """
     recording = Recording(path, offset)
-    if crafts is not None:
-        recording.crafts = crafts
-    for _, news in recording.steps():
-        yield from news
+    if aircraft is not None:
+        recording.aircraft = aircraft
+    for _, messages in recording.steps():
+        yield from messages
     for sentence in recording.skipped:
-        _log.warning(sentence)
+        _logger.warning(sentence)
     if skipped is not None:
         skipped += recording.skipped

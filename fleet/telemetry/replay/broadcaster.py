@@ -13,28 +13,28 @@ from fleet.frames import Origin
 from fleet.telemetry.mavlink.heartbeat import is_aircraft
 from fleet.telemetry.mavlink.parsing.decode import IDS, Frames
 from fleet.telemetry.mavlink.parsing.scan import ID, SYSTEM
-from fleet.telemetry.recording.ids import Ids
-from fleet.telemetry.recording.opening import Source
-from fleet.telemetry.recording.pace import Pace
+from fleet.telemetry.recording.ids import IdAllocator
+from fleet.telemetry.recording.opening import RecordingFile
+from fleet.telemetry.recording.pace import ReplayPace
 from fleet.telemetry.recording.recordings import Recording
 from fleet.telemetry.recording.tlog import Tlog
-from fleet.telemetry.replay.offset import Aside
-from fleet.telemetry.replay.offset_copies import GROUPS
-from fleet.telemetry.replay.rewrite_frames import Cut, cut, recast
-from fleet.telemetry.replay.send_batch import Volley
+from fleet.telemetry.replay.offset import GridOffset
+from fleet.telemetry.replay.offset_copies import GROUP_COUNT
+from fleet.telemetry.replay.rewrite_frames import FrameBlock, extract_frames, rewrite_frames
+from fleet.telemetry.replay.send_batch import DatagramSender
 
-Said = tuple[np.ndarray, Cut]
+SystemFrames = tuple[np.ndarray, FrameBlock]
 """Frames of one aircraft rewritten for each copy, (n, b) uint8, and their positions; each frame is a datagram."""
 STEP_S = 0.05  # recorded time between two batches of datagrams [s]
-MOST_ON_A_LINK = 250  # system ids 1 to 250; higher ones are for ground stations
+MAX_PER_LINK = 250  # system ids 1 to 250; higher ones are for ground stations
 
 
-def shared(copies: int, places: int) -> list[range]:
+def share_out(copies: int, places: int) -> list[range]:
     """Distribute copies over destinations: the copy numbers of each."""
     return [range(place, copies, places) for place in range(places)]
 
 
-def address(text: str) -> tuple[str, int]:
+def loopback_address(text: str) -> tuple[str, int]:
     """Parse HOST:PORT of this machine, with optional prefix `udpout:`.
 
     Raises:
@@ -44,18 +44,18 @@ def address(text: str) -> tuple[str, int]:
     if not host or not port.isdecimal() or not 0 < int(port) < 65_536:
         raise ValueError(f"--to: found {text!r}, expected HOST:PORT such as 127.0.0.1:14550; correct it")
     try:
-        found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_DGRAM)[0][4]
+        host_address = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_DGRAM)[0][4]
     except OSError as error:
         raise ValueError(f"--to: found {host!r}, expected a resolvable host ({error}); use 127.0.0.1") from None
-    if not ipaddress.ip_address(str(found[0]).partition("%")[0]).is_loopback:
+    if not ipaddress.ip_address(str(host_address[0]).partition("%")[0]).is_loopback:
         raise ValueError(
             f"--to: found {text!r} on another machine, expected a loopback address such as 127.0.0.1:{port}; "
             "copies of aircraft must stay on this machine"
         )
-    return str(found[0]), int(port)
+    return str(host_address[0]), int(port)
 
 
-class Airing:
+class Broadcaster:
     """Send one telemetry log.
 
     Args:
@@ -69,100 +69,102 @@ class Airing:
         OSError: if it cannot be read; check path and permissions.
     """
 
-    def __init__(self, path: Path, speed: float, numbers: range, total: int, ids: Ids) -> None:
+    def __init__(self, path: Path, speed: float, numbers: range, total: int, ids: IdAllocator) -> None:
         recording = Recording(path)
         if recording.suffix != ".tlog":
             raise ValueError(f"{path.name}: found a {recording.kind}, expected a telemetry log for --to; omit --to")
         self.name = path.name
-        self.pace = Pace(speed)
+        self.pace = ReplayPace(speed)
         self.sent = 0  # datagrams
-        self.trouble = ""
-        self._source = Source(path)
+        self.problem = ""
+        self._source = RecordingFile(path)
         self._tlog = Tlog(self._source)
         self._numbers, self._total, self._ids = np.array(numbers), total, ids
         self._systems: dict[int, np.ndarray] = {}  # system ids of the copies, by recorded system id, (copies,)
-        self._asides: list[Aside] | None = None
+        self._offsets: list[GridOffset] | None = None
 
     @property
     def share(self) -> float:
         """Return the read progress, 0..1."""
         return self._tlog.share
 
-    def words(self) -> str:
+    def progress_text(self) -> str:
         """Return progress and send rate as text."""
-        aircraft, took = len(self._systems) * len(self._numbers), self.pace.took_s
-        rate = f", {self.sent / took:,.0f} a second" if took > 0 else ""
-        return f"{self.pace.words()}, {aircraft} aircraft, {self.sent:,} datagrams{rate}"
+        aircraft, elapsed = len(self._systems) * len(self._numbers), self.pace.elapsed_s
+        rate = f", {self.sent / elapsed:,.0f} a second" if elapsed > 0 else ""
+        return f"{self.pace.progress_text()}, {aircraft} aircraft, {self.sent:,} datagrams{rate}"
 
-    def send(self, to: tuple[str, int], stop: threading.Event) -> None:
+    def send(self, destination: tuple[str, int], stop: threading.Event) -> None:
         """Send the log until its end or until `stop` is set; errors are stored in `problem`."""
         self._source.stop = stop
-        family = socket.AF_INET6 if ":" in to[0] else socket.AF_INET
+        family = socket.AF_INET6 if ":" in destination[0] else socket.AF_INET
         try:
-            with socket.socket(family, socket.SOCK_DGRAM) as out:
-                out.connect(to)
-                volley = Volley(out)
-                for now, said in self._rounds():
+            with socket.socket(family, socket.SOCK_DGRAM) as connection:
+                connection.connect(destination)
+                sender = DatagramSender(connection)
+                for now, batches in self._rounds():
                     if self.pace.wait(now, stop):
                         return
-                    for told, one in said:
-                        at = np.arange(len(told))[:, None] * told.shape[1] + one.start
-                        length = np.broadcast_to(one.payload - one.start + one.size + 2, at.shape)
-                        self.sent += volley.send(told.ravel(), at.ravel(), length.ravel())
+                    for data, block in batches:
+                        starts = np.arange(len(data))[:, None] * data.shape[1] + block.start
+                        length = np.broadcast_to(block.payload - block.start + block.size + 2, starts.shape)
+                        self.sent += sender.send(data.ravel(), starts.ravel(), length.ravel())
         except (ValueError, OSError) as error:
-            self.trouble = str(error)
-        if not self._systems and not self.trouble and not stop.is_set():
-            self.trouble = f"{self.name}: found no aircraft in it, expected at least one heartbeat; check the file"
+            self.problem = str(error)
+        if not self._systems and not self.problem and not stop.is_set():
+            self.problem = f"{self.name}: found no aircraft in it, expected at least one heartbeat; check the file"
 
-    def _rounds(self) -> Iterator[tuple[float, list[Said]]]:
+    def _rounds(self) -> Iterator[tuple[float, list[SystemFrames]]]:
         """Return the batches: (recorded time [s since 1970], frames to send)."""
-        past: deque[list[Cut]] = deque(maxlen=GROUPS)  # newest first
-        sources: deque[list[int]] = deque(maxlen=GROUPS)
+        past: deque[list[FrameBlock]] = deque(maxlen=GROUP_COUNT)  # newest first
+        sources: deque[list[int]] = deque(maxlen=GROUP_COUNT)
         first, now = np.nan, 0.0
         for frames in self._tlog.batches():
-            self._meet(frames)
+            self._register_systems(frames)
             first = float(frames.arrival[0]) if np.isnan(first) else first
             number = np.floor((frames.arrival - first) / STEP_S)
             for part in np.split(np.arange(len(number)), np.flatnonzero(np.diff(number)) + 1):
                 now = first + float(number[part[0]]) * STEP_S
-                systems = [int(n) for n in np.unique(frames.at[part, SYSTEM]) if int(n) in self._systems]
-                past.appendleft([cut(frames, part[frames.at[part, SYSTEM] == n]) for n in systems])
+                systems = [int(n) for n in np.unique(frames.headers[part, SYSTEM]) if int(n) in self._systems]
+                past.appendleft([extract_frames(frames, part[frames.headers[part, SYSTEM] == n]) for n in systems])
                 sources.appendleft(systems)
-                yield now, list(self._said(past, sources))
-        for lag in range(1, GROUPS):  # delayed copies after the end of the log
+                yield now, list(self._frames_to_send(past, sources))
+        for lag in range(1, GROUP_COUNT):  # delayed copies after the end of the log
             past.appendleft([])
             sources.appendleft([])
-            yield now + lag * STEP_S, list(self._said(past, sources))
+            yield now + lag * STEP_S, list(self._frames_to_send(past, sources))
 
-    def _said(self, past: deque[list[Cut]], sources: deque[list[int]]) -> Iterator[Said]:
+    def _frames_to_send(self, past: deque[list[FrameBlock]], sources: deque[list[int]]) -> Iterator[SystemFrames]:
         """Return the frames of the originals, and delayed frames of the copies."""
         for lag, (cuts, systems) in enumerate(zip(past, sources, strict=True)):
-            for one, system in zip(cuts, systems, strict=True):
-                cast = self._systems[system][lag::GROUPS]
-                if len(cast):
-                    aside = self._asides[lag] if self._asides is not None else None
-                    yield recast(one, cast, aside), one
+            for block, system in zip(cuts, systems, strict=True):
+                copy_systems = self._systems[system][lag::GROUP_COUNT]
+                if len(copy_systems):
+                    offset = self._offsets[lag] if self._offsets is not None else None
+                    yield rewrite_frames(block, copy_systems, offset), block
 
-    def _meet(self, frames: Frames) -> None:
+    def _register_systems(self, frames: Frames) -> None:
         """Register new aircraft, and allocate system ids for them and their copies."""
-        new: set[int] = set()
-        for heartbeat in frames.messages(np.flatnonzero(frames.at[:, ID] == IDS["HEARTBEAT"])):
+        new_systems: set[int] = set()
+        for heartbeat in frames.messages(np.flatnonzero(frames.headers[:, ID] == IDS["HEARTBEAT"])):
             system = heartbeat.get_srcSystem()
             if system not in self._systems and system and is_aircraft(heartbeat):
-                new.add(system)
-        cast = {system: [self._ids.give((self, system, 0), system)] for system in sorted(new)}
+                new_systems.add(system)
+        system_ids = {system: [self._ids.allocate((self, system, 0), system)] for system in sorted(new_systems)}
         for copy in range(1, len(self._numbers)):
-            for system, mine in cast.items():
-                mine.append(self._ids.give((self, system, copy), mine[0]))
-        self._systems.update((system, np.array(mine, np.uint8)) for system, mine in cast.items())
-        if self._asides is None and self._total > 1:
-            self._find_place(frames)
+            for system, copy_ids in system_ids.items():
+                copy_ids.append(self._ids.allocate((self, system, copy), copy_ids[0]))
+        self._systems.update((system, np.array(mine, np.uint8)) for system, mine in system_ids.items())
+        if self._offsets is None and self._total > 1:
+            self._find_origin(frames)
 
-    def _find_place(self, frames: Frames) -> None:
-        which = np.flatnonzero(frames.at[:, ID] == IDS["GLOBAL_POSITION_INT"])
-        fields = frames.fields(which, "GLOBAL_POSITION_INT")
-        known = np.flatnonzero((fields.lat != 0) | (fields.lon != 0)) if len(which) else which
-        if len(known):
-            at = known[0]
-            origin = Origin(int(fields.lat[at]), int(fields.lon[at]), int(fields.alt[at]))
-            self._asides = [Aside(self._numbers[lag::GROUPS], self._total, origin) for lag in range(GROUPS)]
+    def _find_origin(self, frames: Frames) -> None:
+        frame_numbers = np.flatnonzero(frames.headers[:, ID] == IDS["GLOBAL_POSITION_INT"])
+        fields = frames.fields(frame_numbers, "GLOBAL_POSITION_INT")
+        has_position = np.flatnonzero((fields.lat != 0) | (fields.lon != 0)) if len(frame_numbers) else frame_numbers
+        if len(has_position):
+            first = has_position[0]
+            origin = Origin(int(fields.lat[first]), int(fields.lon[first]), int(fields.alt[first]))
+            self._offsets = [
+                GridOffset(self._numbers[lag::GROUP_COUNT], self._total, origin) for lag in range(GROUP_COUNT)
+            ]

@@ -7,10 +7,10 @@ import numpy as np
 from fleet.frames import Origin, to_geodetic
 
 SPACING_M = 500.0  # distance between neighbours [m]
-_TURN = 3_600_000_000  # 360 deg [1e-7 deg]
+_FULL_TURN_E7 = 3_600_000_000  # 360 deg [1e-7 deg]
 
 
-class Aside:
+class GridOffset:
     """Position offset of each copy.
 
     Args:
@@ -23,18 +23,18 @@ class Aside:
         side = ceil(sqrt(total))
         ned = np.zeros((len(numbers), 3))
         ned[:, 0], ned[:, 1] = numbers // side * SPACING_M, numbers % side * SPACING_M
-        there = to_geodetic(origin, ned)
+        places = to_geodetic(origin, ned)
         self._lon0 = origin.lon_e7
-        self._north = (there[:, 0] - origin.lat_e7)[:, None]
-        self._east = (there[:, 1] - origin.lon_e7)[:, None]
-        here, moved = np.cos(np.radians([origin.lat_e7 * 1e-7])), np.cos(np.radians(there[:, 0] * 1e-7))
-        self._wider = (here / np.maximum(moved, 1e-3))[:, None]  # wider at high latitude
+        self._north = (places[:, 0] - origin.lat_e7)[:, None]
+        self._east = (places[:, 1] - origin.lon_e7)[:, None]
+        origin_cos, place_cos = np.cos(np.radians([origin.lat_e7 * 1e-7])), np.cos(np.radians(places[:, 0] * 1e-7))
+        self._east_scale = (origin_cos / np.maximum(place_cos, 1e-3))[:, None]  # wider at high latitude
 
     def move(self, lat: np.ndarray, lon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Offset positions, (m,) [1e-7 deg], to (n, m), one row per copy; unset positions 0, 0 are unchanged."""
-        nowhere = (lat == 0) & (lon == 0)
-        off = (np.asarray(lon, np.int64) - self._lon0 + _TURN // 2) % _TURN - _TURN // 2
-        east = self._lon0 + self._east + off * self._wider
+        is_unset = (lat == 0) & (lon == 0)
+        from_origin = (np.asarray(lon, np.int64) - self._lon0 + _FULL_TURN_E7 // 2) % _FULL_TURN_E7 - _FULL_TURN_E7 // 2
+        east = self._lon0 + self._east + from_origin * self._east_scale
         north = np.clip(lat + self._north, -900_000_000, 900_000_000)
-        around = (np.rint(east).astype(np.int64) + _TURN // 2) % _TURN - _TURN // 2
-        return np.where(nowhere, 0, north), np.where(nowhere, 0, around)
+        wrapped_east = (np.rint(east).astype(np.int64) + _FULL_TURN_E7 // 2) % _FULL_TURN_E7 - _FULL_TURN_E7 // 2
+        return np.where(is_unset, 0, north), np.where(is_unset, 0, wrapped_east)

@@ -8,9 +8,9 @@ import numpy as np
 from fleet.mission import GLOBAL_FRAMES
 from fleet.telemetry.mavlink.parsing import scan as s
 from fleet.telemetry.mavlink.parsing.decode import IDS, Frames, layout
-from fleet.telemetry.replay.offset import Aside
+from fleet.telemetry.replay.offset import GridOffset
 
-PLACES = {
+POSITION_FIELDS = {
     "GLOBAL_POSITION_INT": ("lat", "lon"),
     "GPS_RAW_INT": ("lat", "lon"),
     "GPS2_RAW": ("lat", "lon"),
@@ -24,30 +24,30 @@ PLACES = {
 """Messages with geodetic positions: their fields of latitude and longitude."""
 
 
-class Cut(NamedTuple):
+class FrameBlock(NamedTuple):
     """Concatenated frames of one system, without signatures."""
 
-    told: np.ndarray  # bytes, (b,) uint8
+    data: np.ndarray  # bytes, (b,) uint8
     start: np.ndarray  # start of each frame in them, (m,)
     payload: np.ndarray  # start of each payload in them, (m,)
     size: np.ndarray  # size of each payload, (m,) [bytes]
     message: np.ndarray  # message ids, (m,)
 
 
-def cut(frames: Frames, which: np.ndarray) -> Cut:
+def extract_frames(frames: Frames, frame_numbers: np.ndarray) -> FrameBlock:
     """Extract frames of one system from the received frames."""
-    at = frames.at[which]
-    head, size = at[:, s.PAYLOAD] - at[:, s.START], at[:, s.SIZE]
+    headers = frames.headers[frame_numbers]
+    head, size = headers[:, s.PAYLOAD] - headers[:, s.START], headers[:, s.SIZE]
     length = head + size + 2
     start = np.concatenate([[0], np.cumsum(length)[:-1]])
-    spans = zip(at[:, s.START].tolist(), length.tolist(), strict=True)
-    told = np.concatenate([frames.buf[begin : begin + n] for begin, n in spans])
-    second = start[told[start] == s.V2]
-    told[second + 2] &= ~np.uint8(s.SIGNED)  # the signature is invalid for changed frames
-    return Cut(told, start, start + head, size, at[:, s.ID])
+    spans = zip(headers[:, s.START].tolist(), length.tolist(), strict=True)
+    data = np.concatenate([frames.buf[begin : begin + n] for begin, n in spans])
+    v2_starts = start[data[start] == s.V2]
+    data[v2_starts + 2] &= ~np.uint8(s.SIGNED)  # the signature is invalid for changed frames
+    return FrameBlock(data, start, start + head, size, headers[:, s.ID])
 
 
-def recast(one: Cut, systems: np.ndarray, aside: Aside | None) -> np.ndarray:
+def rewrite_frames(block: FrameBlock, systems: np.ndarray, offset: GridOffset | None) -> np.ndarray:
     """Return the bytes of the frames rewritten for each system, (n, b) uint8.
 
     Args:
@@ -55,39 +55,42 @@ def recast(one: Cut, systems: np.ndarray, aside: Aside | None) -> np.ndarray:
         systems: MAVLink system ids, (n,)
         offset: position offset, one row per system; None: no offset
     """
-    out = np.tile(one.told, (len(systems), 1))
-    at = one.start + np.where(one.told[one.start] == s.V2, 5, 3)
-    out[:, at] = systems[:, None]
-    for name in PLACES if aside is not None else ():
-        _move(out, one, name, aside)  # type: ignore[arg-type]
-    seal(out, one.start, one.payload, one.size, s.EXTRA[one.message].astype(np.uint8), s.CRC)
+    out = np.tile(block.data, (len(systems), 1))
+    system_at = block.start + np.where(block.data[block.start] == s.V2, 5, 3)
+    out[:, system_at] = systems[:, None]
+    for name in POSITION_FIELDS if offset is not None else ():
+        _move_positions(out, block, name, offset)  # type: ignore[arg-type]
+    write_checksums(out, block.start, block.payload, block.size, s.EXTRA[block.message].astype(np.uint8), s.CRC)
     return out
 
 
-def _move(out: np.ndarray, one: Cut, name: str, aside: Aside) -> None:
+def _move_positions(out: np.ndarray, block: FrameBlock, name: str, offset: GridOffset) -> None:
     """Offset the positions in all frames of one message; truncated zero positions are unchanged."""
     fields = layout(name).fields
     assert fields is not None
-    (lat, _), (lon, _) = (fields[field][:2][::-1] for field in PLACES[name])
-    which = np.flatnonzero((one.message == IDS[name]) & (one.size >= max(lat, lon) + 4))
-    if "frame" in fields and len(which):
-        place, last = one.payload[which] + fields["frame"][1], one.size[which] > fields["frame"][1]
-        frame = np.where(last, one.told[np.minimum(place, len(one.told) - 1)], 0)
-        which = which[np.isin(frame, GLOBAL_FRAMES)]
-    if not len(which):
+    (lat, _), (lon, _) = (fields[field][:2][::-1] for field in POSITION_FIELDS[name])
+    frame_numbers = np.flatnonzero((block.message == IDS[name]) & (block.size >= max(lat, lon) + 4))
+    if "frame" in fields and len(frame_numbers):
+        place, is_present = (
+            block.payload[frame_numbers] + fields["frame"][1],
+            block.size[frame_numbers] > fields["frame"][1],
+        )
+        frame = np.where(is_present, block.data[np.minimum(place, len(block.data) - 1)], 0)
+        frame_numbers = frame_numbers[np.isin(frame, GLOBAL_FRAMES)]
+    if not len(frame_numbers):
         return
-    kind = np.dtype(fields[PLACES[name][0]][0])
+    kind = np.dtype(fields[POSITION_FIELDS[name][0]][0])
     scale = 1e7 if kind.kind == "f" else 1
-    at = [one.payload[which, None] + offset + np.arange(4) for offset in (lat, lon)]
-    was = [np.ascontiguousarray(one.told[place]).view(kind)[:, 0] * scale for place in at]
+    field_bytes = [block.payload[frame_numbers, None] + field_offset + np.arange(4) for field_offset in (lat, lon)]
+    values = [np.ascontiguousarray(block.data[place]).view(kind)[:, 0] * scale for place in field_bytes]
     with np.errstate(invalid="ignore"):
-        moved = aside.move(*(np.rint(np.nan_to_num(x)).astype(np.int64) for x in was))
-    for place, x in zip(at, moved, strict=True):
+        moved = offset.move(*(np.rint(np.nan_to_num(coordinate)).astype(np.int64) for coordinate in values))
+    for place, x in zip(field_bytes, moved, strict=True):
         out[:, place.ravel()] = np.ascontiguousarray((x / scale if scale != 1 else x).astype(kind)).view(np.uint8)
 
 
 @nb.njit(cache=True)
-def seal(out, start, payload, size, extra, table):
+def write_checksums(out, start, payload, size, extra, table):
     """Write the checksum of each frame.
 
     Args:

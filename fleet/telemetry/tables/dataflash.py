@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from fleet.frames import wrap
-from fleet.telemetry.tables.row import HIGHEST, Row
+from fleet.telemetry.tables.row import MAX_MAGNITUDE, FieldSource
 
 DEG = pi / 180  # [rad/deg]
 
@@ -28,10 +28,10 @@ PARTS: dict[str, tuple[tuple[str, int], ...]] = {
 
 ANGLES, RATES = "attitude", "attitude: rates"
 
-_FIX = 3  # minimum GPS status of a 3D fix
+_FIX_3D = 3  # minimum GPS status of a 3D fix
 _NO_FIX_DEG = 0.01  # within 1 km of latitude 0, longitude 0
 _LAST_NAV = 95  # last navigation MAV_CMD; later ones are conditions and actions, except
-_NAV_TOO = (213, 42702, 42703)  # set yaw and speed, script time, attitude time
+_EXTRA_NAV = (213, 42702, 42703)  # set yaw and speed, script time, attitude time
 
 
 def _angles(m: Any) -> tuple[Any, ...]:
@@ -50,19 +50,19 @@ def _imu(m: Any) -> tuple[Any, ...]:
     return (m.AccX, m.AccY, m.AccZ, m.GyrX, m.GyrY, m.GyrZ)
 
 
-def _place(m: Any) -> tuple[Any, ...]:
+def _position(m: Any) -> tuple[Any, ...]:
     return (np.rint(m.Lat * 1e7), np.rint(m.Lng * 1e7), np.rint(m.Alt * 1e3))
 
 
-def _somewhere(m: Any) -> Any:
+def _has_position(m: Any) -> Any:
     return (abs(m.Lat) > _NO_FIX_DEG) | (abs(m.Lng) > _NO_FIX_DEG)
 
 
 def _fix(m: Any) -> Any:
-    return (m.Status >= _FIX) & _somewhere(m)
+    return (m.Status >= _FIX_3D) & _has_position(m)
 
 
-def _course(m: Any) -> tuple[Any, ...]:
+def _course_velocity(m: Any) -> tuple[Any, ...]:
     return (m.Spd * np.cos(m.GCrs * DEG), m.Spd * np.sin(m.GCrs * DEG), m.VZ)
 
 
@@ -78,13 +78,13 @@ def _wind(m: Any) -> tuple[Any, ...]:
     return (m.VWN, m.VWE)  # direction the wind blows to
 
 
-def _blows(m: Any) -> Any:
+def _has_wind(m: Any) -> Any:
     return (m.VWN != 0) | (m.VWE != 0)  # exact zeros: no wind estimate
 
 
 def _outputs(m: Any, names: str) -> tuple[Any, ...]:
-    given = tuple(getattr(m, name) for name in names.split())
-    return (*given, *(given[0] * 0.0,) * (8 - len(given)))  # an output that is not logged is 0, as in MAVLink
+    outputs = tuple(getattr(m, name) for name in names.split())
+    return (*outputs, *(outputs[0] * 0.0,) * (8 - len(outputs)))  # an output that is not logged is 0, as in MAVLink
 
 
 def _is_plane(m: Any) -> Any:
@@ -92,7 +92,9 @@ def _is_plane(m: Any) -> Any:
 
 
 def _copter_throttle(m: Any) -> tuple[Any, ...]:
-    return (m.ThrOut * np.where(m.whole("ThrOut"), 1e-3, 1.0) + 0.0 * m.AngBst,)  # integers run to 1000, floats to 1
+    return (
+        m.ThrOut * np.where(m.is_integer("ThrOut"), 1e-3, 1.0) + 0.0 * m.AngBst,
+    )  # integers run to 1000, floats to 1
 
 
 def _target(m: Any, altitude: Any) -> tuple[Any, ...]:
@@ -104,85 +106,85 @@ def _has_target(m: Any) -> Any:
 
 
 def _is_leg(m: Any) -> Any:
-    return ((m.CId <= _LAST_NAV) | np.isin(m.CId, _NAV_TOO)) & (m.CNum > 0)
+    return ((m.CId <= _LAST_NAV) | np.isin(m.CId, _EXTRA_NAV)) & (m.CNum > 0)
 
 
-TABLE: tuple[Row, ...] = (
-    Row("ATT", "attitude", _angles, rank=3),
-    Row("AHR2", "attitude", _angles, rank=2),
-    Row("EKF1", "attitude", _angles, rank=1),
-    Row("IMU", "attitude: rates", _gyro, rank=4, when=lambda m: m.I == 0),
-    Row("IMU", "attitude: rates", _gyro, rank=3),
-    Row("GYR", "attitude: rates", _gyro, rank=2, when=lambda m: m.I == 0),
-    Row("RATE", "attitude: rates", lambda m: _rate(m, DEG + 0.0 * m.AOutSlew), rank=1),
-    Row("RATE", "attitude: rates", lambda m: _rate(m, DEG / 100 + 0.0 * m.TimeMS), rank=1),  # either unit
-    Row("IMU", "imu", _imu, rank=2, when=lambda m: m.I == 0),
-    Row("IMU", "imu", _imu, rank=1),
-    Row("POS", "position", _place, rank=4, when=_somewhere),
-    Row("GPS", "position", _place, rank=3, when=lambda m: (m.I == 0) & _fix(m)),
-    Row("GPS", "position", _place, rank=2, when=_fix),
-    Row("AHR2", "position", _place, rank=1, when=_somewhere),
-    Row("XKF1", "velocity", _ned, rank=8, when=lambda m: (m.C == 0) & _started(m)),
-    Row("XKF1", "velocity", _ned, rank=7, when=_started),
-    Row("NKF1", "velocity", _ned, rank=6, when=lambda m: (m.C == 0) & _started(m)),
-    Row("NKF1", "velocity", _ned, rank=5, when=_started),
-    Row("EKF1", "velocity", _ned, rank=4, when=_started),
-    Row("GPS", "velocity", _course, rank=2, when=lambda m: (m.I == 0) & _fix(m)),
-    Row("GPS", "velocity", _course, rank=1, when=_fix),
-    Row("CTUN", "air", lambda m: (m.As,), rank=6),
-    Row("CTUN", "air", lambda m: (m.Aspd,), rank=5),
-    Row("ARSP", "air", lambda m: (m.Airspeed,), rank=4, when=lambda m: (m.I == 0) & (m.U != 0)),
-    Row("ARSP", "air", lambda m: (m.Airspeed,), rank=3, when=lambda m: m.U != 0),
-    Row("ARSP", "air", lambda m: (m.Airspeed,), rank=2),
-    Row("NTUN", "air", lambda m: (m.Arspd,), rank=1),
-    Row("CTUN", "air: throttle", lambda m: (m.ThO * 1e-2,), rank=4, when=_is_plane),  # per cent
-    Row("CTUN", "air: throttle", lambda m: (m.ThrOut * 1e-2,), rank=3, when=_is_plane),  # per cent
-    Row("CTUN", "air: throttle", lambda m: (m.ThO + 0.0 * m.ABst,), rank=2),  # Copter since 3.5, 0..1
-    Row("CTUN", "air: throttle", _copter_throttle, rank=1),
-    Row("XKF1", "air: climb", lambda m: (-m.VD,), rank=8, when=lambda m: (m.C == 0) & _started(m)),
-    Row("XKF1", "air: climb", lambda m: (-m.VD,), rank=7, when=_started),
-    Row("NKF1", "air: climb", lambda m: (-m.VD,), rank=6, when=lambda m: (m.C == 0) & _started(m)),
-    Row("NKF1", "air: climb", lambda m: (-m.VD,), rank=5, when=_started),
-    Row("EKF1", "air: climb", lambda m: (-m.VD,), rank=4, when=_started),
-    Row("BARO", "air: climb", lambda m: (m.CRt,), rank=3, when=lambda m: m.I == 0),
-    Row("BARO", "air: climb", lambda m: (m.CRt,), rank=2),
-    Row("GPS", "air: climb", lambda m: (-m.VZ,), rank=1, when=_fix),
-    Row("RCOU", "servo", lambda m: _outputs(m, "C1 C2 C3 C4 C5 C6 C7 C8"), rank=9),
-    Row("RCOU", "servo", lambda m: _outputs(m, "Ch1 Ch2 Ch3 Ch4 Ch5 Ch6 Ch7 Ch8"), rank=8),
-    Row("RCOU", "servo", lambda m: _outputs(m, "Chan1 Chan2 Chan3 Chan4 Chan5 Chan6 Chan7 Chan8"), rank=8),
-    Row("RCOU", "servo", lambda m: _outputs(m, "Ch1 Ch2 Ch3 Ch4 Ch5 Ch6"), rank=7),
-    Row("RCOU", "servo", lambda m: _outputs(m, "Ch1 Ch2 Ch3 Ch4"), rank=6),
-    Row("MOT", "servo", lambda m: _outputs(m, "Mot1 Mot2 Mot3 Mot4 Mot5 Mot6 Mot7 Mot8"), rank=5),
-    Row("MOT", "servo", lambda m: _outputs(m, "Mot1 Mot2 Mot3 Mot4 Mot5 Mot6"), rank=4),
-    Row("MOT", "servo", lambda m: _outputs(m, "Mot1 Mot2 Mot3 Mot4"), rank=3),
-    Row("ATT", "command", lambda m: (m.DesRoll * DEG, m.DesPitch * DEG), rank=3),
-    Row("CTUN", "command", lambda m: (m.NavRoll * DEG, m.NavPitch * DEG), rank=2),
-    Row("ATT", "command", lambda m: (m.RollIn * DEG, m.PitchIn * DEG), rank=1),
-    Row("NTUN", "command: errors", lambda m: (m.XT, m.AltE, m.AsE), rank=3),
-    Row("NTUN", "command: errors", lambda m: (m.XT, m.AltErr, m.AspdE), rank=2),
-    Row("NTUN", "command: errors", lambda m: (m.XT, m.AltErr, m.ArspdErr), rank=1),
-    Row("MISE", "leg", lambda m: (m.CNum,), rank=2, when=_is_leg),
-    Row("CMD", "leg", lambda m: (m.CNum,), rank=1, when=_is_leg),  # executed items; item lists are missions
-    Row("XKF2", "wind", _wind, rank=5, when=lambda m: (m.C == 0) & _blows(m)),
-    Row("XKF2", "wind", _wind, rank=4, when=_blows),
-    Row("NKF2", "wind", _wind, rank=3, when=lambda m: (m.C == 0) & _blows(m)),
-    Row("NKF2", "wind", _wind, rank=2, when=_blows),
-    Row("EKF2", "wind", _wind, rank=1, when=_blows),
-    Row("NTUN", "target", lambda m: _target(m, m.TAW), rank=2, when=_has_target),
-    Row(
+TABLE: tuple[FieldSource, ...] = (
+    FieldSource("ATT", "attitude", _angles, rank=3),
+    FieldSource("AHR2", "attitude", _angles, rank=2),
+    FieldSource("EKF1", "attitude", _angles, rank=1),
+    FieldSource("IMU", "attitude: rates", _gyro, rank=4, when=lambda m: m.I == 0),
+    FieldSource("IMU", "attitude: rates", _gyro, rank=3),
+    FieldSource("GYR", "attitude: rates", _gyro, rank=2, when=lambda m: m.I == 0),
+    FieldSource("RATE", "attitude: rates", lambda m: _rate(m, DEG + 0.0 * m.AOutSlew), rank=1),
+    FieldSource("RATE", "attitude: rates", lambda m: _rate(m, DEG / 100 + 0.0 * m.TimeMS), rank=1),  # either unit
+    FieldSource("IMU", "imu", _imu, rank=2, when=lambda m: m.I == 0),
+    FieldSource("IMU", "imu", _imu, rank=1),
+    FieldSource("POS", "position", _position, rank=4, when=_has_position),
+    FieldSource("GPS", "position", _position, rank=3, when=lambda m: (m.I == 0) & _fix(m)),
+    FieldSource("GPS", "position", _position, rank=2, when=_fix),
+    FieldSource("AHR2", "position", _position, rank=1, when=_has_position),
+    FieldSource("XKF1", "velocity", _ned, rank=8, when=lambda m: (m.C == 0) & _started(m)),
+    FieldSource("XKF1", "velocity", _ned, rank=7, when=_started),
+    FieldSource("NKF1", "velocity", _ned, rank=6, when=lambda m: (m.C == 0) & _started(m)),
+    FieldSource("NKF1", "velocity", _ned, rank=5, when=_started),
+    FieldSource("EKF1", "velocity", _ned, rank=4, when=_started),
+    FieldSource("GPS", "velocity", _course_velocity, rank=2, when=lambda m: (m.I == 0) & _fix(m)),
+    FieldSource("GPS", "velocity", _course_velocity, rank=1, when=_fix),
+    FieldSource("CTUN", "air", lambda m: (m.As,), rank=6),
+    FieldSource("CTUN", "air", lambda m: (m.Aspd,), rank=5),
+    FieldSource("ARSP", "air", lambda m: (m.Airspeed,), rank=4, when=lambda m: (m.I == 0) & (m.U != 0)),
+    FieldSource("ARSP", "air", lambda m: (m.Airspeed,), rank=3, when=lambda m: m.U != 0),
+    FieldSource("ARSP", "air", lambda m: (m.Airspeed,), rank=2),
+    FieldSource("NTUN", "air", lambda m: (m.Arspd,), rank=1),
+    FieldSource("CTUN", "air: throttle", lambda m: (m.ThO * 1e-2,), rank=4, when=_is_plane),  # per cent
+    FieldSource("CTUN", "air: throttle", lambda m: (m.ThrOut * 1e-2,), rank=3, when=_is_plane),  # per cent
+    FieldSource("CTUN", "air: throttle", lambda m: (m.ThO + 0.0 * m.ABst,), rank=2),  # Copter since 3.5, 0..1
+    FieldSource("CTUN", "air: throttle", _copter_throttle, rank=1),
+    FieldSource("XKF1", "air: climb", lambda m: (-m.VD,), rank=8, when=lambda m: (m.C == 0) & _started(m)),
+    FieldSource("XKF1", "air: climb", lambda m: (-m.VD,), rank=7, when=_started),
+    FieldSource("NKF1", "air: climb", lambda m: (-m.VD,), rank=6, when=lambda m: (m.C == 0) & _started(m)),
+    FieldSource("NKF1", "air: climb", lambda m: (-m.VD,), rank=5, when=_started),
+    FieldSource("EKF1", "air: climb", lambda m: (-m.VD,), rank=4, when=_started),
+    FieldSource("BARO", "air: climb", lambda m: (m.CRt,), rank=3, when=lambda m: m.I == 0),
+    FieldSource("BARO", "air: climb", lambda m: (m.CRt,), rank=2),
+    FieldSource("GPS", "air: climb", lambda m: (-m.VZ,), rank=1, when=_fix),
+    FieldSource("RCOU", "servo", lambda m: _outputs(m, "C1 C2 C3 C4 C5 C6 C7 C8"), rank=9),
+    FieldSource("RCOU", "servo", lambda m: _outputs(m, "Ch1 Ch2 Ch3 Ch4 Ch5 Ch6 Ch7 Ch8"), rank=8),
+    FieldSource("RCOU", "servo", lambda m: _outputs(m, "Chan1 Chan2 Chan3 Chan4 Chan5 Chan6 Chan7 Chan8"), rank=8),
+    FieldSource("RCOU", "servo", lambda m: _outputs(m, "Ch1 Ch2 Ch3 Ch4 Ch5 Ch6"), rank=7),
+    FieldSource("RCOU", "servo", lambda m: _outputs(m, "Ch1 Ch2 Ch3 Ch4"), rank=6),
+    FieldSource("MOT", "servo", lambda m: _outputs(m, "Mot1 Mot2 Mot3 Mot4 Mot5 Mot6 Mot7 Mot8"), rank=5),
+    FieldSource("MOT", "servo", lambda m: _outputs(m, "Mot1 Mot2 Mot3 Mot4 Mot5 Mot6"), rank=4),
+    FieldSource("MOT", "servo", lambda m: _outputs(m, "Mot1 Mot2 Mot3 Mot4"), rank=3),
+    FieldSource("ATT", "command", lambda m: (m.DesRoll * DEG, m.DesPitch * DEG), rank=3),
+    FieldSource("CTUN", "command", lambda m: (m.NavRoll * DEG, m.NavPitch * DEG), rank=2),
+    FieldSource("ATT", "command", lambda m: (m.RollIn * DEG, m.PitchIn * DEG), rank=1),
+    FieldSource("NTUN", "command: errors", lambda m: (m.XT, m.AltE, m.AsE), rank=3),
+    FieldSource("NTUN", "command: errors", lambda m: (m.XT, m.AltErr, m.AspdE), rank=2),
+    FieldSource("NTUN", "command: errors", lambda m: (m.XT, m.AltErr, m.ArspdErr), rank=1),
+    FieldSource("MISE", "leg", lambda m: (m.CNum,), rank=2, when=_is_leg),
+    FieldSource("CMD", "leg", lambda m: (m.CNum,), rank=1, when=_is_leg),  # executed items; item lists are missions
+    FieldSource("XKF2", "wind", _wind, rank=5, when=lambda m: (m.C == 0) & _has_wind(m)),
+    FieldSource("XKF2", "wind", _wind, rank=4, when=_has_wind),
+    FieldSource("NKF2", "wind", _wind, rank=3, when=lambda m: (m.C == 0) & _has_wind(m)),
+    FieldSource("NKF2", "wind", _wind, rank=2, when=_has_wind),
+    FieldSource("EKF2", "wind", _wind, rank=1, when=_has_wind),
+    FieldSource("NTUN", "target", lambda m: _target(m, m.TAW), rank=2, when=_has_target),
+    FieldSource(
         "NTUN",
         "target",
-        lambda m: _target(m, m.TAlt * np.where(m.whole("TAlt"), 1e-2, 1.0)),  # integers are centimetres
+        lambda m: _target(m, m.TAlt * np.where(m.is_integer("TAlt"), 1e-2, 1.0)),  # integers are centimetres
         rank=1,
         when=_has_target,
     ),
-    Row("BARO", "pressure", lambda m: (m.Press,), rank=2, when=lambda m: (m.I == 0) & (m.Press > 0)),
-    Row("BARO", "pressure", lambda m: (m.Press,), rank=1, when=lambda m: m.Press > 0),
-    Row("GPS", "gnss", lambda m: (np.rint(m.Alt * 1e3),), rank=2, when=lambda m: (m.I == 0) & _fix(m)),
-    Row("GPS", "gnss", lambda m: (np.rint(m.Alt * 1e3),), rank=1, when=_fix),
+    FieldSource("BARO", "pressure", lambda m: (m.Press,), rank=2, when=lambda m: (m.I == 0) & (m.Press > 0)),
+    FieldSource("BARO", "pressure", lambda m: (m.Press,), rank=1, when=lambda m: m.Press > 0),
+    FieldSource("GPS", "gnss", lambda m: (np.rint(m.Alt * 1e3),), rank=2, when=lambda m: (m.I == 0) & _fix(m)),
+    FieldSource("GPS", "gnss", lambda m: (np.rint(m.Alt * 1e3),), rank=1, when=_fix),
 )
 
-ROWS: dict[str, tuple[Row, ...]] = {
+ROWS: dict[str, tuple[FieldSource, ...]] = {
     name: tuple(row for row in TABLE if row.message == name) for name in {row.message for row in TABLE}
 }
 
@@ -199,7 +201,7 @@ def field_of(part: str) -> str:
     return part.split(":")[0]
 
 
-def believable(part: str, values: np.ndarray) -> np.ndarray:
+def is_plausible(part: str, values: np.ndarray) -> np.ndarray:
     """Return a mask of the rows of a part, (n, k), with all columns finite and within `MAX_MAGNITUDE`, (n,)."""
-    highest = np.array(HIGHEST[field_of(part)])[COLUMNS_OF.get(part, slice(None))]
+    highest = np.array(MAX_MAGNITUDE[field_of(part)])[COLUMNS_OF.get(part, slice(None))]
     return (np.abs(values) <= highest).all(axis=-1)

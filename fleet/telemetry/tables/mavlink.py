@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fleet.telemetry.tables.clock import BOOT, NONE, USEC, USEC32
-from fleet.telemetry.tables.row import Row, euler
+from fleet.telemetry.tables.row import FieldSource, euler
 
 DEG = pi / 180  # [rad/deg]
 MILLI_G = 9.80665e-3  # [m/s2 per milli-g]
@@ -36,22 +36,22 @@ _NO_FIX_E7 = 100_000  # within 1 km of latitude 0, longitude 0 [1e-7 deg]
 
 
 def _has_fix(m: Any) -> Any:
-    return _somewhere(m.lat, m.lon)  # without a fix autopilots send 0, 0 or values near it
+    return _has_position(m.lat, m.lon)  # without a fix autopilots send 0, 0 or values near it
 
 
-def _somewhere(lat: Any, lon: Any) -> Any:
+def _has_position(lat: Any, lon: Any) -> Any:
     return (abs(lat) > _NO_FIX_E7) | (abs(lon) > _NO_FIX_E7)
 
 
 _ABS_PRESSURE = 1 << 9  # HIGHRES_IMU_UPDATED_FLAGS
 
 
-def _started(m: Any) -> Any:
+def _has_velocity(m: Any) -> Any:
     """Return a mask of valid velocities: an estimator without velocity sends exact zeros or NaN."""
     return np.isfinite(m.vx + m.vy + m.vz) & ((m.vx != 0) | (m.vy != 0) | (m.vz != 0))
 
 
-def _measured(m: Any) -> Any:
+def _has_pressure(m: Any) -> Any:
     return ((m.fields_updated & _ABS_PRESSURE) != 0) & np.isfinite(m.abs_pressure) & (m.abs_pressure > 0)
 
 
@@ -60,57 +60,57 @@ def _wind(m: Any) -> tuple[Any, ...]:
     return (-m.speed * np.cos(m.direction * DEG), -m.speed * np.sin(m.direction * DEG))
 
 
-TABLE: tuple[Row, ...] = (
-    Row(
+TABLE: tuple[FieldSource, ...] = (
+    FieldSource(
         "ATTITUDE",
         "attitude",
         lambda m: (m.roll, m.pitch, m.yaw, m.rollspeed, m.pitchspeed, m.yawspeed),
         BOOT,
     ),
-    Row("HIGHRES_IMU", "imu", lambda m: (m.xacc, m.yacc, m.zacc, m.xgyro, m.ygyro, m.zgyro), USEC, rank=3),
-    Row("SCALED_IMU", "imu", _imu_milli, BOOT, rank=2),
-    Row("RAW_IMU", "imu", _imu_milli, USEC, rank=1, autopilots=("ardupilot",)),  # others: raw without unit
-    Row("GLOBAL_POSITION_INT", "position", lambda m: (m.lat, m.lon, m.alt), BOOT, when=_has_fix),
-    Row(
+    FieldSource("HIGHRES_IMU", "imu", lambda m: (m.xacc, m.yacc, m.zacc, m.xgyro, m.ygyro, m.zgyro), USEC, rank=3),
+    FieldSource("SCALED_IMU", "imu", _imu_milli, BOOT, rank=2),
+    FieldSource("RAW_IMU", "imu", _imu_milli, USEC, rank=1, autopilots=("ardupilot",)),  # others: raw without unit
+    FieldSource("GLOBAL_POSITION_INT", "position", lambda m: (m.lat, m.lon, m.alt), BOOT, when=_has_fix),
+    FieldSource(
         "GLOBAL_POSITION_INT",
         "velocity",
         lambda m: (m.vx * 1e-2, m.vy * 1e-2, m.vz * 1e-2),
         BOOT,
         when=_has_fix,
     ),
-    Row(
+    FieldSource(
         "LOCAL_POSITION_NED",  # the same estimator, unrounded and often faster
         "velocity",
         lambda m: (m.vx, m.vy, m.vz),
         BOOT,
         rank=1,
-        when=_started,
-        given="position",  # without a fix PX4 sends a drifting velocity, not aligned with north
+        when=_has_velocity,
+        requires="position",  # without a fix PX4 sends a drifting velocity, not aligned with north
     ),
-    Row("VFR_HUD", "air", lambda m: (m.airspeed, m.throttle * 1e-2, m.climb), NONE),
-    Row("SERVO_OUTPUT_RAW", "servo", _servo, USEC32, when=lambda m: m.port == 0),
-    Row(
+    FieldSource("VFR_HUD", "air", lambda m: (m.airspeed, m.throttle * 1e-2, m.climb), NONE),
+    FieldSource("SERVO_OUTPUT_RAW", "servo", _servo, USEC32, when=lambda m: m.port == 0),
+    FieldSource(
         "NAV_CONTROLLER_OUTPUT",
         "command",
         lambda m: _command(m, m.alt_error, m.aspd_error * 1e-2),  # ArduPilot sends cm/s, not the m/s of common.xml
         NONE,
         autopilots=("ardupilot",),
     ),
-    Row(
+    FieldSource(
         "NAV_CONTROLLER_OUTPUT",
         "command",
         lambda m: _command(m, -m.alt_error, -m.aspd_error),  # PX4 sends actual minus commanded
         NONE,
         autopilots=("px4",),
     ),
-    Row(
+    FieldSource(
         "NAV_CONTROLLER_OUTPUT",
         "command",
         lambda m: _command(m, m.alt_error, m.aspd_error),
         NONE,
         autopilots=("generic",),
     ),
-    Row(
+    FieldSource(
         "ATTITUDE_TARGET",
         "command",
         lambda m: (*euler(np.asarray(m.q, float).T)[:2], np.nan, np.nan, np.nan),
@@ -118,19 +118,19 @@ TABLE: tuple[Row, ...] = (
         rank=1,  # PX4 attitude set points; only some builds send the other message
         autopilots=("px4",),
     ),
-    Row("MISSION_CURRENT", "leg", lambda m: (np.where(m.seq == _NO_ITEM, -1.0, m.seq),), NONE),
-    Row("WIND", "wind", _wind, NONE, rank=1),
-    Row("WIND_COV", "wind", lambda m: (m.wind_x, m.wind_y), USEC, rank=2),
-    Row(
+    FieldSource("MISSION_CURRENT", "leg", lambda m: (np.where(m.seq == _NO_ITEM, -1.0, m.seq),), NONE),
+    FieldSource("WIND", "wind", _wind, NONE, rank=1),
+    FieldSource("WIND_COV", "wind", lambda m: (m.wind_x, m.wind_y), USEC, rank=2),
+    FieldSource(
         "POSITION_TARGET_GLOBAL_INT",
         "target",
         lambda m: (m.lat_int, m.lon_int, m.alt * 1e3),
         BOOT,
-        when=lambda m: ((m.coordinate_frame == 0) | (m.coordinate_frame == 5)) & _somewhere(m.lat_int, m.lon_int),
+        when=lambda m: ((m.coordinate_frame == 0) | (m.coordinate_frame == 5)) & _has_position(m.lat_int, m.lon_int),
     ),
-    Row("HIGHRES_IMU", "pressure", lambda m: (m.abs_pressure * 1e2,), USEC, rank=1, when=_measured),
-    Row("GLOBAL_POSITION_INT", "height", lambda m: (m.relative_alt * 1e-3,), BOOT, when=_has_fix),
-    Row(
+    FieldSource("HIGHRES_IMU", "pressure", lambda m: (m.abs_pressure * 1e2,), USEC, rank=1, when=_has_pressure),
+    FieldSource("GLOBAL_POSITION_INT", "height", lambda m: (m.relative_alt * 1e-3,), BOOT, when=_has_fix),
+    FieldSource(
         "SCALED_PRESSURE",
         "pressure",
         lambda m: (m.press_abs * 1e2,),
@@ -138,13 +138,13 @@ TABLE: tuple[Row, ...] = (
         when=lambda m: m.press_abs != 0,  # 0: no barometer
     ),
     # time_usec is boot time or receiver time, depending on the autopilot: not usable for the shared clock
-    Row("GPS_RAW_INT", "gnss", lambda m: (m.alt,), NONE, when=lambda m: m.fix_type >= _FIX_3D),
+    FieldSource("GPS_RAW_INT", "gnss", lambda m: (m.alt,), NONE, when=lambda m: m.fix_type >= _FIX_3D),
 )
 
 _OWN_TIME = {BOOT: lambda m: m.time_boot_ms * 1e-3, USEC: lambda m: m.time_usec * 1e-6, NONE: lambda m: 0.0}
 _OWN_TIME[USEC32] = _OWN_TIME[USEC]
 
 
-def own_seconds(row: Row, message: Any) -> Any:
+def own_seconds(row: FieldSource, message: Any) -> Any:
     """Return the time stamps of the messages from the row's time source [s]; 0 without source."""
     return _OWN_TIME[row.tick](message)

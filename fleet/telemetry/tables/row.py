@@ -5,10 +5,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fleet.contract import UNTOLD
+from fleet.contract import FIRST_OPTIONAL_COLUMN
 
 
-class Row(NamedTuple):
+class FieldSource(NamedTuple):
     """Mapping from one message to the columns of a `Sample` field.
 
     `columns` and `when` read message fields as attributes, numbers or arrays: they must not use `if` or `math`.
@@ -21,40 +21,40 @@ class Row(NamedTuple):
     rank: int = 0  # priority: the highest active rank of a field wins; in MAVLink below `RANK_COUNT`
     autopilots: tuple[str, ...] = ()  # empty: any
     when: Callable[[Any], Any] | None = None  # mask of the applicable messages
-    given: str = ""  # MAVLink: used only while this field is active
+    requires: str = ""  # MAVLink: used only while this field is active
 
 
-_RATES = (100.0,) * 3  # [rad/s]
-_PLACE = (9e8, 1.8e9, 1e8)  # [1e-7 deg, 1e-7 deg, mm]
-HIGHEST: dict[str, tuple[float, ...]] = {
-    "attitude": (7.0, 7.0, 7.0, *_RATES),
-    "imu": (1e3, 1e3, 1e3, *_RATES),
-    "position": _PLACE,
+_MAX_RATES = (100.0,) * 3  # [rad/s]
+_MAX_POSITION = (9e8, 1.8e9, 1e8)  # [1e-7 deg, 1e-7 deg, mm]
+MAX_MAGNITUDE: dict[str, tuple[float, ...]] = {
+    "attitude": (7.0, 7.0, 7.0, *_MAX_RATES),
+    "imu": (1e3, 1e3, 1e3, *_MAX_RATES),
+    "position": _MAX_POSITION,
     "velocity": (500.0, 500.0, 500.0),
     "air": (500.0, 1.5, 500.0),
     "servo": (65535.0,) * 8,
     "command": (7.0, 7.0, 1e6, 1e5, 1e3),
     "leg": (65535.0,),
     "wind": (150.0, 150.0),
-    "target": _PLACE,
+    "target": _MAX_POSITION,
     "pressure": (120_000.0,),
-    "gnss": _PLACE[2:],
+    "gnss": _MAX_POSITION[2:],
     "height": (9e4,),
 }
 """Maximum plausible magnitude per column in the units of `contract.COLUMNS`; other values are rejected."""
 
-_HIGHEST = {field: np.array(values) for field, values in HIGHEST.items()}
+_MAX_ARRAY = {field: np.array(values) for field, values in MAX_MAGNITUDE.items()}
 
 
-def believable(field: str, values: np.ndarray) -> np.ndarray:
+def is_plausible(field: str, values: np.ndarray) -> np.ndarray:
     """Return a mask of the rows, (n, k), with all columns within `MAX_MAGNITUDE`, (n,).
 
     Only the optional columns of `UNTOLD` may be non-finite.
     """
-    good = np.abs(values) <= _HIGHEST[field]
-    untold = UNTOLD.get(field, values.shape[-1])
-    good[..., untold:] |= np.isnan(values[..., untold:])
-    return good.all(axis=-1)
+    plausible = np.abs(values) <= _MAX_ARRAY[field]
+    optional_from = FIRST_OPTIONAL_COLUMN.get(field, values.shape[-1])
+    plausible[..., optional_from:] |= np.isnan(values[..., optional_from:])
+    return plausible.all(axis=-1)
 
 
 def euler(q: Any) -> tuple[Any, ...]:

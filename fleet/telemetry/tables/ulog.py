@@ -12,28 +12,28 @@ from typing import Any
 
 import numpy as np
 
-from fleet.telemetry.tables.row import Row, euler
+from fleet.telemetry.tables.row import FieldSource, euler
 
 DEG = pi / 180  # [rad/deg]
 _NO_FIX_DEG = 0.01  # within 1 km of latitude 0, longitude 0 [deg]
 _FIX_3D = 3
-_RAREST_PA = 2_000.0  # at 26 km altitude; lower values are in millibar
+_MIN_PRESSURE_PA = 2_000.0  # at 26 km altitude; lower values are in millibar
 _IDLE = 5  # position_setpoint.type without target
 _EARTH_M = 6_371_000.0  # radius of the sphere of PX4's local projection
-_SHORTEST_US, _LONGEST_US = 700.0, 2300.0  # valid servo pulse widths
+_MIN_PULSE_US, _MAX_PULSE_US = 700.0, 2300.0  # valid servo pulse widths
 
 Columns = Callable[[Any], tuple[Any, ...]]
 
 
-def _somewhere(lat_deg: Any, lon_deg: Any) -> Any:
+def _has_position(lat_deg: Any, lon_deg: Any) -> Any:
     return (np.abs(lat_deg) > _NO_FIX_DEG) | (np.abs(lon_deg) > _NO_FIX_DEG)
 
 
-def _place(lat_deg: Any, lon_deg: Any, alt_m: Any) -> tuple[Any, ...]:
+def _position(lat_deg: Any, lon_deg: Any, alt_m: Any) -> tuple[Any, ...]:
     return np.rint(lat_deg * 1e7), np.rint(lon_deg * 1e7), np.rint(alt_m * 1e3)
 
 
-def _local(m: Any) -> tuple[Any, ...]:
+def _position_from_local(m: Any) -> tuple[Any, ...]:
     """Invert PX4's azimuthal equidistant projection. Source: PX4 src/lib/geo, MapProjection::reproject."""
     lat, lon = m.ref_lat * DEG, m.ref_lon * DEG
     c = np.hypot(m.x, m.y) / _EARTH_M
@@ -41,7 +41,7 @@ def _local(m: Any) -> tuple[Any, ...]:
     n, e = m.x / _EARTH_M * k, m.y / _EARTH_M * k
     north = np.arcsin(np.clip(np.cos(c) * np.sin(lat) + n * np.cos(lat), -1, 1))
     east = lon + np.arctan2(e, np.cos(lat) * np.cos(c) - n * np.sin(lat))
-    return _place(north / DEG, (east / DEG + 180) % 360 - 180, m.ref_alt - m.z)
+    return _position(north / DEG, (east / DEG + 180) % 360 - 180, m.ref_alt - m.z)
 
 
 # --- air: sources of airspeed and throttle ------------------------------------------------------------------------
@@ -59,22 +59,26 @@ def _thrust(m: Any) -> Any:
 
 
 _THROTTLE: tuple[Callable[[Any], Any], ...] = (  # VTOL: the larger thrust, as in VFR_HUD
-    lambda m: np.fmax(m.beside("actuator_controls_0").control[3], m.beside("actuator_controls_1").control[3]),
-    lambda m: m.beside("actuator_controls_0").control[3],  # until 1.13
-    lambda m: np.fmax(_thrust(m.beside("vehicle_thrust_setpoint")), _thrust(m.beside("vehicle_thrust_setpoint.1"))),
-    lambda m: _thrust(m.beside("vehicle_thrust_setpoint")),  # since 1.14
-    lambda m: m.beside("actuator_motors").control[0],
+    lambda m: np.fmax(
+        m.interpolated("actuator_controls_0").control[3], m.interpolated("actuator_controls_1").control[3]
+    ),
+    lambda m: m.interpolated("actuator_controls_0").control[3],  # until 1.13
+    lambda m: np.fmax(
+        _thrust(m.interpolated("vehicle_thrust_setpoint")), _thrust(m.interpolated("vehicle_thrust_setpoint.1"))
+    ),
+    lambda m: _thrust(m.interpolated("vehicle_thrust_setpoint")),  # since 1.14
+    lambda m: m.interpolated("actuator_motors").control[0],
 )
 
 
-def _air_row(topic: str, airspeed: Columns, throttle: Callable[[Any], Any], rank: int) -> Row:
+def _air_row(topic: str, airspeed: Columns, throttle: Callable[[Any], Any], rank: int) -> FieldSource:
     def columns(m: Any) -> tuple[Any, ...]:
-        return (*airspeed(m), throttle(m), -m.beside("vehicle_local_position").vz)
+        return (*airspeed(m), throttle(m), -m.interpolated("vehicle_local_position").vz)
 
-    return Row(topic, "air", columns, rank=rank)
+    return FieldSource(topic, "air", columns, rank=rank)
 
 
-def _air_rows() -> Iterator[Row]:
+def _air_rows() -> Iterator[FieldSource]:
     pairs = [(topic, airspeed, throttle) for topic, airspeed in _AIRSPEED for throttle in _THROTTLE]
     for rank, (topic, airspeed, throttle) in enumerate(reversed(pairs)):
         yield _air_row(topic, airspeed, throttle, rank)
@@ -87,90 +91,90 @@ def _output(m: Any) -> tuple[Any, ...]:
     return tuple(np.where(np.isfinite(output), output, 0.0) for output in m.output[:8])
 
 
-def _pulses(m: Any) -> Any:
+def _are_pulses(m: Any) -> Any:
     """Return a mask of outputs that are pulse widths, not ESC counts or rad/s (since 1.13) nor all zero."""
     outputs = np.array(_output(m))
-    fits = ((outputs == 0) | ((outputs > _SHORTEST_US) & (outputs < _LONGEST_US))).all(axis=0)
+    is_pulse = ((outputs == 0) | ((outputs > _MIN_PULSE_US) & (outputs < _MAX_PULSE_US))).all(axis=0)
     driven = (outputs != 0).any(axis=0)
-    return fits & driven & (np.sum(fits & driven) >= 0.9 * np.sum(driven))
+    return is_pulse & driven & (np.sum(is_pulse & driven) >= 0.9 * np.sum(driven))
 
 
-def _widths(m: Any, middle: float, reach: float) -> tuple[Any, ...]:
+def _pulse_widths(m: Any, middle: float, reach: float) -> tuple[Any, ...]:
     """Return pulse widths [us] for a control of -1..1; 0 for non-finite controls."""
     pulses = [np.where(np.isfinite(c), middle + reach * np.clip(c, -1, 1), 0.0) for c in m.control[:8]]
     return (*pulses, *([np.zeros_like(pulses[0])] * (8 - len(pulses))))
 
 
-def _driven(m: Any) -> Any:
+def _is_driven(m: Any) -> Any:
     return np.isfinite(np.array(m.control[:8])).any(axis=0)
 
 
 # --- command: set points of a fixed wing; errors are commanded minus actual ---------------------------------------
 
-_WANTED: tuple[tuple[Columns, str, Columns], ...] = (  # roll and pitch, path topic, errors
+_COMMAND_SOURCES: tuple[tuple[Columns, str, Columns], ...] = (  # roll and pitch, path topic, errors
     (
         lambda m: euler(m.q_d)[:2],  # 1.16 has no roll_body
         "position_controller_status",
         lambda m: (
-            m.beside("tecs_status").altitude_sp - m.beside("vehicle_global_position").alt,
-            m.beside("tecs_status").true_airspeed_sp - m.beside("tecs_status").true_airspeed_filtered,
+            m.interpolated("tecs_status").altitude_sp - m.interpolated("vehicle_global_position").alt,
+            m.interpolated("tecs_status").true_airspeed_sp - m.interpolated("tecs_status").true_airspeed_filtered,
         ),
     ),
     (
         lambda m: (m.roll_body, m.pitch_body),  # 1.14, 1.15: TECS no longer logs its own altitude
         "position_controller_status",
         lambda m: (
-            m.beside("tecs_status").altitude_sp - m.beside("vehicle_global_position").alt,
-            m.beside("tecs_status").true_airspeed_sp - m.beside("tecs_status").true_airspeed_filtered,
+            m.interpolated("tecs_status").altitude_sp - m.interpolated("vehicle_global_position").alt,
+            m.interpolated("tecs_status").true_airspeed_sp - m.interpolated("tecs_status").true_airspeed_filtered,
         ),
     ),
     (
         lambda m: (m.roll_body, m.pitch_body),  # 1.11 to 1.13
         "position_controller_status",
         lambda m: (
-            m.beside("tecs_status").altitude_sp - m.beside("tecs_status").altitude_filtered,
-            m.beside("tecs_status").true_airspeed_sp - m.beside("tecs_status").true_airspeed_filtered,
+            m.interpolated("tecs_status").altitude_sp - m.interpolated("tecs_status").altitude_filtered,
+            m.interpolated("tecs_status").true_airspeed_sp - m.interpolated("tecs_status").true_airspeed_filtered,
         ),
     ),
     (
         lambda m: (m.roll_body, m.pitch_body),  # 1.9, 1.10
         "position_controller_status",
         lambda m: (
-            m.beside("tecs_status").altitude_sp - m.beside("tecs_status").altitude_filtered,
-            m.beside("tecs_status").airspeed_sp - m.beside("tecs_status").airspeed_filtered,
+            m.interpolated("tecs_status").altitude_sp - m.interpolated("tecs_status").altitude_filtered,
+            m.interpolated("tecs_status").airspeed_sp - m.interpolated("tecs_status").airspeed_filtered,
         ),
     ),
     (
         lambda m: (m.roll_body, m.pitch_body),  # 1.8
         "fw_pos_ctrl_status",
         lambda m: (
-            m.beside("tecs_status").altitude_sp - m.beside("tecs_status").altitude_filtered,
-            m.beside("tecs_status").airspeed_sp - m.beside("tecs_status").airspeed_filtered,
+            m.interpolated("tecs_status").altitude_sp - m.interpolated("tecs_status").altitude_filtered,
+            m.interpolated("tecs_status").airspeed_sp - m.interpolated("tecs_status").airspeed_filtered,
         ),
     ),
     (
         lambda m: (m.roll_body, m.pitch_body),  # 1.6, 1.7
         "fw_pos_ctrl_status",
         lambda m: (
-            m.beside("tecs_status").altitudeSp - m.beside("tecs_status").altitude_filtered,
-            m.beside("tecs_status").airspeedSp - m.beside("tecs_status").airspeed_filtered,
+            m.interpolated("tecs_status").altitudeSp - m.interpolated("tecs_status").altitude_filtered,
+            m.interpolated("tecs_status").airspeedSp - m.interpolated("tecs_status").airspeed_filtered,
         ),
     ),
 )
 
 
-def _command_row(attitude: Columns, path: str, errors: Columns, rank: int) -> Row:
+def _command_row(attitude: Columns, path: str, errors: Columns, rank: int) -> FieldSource:
     def columns(m: Any) -> tuple[Any, ...]:
-        return (*attitude(m), m.beside(path).xtrack_error, *errors(m))
+        return (*attitude(m), m.interpolated(path).xtrack_error, *errors(m))
 
-    return Row("vehicle_attitude_setpoint", "command", columns, rank=rank)
+    return FieldSource("vehicle_attitude_setpoint", "command", columns, rank=rank)
 
 
 # --- pressure and satellites --------------------------------------------------------------------------------------
 
 
 def _baro(m: Any) -> tuple[Any, ...]:
-    return (m.pressure * np.where(m.pressure < _RAREST_PA, 100.0, 1.0),)  # millibar until 1.13
+    return (m.pressure * np.where(m.pressure < _MIN_PRESSURE_PA, 100.0, 1.0),)  # millibar until 1.13
 
 
 def _fix(m: Any) -> Any:
@@ -179,54 +183,60 @@ def _fix(m: Any) -> Any:
 
 # --- the table ----------------------------------------------------------------------------------------------------
 
-TABLE: tuple[Row, ...] = (
-    Row("vehicle_attitude", "attitude", lambda m: (*euler(m.q), *m.beside("vehicle_angular_velocity").xyz), rank=3),
-    Row(
+TABLE: tuple[FieldSource, ...] = (
+    FieldSource(
+        "vehicle_attitude", "attitude", lambda m: (*euler(m.q), *m.interpolated("vehicle_angular_velocity").xyz), rank=3
+    ),
+    FieldSource(
         "vehicle_attitude",  # until 1.9
         "attitude",
         lambda m: (*euler(m.q), m.rollspeed, m.pitchspeed, m.yawspeed),
         rank=2,
     ),
-    Row("vehicle_attitude", "attitude", lambda m: (*euler(m.q), *m.beside("sensor_combined").gyro_rad), rank=1),
-    Row("sensor_combined", "imu", lambda m: (*m.accelerometer_m_s2, *m.gyro_rad), rank=2),
-    Row("vehicle_acceleration", "imu", lambda m: (*m.xyz, *m.beside("vehicle_angular_velocity").xyz), rank=1),
-    Row(
+    FieldSource(
+        "vehicle_attitude", "attitude", lambda m: (*euler(m.q), *m.interpolated("sensor_combined").gyro_rad), rank=1
+    ),
+    FieldSource("sensor_combined", "imu", lambda m: (*m.accelerometer_m_s2, *m.gyro_rad), rank=2),
+    FieldSource(
+        "vehicle_acceleration", "imu", lambda m: (*m.xyz, *m.interpolated("vehicle_angular_velocity").xyz), rank=1
+    ),
+    FieldSource(
         "vehicle_global_position",
         "position",
-        lambda m: _place(m.lat, m.lon, m.alt),
+        lambda m: _position(m.lat, m.lon, m.alt),
         rank=6,
-        when=lambda m: _somewhere(m.lat, m.lon),
+        when=lambda m: _has_position(m.lat, m.lon),
     ),
-    Row(
+    FieldSource(
         "vehicle_local_position",
         "position",
-        _local,
+        _position_from_local,
         rank=5,
-        when=lambda m: (m.xy_global != 0) & (m.z_global != 0) & _somewhere(m.ref_lat, m.ref_lon),
+        when=lambda m: (m.xy_global != 0) & (m.z_global != 0) & _has_position(m.ref_lat, m.ref_lon),
     ),
     *(
         row
         for topic, rank in (("vehicle_gps_position", 3), ("sensor_gps", 1))
         for row in (
-            Row(
+            FieldSource(
                 topic,
                 "position",
-                lambda m: _place(m.latitude_deg, m.longitude_deg, m.altitude_msl_m),  # since 1.14
+                lambda m: _position(m.latitude_deg, m.longitude_deg, m.altitude_msl_m),  # since 1.14
                 rank=rank + 1,
                 when=_fix,
             ),
-            Row(topic, "position", lambda m: (m.lat, m.lon, m.alt), rank=rank, when=_fix),
+            FieldSource(topic, "position", lambda m: (m.lat, m.lon, m.alt), rank=rank, when=_fix),
         )
     ),
-    Row(
+    FieldSource(
         "vehicle_local_position",
         "velocity",
         lambda m: (m.vx, m.vy, m.vz),
         rank=3,
         when=lambda m: (m.v_xy_valid != 0) & (m.v_z_valid != 0),
     ),
-    Row("vehicle_global_position", "velocity", lambda m: (m.vel_n, m.vel_e, m.vel_d), rank=2),  # until 1.10
-    Row(
+    FieldSource("vehicle_global_position", "velocity", lambda m: (m.vel_n, m.vel_e, m.vel_d), rank=2),  # until 1.10
+    FieldSource(
         "vehicle_gps_position",
         "velocity",
         lambda m: (m.vel_n_m_s, m.vel_e_m_s, m.vel_d_m_s),
@@ -234,16 +244,18 @@ TABLE: tuple[Row, ...] = (
         when=lambda m: (m.vel_ned_valid != 0) & (m.fix_type >= _FIX_3D),
     ),
     *_air_rows(),
-    Row("actuator_outputs", "servo", _output, rank=3, when=_pulses),
-    Row("actuator_servos", "servo", lambda m: _widths(m, 1500.0, 500.0), rank=2, when=_driven),
-    Row("actuator_motors", "servo", lambda m: _widths(m, 1000.0, 1000.0), rank=1, when=_driven),
-    *(_command_row(*wanted, len(_WANTED) - i) for i, wanted in enumerate(_WANTED)),
-    Row("mission_result", "leg", lambda m: (np.where(m.seq_current < 0, -1.0, m.seq_current),), rank=4),
-    Row("navigator_mission_item", "leg", lambda m: (m.sequence_current,), rank=3),
-    Row("mission", "leg", lambda m: (np.where(m.current_seq < 0, -1.0, m.current_seq),), rank=2),
-    Row("offboard_mission", "leg", lambda m: (np.where(m.current_seq < 0, -1.0, m.current_seq),), rank=1),  # 1.6
+    FieldSource("actuator_outputs", "servo", _output, rank=3, when=_are_pulses),
+    FieldSource("actuator_servos", "servo", lambda m: _pulse_widths(m, 1500.0, 500.0), rank=2, when=_is_driven),
+    FieldSource("actuator_motors", "servo", lambda m: _pulse_widths(m, 1000.0, 1000.0), rank=1, when=_is_driven),
+    *(_command_row(*wanted, len(_COMMAND_SOURCES) - i) for i, wanted in enumerate(_COMMAND_SOURCES)),
+    FieldSource("mission_result", "leg", lambda m: (np.where(m.seq_current < 0, -1.0, m.seq_current),), rank=4),
+    FieldSource("navigator_mission_item", "leg", lambda m: (m.sequence_current,), rank=3),
+    FieldSource("mission", "leg", lambda m: (np.where(m.current_seq < 0, -1.0, m.current_seq),), rank=2),
+    FieldSource(
+        "offboard_mission", "leg", lambda m: (np.where(m.current_seq < 0, -1.0, m.current_seq),), rank=1
+    ),  # 1.6
     *(
-        Row(
+        FieldSource(
             topic,
             "wind",
             lambda m: (m.windspeed_north, m.windspeed_east),
@@ -252,25 +264,29 @@ TABLE: tuple[Row, ...] = (
         )
         for topic, rank in (("wind", 3), ("wind_estimate", 2), ("airspeed_wind", 1))
     ),
-    Row(
+    FieldSource(
         "position_setpoint_triplet",
         "target",
-        lambda m: _place(m.current.lat, m.current.lon, m.current.alt),
-        when=lambda m: (m.current.valid != 0) & (m.current.type != _IDLE) & _somewhere(m.current.lat, m.current.lon),
+        lambda m: _position(m.current.lat, m.current.lon, m.current.alt),
+        when=lambda m: (m.current.valid != 0) & (m.current.type != _IDLE) & _has_position(m.current.lat, m.current.lon),
     ),
-    Row("vehicle_air_data", "pressure", lambda m: (m.baro_pressure_pa,), rank=2, when=lambda m: m.baro_pressure_pa > 0),
-    Row("sensor_baro", "pressure", _baro, rank=1, when=lambda m: m.pressure > 0),
+    FieldSource(
+        "vehicle_air_data", "pressure", lambda m: (m.baro_pressure_pa,), rank=2, when=lambda m: m.baro_pressure_pa > 0
+    ),
+    FieldSource("sensor_baro", "pressure", _baro, rank=1, when=lambda m: m.pressure > 0),
     *(
         row
         for topic, rank in (("vehicle_gps_position", 3), ("sensor_gps", 1))
         for row in (
-            Row(topic, "gnss", lambda m: (np.rint(m.altitude_msl_m * 1e3),), rank=rank + 1, when=_fix),  # since 1.14
-            Row(topic, "gnss", lambda m: (m.alt,), rank=rank, when=_fix),
+            FieldSource(
+                topic, "gnss", lambda m: (np.rint(m.altitude_msl_m * 1e3),), rank=rank + 1, when=_fix
+            ),  # since 1.14
+            FieldSource(topic, "gnss", lambda m: (m.alt,), rank=rank, when=_fix),
         )
     ),
 )
 
-FLOWS_HZ = {"attitude": 4.0, "imu": 4.0, "position": 1.0, "velocity": 1.0, "air": 2.0, "servo": 2.0, "command": 1.0}
+MIN_RATE_HZ = {"attitude": 4.0, "imu": 4.0, "position": 1.0, "velocity": 1.0, "air": 2.0, "servo": 2.0, "command": 1.0}
 """Minimum rate of an active source; without one, the source with the most rows wins [Hz]."""
 
 CALCULATED = {
@@ -279,17 +295,17 @@ CALCULATED = {
 }
 """Notes on fields that are calculated, not logged."""
 
-HELD = ("vehicle_status", "vtol_vehicle_status", "mission_result", "mission", "position_setpoint_triplet")
+LATCHED_TOPICS = ("vehicle_status", "vtol_vehicle_status", "mission_result", "mission", "position_setpoint_triplet")
 """Topics published on change: the last value before the log start applies at the start."""
 
-_SISTERS = (
+_AUXILIARY_TOPICS = (
     *("vehicle_angular_velocity", "actuator_controls_0", "actuator_controls_1", "vehicle_thrust_setpoint"),
     *("position_controller_status", "fw_pos_ctrl_status", "tecs_status", "vehicle_status", "vtol_vehicle_status"),
 )
-TOPICS: frozenset[str] = frozenset({row.message for row in TABLE} | set(_SISTERS))
+TOPICS: frozenset[str] = frozenset({row.message for row in TABLE} | set(_AUXILIARY_TOPICS))
 
 FIELDS = tuple(dict.fromkeys(row.field for row in TABLE))
-ROWS: dict[str, tuple[Row, ...]] = {
+ROWS: dict[str, tuple[FieldSource, ...]] = {
     field: tuple(sorted((row for row in TABLE if row.field == field), key=lambda row: -row.rank)) for field in FIELDS
 }
 
@@ -324,7 +340,7 @@ MODES: dict[int, tuple[tuple[tuple[int, int], str], ...]] = {
 """vehicle_status.nav_state -> (first release, name), names as in the heartbeat, if it has one."""
 
 
-def mode(nav_state: int, release: tuple[int, int]) -> str:
+def mode_name(nav_state: int, release: tuple[int, int]) -> str:
     """Return the mode name of a nav_state in `release` (major, minor)."""
     names = [name for since, name in MODES.get(nav_state, ()) if since <= release]
     return names[-1] if names else f"nav_state {nav_state}"

@@ -22,7 +22,7 @@ import numpy as np
 from fleet.contract import Alert, AlertKind, Prediction
 from fleet.simulator.flight.drive import EPOCH_US, to_tlog
 from fleet.telemetry.recording.recordings import replay_messages
-from twin_worker.evaluation.offline import run
+from twin_worker.evaluation.offline import run_offline
 from twin_worker.service.warm_up import warm_up
 
 from .world import END_S, HIGH_M, SAFE_M, STEP_S, WIDE_M, Flight, apart, chain, is_clear, lost_at, make
@@ -38,7 +38,7 @@ def heard(flights: list[Flight], seed: int, loss: float) -> tuple[list[Alert], d
         path = Path(folder) / "fleet.tlog"
         to_tlog(path, uavs, seconds=END_S, loss=loss, seed=seed)
         began, alerts, methods = time.process_time(), [], dict[str, int]()
-        for message in run(replay_messages(path, -1), {}):
+        for message in run_offline(replay_messages(path, -1), {}):
             if isinstance(message, Alert):
                 alerts.append(message)
             elif isinstance(message, Prediction):

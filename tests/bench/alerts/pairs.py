@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from fleet.contract import Array, Prediction, State
+from fleet.contract import Array, Prediction, TwinState
 from fleet.frames import to_geodetic
 from fleet.simulator.vehicle.missions import HOME
-from twin_worker.alerts.traffic import Traffic
+from twin_worker.alerts.traffic import TrafficMonitor
 
 T = 1_700_000_000.0
 AHEAD = np.concatenate([np.arange(0.0, 61.0), np.arange(63.0, 181.0, 3.0)])
@@ -30,12 +30,12 @@ def wandering(uav: int, rng: np.random.Generator, reach: float) -> Prediction:
     return Prediction(
         uav=uav,
         t=T + rng.uniform(-0.5, 0.5),
-        state=State.PREDICTING,
+        state=TwinState.PREDICTING,
         method="dynamics",
         origin=(lat, lon, alt),
         ahead=Array.of(AHEAD),
         path=Array.of(path),
-        tube=Array.of(tube),
+        prediction_region_half_axes=Array.of(tube),
     )
 
 
@@ -43,13 +43,13 @@ def cost(uavs: int = 100, seconds: int = 10, seed: int = 1) -> dict[str, Any]:
     """Give the processor time of one second of judgement, for a crowded and a spread fleet [ms]."""
     rng, out = np.random.default_rng(seed), {}
     for name, reach in (("crowded_1_km", 1_000.0), ("spread_5_km", 5_000.0)):
-        traffic, took, alerts = Traffic(), [], 0
+        traffic, took, alerts = TrafficMonitor(), [], 0
         for second in range(-1, seconds):
             made = [wandering(uav, rng, reach) for uav in range(uavs)]
             began = time.process_time()
             for one in made:
-                traffic.hear(one)
-            alerts += sum(len(traffic.judge(uav, T + second)) for uav in range(uavs))
+                traffic.receive(one)
+            alerts += sum(len(traffic.assess(uav, T + second)) for uav in range(uavs))
             took.append(1e3 * (time.process_time() - began))
         out[name] = {"pairs": uavs * (uavs - 1) // 2, "ms_median": round(float(np.median(took[1:])), 1)}
         out[name] |= {"ms_worst": round(max(took[1:]), 1), "alerts": alerts}

@@ -14,9 +14,9 @@ import numpy as np
 from fleet.contract import Item
 from fleet.frames import Origin, to_geodetic, to_ned
 from fleet.mission import SEQ
-from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.jsbsim import CRUISE
-from fleet.simulator.vehicle.missions import HOME, Start, mission
+from fleet.simulator.vehicle.missions import HOME, StartState, draw_mission
 
 END_S = 152.0  # the twins hear so much of each flight [s]
 LOOK_S = 120.0  # what is never to happen does not happen for so long after it either [s]
@@ -36,7 +36,7 @@ class Plan(NamedTuple):
     """What one aircraft flies: items, where it starts on them, home."""
 
     items: tuple[Item, ...]
-    start: Start
+    start: StartState
     origin: Origin
 
 
@@ -84,10 +84,10 @@ class Flight:
         return bool((self.away() > self.radius).any())
 
 
-def make(told: Told, plan: Plan, radius: float = 0.0) -> PretendUav:
+def make(told: Told, plan: Plan, radius: float = 0.0) -> SimulatedUav:
     """Put one aircraft in the air."""
     fenced = {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 2.0, "FENCE_RADIUS": radius} if radius else {}
-    return PretendUav(told.uav, told.seed, origin=plan.origin, plan=(plan.items, plan.start), more=fenced)
+    return SimulatedUav(told.uav, told.seed, origin=plan.origin, plan=(plan.items, plan.start), extra_params=fenced)
 
 
 def fly(told: Told, plan: Plan, seconds: float) -> Flight:
@@ -197,7 +197,7 @@ def chain(count: int, seed: int, say: Callable[[str], None] = print) -> list[Fli
 
 def _arrange(told: Told, rng: np.random.Generator, before: np.ndarray | None) -> Flight:
     own = int(np.random.SeedSequence((told.seed, told.uav)).generate_state(1)[0])
-    drawn = fly(told, Plan(*mission(own, CRUISE, HOME), HOME), MEET_S[1] + 5)
+    drawn = fly(told, Plan(*draw_mission(own, CRUISE, HOME), HOME), MEET_S[1] + 5)
     one = _heights(told, drawn, rng)
     plan = one.plan
     if told.may_leave:

@@ -28,7 +28,7 @@ from typing import Any
 
 from fleet.bus.bus_protocol import Bus
 from fleet.bus.session import ZenohBus, connect
-from fleet.cli import guarded, parser_for
+from fleet.cli import make_parser, run_command
 from fleet.contract import Prediction, Predictions
 from tests.bench.referee.site import Site
 
@@ -42,7 +42,7 @@ _TIMEOUT_S = 0.5  # of a question while one worker is frozen: nobody waits for i
 def once(bus: Bus, kind: type, wanted: int, timeout_s: float = 5.0) -> float | None:
     """Ask once; give how long the last of so many answers took [s]; None where fewer came."""
     begun, last, came = time.perf_counter(), 0.0, 0
-    for _ in bus.gather(kind, "*", b"", timeout_s):
+    for _ in bus.get_stream(kind, "*", b"", timeout_s):
         last, came = time.perf_counter() - begun, came + 1
         if came == wanted:
             break
@@ -122,14 +122,14 @@ def _run(args: argparse.Namespace) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Measure."""
-    parser = parser_for("python -m tests.bench.asking", "Measure how long a question for all takes.", __doc__ or "")
+    parser = make_parser("python -m tests.bench.asking", "Measure how long a question for all takes.", __doc__ or "")
     parser.add_argument("--uavs", type=int, default=1000)
     parser.add_argument("--workers", type=int, default=4)
     parser.add_argument("--times", type=int, default=50, help="questions of each kind")
     parser.add_argument("--router", default="tcp/127.0.0.1:7465")
     parser.add_argument("--zenohd", help="the real router; without it a session of ours in router mode")
     parser.add_argument("--json", type=Path, metavar="FILE")
-    return guarded("bench.asking", _run, parser.parse_args(argv))
+    return run_command("bench.asking", _run, parser.parse_args(argv))
 
 
 if __name__ == "__main__":

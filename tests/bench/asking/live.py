@@ -20,7 +20,7 @@ from typing import Any
 import msgpack
 
 from fleet.bus.session import connect
-from fleet.cli import guarded, parser_for
+from fleet.cli import make_parser, run_command
 from tests.bench.referee.site import Site, until
 
 _PATIENCE_S = 300.0
@@ -68,7 +68,7 @@ def _run(args: argparse.Namespace) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Ask."""
-    parser = parser_for("python -m tests.bench.asking.live", "Ask two workers for 50 predictions.", __doc__ or "")
+    parser = make_parser("python -m tests.bench.asking.live", "Ask two workers for 50 predictions.", __doc__ or "")
     parser.add_argument("--uavs", type=int, default=50)
     parser.add_argument("--pace", default=_PACE)
     parser.add_argument("--times", type=int, default=20)
@@ -76,7 +76,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--zenohd", help="the real router; without it a session of ours in router mode")
     parser.add_argument("--recording", type=Path, help="a flight to play; without it one is flown first")
     parser.add_argument("--json", type=Path, metavar="FILE")
-    return guarded("bench.asking.live", _run, parser.parse_args(argv))
+    return run_command("bench.asking.live", _run, parser.parse_args(argv))
 
 
 if __name__ == "__main__":

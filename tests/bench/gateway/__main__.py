@@ -16,7 +16,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from fleet.telemetry.recording.opening import Source
+from fleet.telemetry.recording.opening import RecordingFile
 
 from . import decoding, load
 
@@ -36,7 +36,7 @@ def main() -> int:
     if args.uavs:
         with tempfile.TemporaryDirectory() as folder:
             plain = Path(folder) / "flight.tlog"
-            plain.write_bytes(Source(args.file).open().read(1 << 30) or b"")
+            plain.write_bytes(RecordingFile(args.file).open().read(1 << 30) or b"")
             fleet = load.measure(plain, args.uavs, args.seconds, args.begin)
             loop = load.plain(plain, min(args.uavs, PLAIN), args.seconds, args.begin)
         loop["ratio"] = round(loop["us_a_message"] / fleet["us_a_message"], 1)

@@ -8,10 +8,10 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from fleet.telemetry.mavlink.parsing.decode import Dealt, Decoder
-from fleet.telemetry.mavlink.parsing.received import Heard
+from fleet.telemetry.mavlink.parsing.decode import Decoder, GroupedFrames
+from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
 from fleet.telemetry.mavlink.parsing.scan import START, STOP
-from fleet.telemetry.recording.opening import Source
+from fleet.telemetry.recording.opening import RecordingFile
 from fleet.telemetry.recording.tlog import Tlog
 
 BATCH = 1_024  # datagrams
@@ -20,17 +20,17 @@ BATCH = 1_024  # datagrams
 def datagrams(path: Path) -> list[bytes]:
     """Give every frame of a telemetry log."""
     found = []
-    for frames in Tlog(Source(path)).batches():
+    for frames in Tlog(RecordingFile(path)).batches():
         told = frames.buf.tobytes()
-        found += [told[start:stop] for start, stop in frames.at[:, [START, STOP]].tolist()]
+        found += [told[start:stop] for start, stop in frames.headers[:, [START, STOP]].tolist()]
     return found
 
 
-def ours(batches: list[Heard]) -> int:
+def ours(batches: list[ReceivedBytes]) -> int:
     """Decode every batch, down to the arrays of every message in it."""
     decoder, count = Decoder(), 0
     for batch in batches:
-        dealt = Dealt(decoder.feed(batch))
+        dealt = GroupedFrames(decoder.decode(batch))
         count += sum(len(dealt.fields(name)[0]) for name in dealt.names())
     return count
 
@@ -56,7 +56,7 @@ def measure(path: Path, times: int = 7) -> dict[str, Any]:
     """Measure both on one recording, taking turns."""
     frames = datagrams(path)
     pieces = [(0.0, None, frame) for frame in frames]
-    batches = [Heard.of(pieces[k : k + BATCH]) for k in range(0, len(pieces), BATCH)]
+    batches = [ReceivedBytes.from_pieces(pieces[k : k + BATCH]) for k in range(0, len(pieces), BATCH)]
     ours(batches)  # compiles
     mine, peer = rate(lambda: ours(batches), len(frames), times), rate(lambda: theirs(frames), len(frames), 3)
     return {

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet.telemetry.recording.opening import Source
+from fleet.telemetry.recording.opening import RecordingFile
 from fleet.telemetry.recording.tlog import Tlog
 from tests import oracle
 
@@ -32,7 +32,7 @@ def sound(rng: np.random.Generator, count: int) -> dict[str, int]:
         frames = oracle.ours([damaged, bytes(600)])
         oracle.assert_equal(frames, oracle.searched(damaged))
         found["sound"] += len(messages)
-        found["from_damaged"] += len(frames.at)
+        found["from_damaged"] += len(frames.headers)
         found["from_damaged_by_pymavlink"] += len(oracle.by_pymavlink([damaged]))
     return found
 
@@ -42,7 +42,7 @@ def recorded(folder: Path) -> dict[str, int]:
     found = {}
     for path in sorted({*folder.rglob("*.tlog"), *folder.rglob("*.tlog.xz")}):
         count = 0
-        for batch in Tlog(Source(path)).batches():
+        for batch in Tlog(RecordingFile(path)).batches():
             frames = oracle.raw(batch)
             oracle.assert_equal(oracle.ours(frames), oracle.by_pymavlink(frames))
             count += len(frames)

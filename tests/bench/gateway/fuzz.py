@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from fleet.bus.codec import Wire
-from fleet.telemetry.mavlink.intake import Intake
-from fleet.telemetry.mavlink.parsing.received import Heard
+from fleet.bus.codec import EncodedMessage
+from fleet.telemetry.mavlink.intake import MavlinkReceiver
+from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
 from tests import oracle
 from tests.bench.peak_memory import peak_mb
 from tests.talker import Talker
@@ -46,28 +46,28 @@ def blocks(seed: int, total: int) -> Iterator[bytes]:
             yield rng.choice(np.array([0xFD, 0xFE, 0, 1, 255, 12, 30, 76], np.uint8), BLOCK).tobytes()
 
 
-def pieces(rng: np.random.Generator, block: bytes, t: float) -> Heard:
+def pieces(rng: np.random.Generator, block: bytes, t: float) -> ReceivedBytes:
     """Cut a block anywhere, and say that a few senders sent it."""
     cuts = np.unique(rng.integers(0, len(block) + 1, int(rng.integers(1, 400))))
     stop = np.append(cuts, len(block))
     start = np.concatenate([[0], stop[:-1]])
     sender = rng.integers(0, 5, len(stop))
     senders = tuple(("10.0.0.9", int(port)) for port in rng.integers(1024, 65_536, 5))
-    return Heard(np.frombuffer(block, np.uint8), start, stop, np.full(len(stop), t), sender, senders)
+    return ReceivedBytes(np.frombuffer(block, np.uint8), start, stop, np.full(len(stop), t), sender, senders)
 
 
 def run(seed: int, total: int) -> dict[str, Any]:
     """Feed so many bytes; gives counters, slowest block and growth of memory after the first tenth."""
-    rng, intake, t, slowest, early = np.random.default_rng(seed + 1), Intake(), 1.7e9, 0.0, 0
+    rng, intake, t, slowest, early = np.random.default_rng(seed + 1), MavlinkReceiver(), 1.7e9, 0.0, 0
     began = time.perf_counter()
     fed = heard = k = 0
     good = Talker(GOOD)
     for k, block in enumerate(blocks(seed, total)):
         t += 0.1
         took = time.process_time()
-        intake.listen(pieces(rng, block, t))
-        intake.hear(t, good.heartbeat() + good.attitude(0.1 * k), "good")
-        heard += any(isinstance(one, Wire) and one.uav == GOOD for one in intake.pack(t))
+        intake.receive_batch(pieces(rng, block, t))
+        intake.receive(t, good.heartbeat() + good.attitude(0.1 * k), "good")
+        heard += any(isinstance(one, EncodedMessage) and one.uav == GOOD for one in intake.flush_packed(t))
         slowest = max(slowest, time.process_time() - took) if k > 3 else 0.0  # the first ones compile
         fed += len(block)
         if fed >= total // 10 and not early:
@@ -75,10 +75,10 @@ def run(seed: int, total: int) -> dict[str, Any]:
     return {
         "bytes": fed,
         "counters": dict(intake.counters()),
-        "refused": dict(intake.refused),
+        "refused": dict(intake.rejected),
         "blocks": k + 1,
         "blocks_with_the_good_aircraft": heard,
-        "aircraft": len(intake.crafts),
+        "aircraft": len(intake.aircraft),
         "slowest_cpu_s": round(slowest, 3),
         "took_s": round(time.perf_counter() - began, 1),
         "more_memory_mb": round(peak_mb() - early, 1),

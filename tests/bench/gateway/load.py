@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from fleet.bus.session import connect, open_router
-from fleet.contract import Account, Sample
+from fleet.contract import GatewayCounters, Sample
 
 A_LINK = 250  # aircraft
 TICKS = os.sysconf("SC_CLK_TCK")
@@ -37,9 +37,9 @@ class Ear:
     def __init__(self, where: str) -> None:
         self.bus = connect(where)
         self.samples = self.bytes = 0
-        self.accounts: queue.Queue[Account] = queue.Queue()
-        self.bus.overhear(Sample, self._sample)
-        self.bus.subscribe(Account, lambda account, _: self.accounts.put(account))
+        self.accounts: queue.Queue[GatewayCounters] = queue.Queue()
+        self.bus.subscribe_raw(Sample, self._sample)
+        self.bus.subscribe(GatewayCounters, lambda account, _: self.accounts.put(account))
 
     def _sample(self, payload: bytes, *_: Any) -> None:
         self.samples += 1
@@ -85,7 +85,7 @@ def _watched(
     ear: Ear,
     children: tuple[subprocess.Popen[str], subprocess.Popen[str]],
     ports: list[int],
-    met: Account,
+    met: GatewayCounters,
     when: tuple[float, float],
 ) -> dict[str, Any]:
     gateway, sender = children
@@ -123,7 +123,7 @@ def _watched(
     }
 
 
-def _next(ear: Ear, t: float) -> Account:
+def _next(ear: Ear, t: float) -> GatewayCounters:
     """Wait for the first count at or after fleet time `t` [s since 1970]."""
     account = ear.accounts.get(timeout=LONG_S)
     while account.t < t:
@@ -131,7 +131,7 @@ def _next(ear: Ear, t: float) -> Account:
     return account
 
 
-def _quiet(ear: Ear, account: Account) -> Account:
+def _quiet(ear: Ear, account: GatewayCounters) -> GatewayCounters:
     """Wait until nothing more comes."""
     while True:
         after = ear.accounts.get(timeout=LONG_S)

@@ -12,7 +12,7 @@ from typing import Any
 import msgpack
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from fleet.bus.codec import Wire
+from fleet.bus.codec import EncodedMessage
 from fleet.bus.session import connect
 from fleet.contract import Sample
 from fleet.telemetry.tables.mavlink import TABLE
@@ -47,7 +47,7 @@ def main() -> int:
             if now >= tick + TICK_S:
                 tick = now
                 for uav, mine in rows.items():
-                    bus.put(Wire(Sample, uav, msgpack.packb(mine)))
+                    bus.put(EncodedMessage(Sample, uav, msgpack.packb(mine)))
                 rows.clear()
             if now >= tell + TELL_S:
                 tell = now

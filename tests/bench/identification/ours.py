@@ -14,8 +14,8 @@ from fleet.physics.actuators import TAU, lagged
 from fleet.window import Window
 from twin_worker.estimation.wind_filter import WindFilter
 from twin_worker.identification.fixed_wing.derivatives_model import identify
-from twin_worker.validation.forecast_shrinkage import Earned, runs_and_flown
-from twin_worker.validation.gust_observer import Observer
+from twin_worker.validation.forecast_shrinkage import Shrinkage, runs_and_measured
+from twin_worker.validation.gust_observer import AlphaBetaFilter
 
 from .flight import Flight
 from .gusty import WEATHER
@@ -31,14 +31,14 @@ _WIND_S = 0.2  # between rows the wind filter takes [s]
 class Seen:
     """One identified aircraft, as the bench asks for it."""
 
-    eye: Observer
-    earned: Earned
+    eye: AlphaBetaFilter
+    earned: Shrinkage
     mean: np.ndarray  # of the states over the stretch, (9,)
 
     def runs(self, x: np.ndarray, u: np.ndarray, begins: np.ndarray, length: int) -> np.ndarray:
         """Run free from rows of a stretch, `length` rows each with the one begun at, (m, length, 9)."""
         delta = lagged(u, self.eye.dt, TAU)
-        return self.eye.fly(self.eye.track(x, delta[: len(x)])[begins], begins, length, delta)
+        return self.eye.free_run(self.eye.filter(x, delta[: len(x)])[begins], begins, length, delta)
 
     def forecast(self, known: Flight, u: np.ndarray) -> np.ndarray:
         """Run free from the end of `known` under the inputs u (n, 4): rows (n, 9), the first right after `known`."""
@@ -52,12 +52,12 @@ class Seen:
         run = self.runs(flight.x, flight.u, begins, k + 1)[:, k:]
         return self.earned.forecast(run, flight.x[begins], self.mean, self.eye.dt * np.array([k]))[:, 0]
 
-    def look_back(self, flight: Flight, weight: float, earned: Earned | None = None) -> None:
+    def look_back(self, flight: Flight, weight: float, earned: Shrinkage | None = None) -> None:
         """Learn from a stretch what the runs are worth."""
         begins = np.arange(_SETTLE, len(flight) - round(1 / flight.dt), round(_EVERY_S / flight.dt))
         y, delta = np.where(flight.ok[:, None], flight.x, np.nan), lagged(flight.u, flight.dt, TAU)
-        runs, flown = runs_and_flown(self.eye, y, delta, begins, _AHEAD_S)
-        (earned or self.earned).learn(runs, flown, self.mean, flight.dt, weight)
+        runs, flown = runs_and_measured(self.eye, y, delta, begins, _AHEAD_S)
+        (earned or self.earned).update(runs, flown, self.mean, flight.dt, weight)
 
 
 class Ours:
@@ -67,7 +67,7 @@ class Ours:
         self._wind = WindFilter()
         self._heard = 0
         self._seen: Seen | None = None
-        self._earned = Earned()
+        self._earned = Shrinkage()
         self._taught = 0  # rows of the flight the lessons have reached
 
     def identify(self, known: Flight, start: int) -> Seen:
@@ -87,7 +87,7 @@ class Ours:
         stretch = known.part(start, len(known))
         if self._seen:
             self._seen.look_back(known.part(self._taught, len(known)), 1.0, self._earned)
-        seen = Seen(Observer(model, known.dt), self._earned.copy(), stretch.x[stretch.ok].mean(axis=0))
+        seen = Seen(AlphaBetaFilter(model, known.dt), self._earned.copy(), stretch.x[stretch.ok].mean(axis=0))
         seen.look_back(stretch, _IN_SAMPLE)
         self._seen, self._taught = seen, len(known)
         return seen

@@ -14,7 +14,7 @@ import numpy as np
 from fleet.frames import ned_to_body
 from fleet.process import private_files
 from fleet.simulator.flight.uav import DT as TICK_S
-from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.jsbsim import Aircraft, Truth
 from fleet.simulator.vehicle.missions import HOME
 from fleet.simulator.vehicle.sensors import Servos
@@ -66,16 +66,16 @@ def _own(seed: int, k: int) -> int:
 
 def _fly(seed: int, k: int) -> dict[str, np.ndarray]:
     """Fly one aircraft; keep a row every 0.04 s: measured, pulses, truth, wind."""
-    uav = PretendUav(k, seed, wind=WIND, turbulence=TURBULENCE)
+    uav = SimulatedUav(k, seed, wind=WIND, turbulence=TURBULENCE)
     kept: dict[str, list] = {name: [] for name in ("measured", "pulses", "p", "v", "euler", "rates", "wind")}
     first = int(SETTLE_S / TICK_S)
     for tick in range(first, first + int(SECONDS / TICK_S), _ROW):
         uav.step(tick * TICK_S)
         truth = uav.aircraft.truth()
         uav.step((tick + 1) * TICK_S)  # in this tick it measures that, and answers
-        if uav.down:
+        if uav.crashed:
             raise ValueError(f"pretend-{k}: came down after {tick * TICK_S:.0f} s, expected it to fly; choose a seed")
-        now = uav.now
+        now = uav.estimate
         kept["measured"].append(np.concatenate([now.v, now.euler, now.rates, [now.Va]]))
         kept["pulses"].append(uav.pulses)
         for name in ("p", "v", "euler", "rates"):
@@ -86,7 +86,7 @@ def _fly(seed: int, k: int) -> dict[str, np.ndarray]:
 
 def _folder() -> Path:
     given = os.environ.get("PARAUAV_BENCH_CACHE")
-    return private_files.folder(
+    return private_files.ensure_private_folder(
         Path(given).absolute() if given else private_files.cache_folder() / "bench", "PARAUAV_BENCH_CACHE"
     )
 
@@ -117,9 +117,9 @@ class Replay(Aircraft):
         told = []
         for k in range(at, at + n):
             told.append(self.truth())
-            self.drive(*self._flight.u[k])
+            self.set_controls(*self._flight.u[k])
             for _ in range(_ROW):
-                self.blow(*wind)
+                self.set_wind(*wind)
                 self.step()
         return self._rows(told, self._flight.x[at, 8])
 
@@ -147,11 +147,11 @@ class Replay(Aircraft):
             fdm[f"ic/v{name}-fps"] = value / FT
         for name, value in zip("pqr", rates, strict=True):
             fdm[f"ic/{name}-rad_sec"] = value
-        self.drive(*self._flight.u[max(at - 2, 0)])  # about one lag of the servos ago
+        self.set_controls(*self._flight.u[max(at - 2, 0)])  # about one lag of the servos ago
         fdm.set_trim_status(True)  # lags pass through
         fdm.run_ic()
         fdm.set_trim_status(False)
-        self.blow(*wind)
+        self.set_wind(*wind)
 
     def _rows(self, told: list[Truth], psi: float) -> np.ndarray:
         """Lay the truth as a flight's states, the heading unwrapped next to `psi` [rad]."""

@@ -10,7 +10,7 @@ from fleet.airframes.airframe import servo_map
 from fleet.contract import Params, Sample
 from fleet.frames import Origin, ned_to_body
 from fleet.telemetry.recording.recordings import replay_messages
-from twin_worker.telemetry.history import History
+from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.resample import DT, preprocess
 
 from .flight import Case, Flight, true_airspeed, unwrapped
@@ -82,7 +82,7 @@ def stack(folder: Path) -> list[Case]:
 
 
 def _airborne(path: Path, k: int) -> Flight:
-    history, params = History(keep_s=1e5), {}
+    history, params = TelemetryHistory(keep_s=1e5), {}
     for message in replay_messages(path):
         if isinstance(message, Sample):
             history.add(message)

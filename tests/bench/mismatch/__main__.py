@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from fleet.cli import id_range
-from fleet.contract import Found, Mismatch
+from fleet.contract import DiagnosisOutcome, Mismatch
 
 from .flown import Flown, errors, hear
 from .shown import line, summary
@@ -33,8 +33,8 @@ def judged(fault: str, flown: Flown) -> dict[str, Any]:
     """Judge one flight: when it was flagged and named, as what, and the errors with and without what was named."""
     since = flown.begin + ONSET_S
     told = [m for m in flown.adapting if isinstance(m, Mismatch) and m.t > since]
-    flagged = next((m.t - since for m in told if m.outcome is not Found.NONE), None)
-    named = next((m for m in told if m.outcome is Found.NAMED), None)
+    flagged = next((m.t - since for m in told if m.outcome is not DiagnosisOutcome.NONE), None)
+    named = next((m for m in told if m.outcome is DiagnosisOutcome.NAMED), None)
     name, _, of = fault.split(",")[0].partition(":")
     row: dict[str, Any] = {"fault": fault, "flagged_s": flagged, "named_s": named and named.t - since}
     row["before_the_fault"] = [one for one in alarms(flown)["said"] if one[0] <= ONSET_S]
@@ -42,8 +42,8 @@ def judged(fault: str, flown: Flown) -> dict[str, Any]:
         return row
     first = named.causes[0]
     right = (first.name, first.surface) == (name, of)
-    row["verdict"] = "right" if right else "in class" if name in first.rivals else "wrong"
-    row["named"] = [(one.name, one.surface, one.rivals, one.parameters) for one in named.causes]
+    row["verdict"] = "right" if right else "in class" if name in first.confusable_with else "wrong"
+    row["named"] = [(one.name, one.surface, one.confusable_with, one.parameters) for one in named.causes]
     row["onset_error_s"] = first.segments[0][0] - since
     row["adapted"] = any(m.adapted for m in told if m.t <= named.t + MINUTE_S)
     spans = {"before": (flown.adapting, since, named.t), "after": (flown.adapting, named.t, named.t + MINUTE_S)}
@@ -55,7 +55,9 @@ def judged(fault: str, flown: Flown) -> dict[str, Any]:
 def alarms(flown: Flown) -> dict[str, Any]:
     """List what was said of a healthy flight."""
     told = [m for m in flown.adapting if isinstance(m, Mismatch)]
-    said = [(round(m.t - flown.begin), m.outcome.value, m.sentence) for m in told if m.outcome is not Found.NONE]
+    said = [
+        (round(m.t - flown.begin), m.outcome.value, m.sentence) for m in told if m.outcome is not DiagnosisOutcome.NONE
+    ]
     return {"looks": len(told), "said": said}
 
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fleet.contract import Found, Message, Prediction, Sample
+from fleet.contract import DiagnosisOutcome, Message, Prediction, Sample
 from fleet.frames import to_ned
 from twin_worker.diagnosis.model.baseline import Baseline
-from twin_worker.mismatch.coordinator import ALL, Live
-from twin_worker.mismatch.job import Answer, Job, work
+from twin_worker.mismatch.coordinator import ALL_UAVS, Coordinator
+from twin_worker.mismatch.job import DiagnosisJob, DiagnosisResult, run_job
 from twin_worker.twin.step import Twin, advance
 
 ANSWER_S, REST_S = 3.0, 12.0  # after a diagnosis began: its answer, and the next one [s of data time]
@@ -24,7 +24,7 @@ class Inline:
     now: float = 0.0
     cpu_s: float = 0.0
     began: float = -np.inf
-    kept: Answer | None = None
+    kept: DiagnosisResult | None = None
 
     @property
     def free(self) -> bool:
@@ -36,12 +36,12 @@ class Inline:
         """Tell whether an answer is to be given now."""
         return self.kept is not None and self.now >= self.began + ANSWER_S
 
-    def give(self, job: Job) -> None:
+    def submit(self, job: DiagnosisJob) -> None:
         """Work a job out."""
-        self.kept, self.began = work(job), self.now
+        self.kept, self.began = run_job(job), self.now
         self.cpu_s += self.kept.cpu_s
 
-    def answer(self) -> Answer | None:
+    def poll(self) -> DiagnosisResult | None:
         """Give its answer when it is due."""
         if self.kept is None or not self.due:
             return None
@@ -70,8 +70,8 @@ def hear(heard: list[Message], base: Baseline | None) -> Flown:
     positions = [m.position for m in heard if isinstance(m, Sample) and m.position is not None]
     truth = np.concatenate([np.column_stack([p.t.numpy(), p.x.numpy().astype(float)]) for p in positions])
     flown, hand = Flown(float(truth[0, 0]), truth), Inline()
-    live = Live(hand, {} if base is None else {ALL: base})
-    twin, plain = Twin(heard[0].uav), None
+    live = Coordinator(hand, {} if base is None else {ALL_UAVS: base})
+    twin, plain = Twin.of(heard[0].uav), None
     for message in heard:
         flown.adapting += advance(twin, (message,))
         if plain is not None:
@@ -80,9 +80,9 @@ def hear(heard: list[Message], base: Baseline | None) -> Flown:
             continue
         hand.now = message.t
         before = copy.deepcopy(twin) if plain is None and hand.due else None
-        told = list(live.turn([(twin, nullcontext())]))
+        told = list(live.run_once([(twin, nullcontext())]))
         flown.adapting += told
-        if any(one.outcome is Found.NAMED for one in told):
+        if any(one.outcome is DiagnosisOutcome.NAMED for one in told):
             plain = plain or before
     flown.cpu_s = hand.cpu_s
     return flown

@@ -5,11 +5,11 @@ from pathlib import Path
 
 from fleet.contract import Message
 from fleet.simulator.conceal.cards import card
-from fleet.simulator.conceal.plan import EXCITED, Job, draw
+from fleet.simulator.conceal.plan import NOMINAL_EXCITATION, FlightJob, draw_flight
 from fleet.simulator.conceal.record import fly
-from fleet.simulator.faults.kinds import read
+from fleet.simulator.faults.kinds import parse_fault
 from fleet.simulator.flight.drive import to_tlog
-from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.weather import FT, wind_at_20ft
 from fleet.telemetry.recording.recordings import replay_messages
 from twin_worker.diagnosis.baseline.calibrate import calibrate
@@ -29,10 +29,10 @@ def model(seed: int, folder: Path) -> Path:
     if path.exists():
         return path
     (folder / "card.json").write_text(json.dumps(card("small")))
-    known, flights = cards.read(folder / "card.json"), []
-    for k, strength in enumerate(EXCITED):
+    known, flights = cards.read_card(folder / "card.json"), []
+    for k, strength in enumerate(NOMINAL_EXCITATION):
         recording = folder / f"nominal_{seed}_{k}.tlog"
-        planned = draw(Job(recording.stem, "small", "nominal", (), k, strength), seed, 0)
+        planned = draw_flight(FlightJob(recording.stem, "small", "nominal", (), k, strength), seed, 0)
         fly(planned._replace(w20_mps=USUAL_W20_MPS), (), recording)
         flights += read_flights(recording, known)
         recording.unlink()
@@ -47,9 +47,9 @@ def baseline(seed: int, folder: Path) -> Baseline:
 
 def messages(fault: str, seed: int, seconds: int, folder: Path) -> list[Message]:
     """Give what a gateway says of an ordinary flight of that aircraft, with a fault from `ONSET_S` on, or none."""
-    faults = (read(f"{fault},at={ONSET_S:.0f}", "small"),) if fault else ()
+    faults = (parse_fault(f"{fault},at={ONSET_S:.0f}", "small"),) if fault else ()
     path = folder / "flight.tlog"
-    to_tlog(path, [PretendUav(0, seed, faults=faults)], seconds=seconds, loss=0.02, seed=seed)
+    to_tlog(path, [SimulatedUav(0, seed, faults=faults)], seconds=seconds, loss=0.02, seed=seed)
     heard = list(replay_messages(path))
     path.unlink()
     return heard

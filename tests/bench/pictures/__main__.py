@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from fleet.bus.session import connect
-from fleet.contract import Alert, AlertKind, Cause, Found, Mismatch
+from fleet.contract import Alert, AlertKind, Cause, DiagnosisOutcome, Mismatch
 from tests.bench.viewing.page import ARGS
 from tests.bench.viewing.process import free_port, start, tell
 
@@ -66,7 +66,9 @@ def trouble(router: str, stop: threading.Event) -> None:
             t = time.time()
             for uav in (23, 61, 118, 164):
                 cause = Cause(name="thrust_loss", channel="thrust", segments=((t - 30.0, t),))
-                bus.publish(Mismatch(uav=uav, t=t, outcome=Found.NAMED, causes=(cause,), sentence="thrust is lost"))
+                bus.publish(
+                    Mismatch(uav=uav, t=t, outcome=DiagnosisOutcome.NAMED, causes=(cause,), sentence="thrust is lost")
+                )
             for uav, other in ((7, 90), (45, 131), (150, 199)):
                 words = f"uav-{uav}: 40 m from uav-{other} in 18 s"
                 bus.publish(Alert(uav=uav, t=t, kind=AlertKind.CONFLICT, other=other, sentence=words))

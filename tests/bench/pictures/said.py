@@ -14,14 +14,14 @@ from typing import Any
 
 from fleet.bus.codec import Stamp
 from fleet.bus.session import connect, open_router
-from fleet.contract import Account, Found, Mismatch, Prediction, Sample, Status
+from fleet.contract import DiagnosisOutcome, GatewayCounters, Mismatch, Prediction, Sample, Status
 from fleet.process import private_files
 from fleet.telemetry.recording.recordings import Recording
 from tests.bench.mismatch.flown import Inline
 from tests.bench.mismatch.world import baseline
 from tests.bench.viewing.process import free_port
-from twin_worker.alerts.traffic import Traffic
-from twin_worker.mismatch.coordinator import ALL, Live
+from twin_worker.alerts.traffic import TrafficMonitor
+from twin_worker.mismatch.coordinator import ALL_UAVS, Coordinator
 from twin_worker.twin.step import Twin, advance
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -36,7 +36,7 @@ Said = list[tuple[float, Any, Stamp | None]]
 
 def flown(name: str, *options: str) -> Path:
     """Fly simulated aircraft into a recording, kept for the next time."""
-    path = private_files.folder(private_files.cache_folder() / "pictures", "pictures") / f"{name}.tlog"
+    path = private_files.ensure_private_folder(private_files.cache_folder() / "pictures", "pictures") / f"{name}.tlog"
     if not path.is_file():
         command = [sys.executable, "-m", "fleet.cli", "fly", *options, "--seed", "1", "--tlog", str(path)]
         subprocess.run(command, cwd=ROOT, check=True)
@@ -47,17 +47,22 @@ def judged(path: Path, diagnosed: int | None = None) -> Said:
     """Let twins judge a recording; of one UAV also what its simulation lacks. Everything said, in the order of time."""
     said: Said = []
     twins: dict[int, Twin] = {}
-    traffic, hand = Traffic(), Inline()
+    traffic, hand = TrafficMonitor(), Inline()
     with tempfile.TemporaryDirectory() as folder:
-        live = Live(hand, {ALL: baseline(1, Path(folder))}) if diagnosed is not None else None
+        live = Coordinator(hand, {ALL_UAVS: baseline(1, Path(folder))}) if diagnosed is not None else None
     for now, news in Recording(str(path), 0).steps():
         for message in news:
             said.append((now, message, None))
-            twin = twins.setdefault(message.uav, Twin(message.uav))
-            said += [(now, told, STAMP) for told in traffic.after(twin.uav, twin.turned_t, advance(twin, (message,)))]
+            twin = twins.setdefault(message.uav, Twin.of(message.uav))
+            said += [
+                (now, told, STAMP)
+                for told in traffic.process_results(
+                    twin.config.uav, twin.telemetry.last_step_t, advance(twin, (message,))
+                )
+            ]
             if live is not None and isinstance(message, Sample) and message.uav == diagnosed:
                 hand.now = message.t
-                said += [(now, told, STAMP) for told in live.turn([(twin, nullcontext())])]
+                said += [(now, told, STAMP) for told in live.run_once([(twin, nullcontext())])]
     return said
 
 
@@ -67,7 +72,7 @@ def played(said: Said, name: str) -> Said:
     for t, message, stamp in said:
         found.append((t, message, stamp))
         if isinstance(message, Status):
-            found.append((t, Account(t=t, links=(f"replay:{name}",), uavs=(message.uav,)), None))
+            found.append((t, GatewayCounters(t=t, links=(f"replay:{name}",), uavs=(message.uav,)), None))
     return found
 
 
@@ -95,7 +100,7 @@ def moment(said: Said, since: float = SETTLED_S, uav: int | None = None) -> tupl
 
 def named_s(said: Said) -> float:
     """Tell how long after the first word a mismatch was first named and predicted with [s]."""
-    found = (m for _, m, _ in said if isinstance(m, Mismatch) and m.outcome is Found.NAMED and m.adapted)
+    found = (m for _, m, _ in said if isinstance(m, Mismatch) and m.outcome is DiagnosisOutcome.NAMED and m.adapted)
     return float(next(found).t) - said[0][0]
 
 

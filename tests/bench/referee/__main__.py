@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet.cli import guarded, parser_for
+from fleet.cli import make_parser, run_command
 from fleet.contract import Claim
 from twin_worker.ownership.rendezvous import owners
 
@@ -77,8 +77,8 @@ def happen(site: Site, name: str, rng: np.random.Generator) -> dict[str, Any]:
     try:
         found = fault(site, worker)
     except TimeoutError as error:
-        claims = {claim.worker[-4:]: (sorted(uav for uav, _ in claim.held), claim.bare, claim.leaving)
-                  for claim, _ in site.reader.bus.ask(Claim)}  # fmt: skip
+        claims = {claim.worker[-4:]: (sorted(uav for uav, _ in claim.owned), claim.without_history, claim.leaving)
+                  for claim, _ in site.reader.bus.get(Claim)}  # fmt: skip
         found = {"failed": str(error), "claims": claims}
     limits = LIMITS.get(name, {})
     found["over"] = [key for key, most_of in limits.items() if not (found.get(key, np.inf) <= most_of)]
@@ -162,7 +162,7 @@ def _run(args: argparse.Namespace) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Judge the workers."""
-    parser = parser_for("python -m tests.bench.referee", "Judge workers that share a fleet.", __doc__ or "")
+    parser = make_parser("python -m tests.bench.referee", "Judge workers that share a fleet.", __doc__ or "")
     parser.add_argument("--uavs", type=int, default=200)
     parser.add_argument("--workers", type=int, default=4)
     parser.add_argument("--pace", default=PACE)
@@ -177,7 +177,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write what was measured")
     parser.add_argument("--words", action="store_true", help="show what the processes said")
-    return guarded("bench.referee", _run, parser.parse_args(argv))
+    return run_command("bench.referee", _run, parser.parse_args(argv))
 
 
 if __name__ == "__main__":

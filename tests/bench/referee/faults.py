@@ -206,7 +206,7 @@ def busy(site: Site, _: Worker, seconds: float = 20.0) -> dict[str, Any]:
 def _silent(site: Site, uavs: set[int], since: float) -> list[str]:
     """Tell of the aircraft with the longest gaps what their workers say of them."""
     gaps = sorted(((site.reader.gap({uav}, since), uav) for uav in uavs), reverse=True)[:_SHOWN]
-    rows = {row.uav: row for state, _ in site.reader.bus.ask(FleetState, timeout_s=5.0) for row in state.rows}
+    rows = {row.uav: row for state, _ in site.reader.bus.get(FleetState, timeout_s=5.0) for row in state.rows}
     found = [(gap, uav, rows.get(uav)) for gap, uav in gaps if gap > _LONG_S]
     return [
         f"uav-{uav} {gap:.1f} s: {row and (row.state.value, row.sample_age_s, row.prediction_age_s)}"

@@ -9,7 +9,7 @@ import numpy as np
 
 from fleet.bus.bus_protocol import Bus
 from fleet.bus.codec import Stamp
-from fleet.bus.epoch_fence import Fence
+from fleet.bus.epoch_fence import EpochFence
 from fleet.contract import Claim, FleetState, Model, Prediction
 
 
@@ -25,7 +25,7 @@ class Reader:
     """Listens to everything a viewer would, and remembers."""
 
     def __init__(self, bus: Bus) -> None:
-        self.bus, self.lock, self.fence = bus, threading.Lock(), Fence()
+        self.bus, self.lock, self.fence = bus, threading.Lock(), EpochFence()
         self.came: dict[int, list[Came]] = defaultdict(list)
         self.fits: dict[int, float] = {}  # mean fit of the model in force, as published last
         self.windows: dict[int, float] = {}
@@ -42,7 +42,7 @@ class Reader:
         assert stamp is not None
         with self.lock:
             came = self.came[made.uav]
-            if not self.fence.believes(made.uav, stamp):
+            if not self.fence.accepts(made.uav, stamp):
                 self.fenced += 1
                 return
             self.regressions += bool(came) and stamp < came[-1].stamp
@@ -51,7 +51,7 @@ class Reader:
             came.append(Came(time.monotonic(), stamp, made.t))
 
     def _model(self, model: Model, stamp: Stamp | None) -> None:
-        fit = (model.in_force or model.verdict).fit
+        fit = (model.active_verdict or model.verdict).fit
         with self.lock:
             self.fits[model.uav] = float(np.mean(list(fit.values()))) if fit else float("nan")
             self.windows[model.uav] = model.window_s
@@ -60,24 +60,26 @@ class Reader:
         now = time.monotonic()
         with self.lock:
             self.claimed[claim.worker].append(now)
-            for uav, epoch in claim.held:
+            for uav, epoch in claim.owned:
                 rank = self.ranks.get(uav, (0, ""))
                 self.moved += bool(rank[1]) and claim.worker != rank[1] and (epoch, claim.worker) > rank
                 self.ranks[uav] = max(rank, (epoch, claim.worker))
             before = self.whole.get(claim.worker, {})
-            self.whole[claim.worker] = {uav: before.get(uav, now) for uav, _ in claim.held if uav not in claim.bare}
+            self.whole[claim.worker] = {
+                uav: before.get(uav, now) for uav, _ in claim.owned if uav not in claim.without_history
+            }
 
     def holders(self) -> dict[int, str]:
         """Ask who holds what."""
         found: dict[int, tuple[int, str]] = {}
-        for claim, _ in self.bus.ask(Claim):
-            for uav, epoch in claim.held:
+        for claim, _ in self.bus.get(Claim):
+            for uav, epoch in claim.owned:
                 found[uav] = max(found.get(uav, (0, "")), (epoch, claim.worker))
         return {uav: worker for uav, (_, worker) in found.items()}
 
     def rows(self) -> dict[int, float]:
         """Ask for the mean fit of each model in force, by UAV id."""
-        rows = [row for state, _ in self.bus.ask(FleetState, timeout_s=3.0) for row in state.rows]
+        rows = [row for state, _ in self.bus.get(FleetState, timeout_s=3.0) for row in state.rows]
         return {row.uav: float(np.mean(list(row.fit.values()))) for row in rows if row.fit}
 
     def taken(self, uavs: set[int], since: float, was: str) -> float | None:

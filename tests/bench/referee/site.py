@@ -12,11 +12,11 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 
-from fleet.access.entry import ROUTER, endpoint
-from fleet.access.knock import reachable
+from fleet.access.entry import ROUTER, parse_endpoint
+from fleet.access.knock import accepts_connections
 from fleet.bus.session import connect
 from fleet.simulator.flight.drive import to_tlog
-from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.flight.uav import SimulatedUav
 
 from .forwarder import Forwarder
 from .reader import Reader
@@ -54,7 +54,7 @@ def rss_mb(pid: int) -> float:
 
 def fly(path: Path, seconds: float = 1200.0) -> Path:
     """Fly one pretend aircraft in wind and turbulence, and record it."""
-    to_tlog(path, [PretendUav(0, 3, wind=3.0, turbulence=2)], seconds=seconds, loss=0.01, seed=3)
+    to_tlog(path, [SimulatedUav(0, 3, wind=3.0, turbulence=2)], seconds=seconds, loss=0.01, seed=3)
     return path
 
 
@@ -143,12 +143,12 @@ class Site(AbstractContextManager):
         else:
             command = [sys.executable, "-c", _ROUTER, self.router]
         self.router_process = self._begin(command, "router")
-        until(lambda: reachable(self.router), 60.0, "the router")
+        until(lambda: accepts_connections(self.router), 60.0, "the router")
 
     def add(self) -> Worker:
         """Start a worker, and wait until it may claim."""
         ways = sum(worker.way is not None for worker in self.workers)
-        worker = Worker(self, Forwarder(endpoint(self.router)) if ways < self.ways else None)
+        worker = Worker(self, Forwarder(parse_endpoint(self.router)) if ways < self.ways else None)
         self.workers.append(worker)
         until(lambda: worker.name or worker.process.poll() is not None, 300.0, "a worker")
         return worker

@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet.cli import guarded, parser_for
+from fleet.cli import make_parser, run_command
 from fleet.contract import Claim, FleetState
 
 from .__main__ import RANDOM, happen, settle
@@ -70,10 +70,10 @@ class Soak:
     def _look(self, after: str) -> None:
         reader = self.site.reader
         for uav in sorted(reader.silent(set(range(self.site.uavs)), _SILENT_S)):
-            states = [row for state, _ in reader.bus.ask(FleetState) for row in state.rows if row.uav == uav]
+            states = [row for state, _ in reader.bus.get(FleetState) for row in state.rows if row.uav == uav]
             said = [f"{row.worker} {row.state} {row.prediction_age_s} {row.verdict}" for row in states]
             self.orphans.append({"uav": uav, "after": after, "fault": len(self.rows), "held": said})
-        held = Counter(uav for claim, _ in reader.bus.ask(Claim) for uav, _ in claim.held)
+        held = Counter(uav for claim, _ in reader.bus.get(Claim) for uav, _ in claim.owned)
         self.doubles += [uav for uav, count in held.items() if count > 1]
 
     def summary(self) -> dict[str, Any]:
@@ -164,7 +164,7 @@ def _write(path: Path | None, found: dict[str, Any]) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Soak."""
-    parser = parser_for("python -m tests.bench.referee.soak", "Hurt a site for long.", __doc__ or "")
+    parser = make_parser("python -m tests.bench.referee.soak", "Hurt a site for long.", __doc__ or "")
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--every", type=float, default=10.0, help="between faults, at least [s]")
     parser.add_argument("--uavs", type=int, default=30)
@@ -176,7 +176,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--recording", type=Path, help="a flight to play, long enough; without it one is flown first")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write what was found, anew after every fault")
-    return guarded("bench.referee.soak", _run, parser.parse_args(argv))
+    return run_command("bench.referee.soak", _run, parser.parse_args(argv))
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet.cli import guarded, parser_for
+from fleet.cli import make_parser, run_command
 from tests.bench.referee.site import fly
 
 from .watched import Size, watch
@@ -83,7 +83,7 @@ def _run(args: argparse.Namespace) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Measure."""
-    parser = parser_for("python -m tests.bench.scale", "Measure how many aircraft a machine holds.", __doc__ or "")
+    parser = make_parser("python -m tests.bench.scale", "Measure how many aircraft a machine holds.", __doc__ or "")
     parser.add_argument("--only", nargs="+", default=list(KINDS), choices=KINDS)
     parser.add_argument("--hundred", type=int, default=100, metavar="N", help="aircraft of `hundred`")
     parser.add_argument("--most", type=int, default=500, metavar="N", help="aircraft of `most`")
@@ -94,7 +94,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--router", default="tcp/127.0.0.1:7463")
     parser.add_argument("--recording", type=Path, help="a flight to play; without it one is flown first")
     parser.add_argument("--json", type=Path, metavar="FILE")
-    return guarded("bench.scale", _run, parser.parse_args(argv))
+    return run_command("bench.scale", _run, parser.parse_args(argv))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import numpy as np
 
 from fleet.contract import FleetState, Prediction, Sample
 from tests.bench.referee.site import Site, cpu_s, until
-from twin_worker.twin.state.schedule import read_pace
+from twin_worker.twin.state.schedule import parse_schedule
 
 _MODELS = 0.95  # share of the aircraft that must have a model before anything is counted [-]
 _PATIENCE_S = 240.0  # with models [s]
@@ -42,15 +42,15 @@ class _Ear:
     def __init__(self, site: Site) -> None:
         self.heard: Counter[type] = Counter()
         for kind in (Sample, Prediction):
-            site.reader.bus.overhear(kind, lambda *_, kind=kind: self.heard.update((kind,)))
+            site.reader.bus.subscribe_raw(kind, lambda *_, kind=kind: self.heard.update((kind,)))
 
 
 def _state(site: Site) -> dict[str, int]:
     """Ask every worker what it did and shed so far."""
     found: Counter[str] = Counter()
-    for state, _ in site.reader.bus.ask(FleetState, timeout_s=5.0):
-        found.update(state.done)
-        found["shed"] += state.shed
+    for state, _ in site.reader.bus.get(FleetState, timeout_s=5.0):
+        found.update(state.tasks)
+        found["shed"] += state.dropped_messages
         found["answered"] += 1
     return dict(found)
 
@@ -73,14 +73,14 @@ def watch(size: Size, recording: Path, router: str) -> dict[str, Any]:
         before = _count(site, ear)
         gaps = _watch_gaps(site, size.seconds, never)
         after = _count(site, ear)
-        rows = [row for state, _ in site.reader.bus.ask(FleetState, timeout_s=5.0) for row in state.rows]
-        said = [state.sentence for state, _ in site.reader.bus.ask(FleetState, timeout_s=5.0) if state.sentence]
+        rows = [row for state, _ in site.reader.bus.get(FleetState, timeout_s=5.0) for row in state.rows]
+        said = [state.sentence for state, _ in site.reader.bus.get(FleetState, timeout_s=5.0) if state.sentence]
         rss = [worker.rss_mb for worker in site.workers]
         models = len(site.reader.fits)
     took = after["t"] - before["t"]
     rate = {name: (after.get(name, 0) - before.get(name, 0)) / took for name in after if name != "t"}
     ages = [row.prediction_age_s for row in rows if row.prediction_age_s is not None]
-    wanted = read_pace(size.pace)
+    wanted = parse_schedule(size.pace)
     periods = {kind: round(size.uavs / rate[kind], 2) if rate.get(kind) else None for kind in _KINDS}
     late = [kind for kind in _KINDS if periods[kind] is None or periods[kind] > 1.1 * getattr(wanted, kind)]  # type: ignore[operator]
     return {

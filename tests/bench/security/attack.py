@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator
 
 import zenoh
 
-from fleet.access.entry import Entry
-from fleet.access.roles import LIVE, MOST, ROOT, keys
+from fleet.access.entry import BusConfig
+from fleet.access.roles import LIVE, MAX_BYTES, ROOT, topic_keys
 from fleet.bus.codec import Stamp, encode, encoding, pack_stamp
 from fleet.bus.session import _config
 from fleet.contract import TOPICS
@@ -29,7 +29,7 @@ STRANGE = ("*", str(UAV), "18446744073709551616", "²", "1$*")
 Attack = Callable[..., int]  # what: BOMBARD, or the topics that are asked; gives how many
 
 
-def attack(at: str, *what: str, most: int = MOST) -> int:
+def attack(at: str, *what: str, most: int = MAX_BYTES) -> int:
     """Do it from this process, with bombs of at most so many bytes."""
     with raw(at) as session:
         return _bombard(session, most) if what == (BOMBARD,) else _interrogate(session, what)
@@ -43,7 +43,7 @@ def from_outside(at: str, *what: str) -> int:
 
 def raw(at: str) -> zenoh.Session:
     """Open a session that obeys no contract."""
-    return zenoh.open(_config(Entry(at).session()))
+    return zenoh.open(_config(BusConfig(at).session_settings()))
 
 
 @contextlib.contextmanager
@@ -51,13 +51,13 @@ def lying(at: str, kinds: tuple[type, ...]) -> Iterator[None]:
     """Answer every question about some classes with every bomb, for as long as the block lasts."""
     with raw(at) as session:
         for kind in kinds:
-            session.declare_queryable(keys(kind.topic), _liar(kind))  # type: ignore[attr-defined]
+            session.declare_queryable(topic_keys(kind.topic), _liar(kind))  # type: ignore[attr-defined]
         yield
 
 
 def _liar(kind: type) -> Callable[[zenoh.Query], None]:
     said = [payload for _, payload in bombs(EXAMPLES[kind])]
-    name = keys(kind.topic).replace("*", str(UAV))  # type: ignore[attr-defined]
+    name = topic_keys(kind.topic).replace("*", str(UAV))  # type: ignore[attr-defined]
 
     def reply(query: zenoh.Query) -> None:
         with query:
@@ -72,7 +72,7 @@ def _bombard(session: zenoh.Session, most: int) -> int:
     count = 0
     every = {"congestion_control": zenoh.CongestionControl.BLOCK}
     for kind in TOPICS.values():
-        name = keys(kind.topic).replace("*", str(UAV))  # type: ignore[attr-defined]
+        name = topic_keys(kind.topic).replace("*", str(UAV))  # type: ignore[attr-defined]
         for n, (_, payload) in enumerate(bombs(EXAMPLES[kind], most)):
             attachment = ATTACHMENTS[n % len(ATTACHMENTS)]
             session.put(name, payload, encoding=encoding(kind), attachment=attachment, **every)
@@ -89,7 +89,7 @@ def _interrogate(session: zenoh.Session, topics: tuple[str, ...]) -> int:
     for topic in topics:
         for who in STRANGE if not topic.startswith("@") else ("*",):
             for _, parameters, payload in questions():
-                name = keys(topic).replace("*", who) + (f"?{parameters}" if parameters else "")
+                name = topic_keys(topic).replace("*", who) + (f"?{parameters}" if parameters else "")
                 list(session.get(name, payload=payload or None, timeout=2.0))
                 count += 1
     return count

@@ -7,7 +7,7 @@ from typing import Any
 import msgpack
 import msgspec
 
-from fleet.access.roles import MOST, SAID
+from fleet.access.roles import MAX_BYTES, TOPIC_RULES
 from fleet.bus.codec import encode
 
 DEPTH = 200_000
@@ -16,9 +16,9 @@ HEADS = (b"\xdd", b"\xdf", b"\xc6", b"\xdb", b"\xc9")  # array, map, bytes, text
 ESCAPES = "\x1b]0;owned\x07\x1b[2J\x1b[31m‮\r\n"
 
 
-def bombs(example: Any, most: int = MOST) -> Iterator[tuple[str, bytes]]:
+def bombs(example: Any, most: int = MAX_BYTES) -> Iterator[tuple[str, bytes]]:
     """Give payloads for the class of an example, none larger than it may be, nor than `most`: (what, bytes)."""
-    most = min(most, SAID[example.topic].most)
+    most = min(most, TOPIC_RULES[example.topic].max_bytes)
     plain = msgpack.unpackb(encode(example), strict_map_key=False)
     yield "nothing", b""
     yield "no msgpack", b"\xc1" * 64

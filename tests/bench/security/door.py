@@ -9,7 +9,7 @@ from typing import Any
 
 import zenoh
 
-from fleet.access.knock import answers
+from fleet.access.knock import probe_router
 from fleet.bus.session import _config
 
 from .site import PATIENCE_S, Site, expired, make_papers
@@ -124,20 +124,20 @@ def _kept_out(site: Site, role: str, changed: dict[str, Any]) -> str:
 def _impostor(site: Site, folder: Path, name: str) -> str:
     """Open a router of our own beside the site's with papers of `folder`, and join it as a worker would."""
     host, _, port = site.at.rpartition(":")
-    entry = replace(site.entry("worker"), at=f"{host}:{int(port) + next(IDS)}")
+    entry = replace(site.entry("worker"), endpoint=f"{host}:{int(port) + next(IDS)}")
     papers = {
         f"{_TLS}/listen_certificate": f"{folder}/{name}.pem",
         f"{_TLS}/listen_private_key": f"{folder}/{name}.key",
     }
-    with zenoh.open(_config(entry.router() | papers)):
+    with zenoh.open(_config(entry.router_settings() | papers)):
         try:
-            answers(entry)
+            probe_router(entry)
         except ConnectionError as error:
             words = str(error).split("found ")[1]
         else:
             raise Admitted("the knock believed it")
         try:
-            with zenoh.open(_config(entry.session() | {"connect/timeout_ms": REFUSED_MS})):
+            with zenoh.open(_config(entry.session_settings() | {"connect/timeout_ms": REFUSED_MS})):
                 raise Admitted("Zenoh believed it")
         except zenoh.ZError:
             return f"not believed: {words[:80]}"

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fleet.bus.session import connect, open_router
-from fleet.contract import Account, Sample
+from fleet.contract import GatewayCounters, Sample
 from gateway.links.tcp_listener import MOST
 from tests.bench.gateway.fuzz import blocks
 from tests.talker import ITEMS, Talker
@@ -78,14 +78,14 @@ class Watch:
             self.gap_s = max(self.gap_s, now - self._last) if self.heard else 0.0
             self.heard, self._last = self.heard + 1, now
 
-    def _count(self, account: Account, _: object) -> None:
+    def _count(self, account: GatewayCounters, _: object) -> None:
         self.known = len(account.uavs)
         self.uavs = max(self.uavs, self.known)
 
     def _run(self) -> None:
         with connect(self._at) as bus:
             bus.subscribe(Sample, self._hear)
-            bus.subscribe(Account, self._count)
+            bus.subscribe(GatewayCounters, self._count)
             while not self._stop.wait(0.02):
                 self.peak_mb = max(self.peak_mb, megabytes(self._pid))
 

@@ -202,9 +202,11 @@ def many_ids() -> bytes:
     """A fleet recording of a hundred thousand aircraft."""
     from fleet.bus.codec import encode, encoding
     from fleet.contract import Status
-    from fleet.telemetry.recording.fleet_log import Record
+    from fleet.telemetry.recording.fleet_log import BusRecord
 
-    made = (Record(1.6e9 + k * 1e-3, encoding(Status), encode(Status(uav=k, t=1.6e9))).pack() for k in range(100_000))
+    made = (
+        BusRecord(1.6e9 + k * 1e-3, encoding(Status), encode(Status(uav=k, t=1.6e9))).pack() for k in range(100_000)
+    )
     return b"".join(made)
 
 

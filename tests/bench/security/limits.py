@@ -16,13 +16,13 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
-from fleet.telemetry.mavlink.intake import FORGET_S, Intake
+from fleet.telemetry.mavlink.intake import SILENCE_LIMIT_S, MavlinkReceiver
 from gateway.links.link import Batch
 from gateway.links.tcp_listener import MOST, TcpListener
-from gateway.record.tape import AGAIN_S, Budget, Tape
+from gateway.record.tape import RETRY_S, DiskBudget, TlogWriter
 from gateway.settings.link_spec import read_spec
 from tests.talker import T0, Talker
-from viewer.browser.http_server import VIOLATION, quiet, serve
+from viewer.browser.http_server import VIOLATION, serve, without_stdout
 
 from . import hostile
 from .site import PATIENCE_S, free_port
@@ -42,7 +42,7 @@ def silent_callers() -> str:
         link.start(0, out, stop)
         for _ in range(MOST):
             held.enter_context(socket.create_connection(("127.0.0.1", port), PATIENCE_S))
-        if not until(lambda: len(link.greets) == MOST):
+        if not until(lambda: len(link.known_peers) == MOST):
             raise Admitted("not all silent callers were let in, so nothing was tried")
         air = held.enter_context(socket.create_connection(("127.0.0.1", port), PATIENCE_S))
         with contextlib.suppress(OSError):
@@ -55,39 +55,39 @@ def silent_callers() -> str:
 def _heard(out: "Queue[Batch]", air: socket.socket) -> bool:
     with contextlib.suppress(Empty):
         batch = out.get(timeout=0.05)
-        return batch.heard is not None and air.getsockname() in batch.heard.senders
+        return batch.received is not None and air.getsockname() in batch.received.senders
     return False
 
 
 def ghosts() -> str:
     """Take the place of every aircraft with ghosts; a rightful one comes after them, another was there before."""
-    intake, before, after = Intake(most=100), Talker(250), Talker(251)
-    for k in range(round(FORGET_S) + 5):
-        intake.hear(T0 + k, before.heartbeat(), "air")
+    intake, before, after = MavlinkReceiver(max_uavs=100), Talker(250), Talker(251)
+    for k in range(round(SILENCE_LIMIT_S) + 5):
+        intake.receive(T0 + k, before.heartbeat(), "air")
         if k == 1:
-            intake.hear(T0 + k, b"".join(Talker(system).heartbeat() for system in range(1, 200)), "foe")
+            intake.receive(T0 + k, b"".join(Talker(system).heartbeat() for system in range(1, 200)), "foe")
         intake.flush(T0 + k)
-        intake.forget(T0 + k)
-    intake.hear(T0 + FORGET_S + 6, after.heartbeat(), "air")
-    intake.flush(T0 + FORGET_S + 6)
-    if sorted(intake.crafts) != [250, 251]:
-        raise Admitted(f"found aircraft {sorted(intake.crafts)[:5]} …, expected the two rightful ones")
+        intake.remove_silent(T0 + k)
+    intake.receive(T0 + SILENCE_LIMIT_S + 6, after.heartbeat(), "air")
+    intake.flush(T0 + SILENCE_LIMIT_S + 6)
+    if sorted(intake.aircraft) != [250, 251]:
+        raise Admitted(f"found aircraft {sorted(intake.aircraft)[:5]} …, expected the two rightful ones")
     return "99 ghosts forgotten, the two rightful aircraft are there"
 
 
 def full_disk() -> str:
     """Record on a disk that takes nothing, and then on one that does."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    with tempfile.TemporaryDirectory() as name, Tape("udpin", Budget(Path(name), 1 << 20)) as tape:
+    with tempfile.TemporaryDirectory() as name, TlogWriter("udpin", DiskBudget(Path(name), 1 << 20)) as tape:
         resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
         try:
             for k in range(20):
-                tape.write(bytes(100), k * 2 * AGAIN_S)
+                tape.write(bytes(100), k * 2 * RETRY_S)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
         if found := list(Path(name).iterdir()):
             raise Admitted(f"{len(found)} empty recordings")
-        if tape.write(bytes(100), 100 * AGAIN_S):
+        if tape.write(bytes(100), 100 * RETRY_S):
             raise Admitted("nothing was recorded when there was room again")
     return "no empty recording in 20 tries, then one of 100 bytes"
 
@@ -100,7 +100,7 @@ def _served() -> Iterator[int]:
     try:
         yield port
     finally:
-        with quiet():
+        with without_stdout():
             server.stop()
 
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from gateway.onboard.cache import Cache, Card
+from gateway.onboard.cache import Cache, CachedAircraft
 
 ROOT = Path(__file__).resolve().parents[3]
 _PROGRAM = """
@@ -87,7 +87,7 @@ def words_in_the_onboard_cache() -> str:
     """Parameters of an aircraft, planted where anybody may write."""
     with tempfile.TemporaryDirectory() as name:
         told = Path(name) / "told"
-        Cache(told).keep("px4-1-1", Card({"FW_AIRSPD_TRIM": 15.0}))
+        Cache(told).store("px4-1-1", CachedAircraft({"FW_AIRSPD_TRIM": 15.0}))
         assert Cache(told).read("px4-1-1") is not None, "what was kept is found again"
         told.chmod(0o777)
         (told / "px4-1-1.json").write_text('{"values": {"FW_AIRSPD_TRIM": 99.0}}')

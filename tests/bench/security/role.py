@@ -6,7 +6,7 @@ from queue import SimpleQueue
 
 import zenoh
 
-from fleet.access.roles import LIVE, ROOT, SAID
+from fleet.access.roles import LIVE, ROOT, TOPIC_RULES
 
 from .site import PATIENCE_S, Site
 from .trying import (
@@ -30,7 +30,11 @@ def _publishing(topic: str, by: str) -> Attempt:
 
     def attempt(site: Site) -> str:
         name = fresh(topic)
-        with site.session(SAID[topic].by[0]) as owner, site.session(by) as forger, site.session("tools") as reader:
+        with (
+            site.session(TOPIC_RULES[topic].publishers[0]) as owner,
+            site.session(by) as forger,
+            site.session("tools") as reader,
+        ):
             return only_heard(reader, name, lambda: owner.put(name, RIGHT), lambda: forger.put(name, FORGED))
 
     attempt.__name__ = f"{topic.lstrip('@')}_by_{by}"

@@ -19,11 +19,11 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from fleet.access.entry import Entry, endpoint
-from fleet.access.knock import reachable
+from fleet.access.entry import BusConfig, parse_endpoint
+from fleet.access.knock import accepts_connections
 from fleet.access.roles import ROLES, ROUTER_ROLE
 from fleet.bus.session import _config
-from fleet.commands.live.router import text
+from fleet.commands.live.router import format_settings
 
 ROOT = Path(__file__).resolve().parents[3]
 SCRIPT = ROOT / "deploy" / "certificates.sh"
@@ -50,9 +50,9 @@ class Site:
         """Tell whether it speaks TLS."""
         return self.at.startswith("tls/")
 
-    def entry(self, role: str) -> Entry:
+    def entry(self, role: str) -> BusConfig:
         """Give a rightful way in."""
-        return Entry(self.at, role, self.folder if self.tls else None, self.passwords)
+        return BusConfig(self.at, role, self.folder if self.tls else None, self.passwords)
 
     def session(self, role: str, changed: dict[str, Any] | None = None) -> zenoh.Session:
         """Open a raw session as a role, some of its settings changed, or taken away by None.
@@ -60,7 +60,7 @@ class Site:
         Raises:
             zenoh.ZError: when the router does not let it in.
         """
-        settings = self.entry(role).session() | (changed or {})
+        settings = self.entry(role).session_settings() | (changed or {})
         return zenoh.open(_config({path: value for path, value in settings.items() if value is not None}))
 
 
@@ -129,15 +129,15 @@ def zenohd() -> str | None:
 @contextlib.contextmanager
 def routed(kind: str, site: Site, beside: list[str] | None = None) -> Iterator[Site]:
     """Have a router at the site for as long as the block lasts, perhaps beside others."""
-    settings = site.entry("tools").router(beside=beside)
+    settings = site.entry("tools").router_settings(peers=beside)
     if kind == OURS:
         with zenoh.open(_config(settings)):
             yield site
         return
     program = zenohd()
     assert program is not None
-    config = site.folder / f"zenohd-{endpoint(site.at)[1]}.json5"
-    config.write_text(text(settings))
+    config = site.folder / f"zenohd-{parse_endpoint(site.at)[1]}.json5"
+    config.write_text(format_settings(settings))
     log = (site.folder / "zenohd.log").open("wb")
     child = subprocess.Popen([program, "-c", str(config)], stdout=log, stderr=log)
     try:
@@ -151,7 +151,7 @@ def routed(kind: str, site: Site, beside: list[str] | None = None) -> Iterator[S
 
 def _await(at: str, child: subprocess.Popen[bytes]) -> None:
     until = time.monotonic() + PATIENCE_S
-    while not reachable(at):
+    while not accepts_connections(at):
         with contextlib.suppress(subprocess.TimeoutExpired):
             raise RuntimeError(f"zenohd ended with exit code {child.wait(0.02)}; its log is beside its configuration")
         if time.monotonic() > until:

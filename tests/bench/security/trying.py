@@ -9,7 +9,7 @@ from typing import Any
 
 import zenoh
 
-from fleet.access.roles import keys
+from fleet.access.roles import topic_keys
 
 from .site import PATIENCE_S, Site
 
@@ -26,7 +26,7 @@ class Admitted(Exception):
 
 def fresh(topic: str) -> str:
     """Give a key of a topic that no other attempt uses."""
-    return keys(topic).replace("*", str(next(IDS)))
+    return topic_keys(topic).replace("*", str(next(IDS)))
 
 
 def only_heard(reader: zenoh.Session, name: str, right: Callable[[], None], forge: Callable[[], None]) -> str:

@@ -11,15 +11,15 @@ from rich.console import Console
 from fleet.bus.bus_protocol import Bus
 from fleet.bus.codec import encode
 from fleet.bus.session import connect
-from fleet.commands.live.record import Recorder
-from fleet.commands.live.status import as_objects, fleet_rows, table
-from fleet.commands.live.whatif import as_object, ask, text
-from fleet.contract import Account, FleetState, Mission, Prediction, Sample, Status, WhatIf
+from fleet.commands.live.record import BusRecorder
+from fleet.commands.live.status import as_objects, fleet_rows, fleet_table
+from fleet.commands.live.whatif import as_object, format_text, send_request
+from fleet.contract import FleetState, GatewayCounters, Mission, Prediction, Sample, Status, WhatIf
 from gateway.publication.publish import Publisher
 from tests.bench.peak_memory import peak_mb, reset_peak
 from tests.examples import EXAMPLES
 from twin_worker.service.worker import Worker
-from viewer.store.store import Feed
+from viewer.store.store import FleetStore
 
 from .attack import BOMBARD, UAV, Attack, from_outside, lying
 from .trying import until
@@ -35,32 +35,32 @@ class Fallen(Exception):
 def viewer(at: str, attack: Attack) -> str:
     """Bombard the viewer's feed."""
     with connect(at) as bus:
-        feed, stop = Feed(bus), threading.Event()
+        feed, stop = FleetStore(bus), threading.Event()
         listener = threading.Thread(target=_listen, args=(feed, stop), daemon=True)
         listener.start()
         count = attack(at, BOMBARD)
-        _last_word(at, lambda: (vehicle := feed.one(UAV)) is not None and vehicle.status == LAST)
-        feed.catch_up()
+        _last_word(at, lambda: (vehicle := feed.get(UAV)) is not None and vehicle.status == LAST)
+        feed.request_latest()
         stop.set()
         listener.join(10)
         return f"{count} messages, {bus.bad} did not decode, {feed.counts['strange']} were refused"
 
 
-def _listen(feed: Feed, stop: threading.Event) -> None:
+def _listen(feed: FleetStore, stop: threading.Event) -> None:
     """Take in what comes as often as the viewer does."""
     while not stop.wait(0.1):
-        feed.listen()
+        feed.poll()
 
 
 def worker(at: str, attack: Attack) -> str:
     """Bombard a worker, and let its twins turn."""
     with connect(at) as bus:
         victim, heard = Worker(bus, range(50), omega=0.0), []
-        victim.listen()
+        victim.connect()
         bus.subscribe(Status, lambda message, _: heard.append(message))
         count = attack(at, BOMBARD)
         _last_word(at, lambda: LAST in heard)
-        victim.turn()
+        victim.sweep()
         if not victim.state().rows or len(encode(victim.state())) > 1 << 20:
             raise Fallen("its table is empty, or larger than the bus lets through")
         return f"{count} messages, {bus.bad} did not decode; it says {victim.state().sentence[:80]!r}"
@@ -70,8 +70,8 @@ def recorder(at: str, attack: Attack) -> str:
     """Bombard `fleet record`."""
     with connect(at) as bus:
         file = io.BytesIO()
-        victim = Recorder(bus, file)
-        victim.listen()
+        victim = BusRecorder(bus, file)
+        victim.subscribe()
         count = attack(at, BOMBARD)
 
         def written() -> bool:
@@ -85,7 +85,7 @@ def recorder(at: str, attack: Attack) -> str:
 def tools(at: str, attack: Attack) -> str:
     """Answer `fleet status` and `fleet whatif` with bombs."""
     with connect(at) as bus, lying(at, (FleetState, Status, Prediction)):
-        if not until(lambda: bool(bus.ask(Status))):
+        if not until(lambda: bool(bus.get(Status))):
             raise Fallen("no answer arrived, so nothing was tried")
         rows = fleet_rows(bus)
         msgspec.json.encode(as_objects(rows))
@@ -99,15 +99,15 @@ def gateway(at: str, attack: Attack) -> str:
     with connect(at) as bus:
         publisher = Publisher(bus)
         publisher.publish([EXAMPLES[kind] for kind in (Status, Sample, Mission)])
-        publisher.account(EXAMPLES[Account])
+        publisher.account(EXAMPLES[GatewayCounters])
         count = attack(at, "history", "status", "mission", "params", "alert", "@gateway")
-        return _still_answers(at, Account, count)
+        return _still_answers(at, GatewayCounters, count)
 
 
 def answers(at: str, attack: Attack) -> str:
     """Ask a worker everything that no one should ask."""
     with connect(at) as bus:
-        Worker(bus, range(50), omega=0.0).listen()
+        Worker(bus, range(50), omega=0.0).connect()
         count = attack(at, "prediction", "model", "alert", "mismatch", "@fleet/state", "@claim", "@handover")
         return _still_answers(at, FleetState, count)
 
@@ -143,7 +143,7 @@ def _last_word(at: str, heard: Callable[[], bool]) -> None:
 
 def _still_answers(at: str, kind: type, count: int) -> str:
     with connect(at) as bus:
-        if not until(lambda: bool(bus.ask(kind))):
+        if not until(lambda: bool(bus.get(kind))):
             raise Fallen("it answers no more")
     return f"{count} questions, and it still answers"
 
@@ -151,16 +151,16 @@ def _still_answers(at: str, kind: type, count: int) -> str:
 def _printed(rows: list[Any]) -> str:
     console = Console(file=io.StringIO(), width=200, color_system=None)
     with console.capture() as shown:
-        console.print(table(rows))
+        console.print(fleet_table(rows))
     return shown.get()
 
 
 def _told(bus: Bus) -> str:
     """Print what is told of one aircraft, where that makes sense at all."""
     try:
-        if (made := ask(bus, UAV, WhatIf())) is None:
+        if (made := send_request(bus, UAV, WhatIf())) is None:
             return ""
         msgspec.json.encode(as_object(made))
-        return text(made, None)
+        return format_text(made, None)
     except ValueError as error:
         return str(error)

@@ -22,17 +22,17 @@ from fleet.contract import (
     AlertKind,
     Array,
     Cause,
+    DiagnosisOutcome,
     FleetRow,
     FleetState,
-    Found,
     Mismatch,
     Model,
     Outcome,
     Prediction,
     Rows,
     Sample,
-    State,
     Status,
+    TwinState,
     Verdict,
 )
 from fleet.frames import Origin, to_geodetic
@@ -56,9 +56,11 @@ class World:
         self.radius, self.speed = r.uniform(120, 420, n), r.uniform(12, 20, n)
         self.rate, self.phase = self.speed / self.radius * r.choice([-1, 1], n), r.uniform(0, 2 * np.pi, n)
         luck = r.random(n)
-        states = np.where(luck < 0.3, State.VERIFIED, np.where(luck < 0.38, State.IDENTIFYING, State.PREDICTING))
-        self.states = [State(state) for state in states]
-        self.states[0] = State.PREDICTING
+        states = np.where(
+            luck < 0.3, TwinState.VERIFIED, np.where(luck < 0.38, TwinState.IDENTIFYING, TwinState.PREDICTING)
+        )
+        self.states = [TwinState(state) for state in states]
+        self.states[0] = TwinState.PREDICTING
         self.wrong = set(np.flatnonzero((luck > 0.975) & (np.arange(n) > 0)).tolist())  # a mismatch was named
         self.horizon = r.uniform(12, 58, n)
 
@@ -99,22 +101,27 @@ def slowly(world: World, who: np.ndarray, t: float) -> list[Status | Prediction 
     for k, uav in enumerate(who.tolist()):
         found.append(Status(uav=uav, t=t, mode="AUTO", armed=True, autopilot="ardupilot", vehicle="fixed_wing"))
         state = world.states[uav]
-        if state is not State.IDENTIFYING:
+        if state is not TwinState.IDENTIFYING:
             origin = tuple(to_geodetic(HOME, paths[k, 0]).tolist())
             path = Array.of(paths[k] - paths[k, 0])
-            told = {"ahead": ahead, "path": path, "tube": tube, "horizon_s": float(world.horizon[uav])}
-            told |= {"method": "dynamics", "held": 0.91, "held_n": 412, "origin": origin, "seq": 3}
+            told = {
+                "ahead": ahead,
+                "path": path,
+                "prediction_region_half_axes": tube,
+                "horizon_s": float(world.horizon[uav]),
+            }
+            told |= {"method": "dynamics", "coverage": 0.91, "coverage_n": 412, "origin": origin, "seq": 3}
             found.append(Prediction(uav=uav, t=t, state=state, **told))
         if int(t) % 5 == uav % 5:
-            found.append(_model(uav, t, well=state is not State.IDENTIFYING))
+            found.append(_model(uav, t, well=state is not TwinState.IDENTIFYING))
     return found
 
 
 def _model(uav: int, t: float, *, well: bool) -> Model:
     fit = dict.fromkeys(("u", "w", "q", "theta", "phi", "p", "r", "v"), 90.0 if well else 45.0)
-    outcome = Outcome.VERIFIED if well else Outcome.STARVED
+    outcome = Outcome.VERIFIED if well else Outcome.INSUFFICIENT_DATA
     verdict = Verdict(outcome=outcome, sentence=f"uav-{uav}: mean fit {fit['u']:.0f} %", fit=fit, horizon_s=8.0)
-    return Model(uav=uav, t=t, method="dynamics", verdict=verdict, in_force=verdict if well else None)
+    return Model(uav=uav, t=t, method="dynamics", verdict=verdict, active_verdict=verdict if well else None)
 
 
 def begin(world: World, bus: Bus) -> None:
@@ -124,7 +131,7 @@ def begin(world: World, bus: Bus) -> None:
     for uav in sorted(world.wrong):
         spans = ((world.begin - 20.0, world.begin + 1e6),)
         cause = Cause(name="thrust_loss", channel="thrust", segments=spans)
-        said = {"outcome": Found.NAMED, "causes": (cause,), "sentence": "thrust is lost", "adapted": True}
+        said = {"outcome": DiagnosisOutcome.NAMED, "causes": (cause,), "sentence": "thrust is lost", "adapted": True}
         bus.publish(Mismatch(uav=uav, t=world.begin, **said), STAMP)
         if uav % 3 == 0:
             bus.publish(Alert(uav=uav, t=world.begin, kind=AlertKind.SHORT_HORIZON, sentence="short"), STAMP)

@@ -7,11 +7,21 @@ import argparse
 import sys
 import threading
 
-from fleet.bus.bus_protocol import key
+from fleet.bus.bus_protocol import key_of
 from fleet.bus.session import connect
-from fleet.contract import Account, Alert, FleetState, Mismatch, Mission, Model, Prediction, Sample, Status
+from fleet.contract import Alert, FleetState, GatewayCounters, Mismatch, Mission, Model, Prediction, Sample, Status
 
-HEARD = (Sample, Status, Mission, Account, Model, Prediction, Alert, Mismatch, FleetState)  # as the viewer's feed
+HEARD = (
+    Sample,
+    Status,
+    Mission,
+    GatewayCounters,
+    Model,
+    Prediction,
+    Alert,
+    Mismatch,
+    FleetState,
+)  # as the viewer's feed
 TICK_S = 0.1
 
 
@@ -24,14 +34,14 @@ def main() -> int:
         held = []
         for kind in HEARD:
             if args.way == "callback":
-                held.append(bus._session.declare_subscriber(key(kind, "*"), lambda _: None))
+                held.append(bus._session.declare_subscriber(key_of(kind, "*"), lambda _: None))
             else:
-                bus.collect(kind, lambda _: None)
+                bus.subscribe_buffered(kind, lambda _: None)
         print("ready", flush=True)
         tick = threading.Event()
         while True:
             tick.wait(TICK_S)
-            bus.hand_out()
+            bus.dispatch()
 
 
 if __name__ == "__main__":

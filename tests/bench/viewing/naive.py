@@ -12,10 +12,10 @@ import numpy as np
 import viser
 
 from fleet.bus.session import connect
-from viewer.browser.http_server import quiet
+from viewer.browser.http_server import without_stdout
 from viewer.scene.strokes import chain
 from viewer.store.place import scene_quat
-from viewer.store.store import Feed
+from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.theme.shapes import aircraft
 
@@ -37,12 +37,14 @@ class Nodes:
             self.mesh.position = tuple(vehicle.at)
             self.mesh.wxyz = tuple(scene_quat(*(np.array([x]) for x in vehicle.attitude))[0])
 
-    def draw(self, vehicle: Vehicle, feed: Feed) -> None:
+    def draw(self, vehicle: Vehicle, feed: FleetStore) -> None:
         rows = feed.track(vehicle)[-120:, 1:]
         if len(rows) > 1:
             self.trail.points = chain(rows).astype(np.float32)
         if vehicle.forecast is not None:
-            self.told.points = chain(vehicle.forecast.at(np.linspace(0, vehicle.forecast.until, 30))).astype(np.float32)
+            self.told.points = chain(
+                vehicle.forecast.position_at(np.linspace(0, vehicle.forecast.horizon_s, 30))
+            ).astype(np.float32)
 
 
 def main() -> int:
@@ -51,12 +53,12 @@ def main() -> int:
     parser.add_argument("--router", required=True)
     args = parser.parse_args()
     stop = threading.Event()
-    with connect(args.router) as bus, quiet():
-        feed, server, nodes = Feed(bus), viser.ViserServer(host="127.0.0.1", port=args.port, verbose=False), {}
+    with connect(args.router) as bus, without_stdout():
+        feed, server, nodes = FleetStore(bus), viser.ViserServer(host="127.0.0.1", port=args.port, verbose=False), {}
         print("ready", file=sys.__stdout__, flush=True)
         tick, due = 0, time.monotonic()
         while True:
-            feed.listen()
+            feed.poll()
             feed.poses(tuple(nodes))  # of a crowd `all` reads a part at a time; here every place is drawn every time
             with server.atomic():
                 for vehicle in feed.all():

@@ -6,18 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
-from twin_worker.confidence.calibration_table import Doubt, doubt_of
-from twin_worker.confidence.groups import ANY, setting, wider
-from twin_worker.confidence.lagged_ensemble import Earlier
+from twin_worker.confidence.calibration_table import UncertaintyFeatures, uncertainty_features
+from twin_worker.confidence.groups import ANY, group_chain, group_setting
+from twin_worker.confidence.lagged_ensemble import LaggedForecasts
 from twin_worker.numerics.prediction_errors import AHEAD, axes_error
 
-_LEAST = 30  # minimum predictions of a setting that forms a fold of its own
-_WHOLE = ("path", "spread", "flown")
-_ROWS = ("t0", "length", "predicted_length", "group", "method", "flight")
+_MIN_STARTS = 30  # minimum predictions of a setting that forms a fold of its own
+_PATH_KEYS = ("path", "spread", "flown")
+_ROW_KEYS = ("t0", "length", "predicted_length", "group", "method", "flight")
 
 
 @dataclass(frozen=True)
-class Scored:
+class ScoredPredictions:
     """Predictions (s of them) on the common look-ahead grid of k points.
 
     Attributes:
@@ -31,7 +31,7 @@ class Scored:
 
     t0: np.ndarray
     path: np.ndarray
-    doubt: Doubt
+    features: UncertaintyFeatures
     flown: np.ndarray
     length: np.ndarray
     predicted_length: np.ndarray
@@ -42,21 +42,23 @@ class Scored:
     def __len__(self) -> int:
         return len(self.t0)
 
-    def part(self, rows: np.ndarray) -> "Scored":
+    def select(self, rows: np.ndarray) -> "ScoredPredictions":
         """Return the predictions of these rows."""
-        doubt = Doubt(self.doubt.spread[rows], self.doubt.revision[rows])
-        return replace(self, doubt=doubt, **{name: getattr(self, name)[rows] for name in ("path", "flown", *_ROWS)})
+        features = UncertaintyFeatures(self.features.spread[rows], self.features.revision[rows])
+        return replace(
+            self, features=features, **{name: getattr(self, name)[rows] for name in ("path", "flown", *_ROW_KEYS)}
+        )
 
     def errors(self) -> np.ndarray:
         """Return errors along, cross, vertical and the distance, nan where unknown, (s, k, 4) [m]."""
         return axes_error(self.path, self.flown)
 
-    def within(self, group: str) -> np.ndarray:
+    def in_group(self, group: str) -> np.ndarray:
         """Return which predictions belong to a group or parent group, (s,) bool."""
-        named = {name: group in wider(name) for name in set(self.group.tolist())}
-        return np.array([named[name] for name in self.group.tolist()], bool)
+        is_member = {name: group in group_chain(name) for name in set(self.group.tolist())}
+        return np.array([is_member[name] for name in self.group.tolist()], bool)
 
-    def several(self, group: str) -> bool:
+    def spans_settings(self, group: str) -> bool:
         """Return whether a group spans several settings (law, airframe, parameters) with enough predictions."""
         return ANY in group and len(set(self._settings().tolist())) > 1
 
@@ -65,64 +67,68 @@ class Scored:
 
         A table of several settings is used for settings without a table, so validation leaves out settings.
         """
-        return np.unique(self._settings() if self.several(group) else self.flight, return_inverse=True)[1]
+        return np.unique(self._settings() if self.spans_settings(group) else self.flight, return_inverse=True)[1]
 
     def _settings(self) -> np.ndarray:
         """Return the setting of each prediction, (s,); rare settings are merged with the most common one."""
-        names = np.array([setting(name) for name in self.group.tolist()])
-        known, count = np.unique(names, return_counts=True)
-        few = np.isin(names, known[count < _LEAST])
-        return np.where(few, known[np.argmax(count)], names)
+        names = np.array([group_setting(name) for name in self.group.tolist()])
+        unique, count = np.unique(names, return_counts=True)
+        rare = np.isin(names, unique[count < _MIN_STARTS])
+        return np.where(rare, unique[np.argmax(count)], names)
 
 
-def read(paths: Sequence[Path]) -> Scored:
+def read(paths: Sequence[Path]) -> ScoredPredictions:
     """Read and concatenate files of scored predictions.
 
     Raises:
         ValueError: when a file was not written by `assess`.
     """
-    return joined([_read(path) for path in paths])
+    return concatenate([_read_file(path) for path in paths])
 
 
-def joined(parts: Sequence[Scored]) -> Scored:
+def concatenate(parts: Sequence[ScoredPredictions]) -> ScoredPredictions:
     """Concatenate sets of predictions."""
-    doubt = Doubt(*(np.concatenate([getattr(part.doubt, name) for part in parts]) for name in ("spread", "revision")))
-    names = ("path", "flown", *_ROWS)
-    return Scored(doubt=doubt, **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+    features = UncertaintyFeatures(
+        *(np.concatenate([getattr(part.features, name) for part in parts]) for name in ("spread", "revision"))
+    )
+    names = ("path", "flown", *_ROW_KEYS)
+    return ScoredPredictions(
+        features=features, **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    )
 
 
-def _read(path: Path) -> Scored:
+def _read_file(path: Path) -> ScoredPredictions:
     try:
         with np.load(path, allow_pickle=False) as file:
-            held = {name: file[name] for name in ("ahead", *_WHOLE, *_ROWS)}
+            arrays = {name: file[name] for name in ("ahead", *_PATH_KEYS, *_ROW_KEYS)}
     except (OSError, KeyError, ValueError) as error:
         raise ValueError(f"{path.name}: found no scored predictions ({error}); write them with `assess`") from None
-    s, k = len(held["t0"]), len(AHEAD)
-    if not np.array_equal(held.pop("ahead"), AHEAD):
+    s, k = len(arrays["t0"]), len(AHEAD)
+    if not np.array_equal(arrays.pop("ahead"), AHEAD):
         raise ValueError(f"{path.name}: found another look-ahead grid, expected 0 to 180 s in {k} points; assess again")
-    wanted: dict[str, tuple[int, ...]] = dict.fromkeys(_WHOLE, (s, k, 3))
-    wanted |= dict.fromkeys(("length", "predicted_length"), (s, k))
-    for name, value in held.items():
-        if value.shape != wanted.get(name, (s,)):
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_PATH_KEYS, (s, k, 3))
+    shapes |= dict.fromkeys(("length", "predicted_length"), (s, k))
+    for name, value in arrays.items():
+        if value.shape != shapes.get(name, (s,)):
             raise ValueError(
-                f"{path.name}: found {name} of shape {value.shape}, expected {wanted.get(name, (s,))}; assess again"
+                f"{path.name}: found {name} of shape {value.shape}, expected {shapes.get(name, (s,))}; assess again"
             )
-    spread = held.pop("spread")
-    revision = revisions(held["t0"], held["path"], held["flight"])
-    methods = held["method"].tolist()
-    each = [doubt_of(*row, AHEAD) for row in zip(spread, revision, methods, strict=True)]
-    stacked = (np.array([getattr(one, name) for one in each]).reshape(s, k, 3) for name in ("spread", "revision"))
-    return Scored(doubt=Doubt(*stacked), **held)
+    spread = arrays.pop("spread")
+    revision = revisions(arrays["t0"], arrays["path"], arrays["flight"])
+    methods = arrays["method"].tolist()
+    features = [uncertainty_features(*row, AHEAD) for row in zip(spread, revision, methods, strict=True)]
+    stacked = (np.array([getattr(item, name) for item in features]).reshape(s, k, 3) for name in ("spread", "revision"))
+    return ScoredPredictions(features=UncertaintyFeatures(*stacked), **arrays)
 
 
 def revisions(t0: np.ndarray, path: np.ndarray, flight: np.ndarray) -> np.ndarray:
     """Compute the forecast revision of each prediction within its flight, nan where undefined, (s, k, 3) [m]."""
     out = np.full(path.shape, np.nan)
     for name in dict.fromkeys(flight.tolist()):
-        earlier = Earlier()
+        lagged = LaggedForecasts()
         rows = np.flatnonzero(flight == name)
         for r in rows[np.argsort(t0[rows])]:
-            revision = earlier.revised(float(t0[r]), AHEAD, path[r])
+            revision = lagged.revision(float(t0[r]), AHEAD, path[r])
             out[r] = np.nan if revision is None else revision
-            earlier.add(float(t0[r]), AHEAD, path[r])
+            lagged.add(float(t0[r]), AHEAD, path[r])
     return out

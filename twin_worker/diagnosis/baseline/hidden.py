@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from twin_worker.diagnosis.data.flight import Flight
-from twin_worker.diagnosis.model.baseline import Baseline, silenced
+from twin_worker.diagnosis.data.flight import FlightData
+from twin_worker.diagnosis.model.baseline import Baseline, exclude_equations
 
 _READINGS = {
     "airspeed": ("Va",),
@@ -29,23 +29,23 @@ def check(names: Iterable[str]) -> None:
     Raises:
         ValueError: if a name is unknown; the message lists the valid names.
     """
-    if strange := [name for name in names if name not in NAMES]:
-        raise ValueError(f"--conceal: found {strange[0]!r}, expected names of {', '.join(NAMES)}; correct it")
+    if unknown := [name for name in names if name not in NAMES]:
+        raise ValueError(f"--conceal: found {unknown[0]!r}, expected names of {', '.join(NAMES)}; correct it")
 
 
-def concealed(flight: Flight, names: Sequence[str], usual: Flight) -> Flight:
+def conceal_channels(flight: FlightData, names: Sequence[str], typical: FlightData) -> FlightData:
     """Return a flight without some channels; a concealed command is replaced by its median in `typical`."""
     if not names:
         return flight
-    gone = {reading for name in names for reading in _READINGS.get(name, ())}
-    readings = {name: x for name, x in flight.readings.items() if name not in gone}
+    removed = {reading for name in names for reading in _READINGS.get(name, ())}
+    readings = {name: x for name, x in flight.readings.items() if name not in removed}
     commands = flight.commands.copy()
     for column in (_COMMANDS[name] for name in names if name in _COMMANDS):
-        commands[:, column] = np.median(usual.commands[usual.ok, column])
-    lacks = (f"concealed: {', '.join(names)}", *flight.lacks)
-    return replace(flight, readings=readings, commands=commands, lacks=lacks)
+        commands[:, column] = np.median(typical.commands[typical.ok, column])
+    limitations = (f"concealed: {', '.join(names)}", *flight.limitations)
+    return replace(flight, readings=readings, commands=commands, limitations=limitations)
 
 
-def deaf(base: Baseline, names: Iterable[str]) -> Baseline:
+def exclude_concealed(base: Baseline, names: Iterable[str]) -> Baseline:
     """Return a baseline that ignores the axes whose commands are concealed."""
-    return silenced(base, [_EQUATION[name] for name in names if name in _EQUATION])
+    return exclude_equations(base, [_EQUATION[name] for name in names if name in _EQUATION])

@@ -12,13 +12,13 @@ from fleet.airframes import Airframe, load
 from fleet.airframes.airframe import servo_map
 from fleet.effects import Body
 
-_WANTED = ("m", "S", "b", "c", "Ixx", "Iyy", "Izz", "Ixz")
-_MOST = 1e6
+_REQUIRED = ("m", "S", "b", "c", "Ixx", "Iyy", "Izz", "Ixz")
+_MAX_VALUE = 1e6
 _THROWS = ("aileron", "elevator", "throttle", "rudder")
 
 
 @dataclass(frozen=True)
-class Card:
+class AircraftCard:
     """Properties of the aircraft that are known before any flight.
 
     Attributes:
@@ -50,11 +50,11 @@ class Card:
         return lambda u: np.where(u > 0, high, low) * u
 
 
-UNKNOWN = Card("no card", Body(), (1.0, 1.0, 1.0, 0.0), known=False)
+UNKNOWN = AircraftCard("no card", Body(), (1.0, 1.0, 1.0, 0.0), known=False)
 """Unit mass, geometry and inertia: derivatives become dimensional, and forces specific."""
 
 
-def read(path: Path) -> Card:
+def read_card(path: Path) -> AircraftCard:
     """Read an aircraft card.
 
     Raises:
@@ -64,39 +64,41 @@ def read(path: Path) -> Card:
     if path.suffix != ".json":
         return _of_airframe(load(str(path) if path.suffix or path.exists() else path.name))
     try:
-        found = json.loads(path.read_text())
+        document = json.loads(path.read_text())
     except (ValueError, UnicodeDecodeError) as error:
         raise ValueError(f"{path.name}: found no JSON ({error}), expected an airframe card; correct it") from None
-    if not isinstance(found, dict):
-        raise ValueError(f"{path.name}: found a {type(found).__name__}, expected an airframe card; correct it")
-    value = {name: _number(path.name, found, name) for name in _WANTED}
-    diameter = _number(path.name, found, "Dprop") if "Dprop" in found else value["c"]
+    if not isinstance(document, dict):
+        raise ValueError(f"{path.name}: found a {type(document).__name__}, expected an airframe card; correct it")
+    value = {name: _number(path.name, document, name) for name in _REQUIRED}
+    diameter = _number(path.name, document, "Dprop") if "Dprop" in document else value["c"]
     body = Body(value["m"], value["S"], value["b"], value["c"], diameter)
-    throw = _throws(path.name, found.get("surface_full_deg"))
+    throw = _throws(path.name, document.get("surface_full_deg"))
     inertia = (value["Ixx"], value["Iyy"], value["Izz"], value["Ixz"])
-    return Card(str(found.get("airframe", path.stem)), body, inertia, throw, pulses="servo" in found)
+    return AircraftCard(str(document.get("airframe", path.stem)), body, inertia, throw, pulses="servo" in document)
 
 
-def _of_airframe(airframe: Airframe) -> Card:
+def _of_airframe(airframe: Airframe) -> AircraftCard:
     v = airframe.value
     body = Body(v["mass"], v["S"], v["b"], v["c"], v["c"])
-    return Card(airframe.name, body, (v["J_x"], v["J_y"], v["J_z"], v["J_xz"]))
+    return AircraftCard(airframe.name, body, (v["J_x"], v["J_y"], v["J_z"], v["J_xz"]))
 
 
-def _number(file: str, found: Mapping[str, object], name: str) -> float:
-    value = found.get(name)
-    good = isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value) and abs(value) < _MOST
+def _number(file: str, document: Mapping[str, object], name: str) -> float:
+    value = document.get(name)
+    good = (
+        isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value) and abs(value) < _MAX_VALUE
+    )
     if not good or (name != "Ixz" and not float(value) > 0):  # type: ignore[arg-type]
         raise ValueError(f"{file}: found {name} = {value!r}, expected a number above 0; correct it")
     return float(value)  # type: ignore[arg-type]
 
 
-def _throws(file: str, found: object) -> tuple[tuple[float, float], ...]:
-    if not isinstance(found, dict):
+def _throws(file: str, entry: object) -> tuple[tuple[float, float], ...]:
+    if not isinstance(entry, dict):
         return ((1.0, 1.0),) * 3
     out = []
     for name in ("aileron", "elevator", "rudder"):
-        pair = found.get(name)
+        pair = entry.get(name)
         if not isinstance(pair, list) or len(pair) != 2 or not all(isinstance(x, int | float) for x in pair):
             raise ValueError(f"{file}: found surface_full_deg.{name} = {pair!r}, expected [down, up]; correct it")
         out.append((abs(float(np.radians(pair[0]))), abs(float(np.radians(pair[1])))))

@@ -8,7 +8,7 @@ from fleet.effects import Effect, Onset
 
 
 @dataclass(frozen=True)
-class When:
+class OnsetProfile:
     """Onset profile of an effect: always, or from t0 on [s since the start]; a ramp or bump lasts T [s]."""
 
     kind: Onset = Onset.ALWAYS
@@ -25,25 +25,25 @@ class When:
         return share if self.kind is Onset.RAMP else np.sin(np.pi * share) ** 2
 
     @property
-    def size(self) -> int:
+    def n_parameters(self) -> int:
         """Return the number of parameters of the profile."""
         return {Onset.ALWAYS: 0, Onset.STEP: 1}.get(self.kind, 2)
 
-    def moved(self, dt: float) -> "When":
+    def shifted(self, dt: float) -> "OnsetProfile":
         """Shift the onset by dt [s]."""
         return replace(self, t0=self.t0 + dt)
 
-    def stretched(self, by: float) -> "When":
+    def stretched(self, by: float) -> "OnsetProfile":
         """Scale the duration; a bump is scaled about its middle."""
         earlier = 0.5 * (by - 1.0) * self.T if self.kind is Onset.BUMP else 0.0
         return replace(self, t0=self.t0 - earlier, T=self.T * by)
 
 
-ALWAYS = When()
+ALWAYS = OnsetProfile()
 
 
 @dataclass(frozen=True)
-class Guess:
+class FaultHypothesis:
     """One active effect.
 
     Attributes:
@@ -54,22 +54,22 @@ class Guess:
     """
 
     effect: Effect
-    of: str
+    target: str
     par: tuple[float, ...]
-    when: When = ALWAYS
+    onset: OnsetProfile = ALWAYS
 
     @property
     def label(self) -> str:
         """Return effect and target, e.g. `actuator_lag:elevator`."""
-        return f"{self.effect.name}:{self.of}" if self.of else self.effect.name
+        return f"{self.effect.name}:{self.target}" if self.target else self.effect.name
 
     @property
-    def size(self) -> int:
+    def degrees_of_freedom(self) -> int:
         """Return the number of parameters, those of the onset profile included."""
-        return self.effect.price + self.when.size
+        return self.effect.degrees_of_freedom + self.onset.n_parameters
 
-    def at(self, par: np.ndarray, when: When | None = None) -> "Guess":
+    def with_parameters(self, par: np.ndarray, onset: OnsetProfile | None = None) -> "FaultHypothesis":
         """Return a copy with other parameters, limited to their physical bounds."""
         low, high = (np.array([getattr(p, side) for p in self.effect.parameters]) for side in ("low", "high"))
         within = np.clip(np.asarray(par, float), low, high)
-        return replace(self, par=tuple(float(x) for x in within), when=when or self.when)
+        return replace(self, par=tuple(float(x) for x in within), onset=onset or self.onset)

@@ -8,43 +8,55 @@ from dataclasses import replace
 import numpy as np
 
 from fleet.effects import Onset, Stage, catalogue
-from twin_worker.diagnosis.data.fault_hypothesis import ALWAYS, Guess
-from twin_worker.diagnosis.data.flight import Flight
-from twin_worker.diagnosis.data.smooth import thinned
-from twin_worker.diagnosis.inference.isolation.isolate import WELL, Found
+from twin_worker.diagnosis.data.fault_hypothesis import ALWAYS, FaultHypothesis
+from twin_worker.diagnosis.data.flight import FlightData
+from twin_worker.diagnosis.data.smooth import decimated
+from twin_worker.diagnosis.inference.isolation.isolate import MIN_R2, ScoredHypothesis
 from twin_worker.diagnosis.inference.isolation.refine import refine
-from twin_worker.diagnosis.inference.isolation.select_hypotheses import Named, decide, turbulent
-from twin_worker.diagnosis.inference.isolation.unmodelled import oddities, strange
-from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
-from twin_worker.diagnosis.inference.report import Finding, Outcome, Report, Series, Tried
+from twin_worker.diagnosis.inference.isolation.select_hypotheses import (
+    SelectedEffect,
+    select_hypotheses,
+    turbulence_evidence,
+)
+from twin_worker.diagnosis.inference.isolation.unmodelled import find_anomalies, first_unexplained
+from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
+from twin_worker.diagnosis.inference.report import (
+    DiagnosisFinding,
+    FigureSeries,
+    RankedCandidate,
+    Report,
+    ReportOutcome,
+)
 from twin_worker.diagnosis.inference.validation import cross_validate, force_prediction
-from twin_worker.diagnosis.inference.validation.cross_validate import HELD, Proof
-from twin_worker.diagnosis.inference.validation.discriminating_manoeuvre import manoeuvre
-from twin_worker.diagnosis.inference.validation.free_run import stray
-from twin_worker.diagnosis.inference.validation.spread import covariances, told_sigma
-from twin_worker.diagnosis.inference.validation.unexplained import free_form, stretches
-from twin_worker.diagnosis.inference.words import sentence, since
-from twin_worker.diagnosis.model.baseline import CHANNELS, SHOWN_BY, Baseline
-from twin_worker.diagnosis.model.residual import Case
+from twin_worker.diagnosis.inference.validation.cross_validate import MIN_RMS_DROP, CrossValidation
+from twin_worker.diagnosis.inference.validation.discriminating_manoeuvre import recommend_manoeuvre
+from twin_worker.diagnosis.inference.validation.free_run import free_run_error
+from twin_worker.diagnosis.inference.validation.spread import covariances, reported_sigma
+from twin_worker.diagnosis.inference.validation.unexplained import free_form, high_segments
+from twin_worker.diagnosis.inference.words import describe_onset, with_sentence
+from twin_worker.diagnosis.model.baseline import CHANNEL_OF, CHANNELS, Baseline
+from twin_worker.diagnosis.model.residual import ModelledFlight
 from twin_worker.diagnosis.model.weather import own_weather
 
-_TOLD = 0.10  # or of the error of predicted forces
-_KEPT = 0.15  # least share of an effect's gain on held-out data
-_BORNE, _MUCH = 0.4, 450.0  # or a strong gain: least share of it on held-out data, and least gain
-_RARE, _LITTLE = 5.0, 150.0  # least strong gain: multiple of the chance gain, lower limit
-_STRANGE = 3.0  # largest ratio of mean square to usual without an explanation
-_LEFT = 2.6  # the same limit with the named effects included
-_EXPLAINED = 0.6  # least share of the excess that named effects explain
-_DOUBT = 2.0  # a parameter below this many standard deviations is not significant
-_OTHER = 1.7  # a larger speed ratio means another aircraft
-_GUESSED = 0.2  # relative standard deviation of a turbulence intensity
-_GUSTY = 450.0  # least gain of turbulence
-_TELLING = [CHANNELS.index(name) for name in ("force_x", "side", "lift", "roll", "pitch", "yaw", "airspeed", "baro")]
+_MIN_FORCE_DROP = 0.10  # or of the error of predicted forces
+_MIN_HELD_OUT_SHARE = 0.15  # least share of an effect's gain on held-out data
+_STRONG_SHARE, _STRONG_GAIN = 0.4, 450.0  # or a strong gain: least share of it on held-out data, and least gain
+_CHANCE_FACTOR, _MIN_STRONG_GAIN = 5.0, 150.0  # least strong gain: multiple of the chance gain, lower limit
+_MAX_RATIO = 3.0  # largest ratio of mean square to usual without an explanation
+_MAX_RATIO_NAMED = 2.6  # the same limit with the named effects included
+_MIN_EXPLAINED = 0.6  # least share of the excess that named effects explain
+_MIN_SIGMAS = 2.0  # a parameter below this many standard deviations is not significant
+_MAX_SPEED_RATIO = 1.7  # a larger speed ratio means another aircraft
+_INTENSITY_SIGMA = 0.2  # relative standard deviation of a turbulence intensity
+_MIN_GUST_GAIN = 450.0  # least gain of turbulence
+_JUDGED_CHANNELS = [
+    CHANNELS.index(name) for name in ("force_x", "side", "lift", "roll", "pitch", "yaw", "airspeed", "baro")
+]
 
-Say = Callable[[str], None]
+ReportProgress = Callable[[str], None]
 
 
-def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Report:
+def diagnose(flight: FlightData, base: Baseline, progress: ReportProgress = lambda message: None) -> Report:
     """Diagnose one flight.
 
     Args:
@@ -54,44 +66,52 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
     Raises:
         ValueError: if the flight cannot belong to this aircraft; the message names the reason.
     """
-    begun = time.perf_counter()
-    _fits(flight, base)
-    case = Case(flight, base)
-    weather = own_weather(case)
-    sight = Sight(case, weather)
-    before, white_before = sight.left() / base.usual, _profiled(sight)
-    gusts, _ = turbulent(sight)
-    say("selecting effects")
-    plain = copy(sight)
-    named, ranked = decide(sight, weather, say)
-    if gusts > _GUSTY and gusts > sum(one.found.gain for one in named):
+    started = time.perf_counter()
+    _check_same_aircraft(flight, base)
+    modelled = ModelledFlight(flight, base)
+    weather = own_weather(modelled)
+    whitened = WhitenedResiduals(modelled, weather)
+    before, white_before = whitened.mean_square() / base.usual, _profiled_residuals(whitened)
+    gust_gain, _ = turbulence_evidence(whitened)
+    progress("selecting effects")
+    unconditioned = copy(whitened)
+    named, ranked = select_hypotheses(whitened, weather, progress)
+    if gust_gain > _MIN_GUST_GAIN and gust_gain > sum(selected.scored.gain for selected in named):
         named = []
-    say("validating on held-out data")
-    named, proof, findings = _proven(plain, named, before)
-    sight.grant((*weather, *(one.found.guess for one in named)))
-    after, white_after = sight.left() / base.usual, _profiled(sight)
-    if not any(map(_significant, findings)):
+    progress("validating on held-out data")
+    named, validation, findings = _cross_validated(unconditioned, named, before)
+    whitened.condition_on((*weather, *(selected.scored.hypothesis for selected in named)))
+    after, white_after = whitened.mean_square() / base.usual, _profiled_residuals(whitened)
+    if not any(map(_is_significant, findings)):
         findings = ()
-    if (gust := _gusts(sight, not named)) is not None:
-        findings = (*findings, gust)
-    force = force_prediction.forces(case, weather, proof.fitted)
-    errors = [force_prediction.rms(case, force.measured - x) for x in (force.base, force.model)]
-    much = sum(_much(base, one) for one in findings)
-    outcome = _outcome(findings, proof, (1.0 - errors[1] / errors[0], much), before, after)
-    believed = findings if outcome is Outcome.NAMED else ()
-    if not believed:
-        sight.grant(weather)
-    odds = [] if any(one.guess.effect.variance for one in findings) else oddities(sight, plain)
-    odd = strange(odds, base, sum(one.gain for one in believed), loud=after.max() > _LEFT)
-    if odd is not None:
-        outcome = Outcome.UNKNOWN
-    series = _series(case, white_before, white_after, force)
+    if (turbulence := _turbulence_finding(whitened, not named)) is not None:
+        findings = (*findings, turbulence)
+    force = force_prediction.predict_forces(modelled, weather, validation.fitted)
+    errors = [force_prediction.rms(modelled, force.measured - x) for x in (force.base, force.model)]
+    strong_gain = sum(_strong_gain(base, finding) for finding in findings)
+    outcome = _outcome(findings, validation, (1.0 - errors[1] / errors[0], strong_gain), before, after)
+    accepted = findings if outcome is ReportOutcome.NAMED else ()
+    if not accepted:
+        whitened.condition_on(weather)
+    anomalies = (
+        []
+        if any(finding.hypothesis.effect.variance for finding in findings)
+        else find_anomalies(whitened, unconditioned)
+    )
+    anomaly = first_unexplained(
+        anomalies, base, sum(finding.gain for finding in accepted), still_high=after.max() > _MAX_RATIO_NAMED
+    )
+    if anomaly is not None:
+        outcome = ReportOutcome.UNKNOWN
+    series = _series(modelled, white_before, white_after, force)
     where: tuple[str, tuple[tuple[float, float], ...]] = ("", ())
     terms: dict[str, float] = {}
-    if outcome is Outcome.UNKNOWN:
-        channel = CHANNELS.index(odd.channel) if odd else _TELLING[int(np.argmax(after[_TELLING]))]
-        where = (CHANNELS[channel], stretches(case.t, white_after[:, channel], sight.ok))
-        terms = free_form(case, weather, channel)
+    if outcome is ReportOutcome.UNKNOWN:
+        channel = (
+            CHANNELS.index(anomaly.channel) if anomaly else _JUDGED_CHANNELS[int(np.argmax(after[_JUDGED_CHANNELS]))]
+        )
+        where = (CHANNELS[channel], high_segments(modelled.t, white_after[:, channel], whitened.ok))
+        terms = free_form(modelled, weather, channel)
     report = Report(
         flight=flight.name,
         outcome=outcome,
@@ -99,24 +119,24 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
         findings=findings,
         ratio_before=dict(zip(CHANNELS, before.tolist(), strict=True)),
         ratio_after=dict(zip(CHANNELS, after.tolist(), strict=True)),
-        fit_before=proof.before,
-        fit_after=proof.after,
+        fit_before=validation.before,
+        fit_after=validation.after,
         force_before=errors[0],
         force_after=errors[1],
-        stray_before=float(np.degrees(stray(case, weather))),
-        stray_after=float(np.degrees(stray(case, (*weather, *proof.fitted)))),
+        free_run_error_before=float(np.degrees(free_run_error(modelled, weather))),
+        free_run_error_after=float(np.degrees(free_run_error(modelled, (*weather, *validation.fitted)))),
         where=where,
-        odd={one.kind: one.worth / one.limit(base) for one in odds},
+        anomaly_ratio={entry.kind: entry.net_gain / entry.limit(base) for entry in anomalies},
         terms=terms,
-        tried=_ranking(ranked, named),
-        lacks=(*flight.lacks, *uncovered(base)),
+        ranking=_ranking(ranked, named),
+        limitations=(*flight.limitations, *uncovered_axes(base)),
         series=series,
-        seconds=time.perf_counter() - begun,
+        seconds=time.perf_counter() - started,
     )
-    return sentence(report)
+    return with_sentence(report)
 
 
-def _fits(flight: Flight, base: Baseline) -> None:
+def _check_same_aircraft(flight: FlightData, base: Baseline) -> None:
     """Reject a flight that cannot belong to the aircraft of this simulation."""
     if base.vane and not flight.vane:
         raise ValueError(
@@ -124,159 +144,189 @@ def _fits(flight: Flight, base: Baseline) -> None:
             "calibrate on flights recorded like this one"
         )
     speed = float(np.median(np.hypot(flight.readings["v_n"], flight.readings["v_e"])[flight.ok]))
-    if not 1 / _OTHER < speed / base.speed < _OTHER:
+    if not 1 / _MAX_SPEED_RATIO < speed / base.speed < _MAX_SPEED_RATIO:
         raise ValueError(
             f"{flight.name}: found {speed:.0f} m/s, expected about {base.speed:.0f} m/s as on the nominal flights; "
             "use the model of this aircraft"
         )
 
 
-def uncovered(base: Baseline) -> tuple[str, ...]:
+def uncovered_axes(base: Baseline) -> tuple[str, ...]:
     """Describe the axes that the nominal flights did not calibrate."""
-    cure = {"L": "aileron", "M": "elevator", "N": "rudder"}
+    surfaces = {"L": "aileron", "M": "elevator", "N": "rudder"}
     return tuple(
-        f"{SHOWN_BY[name]} not covered: the calibration explains {base.r2.get(name, 0.0):.0%} of its variance; "
+        f"{CHANNEL_OF[name]} not covered: the calibration explains {base.r2.get(name, 0.0):.0%} of its variance; "
         f"calibrate on flights with {surface} doublets"
-        for name, surface in cure.items()
-        if base.r2.get(name, 1.0) <= WELL
+        for name, surface in surfaces.items()
+        if base.r2.get(name, 1.0) <= MIN_R2
     )
 
 
-def _ranking(ranked: list[Found], named: list[Named]) -> tuple[Tried, ...]:
+def _ranking(ranked: list[ScoredHypothesis], named: list[SelectedEffect]) -> tuple[RankedCandidate, ...]:
     """List every hypothesis tested, named and rival ones included, once per label with its best onset."""
-    best: dict[str, Found] = {}
-    for one in (*ranked, *(found for n in named for found in (n.found, *n.rivals))):
-        if one.guess.label not in best or one.gain > best[one.guess.label].gain:
-            best[one.guess.label] = one
-    found = sorted(best.values(), key=lambda one: -one.gain)
-    return tuple(Tried(one.guess.label, since(one.guess.when), one.gain) for one in found)
+    best: dict[str, ScoredHypothesis] = {}
+    for scored in (*ranked, *(alternative for n in named for alternative in (n.scored, *n.rivals))):
+        if scored.hypothesis.label not in best or scored.gain > best[scored.hypothesis.label].gain:
+            best[scored.hypothesis.label] = scored
+    ordered = sorted(best.values(), key=lambda scored: -scored.gain)
+    return tuple(
+        RankedCandidate(scored.hypothesis.label, describe_onset(scored.hypothesis.onset), scored.gain)
+        for scored in ordered
+    )
 
 
-def _profiled(sight: Sight) -> np.ndarray:
-    e = sight.raw + sight.Jn @ sight.xn
-    return np.where(sight.ok[:, None], e, np.nan)
+def _profiled_residuals(whitened: WhitenedResiduals) -> np.ndarray:
+    e = whitened.raw + whitened.Jn @ whitened.xn
+    return np.where(whitened.ok[:, None], e, np.nan)
 
 
-def _proven(plain: Sight, named: list[Named], before: np.ndarray) -> tuple[list[Named], Proof, tuple[Finding, ...]]:
+def _cross_validated(
+    unconditioned: WhitenedResiduals, named: list[SelectedEffect], before: np.ndarray
+) -> tuple[list[SelectedEffect], CrossValidation, tuple[DiagnosisFinding, ...]]:
     """Cross-validate the selected effects; remove those after the first that held-out data do not confirm."""
-    sight, weather = copy(plain), plain.granted
+    whitened, weather = copy(unconditioned), unconditioned.conditions
     while True:
         if not named:
-            return [], Proof(np.nan, np.nan, (), ()), ()
-        proof = cross_validate.held_out(plain, tuple(one.found.guess for one in named), before)
-        findings = _findings(sight, weather, named, proof)
-        order = sorted(range(len(named)), key=lambda k: -named[k].found.gain)
-        weak = [k for k in order[1:] if findings[k].held < _KEPT or not _significant(findings[k])]
+            return [], CrossValidation(np.nan, np.nan, (), ()), ()
+        proof = cross_validate.fit_and_validate(
+            unconditioned, tuple(selected.scored.hypothesis for selected in named), before
+        )
+        findings = _findings(whitened, weather, named, proof)
+        order = sorted(range(len(named)), key=lambda k: -named[k].scored.gain)
+        weak = [
+            k for k in order[1:] if findings[k].held_out_share < _MIN_HELD_OUT_SHARE or not _is_significant(findings[k])
+        ]
         if not weak:
             return named, proof, findings
-        named = [one for k, one in enumerate(named) if k != weak[-1]]
-        for i, one in enumerate(named):
-            sight.grant((*weather, *(other.found.guess for k, other in enumerate(named) if k != i)))
-            named[i] = replace(one, found=refine(sight, one.found.guess))
+        named = [selected for k, selected in enumerate(named) if k != weak[-1]]
+        for i, selected in enumerate(named):
+            whitened.condition_on((*weather, *(other.scored.hypothesis for k, other in enumerate(named) if k != i)))
+            named[i] = replace(selected, scored=refine(whitened, selected.scored.hypothesis))
 
 
-def _findings(sight: Sight, weather: tuple[Guess, ...], named: list[Named], proof: Proof) -> tuple[Finding, ...]:
-    guesses = [one.found.guess for one in named]
+def _findings(
+    whitened: WhitenedResiduals,
+    weather: tuple[FaultHypothesis, ...],
+    named: list[SelectedEffect],
+    validation: CrossValidation,
+) -> tuple[DiagnosisFinding, ...]:
+    hypotheses = [selected.scored.hypothesis for selected in named]
     if not named:
         return ()
-    body = sight.base.card.body
-    out = []
-    for i, (one, covariance) in enumerate(zip(named, covariances(sight, weather, guesses), strict=True)):
-        guess = one.found.guess
-        rivals = [rival.guess for rival in one.rivals]
-        surface = guess.of if guess.effect.stage is Stage.DELTA else ""
-        out.append(
-            Finding(
-                guess=guess,
-                gain=one.found.gain,
-                told=guess.effect.told(guess.effect, np.array(guess.par), body),
-                sigma=told_sigma(guess, covariance, body),
-                doubt=tuple(np.sqrt(np.diag(covariance)).tolist()),
+    body = whitened.base.card.body
+    findings = []
+    for i, (selected, covariance) in enumerate(zip(named, covariances(whitened, weather, hypotheses), strict=True)):
+        hypothesis = selected.scored.hypothesis
+        rivals = [rival.hypothesis for rival in selected.rivals]
+        surface = hypothesis.target if hypothesis.effect.stage is Stage.DELTA else ""
+        findings.append(
+            DiagnosisFinding(
+                hypothesis=hypothesis,
+                gain=selected.scored.gain,
+                reported=hypothesis.effect.reported(hypothesis.effect, np.array(hypothesis.par), body),
+                sigma=reported_sigma(hypothesis, covariance, body),
+                parameter_sigma=tuple(np.sqrt(np.diag(covariance)).tolist()),
                 rivals=tuple(rival.effect.name for rival in rivals),
-                apart=tuple(manoeuvre(sight, guess, rival) for rival in rivals),
-                channel=guess.effect.channel,
+                manoeuvres=tuple(recommend_manoeuvre(whitened, hypothesis, rival) for rival in rivals),
+                channel=hypothesis.effect.channel,
                 surface=surface,
-                segments=(_segment(guess, float(sight.case.t[0]), float(sight.case.t[-1])),),
-                held=proof.kept[i] / max(one.found.gain, 1e-9),
+                segments=(_segment(hypothesis, float(whitened.modelled.t[0]), float(whitened.modelled.t[-1])),),
+                held_out_share=validation.held_out_gains[i] / max(selected.scored.gain, 1e-9),
             )
         )
-    return tuple(out)
+    return tuple(findings)
 
 
-def _segment(guess: Guess, first: float, last: float) -> tuple[float, float]:
-    if guess.when.kind is Onset.ALWAYS:
+def _segment(hypothesis: FaultHypothesis, first: float, last: float) -> tuple[float, float]:
+    if hypothesis.onset.kind is Onset.ALWAYS:
         return first, last
-    if guess.when.kind is Onset.BUMP:
-        return guess.when.t0, guess.when.t0 + guess.when.T
-    return max(guess.when.t0, first), last
+    if hypothesis.onset.kind is Onset.BUMP:
+        return hypothesis.onset.t0, hypothesis.onset.t0 + hypothesis.onset.T
+    return max(hypothesis.onset.t0, first), last
 
 
-def _gusts(sight: Sight, alone: bool) -> Finding | None:
+def _turbulence_finding(whitened: WhitenedResiduals, no_other: bool) -> DiagnosisFinding | None:
     """Return turbulence as a finding if the residuals scatter as gusts do."""
-    gain, louder = turbulent(sight)
-    if gain < _GUSTY or not alone:
+    gain, variance_ratio = turbulence_evidence(whitened)
+    if gain < _MIN_GUST_GAIN or not no_other:
         return None
     effect = catalogue()["turbulence"]
-    made = sight.case.terms(sight.granted)
-    beta = np.radians(sight.case.residuals(sight.granted)[sight.ok][:, CHANNELS.index("side")])
-    intensity = float(np.sqrt(1.0 - 1.0 / louder) * beta.std() * np.median(made.flow.Va))
-    guess = Guess(effect, "", (intensity,), ALWAYS)
-    whole = (float(sight.case.t[0]), float(sight.case.t[-1]))
-    told = effect.told(effect, np.array([intensity]), sight.base.card.body)
-    sigma = {name: _GUESSED * x for name, x in told.items()}
-    return Finding(guess, gain, told, sigma, (_GUESSED * intensity,), (), (), "air", "", (whole,), 1.0)
+    eq_terms = whitened.modelled.equation_terms(whitened.conditions)
+    beta = np.radians(whitened.modelled.residuals(whitened.conditions)[whitened.ok][:, CHANNELS.index("side")])
+    intensity = float(np.sqrt(1.0 - 1.0 / variance_ratio) * beta.std() * np.median(eq_terms.flow.Va))
+    hypothesis = FaultHypothesis(effect, "", (intensity,), ALWAYS)
+    segment = (float(whitened.modelled.t[0]), float(whitened.modelled.t[-1]))
+    reported = effect.reported(effect, np.array([intensity]), whitened.base.card.body)
+    sigma = {name: _INTENSITY_SIGMA * x for name, x in reported.items()}
+    return DiagnosisFinding(
+        hypothesis, gain, reported, sigma, (_INTENSITY_SIGMA * intensity,), (), (), "air", "", (segment,), 1.0
+    )
 
 
 def _outcome(
-    findings: tuple[Finding, ...], proof: Proof, enough: tuple[float, float], before: np.ndarray, after: np.ndarray
-) -> Outcome:
+    findings: tuple[DiagnosisFinding, ...],
+    validation: CrossValidation,
+    force_evidence: tuple[float, float],
+    before: np.ndarray,
+    after: np.ndarray,
+) -> ReportOutcome:
     """Decide the outcome; `force_evidence`: relative drop of the held-out force error, and least strong gain."""
-    told, much = enough
-    gusty = any(one.guess.effect.variance for one in findings)
-    borne_out = all(one.held >= _BORNE for one in findings) and sum(one.gain for one in findings) > much
-    gained = proof.gain >= HELD or (proof.gain > 0.0 and (told >= _TOLD or borne_out))
-    sound = all(one.held >= _KEPT and _significant(one) and not _at_its_end(one) for one in findings)
-    proven = gusty or (gained and sound)
-    excess = [np.maximum(x[_TELLING] - 1.0, 0.0).sum() for x in (before, after)]
+    force_drop, strong_gain = force_evidence
+    turbulent = any(finding.hypothesis.effect.variance for finding in findings)
+    strong = (
+        all(finding.held_out_share >= _STRONG_SHARE for finding in findings)
+        and sum(finding.gain for finding in findings) > strong_gain
+    )
+    gained = validation.rms_drop >= MIN_RMS_DROP or (
+        validation.rms_drop > 0.0 and (force_drop >= _MIN_FORCE_DROP or strong)
+    )
+    significant = all(
+        finding.held_out_share >= _MIN_HELD_OUT_SHARE and _is_significant(finding) and not _at_bound(finding)
+        for finding in findings
+    )
+    proven = turbulent or (gained and significant)
+    excess = [np.maximum(x[_JUDGED_CHANNELS] - 1.0, 0.0).sum() for x in (before, after)]
     explained = 1.0 - excess[1] / max(excess[0], 1e-9)
     if findings and proven:
-        lost = after[_TELLING].max() > _LEFT and explained < _EXPLAINED and not gusty
-        return Outcome.UNKNOWN if lost else Outcome.NAMED
-    if before[_TELLING].max() > _STRANGE:
-        return Outcome.UNKNOWN
-    return Outcome.SUSPECTED if findings else Outcome.NONE
+        unexplained = after[_JUDGED_CHANNELS].max() > _MAX_RATIO_NAMED and explained < _MIN_EXPLAINED and not turbulent
+        return ReportOutcome.UNKNOWN if unexplained else ReportOutcome.NAMED
+    if before[_JUDGED_CHANNELS].max() > _MAX_RATIO:
+        return ReportOutcome.UNKNOWN
+    return ReportOutcome.SUSPECTED if findings else ReportOutcome.NONE
 
 
-def _much(base: Baseline, one: Finding) -> float:
+def _strong_gain(base: Baseline, finding: DiagnosisFinding) -> float:
     """Return the gain that counts as strong for an effect, from the gain that nominal flights reach by chance."""
     if not base.vane:
-        return _MUCH
-    chance = max((x for kind, x in base.chance.items() if kind.startswith(f"{one.guess.label}|")), default=0.0)
-    return min(max(_RARE * chance, _LITTLE), _MUCH)
+        return _STRONG_GAIN
+    chance = max((x for kind, x in base.chance.items() if kind.startswith(f"{finding.hypothesis.label}|")), default=0.0)
+    return min(max(_CHANCE_FACTOR * chance, _MIN_STRONG_GAIN), _STRONG_GAIN)
 
 
-def _significant(one: Finding) -> bool:
+def _is_significant(finding: DiagnosisFinding) -> bool:
     """Return whether any parameter except nuisances is significantly different from zero."""
-    counted = zip(one.guess.effect.parameters, one.guess.par, one.doubt, strict=True)
-    return any(abs(x) > _DOUBT * doubt and not p.aside for p, x, doubt in counted)
+    counted = zip(finding.hypothesis.effect.parameters, finding.hypothesis.par, finding.parameter_sigma, strict=True)
+    return any(abs(x) > _MIN_SIGMAS * sigma and not p.nuisance for p, x, sigma in counted)
 
 
-def _at_its_end(one: Finding) -> bool:
+def _at_bound(finding: DiagnosisFinding) -> bool:
     """Return whether a parameter except nuisances is at its physical bound; a share of 1 is allowed there."""
-    counted = zip(one.guess.effect.parameters, one.guess.par, strict=True)
-    return any(x and x in (p.low, p.high) and x != 1.0 and not p.aside for p, x in counted)
+    counted = zip(finding.hypothesis.effect.parameters, finding.hypothesis.par, strict=True)
+    return any(x and x in (p.low, p.high) and x != 1.0 and not p.nuisance for p, x in counted)
 
 
-def _series(case: Case, before: np.ndarray, after: np.ndarray, force: force_prediction.Forces) -> Series:
-    place = thinned(np.column_stack([case.flight.place, case.flight.readings["h"]]))
-    return Series(
-        t=case.t,
-        ok=case.ok,
-        place=place,
+def _series(
+    modelled: ModelledFlight, before: np.ndarray, after: np.ndarray, force: force_prediction.Forces
+) -> FigureSeries:
+    position = decimated(np.column_stack([modelled.flight.position, modelled.flight.readings["h"]]))
+    return FigureSeries(
+        t=modelled.t,
+        ok=modelled.ok,
+        position=position,
         before=before,
         after=after,
         measured=force.measured,
         base=force.base,
         model=force.model,
-        held=force_prediction.blocks(case.t, odd=True),
+        held_out=force_prediction.blocks(modelled.t, odd=True),
     )

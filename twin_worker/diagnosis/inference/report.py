@@ -5,10 +5,10 @@ from enum import StrEnum
 
 import numpy as np
 
-from twin_worker.diagnosis.data.fault_hypothesis import Guess
+from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
 
 
-class Outcome(StrEnum):
+class ReportOutcome(StrEnum):
     """Outcome of a diagnosis."""
 
     NONE = "none"
@@ -18,7 +18,7 @@ class Outcome(StrEnum):
 
 
 @dataclass(frozen=True)
-class Finding:
+class DiagnosisFinding:
     """One named or suspected effect.
 
     Attributes:
@@ -33,30 +33,30 @@ class Finding:
         held_out_share: share of the gain that is present on held-out data
     """
 
-    guess: Guess
+    hypothesis: FaultHypothesis
     gain: float
-    told: dict[str, float]
+    reported: dict[str, float]
     sigma: dict[str, float]
-    doubt: tuple[float, ...]
+    parameter_sigma: tuple[float, ...]
     rivals: tuple[str, ...]
-    apart: tuple[str, ...]
+    manoeuvres: tuple[str, ...]
     channel: str
     surface: str
     segments: tuple[tuple[float, float], ...]
-    held: float = 0.0
+    held_out_share: float = 0.0
 
 
 @dataclass(frozen=True)
-class Tried:
+class RankedCandidate:
     """One candidate of the ranking: label, onset in words, gain."""
 
     label: str
-    since: str
+    onset: str
     gain: float
 
 
 @dataclass(frozen=True)
-class Series:
+class FigureSeries:
     """Time series of the figures, on the decimated grid.
 
     Attributes:
@@ -68,13 +68,13 @@ class Series:
 
     t: np.ndarray
     ok: np.ndarray
-    place: np.ndarray
+    position: np.ndarray
     before: np.ndarray
     after: np.ndarray
     measured: np.ndarray
     base: np.ndarray
     model: np.ndarray
-    held: np.ndarray
+    held_out: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -98,21 +98,21 @@ class Report:
     """
 
     flight: str
-    outcome: Outcome
+    outcome: ReportOutcome
     sentence: str
-    findings: tuple[Finding, ...]
+    findings: tuple[DiagnosisFinding, ...]
     ratio_before: dict[str, float]
     ratio_after: dict[str, float]
     fit_before: float
     fit_after: float
     force_before: float
     force_after: float
-    stray_before: float
-    stray_after: float
+    free_run_error_before: float
+    free_run_error_after: float
     where: tuple[str, tuple[tuple[float, float], ...]]
-    odd: dict[str, float]
+    anomaly_ratio: dict[str, float]
     terms: dict[str, float]
-    tried: tuple[Tried, ...]
-    lacks: tuple[str, ...]
-    series: Series = field(compare=False)
+    ranking: tuple[RankedCandidate, ...]
+    limitations: tuple[str, ...]
+    series: FigureSeries = field(compare=False)
     seconds: float = 0.0

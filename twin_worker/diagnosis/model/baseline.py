@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from twin_worker.diagnosis.data.card import Card
+from twin_worker.diagnosis.data.card import AircraftCard
 
 CHANNELS = (
     *("force_x", "side", "lift", "roll", "pitch", "yaw", "airspeed"),
@@ -17,7 +17,7 @@ WEATHER_MPS = 1.0  # larger wind spread between nominal flights: a mean wind is 
 
 
 @dataclass(frozen=True)
-class Timing:
+class ActuatorTiming:
     """Actuator dynamics: lag of servos and engine, transport delay [s]."""
 
     servo: float = 0.0
@@ -34,13 +34,13 @@ class Noise:
 
     def whiten(self, x: np.ndarray) -> np.ndarray:
         """Whiten residuals, (n, c), or their slopes, (n, c, k); the first two rows are zero."""
-        a1, a2, sigma = (one.reshape(-1, *(1,) * (x.ndim - 2)) for one in (*self.ar.T, self.sigma))
+        a1, a2, sigma = (column.reshape(-1, *(1,) * (x.ndim - 2)) for column in (*self.ar.T, self.sigma))
         e = np.zeros_like(x)
         e[2:] = (x[2:] - a1 * x[1:-1] - a2 * x[:-2]) / sigma
         return e
 
 
-def no_noise() -> Noise:
+def unit_noise() -> Noise:
     """Return unit white noise, with which `whiten` does not filter."""
     n = len(CHANNELS)
     return Noise(np.zeros((n, 2)), np.ones(n))
@@ -66,14 +66,14 @@ class Baseline:
         flights: names of the nominal flights
     """
 
-    card: Card
+    card: AircraftCard
     coef: dict[str, np.ndarray]
     speed: float
     airspeed: float = 1.0
-    timing: Timing = field(default_factory=Timing)
+    timing: ActuatorTiming = field(default_factory=ActuatorTiming)
     vane: bool = True
     r2: dict[str, float] = field(default_factory=dict)
-    noise: Noise = field(default_factory=no_noise)
+    noise: Noise = field(default_factory=unit_noise)
     spread: dict[str, float] = field(default_factory=dict)
     chance: dict[str, float] = field(default_factory=dict)
     others: tuple[dict[str, np.ndarray], ...] = ()
@@ -86,21 +86,21 @@ class Baseline:
         return replace(self, coef=coef)
 
 
-SHOWN_BY = {"X": "force_x", "beta": "side", "alpha": "lift", "L": "roll", "M": "pitch", "N": "yaw"}
+CHANNEL_OF = {"X": "force_x", "beta": "side", "alpha": "lift", "L": "roll", "M": "pitch", "N": "yaw"}
 """Equation -> channel of its residual."""
 
-DEAF = 1e6  # noise sigma of an ignored channel
+IGNORED_SIGMA = 1e6  # noise sigma of an ignored channel
 
 
-def silenced(base: Baseline, equations: Iterable[str]) -> Baseline:
+def exclude_equations(base: Baseline, equations: Iterable[str]) -> Baseline:
     """Return a baseline that ignores the residuals of some equations."""
     sigma, r2 = base.noise.sigma.copy(), dict(base.r2)
     for name in equations:
-        sigma[CHANNELS.index(SHOWN_BY[name])] = DEAF
+        sigma[CHANNELS.index(CHANNEL_OF[name])] = IGNORED_SIGMA
         r2[name] = min(r2.get(name, 0.0), 0.0)
     return replace(base, noise=Noise(base.noise.ar, sigma), r2=r2)
 
 
-def is_weather(base: Baseline) -> bool:
+def wind_is_nominal(base: Baseline) -> bool:
     """Return whether the nominal flights had wind, so that a mean wind is nominal."""
     return max(base.spread.get(f"wind_steady:{axis}", 0.0) for axis in ("w_n", "w_e")) > WEATHER_MPS

@@ -26,7 +26,7 @@ THRUST = ("t", "t2", "t3", "tv", "t2v", "t3v")
 TERMS = {"alpha": ALPHA, "beta": BETA, "X": X, "T": THRUST, "L": LATERAL, "M": (*M, "T"), "N": LATERAL}
 """Equation -> names of its terms, in the order of its coefficients."""
 
-USUAL = {
+COEF_PRIOR_STD = {
     "alpha": (np.inf, np.inf, 0.05, 1.5, 1.5, 0.03),
     "beta": (np.inf, np.inf, 0.1, 0.3, 0.06),
     "X": (np.inf, np.inf, np.inf, 0.3, np.inf, *6 * (np.inf,)),

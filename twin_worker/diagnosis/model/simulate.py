@@ -12,16 +12,16 @@ import numpy as np
 
 from fleet.effects import ALL_SURFACES, MEMORY, SURFACES, Flow, Onset, Stage
 from fleet.frames import G, rotation
-from twin_worker.diagnosis.data.fault_hypothesis import Guess
+from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
 from twin_worker.diagnosis.data.smooth import DT
 from twin_worker.diagnosis.model import equations as eq
 from twin_worker.diagnosis.model.baseline import Baseline
 from twin_worker.diagnosis.model.residual import RHO_0, density
 
 STATE = ("v_n", "v_e", "v_d", "p", "q", "r", "phi", "theta", "psi", "h")
-_STEEP = 1.45  # limit of the pitch angle [rad]
-_SLOWEST = 3.0  # least airspeed in the equations [m/s]
-_WILDEST = 8.0  # body rate above which a run counts as diverged [rad/s]
+_MAX_PITCH = 1.45  # limit of the pitch angle [rad]
+_MIN_AIRSPEED = 3.0  # least airspeed in the equations [m/s]
+_MAX_RATE = 8.0  # body rate above which a run counts as diverged [rad/s]
 
 Pilot = Callable[[int, np.ndarray], np.ndarray]
 Memories = dict[tuple[int, int, int], np.ndarray]  # run, input, effect -> servo memory
@@ -49,15 +49,24 @@ class Simulation:
     """
 
     def __init__(
-        self, base: Baseline, guesses: Sequence[Sequence[Guess]], begins: np.ndarray, ground: float = 0.0
+        self,
+        base: Baseline,
+        hypotheses: Sequence[Sequence[FaultHypothesis]],
+        start_times: np.ndarray,
+        ground: float = 0.0,
     ) -> None:
-        self.base, self.begins, self.ground = base, np.asarray(begins, float), ground
-        self.runs = len(guesses)
-        self._groups = _grouped(guesses)
-        self._servos = [(run, g) for run, all_ in enumerate(guesses) for g in all_ if g.effect.stage is Stage.DELTA]
+        self.base, self.start_times, self.ground = base, np.asarray(start_times, float), ground
+        self.runs = len(hypotheses)
+        self._groups = _group_effects(hypotheses)
+        self._servos = [
+            (run, g)
+            for run, run_hypotheses in enumerate(hypotheses)
+            for g in run_hypotheses
+            if g.effect.stage is Stage.DELTA
+        ]
         self._no_wind = np.zeros((3, self.runs))
 
-    def fly(self, start: np.ndarray, pilot: Pilot, n: int) -> Runs:
+    def simulate(self, start: np.ndarray, pilot: Pilot, n: int) -> Runs:
         """Simulate n steps of `DT`; commands are constant over a step, servos and engine follow with lag.
 
         Args:
@@ -68,25 +77,25 @@ class Simulation:
         states, force = np.empty((n, len(STATE), self.runs)), np.empty((n, 3, self.runs))
         commands, speed, rho = np.empty((n, 4, self.runs)), np.empty((n, self.runs)), np.empty((n, self.runs))
         memories: Memories = {}
-        acting: np.ndarray | None = None
+        actuated: np.ndarray | None = None
         used = np.zeros(self.runs)
-        half, whole = self._share(0.5 * DT), self._share(DT)
+        half_step, full_step = self._lag_share(0.5 * DT), self._lag_share(DT)
         for k in range(n):
-            t = self.begins + k * DT
+            t = self.start_times + k * DT
             states[k], commands[k] = x, pilot(k, x)
-            moved = self._moved(commands[k], t, memories)
-            acting = moved if acting is None else acting
+            faulty = self._faulty_commands(commands[k], t, memories)
+            actuated = faulty if actuated is None else actuated
             used += commands[k, 3] * DT
             self._gate(t)
-            first, middle = self._angles(acting), self._angles(acting + half * (moved - acting))
-            acting = acting + whole * (moved - acting)
-            k1, force[k], speed[k], rho[k] = self.rates(x, first, t, used)
-            k2 = self.rates(x + 0.5 * DT * k1, middle, t + 0.5 * DT, used)[0]
-            k3 = self.rates(x + 0.5 * DT * k2, middle, t + 0.5 * DT, used)[0]
-            k4 = self.rates(x + DT * k3, self._angles(acting), t + DT, used)[0]
+            first, middle = self._angles(actuated), self._angles(actuated + half_step * (faulty - actuated))
+            actuated = actuated + full_step * (faulty - actuated)
+            k1, force[k], speed[k], rho[k] = self.derivatives(x, first, t, used)
+            k2 = self.derivatives(x + 0.5 * DT * k1, middle, t + 0.5 * DT, used)[0]
+            k3 = self.derivatives(x + 0.5 * DT * k2, middle, t + 0.5 * DT, used)[0]
+            k4 = self.derivatives(x + DT * k3, self._angles(actuated), t + DT, used)[0]
             x = x + DT / 6.0 * (k1 + 2 * k2 + 2 * k3 + k4)
-            lost = ~(np.abs(x[3:6]).max(axis=0) < _WILDEST)
-            x[:, lost] = np.where(np.isfinite(states[k][:, lost]), states[k][:, lost], 0.0)
+            diverged = ~(np.abs(x[3:6]).max(axis=0) < _MAX_RATE)
+            x[:, diverged] = np.where(np.isfinite(states[k][:, diverged]), states[k][:, diverged], 0.0)
         return Runs(states, force, commands, speed, rho)
 
     def airspeed(self, x: np.ndarray, t: np.ndarray) -> np.ndarray:
@@ -95,30 +104,30 @@ class Simulation:
         self._gate(t)
         return np.sqrt(((x[:3] - self._wind(self._increments(flow, (Stage.AIR,)))) ** 2).sum(axis=0))  # type: ignore[no-any-return]
 
-    def _share(self, dt: float) -> np.ndarray:
+    def _lag_share(self, dt: float) -> np.ndarray:
         """Return the share of a command step that servos and engine reach within dt, (4, runs)."""
         timing = self.base.timing
         tau = np.array([timing.servo + timing.delay] * 3 + [timing.engine])
         share = np.repeat((1.0 - np.exp(-dt / np.maximum(tau, 1e-3)))[:, None], self.runs, axis=1)
-        for run, guess in self._servos:
+        for run, hypothesis in self._servos:
             for column, name in enumerate(SURFACES):
-                if guess.effect.takes_lag and guess.of in (name, ALL_SURFACES):
+                if hypothesis.effect.takes_lag and hypothesis.target in (name, ALL_SURFACES):
                     share[column, run] = 1.0
         return share
 
-    def _moved(self, commands: np.ndarray, t: np.ndarray, memories: Memories) -> np.ndarray:
+    def _faulty_commands(self, commands: np.ndarray, t: np.ndarray, memories: Memories) -> np.ndarray:
         """Apply the servo faults to the commands, (4, runs)."""
         out = commands.copy()
-        for run, guess in self._servos:
+        for run, hypothesis in self._servos:
             for column, name in enumerate(SURFACES):
-                if guess.of not in (name, ALL_SURFACES):
+                if hypothesis.target not in (name, ALL_SURFACES):
                     continue
                 u = out[column, run : run + 1].copy()
-                memory = memories.setdefault((run, column, id(guess)), np.full(MEMORY, u[0]))
-                par = np.asarray(guess.par)[:, None] * guess.when.gate(t[run : run + 1])
-                if guess.effect.takes_lag:
+                memory = memories.setdefault((run, column, id(hypothesis)), np.full(MEMORY, u[0]))
+                par = np.asarray(hypothesis.par)[:, None] * hypothesis.onset.gate(t[run : run + 1])
+                if hypothesis.effect.takes_lag:
                     par[0] += self.base.timing.servo + self.base.timing.delay
-                guess.effect.act(u, memory, DT, par)
+                hypothesis.effect.act(u, memory, DT, par)
                 out[column, run] = u[0]
         return out
 
@@ -135,7 +144,7 @@ class Simulation:
             for name, x in group.act(flow).items():
                 if name not in total:
                     total[name] = np.zeros(self.runs)
-                total[name][group.rows] += x
+                total[name][group.run_index] += x
         return total
 
     def _wind(self, air: dict[str, np.ndarray]) -> np.ndarray:
@@ -146,7 +155,7 @@ class Simulation:
     def _angles(self, u: np.ndarray) -> np.ndarray:
         return np.stack([*(self.base.card.angles(i)(u[i]) for i in range(3)), u[3]])
 
-    def rates(
+    def derivatives(
         self, x: np.ndarray, delta: np.ndarray, t: np.ndarray, used: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return d state/dt (10, runs), specific force FRD (3, runs) [m/s2], airspeed [m/s], density [kg/m3], (runs,).
@@ -158,14 +167,14 @@ class Simulation:
         """
         base, body = self.base, self.base.card.body
         v, (p, q, r), (phi, theta, psi), h = x[:3], x[3:6], x[6:9], x[9]
-        theta = np.clip(theta, -_STEEP, _STEEP)
+        theta = np.clip(theta, -_MAX_PITCH, _MAX_PITCH)
         d_a, d_e, d_r, d_t = delta
-        flow = Flow(t, h, h - self.ground, body, p=p, q=q, r=r, delta_t=d_t, used=used)
+        flow = Flow(t, h, h - self.ground, body, p=p, q=q, r=r, delta_t=d_t, throttle_time=used)
         air = self._increments(flow, (Stage.AIR,))
         R = rotation(phi, theta, psi)
-        moving = v - self._wind(air)
-        ua, va, wa = np.einsum("ijn,in->jn", R, moving)
-        flow.Va = np.maximum(np.sqrt(ua * ua + va * va + wa * wa), _SLOWEST)
+        air_velocity = v - self._wind(air)
+        ua, va, wa = np.einsum("ijn,in->jn", R, air_velocity)
+        flow.Va = np.maximum(np.sqrt(ua * ua + va * va + wa * wa), _MIN_AIRSPEED)
         flow.alpha, flow.beta = np.arctan2(wa, ua), np.arcsin(np.clip(va / flow.Va, -1, 1))
         flow.rho = density(h) * (1.0 + air.get("rho", 0.0))
         flow.q_bar = 0.5 * flow.rho * flow.Va**2
@@ -173,9 +182,9 @@ class Simulation:
         p_hat, q_hat, r_hat, q_S = p * span, q * chord, r * span, flow.q_bar * body.S
         thrust = eq.thrust_terms(d_t, flow.Va, flow.rho / RHO_0, base.speed)
         flow.T = base.coef["T"] @ thrust
-        flow.pitch, flow.yaw = base.coef["M"][3] * d_e, base.coef["N"][5] * d_r
+        flow.C_m_elevator, flow.C_n_rudder = base.coef["M"][3] * d_e, base.coef["N"][5] * d_r
         A, B = base.coef["alpha"], base.coef["beta"]
-        c_z = lift_of(A, flow.alpha - A[0] - A[3] * q_hat - A[5] * d_e)
+        c_z = solve_c_z(A, flow.alpha - A[0] - A[3] * q_hat - A[5] * d_e)
         c_y = (flow.beta - B[0] - B[2] * p_hat - B[3] * r_hat - B[4] * d_r) / B[1]
         flow.C_L = -c_z
         add = self._increments(flow, (Stage.WRENCH, Stage.MASS))
@@ -193,17 +202,22 @@ class Simulation:
         x_cg, y_cg = add.get("x_cg", zero), add.get("y_cg", zero)
         M, N, L = M + x_cg * force[2], N - x_cg * force[1] + y_cg * force[0], L - y_cg * force[2]
         f = force / (body.mass * (1.0 + add.get("mass", zero)))
-        return np.concatenate([self._moving(R, f), self._turning(x, (L, M, N)), -v[2:3]]), f, flow.Va, flow.rho
+        return (
+            np.concatenate([self._acceleration(R, f), self._rotation_derivatives(x, (L, M, N)), -v[2:3]]),
+            f,
+            flow.Va,
+            flow.rho,
+        )
 
     @staticmethod
-    def _moving(R: np.ndarray, f: np.ndarray) -> np.ndarray:
+    def _acceleration(R: np.ndarray, f: np.ndarray) -> np.ndarray:
         out = np.einsum("ijn,jn->in", R, f)
         out[2] += G
         return out
 
-    def _turning(self, x: np.ndarray, moments: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+    def _rotation_derivatives(self, x: np.ndarray, moments: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
         (L, M, N), (p, q, r), phi = moments, x[3:6], x[6]
-        theta = np.clip(x[7], -_STEEP, _STEEP)
+        theta = np.clip(x[7], -_MAX_PITCH, _MAX_PITCH)
         J_x, J_y, J_z, _ = self.base.card.inertia
         known = float(self.base.card.known)
         sf, cf = np.sin(phi), np.cos(phi)
@@ -220,42 +234,43 @@ class Simulation:
         )
 
 
-def lift_of(A: np.ndarray, rest: np.ndarray) -> np.ndarray:
+def solve_c_z(A: np.ndarray, lift_angle: np.ndarray) -> np.ndarray:
     """Solve A1 c_z + A2 c_z2 = lift_angle for c_z, the root near zero."""
-    c_z = rest / A[1]
+    c_z = lift_angle / A[1]
     for _ in range(3):
-        c_z = c_z - (A[1] * c_z + A[2] * c_z**2 - rest) / (A[1] + 2 * A[2] * c_z)
+        c_z = c_z - (A[1] * c_z + A[2] * c_z**2 - lift_angle) / (A[1] + 2 * A[2] * c_z)
     return c_z
 
 
-class _Group:
+class _EffectGroup:
     """Hypotheses of one effect on one target, and the runs in which they are active."""
 
-    def __init__(self, guesses: list[Guess], runs: list[int]) -> None:
-        self.effect, self._whens = guesses[0].effect, [guess.when for guess in guesses]
-        self._runs, self._of = np.array(runs), {"of": guesses[0].of} if guesses[0].of else {}
-        side_by_side = np.array_equal(self._runs, np.arange(runs[0], runs[0] + len(runs)))
-        self.rows = slice(runs[0], runs[0] + len(runs)) if side_by_side else self._runs  # a slice yields views
-        self._full = self._par = np.array([guess.par for guess in guesses]).T
-        self._comes = any(when.kind is not Onset.ALWAYS for when in self._whens)
+    def __init__(self, hypotheses: list[FaultHypothesis], runs: list[int]) -> None:
+        self.effect, self._onsets = hypotheses[0].effect, [hypothesis.onset for hypothesis in hypotheses]
+        self._runs, self._target_kwargs = np.array(runs), {"of": hypotheses[0].target} if hypotheses[0].target else {}
+        contiguous = np.array_equal(self._runs, np.arange(runs[0], runs[0] + len(runs)))
+        self.run_index = slice(runs[0], runs[0] + len(runs)) if contiguous else self._runs  # a slice yields views
+        self._full = self._par = np.array([hypothesis.par for hypothesis in hypotheses]).T
+        self._time_varying = any(onset.kind is not Onset.ALWAYS for onset in self._onsets)
 
     def gate(self, t: np.ndarray) -> None:
         """Set the parameters at times t, (runs,) of all runs."""
-        if self._comes:
-            gates = [when.gate(t[run : run + 1])[0] for when, run in zip(self._whens, self._runs, strict=True)]
+        if self._time_varying:
+            gates = [onset.gate(t[run : run + 1])[0] for onset, run in zip(self._onsets, self._runs, strict=True)]
             self._par = self._full * np.array(gates)
 
     def act(self, flow: Flow) -> dict[str, np.ndarray]:
         """Return the increments of the active runs."""
-        part = Flow(**{name: x[self.rows] if isinstance(x, np.ndarray) else x for name, x in flow.__dict__.items()})  # type: ignore[arg-type]
-        return self.effect.act(part, *self._par, **self._of)  # type: ignore[no-any-return]
+        fields = {name: x[self.run_index] if isinstance(x, np.ndarray) else x for name, x in vars(flow).items()}
+        part = Flow(**fields)  # type: ignore[arg-type]
+        return self.effect.act(part, *self._par, **self._target_kwargs)  # type: ignore[no-any-return]
 
 
-def _grouped(guesses: Sequence[Sequence[Guess]]) -> list[_Group]:
+def _group_effects(hypotheses: Sequence[Sequence[FaultHypothesis]]) -> list[_EffectGroup]:
     """Group the hypotheses of all runs by effect and target."""
-    groups: dict[str, list[tuple[Guess, int]]] = {}
-    for run, all_ in enumerate(guesses):
-        for guess in all_:
-            if guess.effect.stage in (Stage.AIR, Stage.WRENCH, Stage.MASS):
-                groups.setdefault(f"{guess.effect.stage}:{guess.label}", []).append((guess, run))
-    return [_Group([g for g, _ in group], [run for _, run in group]) for group in groups.values()]
+    groups: dict[str, list[tuple[FaultHypothesis, int]]] = {}
+    for run, run_hypotheses in enumerate(hypotheses):
+        for hypothesis in run_hypotheses:
+            if hypothesis.effect.stage in (Stage.AIR, Stage.WRENCH, Stage.MASS):
+                groups.setdefault(f"{hypothesis.effect.stage}:{hypothesis.label}", []).append((hypothesis, run))
+    return [_EffectGroup([g for g, _ in group], [run for _, run in group]) for group in groups.values()]

@@ -14,23 +14,23 @@ from matplotlib.patches import Patch
 from PIL import Image
 
 from fleet.report.ink import INK, MUTED
-from fleet.report.report_text import plain
-from twin_worker.diagnosis.inference.report import Outcome, Report
-from twin_worker.diagnosis.output.marks import LEGEND, SAID, empty, marks, span, times
+from fleet.report.report_text import printable
+from twin_worker.diagnosis.inference.report import Report, ReportOutcome
+from twin_worker.diagnosis.output.marks import LEGEND, OUTCOME_TEXT, format_segments, marks, show_empty, time_limits
 from twin_worker.diagnosis.output.traces import residuals, simulated
 from twin_worker.diagnosis.output.written import safe
-from twin_worker.numerics.plot_style import house
+from twin_worker.numerics.plot_style import style_axes
 
 KINDS = ("path", "residuals", "simulated", "candidates")
-_LETTERS = 50  # letters of a flight name in a file name, which is limited to 255 bytes
-_TITLE = 40  # letters of a flight name in a title
-_BARS = 12  # candidates in the figure
-_FEWEST = 4  # least number of rows, so that a single bar stays thin
+_MAX_STEM = 50  # letters of a flight name in a file name, which is limited to 255 bytes
+_MAX_TITLE = 40  # letters of a flight name in a title
+_MAX_CANDIDATES = 12  # candidates in the figure
+_MIN_CANDIDATES = 4  # least number of rows, so that a single bar stays thin
 _RIVAL: Any = {"facecolor": "white", "edgecolor": INK, "hatch": "////", "lw": 0.8}
 _OTHER: Any = {"color": MUTED, "alpha": 0.45}
 _SMALL: Any = {"fontsize": 8, "color": INK, "va": "center"}
 _DPI = 110  # figures are about as wide as a page
-_INKS = 96  # a palette reduces the file size to a third; a page contains four figures per flight
+_N_COLOURS = 96  # a palette reduces the file size to a third; a page contains four figures per flight
 
 
 def draw(report: Report, folder: Path, stem: str = "") -> list[Path]:
@@ -43,14 +43,14 @@ def draw(report: Report, folder: Path, stem: str = "") -> list[Path]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     stem = stem or stems([report.flight])[0]
-    name = plain(report.flight)
-    shown = replace(report, flight=name if len(name) <= _TITLE else name[: _TITLE - 2] + " …")
-    made = [folder / f"{stem}-{kind}.png" for kind in KINDS]
+    name = printable(report.flight)
+    shown = replace(report, flight=name if len(name) <= _MAX_TITLE else name[: _MAX_TITLE - 2] + " …")
+    paths = [folder / f"{stem}-{kind}.png" for kind in KINDS]
     with matplotlib.rc_context({"text.parse_math": False}), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a letter without a glyph becomes a box
-        for path, picture in zip(made, (_path, residuals, simulated, _candidates), strict=True):
-            _save(picture(shown), path)
-    return made
+        for path, draw_figure in zip(paths, (_path, residuals, simulated, _candidates), strict=True):
+            _save(draw_figure(shown), path)
+    return paths
 
 
 def _save(figure: Figure, path: Path) -> None:
@@ -58,18 +58,18 @@ def _save(figure: Figure, path: Path) -> None:
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=_DPI)
     with Image.open(drawn) as picture:
-        picture.convert("RGB").quantize(_INKS, dither=Image.Dither.NONE).save(path, optimize=True)
+        picture.convert("RGB").quantize(_N_COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def stems(flights: Sequence[str]) -> list[str]:
     """Return a unique, safe file stem for every flight."""
     out: list[str] = []
     for flight in flights:
-        found, number = safe(flight)[:_LETTERS], 1
-        while found in out:
+        stem, number = safe(flight)[:_MAX_STEM], 1
+        while stem in out:
             number += 1
-            found = f"{safe(flight)[:_LETTERS]}-{number}"
-        out.append(found)
+            stem = f"{safe(flight)[:_MAX_STEM]}-{number}"
+        out.append(stem)
     return out
 
 
@@ -78,70 +78,74 @@ def _path(report: Report) -> Figure:
     series = report.series
     figure = Figure(figsize=(11, 5.4), layout="constrained")
     above, height = figure.subplots(1, 2, width_ratios=(1.15, 1))
-    north, east, up = series.place.T
-    known = np.isfinite(series.place).all(axis=1)
+    north, east, up = series.position.T
+    valid = np.isfinite(series.position).all(axis=1)
     for ax, x, y in ((above, east, north), (height, series.t, up)):
         ax.plot(x, y, color=MUTED, lw=1.0, label="flown" if ax is above else None)
-        _located(ax, report, x, y)
-        if known.any():
-            first = int(np.argmax(known))
+        _draw_located(ax, report, x, y)
+        if valid.any():
+            first = int(np.argmax(valid))
             label = "start" if ax is above else None
             ax.plot(x[first], y[first], "o", color=INK, mfc="white", ms=7, zorder=6, clip_on=False, label=label)
         else:
-            empty(ax, "no position")
+            show_empty(ax, "no position")
     above.set_aspect("equal", adjustable="datalim")
-    height.set_xlim(*span(series))
-    for ax, words in ((above, ("east [m]", "north [m]")), (height, ("time [s]", "height [m]"))):
-        ax.set_xlabel(words[0], fontsize=9, color=INK)
-        ax.set_ylabel(words[1], fontsize=9, color=INK)
-    house(above, "from above")
-    house(height, "height over time")
+    height.set_xlim(*time_limits(series))
+    for ax, labels in ((above, ("east [m]", "north [m]")), (height, ("time [s]", "height [m]"))):
+        ax.set_xlabel(labels[0], fontsize=9, color=INK)
+        ax.set_ylabel(labels[1], fontsize=9, color=INK)
+    style_axes(above, "from above")
+    style_axes(height, "height over time")
     figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=3, **LEGEND)
-    figure.suptitle(f"{report.flight}: {SAID[report.outcome]}", fontsize=10, color=INK)
+    figure.suptitle(f"{report.flight}: {OUTCOME_TEXT[report.outcome]}", fontsize=10, color=INK)
     return figure
 
 
-def _located(ax: Any, report: Report, x: np.ndarray, y: np.ndarray) -> None:
+def _draw_located(ax: Any, report: Report, x: np.ndarray, y: np.ndarray) -> None:
     """Draw the located segments in colour; where they overlap, longer ones are wider and below."""
     t = report.series.t
-    found = sorted(marks(report), key=lambda mark: -int(mark.rows(t).sum()))
-    for k, mark in enumerate(found):
-        rows = mark.rows(t)
-        width = 2.4 + 2.4 * (len(found) - 1 - k)
-        label = f"{mark.name}: {times(mark.segments)}"
-        ax.plot(np.where(rows, x, np.nan), np.where(rows, y, np.nan), color=mark.colour, lw=width, label=label)
+    ordered = sorted(marks(report), key=lambda mark: -int(mark.mask(t).sum()))
+    for k, mark in enumerate(ordered):
+        mask = mark.mask(t)
+        width = 2.4 + 2.4 * (len(ordered) - 1 - k)
+        label = f"{mark.name}: {format_segments(mark.segments)}"
+        ax.plot(np.where(mask, x, np.nan), np.where(mask, y, np.nan), color=mark.colour, lw=width, label=label)
 
 
 def _candidates(report: Report) -> Figure:
     """Draw the gain of every candidate: selected ones in colour, inseparable ones hatched."""
-    tried = sorted(report.tried, key=lambda one: -one.gain)[:_BARS]
-    figure = Figure(figsize=(11, 0.3 * max(len(tried), _FEWEST) + 1.5), layout="constrained")
+    ranked = sorted(report.ranking, key=lambda candidate: -candidate.gain)[:_MAX_CANDIDATES]
+    figure = Figure(figsize=(11, 0.3 * max(len(ranked), _MIN_CANDIDATES) + 1.5), layout="constrained")
     ax = figure.subplots()
-    chosen = {one.guess.label: mark.colour for one, mark in zip(report.findings, marks(report), strict=False)}
-    rivals = {name for one in report.findings for name in one.rivals}
-    proven = "confirmed" if report.outcome is Outcome.NAMED else "not confirmed"
-    key: dict[str, Patch] = {}
-    for place, one in enumerate(tried):
-        words, looks = "others", _OTHER
-        if one.label in chosen:  # the best onset of its label; further ones have other onsets
-            words, looks = f"selected, {proven}: {one.label}", {"color": chosen.pop(one.label)}
-        elif one.label.split(":")[0] in rivals:
-            words, looks = "not separable from it", _RIVAL
-        key[words] = Patch(**looks, label=words)
-        ax.barh(place, max(one.gain, 0.0), height=0.68, **looks)
-        ax.annotate(f"{one.gain:,.0f}", (max(one.gain, 0.0), place), (4, 0), textcoords="offset points", **_SMALL)
-    ax.set_yticks(range(len(tried)), [f"{one.label}  {one.since}".strip() for one in tried])
+    chosen = {
+        finding.hypothesis.label: mark.colour for finding, mark in zip(report.findings, marks(report), strict=False)
+    }
+    rivals = {name for finding in report.findings for name in finding.rivals}
+    proven = "confirmed" if report.outcome is ReportOutcome.NAMED else "not confirmed"
+    legend: dict[str, Patch] = {}
+    for row, candidate in enumerate(ranked):
+        label, style = "others", _OTHER
+        if candidate.label in chosen:  # the best onset of its label; further ones have other onsets
+            label, style = f"selected, {proven}: {candidate.label}", {"color": chosen.pop(candidate.label)}
+        elif candidate.label.split(":")[0] in rivals:
+            label, style = "not separable from it", _RIVAL
+        legend[label] = Patch(**style, label=label)
+        ax.barh(row, max(candidate.gain, 0.0), height=0.68, **style)
+        ax.annotate(
+            f"{candidate.gain:,.0f}", (max(candidate.gain, 0.0), row), (4, 0), textcoords="offset points", **_SMALL
+        )
+    ax.set_yticks(range(len(ranked)), [f"{candidate.label}  {candidate.onset}".strip() for candidate in ranked])
     ax.margins(x=0.1)
-    ax.set_ylim(max(len(tried), _FEWEST) - 0.4, -0.6)
+    ax.set_ylim(max(len(ranked), _MIN_CANDIDATES) - 0.4, -0.6)
     ax.set_axisbelow(True)
     ax.set_xlabel("gain: drop of the whitened sum of squares", fontsize=9, color=INK)
-    how_many = f", the best {len(tried)} of {len(report.tried)}" if tried else ""
-    house(ax, f"{report.flight}: candidates{how_many}")
+    count_text = f", the best {len(ranked)} of {len(report.ranking)}" if ranked else ""
+    style_axes(ax, f"{report.flight}: candidates{count_text}")
     ax.tick_params(axis="y", labelsize=8, labelcolor=INK, length=0)
     ax.grid(visible=False, axis="y")
-    if tried:
-        figure.legend(handles=list(key.values()), loc="outside lower center", ncols=4, **LEGEND)
+    if ranked:
+        figure.legend(handles=list(legend.values()), loc="outside lower center", ncols=4, **LEGEND)
     else:
-        empty(ax, "no candidate with a significant gain")
+        show_empty(ax, "no candidate with a significant gain")
         ax.set(xticks=[], xlabel="")
     return figure

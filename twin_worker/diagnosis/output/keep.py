@@ -10,33 +10,33 @@ from typing import Any
 import numpy as np
 
 from fleet.effects import Body, Onset, catalogue
-from twin_worker.diagnosis.data.card import Card
-from twin_worker.diagnosis.data.fault_hypothesis import Guess, When
-from twin_worker.diagnosis.inference.report import Finding
-from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline, Noise, Timing
+from twin_worker.diagnosis.data.card import AircraftCard
+from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis, OnsetProfile
+from twin_worker.diagnosis.inference.report import DiagnosisFinding
+from twin_worker.diagnosis.model.baseline import CHANNELS, ActuatorTiming, Baseline, Noise
 from twin_worker.diagnosis.model.equations import TERMS
 
 FORMAT = "parauav.simulation.1"
 
 
-def save(path: Path, base: Baseline, findings: Sequence[Finding] = ()) -> None:
+def save(path: Path, base: Baseline, findings: Sequence[DiagnosisFinding] = ()) -> None:
     """Write the simulation and its effects, with parameters, standard deviations and onset profiles."""
     effects = [
         {
-            "effect": one.guess.effect.name,
-            "of": one.guess.of,
-            "par": list(one.guess.par),
-            "when": asdict(one.guess.when),
-            "told": one.told,
-            "sigma": one.sigma,
+            "effect": finding.hypothesis.effect.name,
+            "of": finding.hypothesis.target,
+            "par": list(finding.hypothesis.par),
+            "when": asdict(finding.hypothesis.onset),
+            "told": finding.reported,
+            "sigma": finding.sigma,
         }
-        for one in findings
+        for finding in findings
     ]
     simulation = {field.name: _plain(getattr(base, field.name)) for field in fields(base)}
     path.write_text(json.dumps({"format": FORMAT, **simulation, "effects": effects}, indent=1) + "\n")
 
 
-def load(path: Path) -> tuple[Baseline, tuple[Guess, ...]]:
+def load(path: Path) -> tuple[Baseline, tuple[FaultHypothesis, ...]]:
     """Read a simulation and its effects.
 
     Raises:
@@ -44,16 +44,18 @@ def load(path: Path) -> tuple[Baseline, tuple[Guess, ...]]:
         OSError: if the file cannot be read.
     """
     try:
-        found = json.loads(path.read_text())
+        document = json.loads(path.read_text())
     except (ValueError, UnicodeDecodeError) as error:
         raise ValueError(
             f"{path.name}: found no JSON ({error}), expected a model; make it with `fleet calibrate`"
         ) from None
-    if not isinstance(found, dict) or found.get("format") != FORMAT:
-        named = found.get("format") if isinstance(found, dict) else type(found).__name__
-        raise ValueError(f"{path.name}: found format {named!r}, expected {FORMAT}; make it with `fleet calibrate`")
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        format_name = document.get("format") if isinstance(document, dict) else type(document).__name__
+        raise ValueError(
+            f"{path.name}: found format {format_name!r}, expected {FORMAT}; make it with `fleet calibrate`"
+        )
     try:
-        return _baseline(found), tuple(_guess(one) for one in found["effects"])
+        return _baseline(document), tuple(_hypothesis(entry) for entry in document["effects"])
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(
             f"{path.name}: found {error!r}, expected a complete model; make it with `fleet calibrate`"
@@ -72,48 +74,49 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _baseline(found: dict[str, Any]) -> Baseline:
-    card, noise = found["card"], found["noise"]
+def _baseline(document: dict[str, Any]) -> Baseline:
+    card, noise = document["card"], document["noise"]
     inertia, throw = tuple(card["inertia"]), tuple(tuple(pair) for pair in card["throw"])
-    coef = _coefficients(found["coef"])
+    coef = _coefficients(document["coef"])
     return Baseline(
-        card=Card(card["name"], Body(**card["body"]), inertia, throw, card["pulses"], card["known"]),  # type: ignore[arg-type]
+        card=AircraftCard(card["name"], Body(**card["body"]), inertia, throw, card["pulses"], card["known"]),  # type: ignore[arg-type]
         coef=coef,
-        speed=_number(found["speed"]),
-        airspeed=_number(found["airspeed"]),
-        timing=Timing(**found["timing"]),
-        vane=bool(found["vane"]),
-        r2={name: float(x) for name, x in found["r2"].items()},
+        speed=_number(document["speed"]),
+        airspeed=_number(document["airspeed"]),
+        timing=ActuatorTiming(**document["timing"]),
+        vane=bool(document["vane"]),
+        r2={name: float(x) for name, x in document["r2"].items()},
         noise=Noise(_array(noise["ar"], (len(CHANNELS), 2)), _array(noise["sigma"], (len(CHANNELS),))),
-        spread={name: float(x) for name, x in found["spread"].items()},
-        chance={name: float(x) for name, x in found["chance"].items()},
-        others=tuple(_coefficients(other) for other in found["others"]),
-        usual=_array(found["usual"], (len(CHANNELS),)),
-        flights=tuple(found["flights"]),
+        spread={name: float(x) for name, x in document["spread"].items()},
+        chance={name: float(x) for name, x in document["chance"].items()},
+        others=tuple(_coefficients(other) for other in document["others"]),
+        usual=_array(document["usual"], (len(CHANNELS),)),
+        flights=tuple(document["flights"]),
     )
 
 
-def _coefficients(found: dict[str, list[float]]) -> dict[str, np.ndarray]:
-    return {name: _array(found[name], (len(terms),)) for name, terms in TERMS.items()}
+def _coefficients(entry: dict[str, list[float]]) -> dict[str, np.ndarray]:
+    return {name: _array(entry[name], (len(terms),)) for name, terms in TERMS.items()}
 
 
-def _array(found: Any, shape: tuple[int, ...]) -> np.ndarray:
-    array = np.array(found, float)
+def _array(values: Any, shape: tuple[int, ...]) -> np.ndarray:
+    array = np.array(values, float)
     if array.shape != shape or not np.isfinite(array).all():
         raise ValueError(f"shape {array.shape} or non-finite numbers, expected finite numbers of shape {shape}")
     return array
 
 
-def _number(found: Any) -> float:
-    if not isinstance(found, int | float) or not isfinite(found) or found <= 0:
-        raise ValueError(f"{found!r}, expected a number above 0")
-    return float(found)
+def _number(value: Any) -> float:
+    if not isinstance(value, int | float) or not isfinite(value) or value <= 0:
+        raise ValueError(f"{value!r}, expected a number above 0")
+    return float(value)
 
 
-def _guess(found: dict[str, Any]) -> Guess:
-    effect = catalogue()[found["effect"]]
-    when = found["when"]
-    guess = Guess(effect, str(found["of"]), (0.0,) * effect.size)
-    return guess.at(
-        _array(found["par"], (effect.size,)), When(Onset(when["kind"]), float(when["t0"]), float(when["T"]))
+def _hypothesis(entry: dict[str, Any]) -> FaultHypothesis:
+    effect = catalogue()[entry["effect"]]
+    onset = entry["when"]
+    hypothesis = FaultHypothesis(effect, str(entry["of"]), (0.0,) * effect.n_parameters)
+    return hypothesis.with_parameters(
+        _array(entry["par"], (effect.n_parameters,)),
+        OnsetProfile(Onset(onset["kind"]), float(onset["t0"]), float(onset["T"])),
     )

@@ -6,10 +6,10 @@ from math import floor, isfinite, log10
 from pathlib import Path
 
 from fleet.effects import Effect
-from fleet.report.html import document, safe
-from twin_worker.diagnosis.inference.report import Finding, Outcome, Report
+from fleet.report.html import document, escape_text
+from twin_worker.diagnosis.inference.report import DiagnosisFinding, Report, ReportOutcome
 from twin_worker.diagnosis.output.figures import draw, stems
-from twin_worker.diagnosis.output.marks import MEANING, SAID, times
+from twin_worker.diagnosis.output.marks import CHANNEL_TEXT, OUTCOME_TEXT, format_segments
 
 _UNITS = {  # suffix of a parameter name -> unit; the first match counts
     "mps_per_100m": "m/s per 100 m",
@@ -44,8 +44,8 @@ def write(reports: Sequence[Report], folder: Path) -> Path:
     index = folder / "index.html"
     for report, stem in zip(reports, names, strict=True):
         path = index if len(reports) == 1 else folder / f"{stem}.html"
-        whole = document(f"Diagnosis of {report.flight}", _section(report, draw(report, folder, stem)))
-        path.write_text(whole, encoding="utf-8")
+        html_page = document(f"Diagnosis of {report.flight}", _section(report, draw(report, folder, stem)))
+        path.write_text(html_page, encoding="utf-8")
     if len(reports) != 1:
         title = f"Diagnosis of {len(reports)} flights"
         index.write_text(document(title, _overview(title, reports, names)), encoding="utf-8")
@@ -54,23 +54,24 @@ def write(reports: Sequence[Report], folder: Path) -> Path:
 
 def _overview(title: str, reports: Sequence[Report], names: Sequence[str]) -> str:
     """Return a table of all flights with their summary sentences."""
-    rows = "".join(
-        f'<tr><td>{_chip(one.outcome)}</td><td><a href="{name}.html">{safe(one.flight)}</a></td>'
-        f'<td>{safe(one.sentence)}</td><td class="num">{_change(one.fit_before, one.fit_after)}</td></tr>'
-        for name, one in zip(names, reports, strict=True)
+    table_rows = "".join(
+        f'<tr><td>{_chip(report.outcome)}</td><td><a href="{name}.html">{escape_text(report.flight)}</a></td>'
+        f"<td>{escape_text(report.sentence)}</td><td "
+        f'class="num">{_change(report.fit_before, report.fit_after)}</td></tr>'
+        for name, report in zip(names, reports, strict=True)
     )
     head = "<tr><th>outcome</th><th>flight</th><th>summary</th><th class='num'>held-out residual</th></tr>"
-    return f'<h1>{title}</h1>\n<table class="all">{head}{rows}</table>'
+    return f'<h1>{title}</h1>\n<table class="all">{head}{table_rows}</table>'
 
 
 def _section(report: Report, figures: Sequence[Path]) -> str:
     parts = (
-        f"<h2>{_chip(report.outcome)} {safe(report.flight)}</h2>",
-        f'<p class="say">{safe(report.sentence)}</p>',
+        f"<h2>{_chip(report.outcome)} {escape_text(report.flight)}</h2>",
+        f'<p class="say">{escape_text(report.sentence)}</p>',
         _cards(report),
-        *(_finding(one) for one in report.findings),
-        _unknown(report),
-        _lacks(report),
+        *(_finding_section(finding) for finding in report.findings),
+        _unknown_section(report),
+        _limitations(report),
         *_figures(report, figures),
     )
     return "<section>" + "\n".join(filter(None, parts)) + "</section>"
@@ -78,65 +79,76 @@ def _section(report: Report, figures: Sequence[Path]) -> str:
 
 def _cards(report: Report) -> str:
     """Return cards with the errors on held-out data, before and after."""
-    told = {
+    values_by_label = {
         "residual on held-out blocks, whitened rms": _change(report.fit_before, report.fit_after),
         "simulated specific force on held-out blocks, rms error [m/s²]": _change(
             report.force_before, report.force_after
         ),
         "computed in": f"{report.seconds:.1f} s",
     }
-    cards = "".join(f'<div class="card"><b>{value}</b>{words}</div>' for words, value in told.items() if value)
+    cards = "".join(
+        f'<div class="card"><b>{value}</b>{label}</div>' for label, value in values_by_label.items() if value
+    )
     return f'<div class="cards">{cards}</div>'
 
 
-def _finding(one: Finding) -> str:
+def _finding_section(finding: DiagnosisFinding) -> str:
     """Return the section of one effect: parameters, location, time, rivals."""
-    effect = one.guess.effect
-    where = ", ".join(filter(None, (one.channel, one.surface)))
-    rows = "".join(
-        f'<tr><td>{safe(name)}</td><td class="num">{amount(value, one.sigma.get(name, float("nan")))}</td>'
-        f"<td>{safe(unit(name, effect))}</td></tr>"
-        for name, value in one.told.items()
+    effect = finding.hypothesis.effect
+    where = ", ".join(filter(None, (finding.channel, finding.surface)))
+    table_rows = "".join(
+        f'<tr><td>{escape_text(name)}</td><td class="num">{amount(value, finding.sigma.get(name, float("nan")))}</td>'
+        f"<td>{escape_text(unit(name, effect))}</td></tr>"
+        for name, value in finding.reported.items()
     )
-    rivals = "".join(_rival(name, apart, effect) for name, apart in zip(one.rivals, one.apart, strict=True))
-    apart = f"<p>Not separable from:</p><ul>{rivals}</ul>" if rivals else "<p>Separable from every other effect.</p>"
-    held = f"{100 * one.held:.0f} % of its gain is present on held-out data; gain" if one.held else "Gain"
+    rivals = "".join(
+        _rival(name, manoeuvre, effect) for name, manoeuvre in zip(finding.rivals, finding.manoeuvres, strict=True)
+    )
+    rival_list = (
+        f"<p>Not separable from:</p><ul>{rivals}</ul>" if rivals else "<p>Separable from every other effect.</p>"
+    )
+    gain_text = (
+        f"{100 * finding.held_out_share:.0f} % of its gain is present on held-out data; gain"
+        if finding.held_out_share
+        else "Gain"
+    )
     return (
-        f"<h3>{safe(one.guess.label)}</h3><p><code>{safe(effect.equation)}</code></p>"
-        f"<p>Where: {safe(where)}. When: {times(one.segments)}. "
-        f'<span class="soft">{held} {one.gain:,.0f}.</span></p>'
-        f'<table><tr><th>number</th><th class="num">value ± standard deviation</th><th>unit</th></tr>{rows}</table>'
-        f"<p>{apart}</p>"
+        f"<h3>{escape_text(finding.hypothesis.label)}</h3><p><code>{escape_text(effect.equation)}</code></p>"
+        f"<p>Where: {escape_text(where)}. When: {format_segments(finding.segments)}. "
+        f'<span class="soft">{gain_text} {finding.gain:,.0f}.</span></p>'
+        '<table><tr><th>number</th><th class="num">value ± standard '
+        f"deviation</th><th>unit</th></tr>{table_rows}</table>"
+        f"<p>{rival_list}</p>"
     )
 
 
-def _rival(name: str, apart: str, effect: Effect) -> str:
+def _rival(name: str, manoeuvre: str, effect: Effect) -> str:
     """Return one rival with the known difference and the manoeuvre that separates it."""
-    known = effect.confused.get(name)
-    words = ". ".join(filter(None, (known, f"To separate them: {apart}")))
-    return f'<li><b>{safe(name)}</b> <span class="soft">{safe(words)}.</span></li>'
+    hint = effect.confusable_with.get(name)
+    text = ". ".join(filter(None, (hint, f"To separate them: {manoeuvre}")))
+    return f'<li><b>{escape_text(name)}</b> <span class="soft">{escape_text(text)}.</span></li>'
 
 
-def _unknown(report: Report) -> str:
+def _unknown_section(report: Report) -> str:
     """Return the section of an unknown mismatch: location, time, free-form term."""
-    if report.outcome is not Outcome.UNKNOWN:
+    if report.outcome is not ReportOutcome.UNKNOWN:
         return ""
     channel, segments = report.where
-    where = safe(MEANING.get(channel, channel) or "no single channel")
-    said = f"<h3>Unknown</h3><p>Where: {where}. When: {times(segments)}.</p>"
+    where = escape_text(CHANNEL_TEXT.get(channel, channel) or "no single channel")
+    intro = f"<h3>Unknown</h3><p>Where: {where}. When: {format_segments(segments)}.</p>"
     if not report.terms:
-        return said
-    rows = "".join(
-        f'<tr><td>{safe(term)}</td><td class="num">{coefficient:.3g}</td></tr>'
+        return intro
+    table_rows = "".join(
+        f'<tr><td>{escape_text(term)}</td><td class="num">{coefficient:.3g}</td></tr>'
         for term, coefficient in report.terms.items()
     )
     head = '<tr><th>term</th><th class="num">coefficient</th></tr>'
-    words = "Sparse free-form fit of the residual, without physical meaning."
-    return f"{said}<p>{words}</p><table>{head}{rows}</table>"
+    note = "Sparse free-form fit of the residual, without physical meaning."
+    return f"{intro}<p>{note}</p><table>{head}{table_rows}</table>"
 
 
-def _lacks(report: Report) -> str:
-    items = "".join(f"<li>{safe(words)}</li>" for words in report.lacks)
+def _limitations(report: Report) -> str:
+    items = "".join(f"<li>{escape_text(limitation)}</li>" for limitation in report.limitations)
     return f"<h3>Limitations</h3><ul>{items}</ul>" if items else ""
 
 
@@ -145,7 +157,7 @@ def _figures(report: Report, figures: Sequence[Path]) -> Iterator[str]:
         data = base64.b64encode(path.read_bytes()).decode()
         yield (
             f"<figure><figcaption>{caption}</figcaption>"
-            f'<img alt="{safe(report.flight)}: {caption}" src="data:image/png;base64,{data}"></figure>'
+            f'<img alt="{escape_text(report.flight)}: {caption}" src="data:image/png;base64,{data}"></figure>'
         )
 
 
@@ -174,5 +186,5 @@ def _change(before: float, after: float) -> str:
     return f"{before:.2f} → {after:.2f}{share}"
 
 
-def _chip(outcome: Outcome) -> str:
-    return f'<span class="chip {outcome.value}">{SAID[outcome]}</span>'
+def _chip(outcome: ReportOutcome) -> str:
+    return f'<span class="chip {outcome.value}">{OUTCOME_TEXT[outcome]}</span>'

@@ -5,25 +5,34 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from fleet.report.ink import GRID, INK, spread
+from fleet.report.ink import GRID, INK, axis_limits
 from twin_worker.diagnosis.inference.report import Report
-from twin_worker.diagnosis.inference.validation.cross_validate import SHOWS
+from twin_worker.diagnosis.inference.validation.cross_validate import MIN_CHANNEL_RATIO
 from twin_worker.diagnosis.model.baseline import CHANNELS
-from twin_worker.diagnosis.output.marks import AFTER, BEFORE, LEGEND, MEANING, empty, marks, runs, span
-from twin_worker.numerics.plot_style import house
+from twin_worker.diagnosis.output.marks import (
+    AFTER,
+    BEFORE,
+    CHANNEL_TEXT,
+    LEGEND,
+    marks,
+    show_empty,
+    time_limits,
+    true_segments,
+)
+from twin_worker.numerics.plot_style import style_axes
 
-_MOST = 8  # channels drawn
-_FEW = 4  # channels drawn if none differs from its usual
+_MAX_CHANNELS = 8  # channels drawn
+_MIN_CHANNELS = 4  # channels drawn if none differs from its usual
 _NOMINAL = 2.0  # half width of the shaded nominal band [standard deviations]
 _FORCES = ("forward", "right", "down")
 
 
 def residuals(report: Report) -> Figure:
     """Draw each channel that differs from its usual, before and after, worst first."""
-    names, title = chosen(report)
-    rows = max((len(names) + 1) // 2, 1)
-    figure = Figure(figsize=(11, max(1.8 * rows + 1.0, 3.6)), layout="constrained")
-    panels = list(figure.subplots(rows, 2, sharex=True, squeeze=False).flat)
+    names, title = choose_channels(report)
+    n_rows = max((len(names) + 1) // 2, 1)
+    figure = Figure(figsize=(11, max(1.8 * n_rows + 1.0, 3.6)), layout="constrained")
+    panels = list(figure.subplots(n_rows, 2, sharex=True, squeeze=False).flat)
     for ax, name in zip(panels, names, strict=False):
         _residual(ax, report, name)
     for ax in panels[len(names) :]:
@@ -32,30 +41,32 @@ def residuals(report: Report) -> Figure:
         ax.tick_params(labelbottom=True)  # the right column may have one row less
         ax.set_xlabel("time [s]", fontsize=9, color=INK)
     if names:
-        panels[0].set_xlim(*span(report.series))
+        panels[0].set_xlim(*time_limits(report.series))
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, **LEGEND)
     figure.supylabel("standard deviations of nominal flights", fontsize=9, color=INK)
     figure.suptitle(f"{report.flight}: {title}", fontsize=10, color=INK)
     return figure
 
 
-def chosen(report: Report) -> tuple[list[str], str]:
+def choose_channels(report: Report) -> tuple[list[str], str]:
     """Return the channels to draw, worst first, and a title that counts nominal channels and those without data."""
     ratio = {name: report.ratio_before.get(name, np.nan) for name in CHANNELS}
-    known = [name for name in CHANNELS if np.isfinite(ratio[name]) and np.isfinite(_trusted(report, name)[0]).any()]
+    known = [
+        name for name in CHANNELS if np.isfinite(ratio[name]) and np.isfinite(_valid_residuals(report, name)[0]).any()
+    ]
     worst = sorted(known, key=lambda name: -ratio[name])
-    off = [name for name in worst if ratio[name] > SHOWS]
-    said = [f"{len(known) - len(off)} of {len(CHANNELS)} channels at their usual"]
+    unusual = [name for name in worst if ratio[name] > MIN_CHANNEL_RATIO]
+    notes = [f"{len(known) - len(unusual)} of {len(CHANNELS)} channels at their usual"]
     if len(known) < len(CHANNELS):
-        said.append(f"{len(CHANNELS) - len(known)} without data")
-    if len(off) > _MOST:
-        said.append(f"drawn: the worst {_MOST} of the other {len(off)}")
-    if not off and worst:
-        said.append(f"drawn: the highest {min(_FEW, len(worst))}")
-    return off[:_MOST] or worst[:_FEW], ", ".join(said)
+        notes.append(f"{len(CHANNELS) - len(known)} without data")
+    if len(unusual) > _MAX_CHANNELS:
+        notes.append(f"drawn: the worst {_MAX_CHANNELS} of the other {len(unusual)}")
+    if not unusual and worst:
+        notes.append(f"drawn: the highest {min(_MIN_CHANNELS, len(worst))}")
+    return unusual[:_MAX_CHANNELS] or worst[:_MIN_CHANNELS], ", ".join(notes)
 
 
-def _trusted(report: Report, name: str) -> tuple[np.ndarray, np.ndarray]:
+def _valid_residuals(report: Report, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return a channel before and after, nan on invalid rows, (n,) each."""
     series, c = report.series, CHANNELS.index(name)
     before, after = (np.where(series.ok, x[:, c], np.nan) for x in (series.before, series.after))
@@ -64,20 +75,20 @@ def _trusted(report: Report, name: str) -> tuple[np.ndarray, np.ndarray]:
 
 def _residual(ax: Any, report: Report, name: str) -> None:
     t = report.series.t
-    before, after = _trusted(report, name)
+    before, after = _valid_residuals(report, name)
     ax.axhspan(-_NOMINAL, _NOMINAL, color=GRID, alpha=0.6, lw=0, label="usual")
-    said = f"{MEANING[name]}: {report.ratio_before[name]:.1f}"
+    title = f"{CHANNEL_TEXT[name]}: {report.ratio_before[name]:.1f}"
     ax.plot(t, before, color=BEFORE, lw=0.9, label="without the effects" if report.findings else "residual")
     if report.findings:
         ax.plot(t, after, color=AFTER, lw=0.9, label="with them")
-        said += f" → {report.ratio_after.get(name, np.nan):.1f}"
+        title += f" → {report.ratio_after.get(name, np.nan):.1f}"
     for mark in marks(report):
-        for k, onset in enumerate(mark.begins(span(report.series))):
+        for k, onset in enumerate(mark.onset_times(time_limits(report.series))):
             ax.axvline(onset, color=mark.colour, lw=1.6, ls="--", label=None if k else f"begins: {mark.name}")
     # short peaks may exceed the axis, lasting deviations may not
     most = np.nanpercentile(np.abs(np.concatenate([before, after if report.findings else before])), 99.7)
     ax.set_ylim(-max(1.15 * most, 2.0 * _NOMINAL), max(1.15 * most, 2.0 * _NOMINAL))
-    house(ax, f"{said} × the usual mean square")
+    style_axes(ax, f"{title} × the usual mean square")
 
 
 def simulated(report: Report) -> Figure:
@@ -85,40 +96,40 @@ def simulated(report: Report) -> Figure:
     series = report.series
     figure = Figure(figsize=(11, 6.8), layout="constrained")
     panels = figure.subplots(3, 2, sharex="col", sharey="row", width_ratios=(2.6, 1), squeeze=False)
-    near = _usual(report)
-    closer = "one held-out block" + (", of median gain" if report.findings else "") if near else "no held-out block"
+    block = _median_block(report)
+    caption = "one held-out block" + (", of median gain" if report.findings else "") if block else "no held-out block"
     for i, pair in enumerate(panels):
         for ax, width in zip(pair, (0.8, 1.6), strict=True):
             _force(ax, report, i, width)
-        house(pair[0], f"{_FORCES[i]} [m/s²]")
-        house(pair[1], "" if i else closer)
+        style_axes(pair[0], f"{_FORCES[i]} [m/s²]")
+        style_axes(pair[1], "" if i else caption)
     for ax in panels[-1]:
         ax.set_xlabel("time [s]", fontsize=9, color=INK)
-    panels[0, 0].set_xlim(*span(series))
-    panels[0, 1].set_xlim(*(near or span(series)))
+    panels[0, 0].set_xlim(*time_limits(series))
+    panels[0, 1].set_xlim(*(block or time_limits(series)))
     figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, **LEGEND)
-    figure.suptitle(f"{report.flight}: specific force, {_rms(report)}", fontsize=10, color=INK)
+    figure.suptitle(f"{report.flight}: specific force, {_rms_text(report)}", fontsize=10, color=INK)
     return figure
 
 
-def _rms(report: Report) -> str:
+def _rms_text(report: Report) -> str:
     """Return the rms error on held-out blocks as text."""
     if not np.isfinite(report.force_before):
         return "measured against simulated"
-    said = f"rms error of the simulation on held-out blocks {report.force_before:.2f}"
+    text = f"rms error of the simulation on held-out blocks {report.force_before:.2f}"
     if report.findings and np.isfinite(report.force_after):
-        said += f" → {report.force_after:.2f}"
-    return f"{said} m/s²"
+        text += f" → {report.force_after:.2f}"
+    return f"{text} m/s²"
 
 
 def _force(ax: Any, report: Report, i: int, width: float) -> None:
     series = report.series
     forces = (series.measured, series.base, series.model)
     measured, base, model = (np.where(series.ok, x[:, i], np.nan) for x in forces)
-    for k, (start, stop) in enumerate(runs(series.t, series.held)):
+    for k, (start, stop) in enumerate(true_segments(series.t, series.held_out)):
         ax.axvspan(start, stop, color=GRID, alpha=0.6, lw=0, label="held out of the fit" if k == 0 else None)
     if not np.isfinite(measured).any():
-        empty(ax, "not measured")
+        show_empty(ax, "not measured")
     ax.plot(series.t, measured, color=INK, lw=width, label="measured")
     without = "simulated without the effects" if report.findings else "simulated"
     ax.plot(series.t, base, color=BEFORE, lw=1.0, label=without)
@@ -127,18 +138,18 @@ def _force(ax: Any, report: Report, i: int, width: float) -> None:
     drawn = np.concatenate([measured, base, model] if report.findings else [measured, base])
     drawn = drawn[np.isfinite(drawn)]
     if len(drawn):
-        ax.set_ylim(*spread(np.percentile(drawn, (0.1, 99.9)), least=0.2))
+        ax.set_ylim(*axis_limits(np.percentile(drawn, (0.1, 99.9)), min_range=0.2))
 
 
-def _usual(report: Report) -> tuple[float, float] | None:
+def _median_block(report: Report) -> tuple[float, float] | None:
     """Return the held-out block of median gain among those with located segments."""
-    series, found = report.series, marks(report)
-    located = np.any([mark.rows(series.t) for mark in found], axis=0) if found else series.ok
+    series, located_marks = report.series, marks(report)
+    located = np.any([mark.mask(series.t) for mark in located_marks], axis=0) if located_marks else series.ok
     located = located if located.any() else series.ok
     gains: dict[tuple[float, float], float] = {}
-    for start, stop in runs(series.t, series.held):
-        rows = series.ok & located & (series.t >= start) & (series.t <= stop)
-        before, after = (((series.measured - x)[rows] ** 2).ravel() for x in (series.base, series.model))
+    for start, stop in true_segments(series.t, series.held_out):
+        mask = series.ok & located & (series.t >= start) & (series.t <= stop)
+        before, after = (((series.measured - x)[mask] ** 2).ravel() for x in (series.base, series.model))
         known = np.isfinite(before) & np.isfinite(after)
         if known.any() and stop > start:
             gains[start, stop] = float((before - after)[known].mean())

@@ -8,46 +8,48 @@ from typing import Any
 
 import numpy as np
 
-from twin_worker.diagnosis.inference.report import Finding, Outcome, Report
+from twin_worker.diagnosis.inference.report import DiagnosisFinding, Report, ReportOutcome
 
-_VERDICT = {Outcome.SUSPECTED: "none"}
+_VERDICT = {ReportOutcome.SUSPECTED: "none"}
 
 
 def write(reports: Sequence[Report], path: Path) -> None:
     """Write the reports, and for each named outcome `<path>-<flight>.npz` with t, f_base, f_model."""
-    path.write_text(json.dumps([as_json(report, _told(report, path)) for report in reports], indent=1) + "\n")
+    path.write_text(
+        json.dumps([as_json(report, _write_predictions(report, path)) for report in reports], indent=1) + "\n"
+    )
 
 
 def as_json(report: Report, predictions: Path | None = None) -> dict[str, Any]:
     """Return one report as plain values; a suspected outcome has verdict `none` and its effects under `suspects`."""
-    named = report.findings if report.outcome is Outcome.NAMED else ()
-    located = [_located(one.channel, one.surface, one.segments) for one in named]
-    if report.outcome is Outcome.UNKNOWN:
+    named = report.findings if report.outcome is ReportOutcome.NAMED else ()
+    located = [_located(finding.channel, finding.surface, finding.segments) for finding in named]
+    if report.outcome is ReportOutcome.UNKNOWN:
         located = [_located(report.where[0], "", report.where[1])]
     return {
         "flight": report.flight,
-        "abstained": report.outcome is Outcome.UNKNOWN,
+        "abstained": report.outcome is ReportOutcome.UNKNOWN,
         "verdict": _VERDICT.get(report.outcome, report.outcome.value),
         "sentence": report.sentence,
-        "named": [one.guess.effect.name for one in named],
-        "equivalents": [list(one.rivals) for one in named],
-        "told_apart_by": [list(one.apart) for one in named],
+        "named": [finding.hypothesis.effect.name for finding in named],
+        "equivalents": [list(finding.rivals) for finding in named],
+        "told_apart_by": [list(finding.manoeuvres) for finding in named],
         "located": located,
-        "parameters": [_finite(one.told) for one in named],
-        "sigma": [_finite(one.sigma) for one in named],
-        "suspects": [_suspect(one) for one in report.findings] if not named else [],
+        "parameters": [_finite(finding.reported) for finding in named],
+        "sigma": [_finite(finding.sigma) for finding in named],
+        "suspects": [_suspect(finding) for finding in report.findings] if not named else [],
         "fit_before": _or_none(report.fit_before),
         "fit_after": _or_none(report.fit_after),
         "force_before": _or_none(report.force_before),
         "force_after": _or_none(report.force_after),
-        "stray_before_deg": _or_none(report.stray_before),
-        "stray_after_deg": _or_none(report.stray_after),
+        "stray_before_deg": _or_none(report.free_run_error_before),
+        "stray_after_deg": _or_none(report.free_run_error_after),
         "predictions": str(predictions) if predictions else None,
         "channels_before": _finite(report.ratio_before),
         "channels_after": _finite(report.ratio_after),
-        "odd": report.odd,
+        "odd": report.anomaly_ratio,
         "free_form": report.terms,
-        "lacks": list(report.lacks),
+        "lacks": list(report.limitations),
         "seconds": round(report.seconds, 2),
     }
 
@@ -57,21 +59,25 @@ def safe(name: str) -> str:
     return "".join(c if c.isalnum() or c in "-_" else "_" for c in name)[:80] or "flight"
 
 
-def _told(report: Report, path: Path) -> Path | None:
-    if report.outcome is not Outcome.NAMED:
+def _write_predictions(report: Report, path: Path) -> Path | None:
+    if report.outcome is not ReportOutcome.NAMED:
         return None
-    told = path.absolute().with_name(f"{path.stem}-{safe(report.flight)}.npz")
+    target = path.absolute().with_name(f"{path.stem}-{safe(report.flight)}.npz")
     series = report.series
-    np.savez_compressed(told, t=series.t, f_base=series.base, f_model=series.model)
-    return told
+    np.savez_compressed(target, t=series.t, f_base=series.base, f_model=series.model)
+    return target
 
 
 def _located(channel: str, surface: str, segments: tuple[tuple[float, float], ...]) -> dict[str, Any]:
     return {"channel": channel, "surface": surface or None, "segments": [list(pair) for pair in segments]}
 
 
-def _suspect(one: Finding) -> dict[str, Any]:
-    return {"name": one.guess.effect.name, "parameters": _finite(one.told), "sigma": _finite(one.sigma)}
+def _suspect(finding: DiagnosisFinding) -> dict[str, Any]:
+    return {
+        "name": finding.hypothesis.effect.name,
+        "parameters": _finite(finding.reported),
+        "sigma": _finite(finding.sigma),
+    }
 
 
 def _finite(values: dict[str, float]) -> dict[str, float | None]:

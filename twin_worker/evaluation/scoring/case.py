@@ -10,7 +10,7 @@ OURS = "ours"
 
 
 @dataclass(frozen=True)
-class Told:
+class MethodForecast:
     """Forecast of one method at one start.
 
     Attributes:
@@ -21,13 +21,13 @@ class Told:
     """
 
     path: np.ndarray
-    made_by: str
+    source: str
     tube: np.ndarray | None = None
     horizon_s: float = float("nan")
 
 
 @dataclass(frozen=True)
-class Asked:
+class EvaluationStart:
     """One start with the data available at that time.
 
     Attributes:
@@ -50,14 +50,14 @@ class Asked:
     ahead: np.ndarray
     origin: Origin
     speed: float
-    follows: str
+    no_route_reason: str
     group: str
-    told: dict[str, Told]
+    forecasts: dict[str, MethodForecast]
     spread: np.ndarray
 
 
 @dataclass(frozen=True)
-class Case:
+class EvaluationCase:
     """One start and the actual flight after it.
 
     Attributes:
@@ -69,9 +69,9 @@ class Case:
         exclusion: reason for exclusion; empty: included
     """
 
-    asked: Asked
-    flown: np.ndarray
+    start: EvaluationStart
+    positions: np.ndarray
     length: np.ndarray
     phase: str
     route: np.ndarray
-    apart: str
+    exclusion: str

@@ -10,44 +10,53 @@ from typing import Any
 import numpy as np
 
 from twin_worker.evaluation.scoring.case import OURS
-from twin_worker.evaluation.scoring.score import LIMITS, Scores
-from twin_worker.evaluation.scoring.truth import WHOLE_S
+from twin_worker.evaluation.scoring.score import LIMITS, MethodScores
+from twin_worker.evaluation.scoring.truth import MIN_EVENT_FREE_S
 
 _DRAWS = 2000
 _SEED = 5
-_SHARES = (2.5, 97.5)  # the interval [%]
+_INTERVAL_PERCENT = (2.5, 97.5)  # the interval [%]
 _ERRORS_S = (16, 60)  # look-aheads whose median error is compared [s]
 BEATEN, MATCHED, WORSE, ONE_FLIGHT = "beaten", "matched", "worse", "one flight, no interval"
 
 
-def compare(scores: dict[str, Scores]) -> dict[str, Any]:
+def compare(scores: dict[str, MethodScores]) -> dict[str, Any]:
     """Compare ours with each method: difference (ours minus other) of mean first passage up to 60 s and median errors.
 
     Returns:
         by method: `t10_s`, `p50_16_m`, `p50_60_m`, each with difference, low, high, verdict; `skill_16`, `skill_60`:
         1 - median error of ours / median error of the other
     """
-    ours = scores.get(OURS)
-    return {name: _against(ours, other) for name, other in scores.items() if ours is not None and name != OURS}
+    own_scores = scores.get(OURS)
+    return {
+        name: _compare_with(own_scores, other_scores)
+        for name, other_scores in scores.items()
+        if own_scores is not None and name != OURS
+    }
 
 
-def _against(ours: Scores, other: Scores) -> dict[str, Any]:
-    pairs = np.column_stack([np.minimum(one.passages[LIMITS[0]][:, 0], WHOLE_S) for one in (ours, other)])
-    out: dict[str, Any] = {"t10_s": _difference(pairs, ours.flight, np.mean, better=1.0)}
+def _compare_with(own_scores: MethodScores, other_scores: MethodScores) -> dict[str, Any]:
+    pairs = np.column_stack(
+        [
+            np.minimum(method_scores.passages[LIMITS[0]][:, 0], MIN_EVENT_FREE_S)
+            for method_scores in (own_scores, other_scores)
+        ]
+    )
+    out: dict[str, Any] = {"t10_s": _difference(pairs, own_scores.flight, np.mean, better=1.0)}
     for seconds in _ERRORS_S:
-        column = ours.at(seconds)
+        column = own_scores.column_at(seconds)
         if column is None:
             continue
-        pairs = np.column_stack([one.distance[:, column] for one in (ours, other)])
-        known = np.isfinite(pairs).all(axis=1)
-        out[f"p50_{seconds}_m"] = _difference(pairs[known], ours.flight[known], np.median, better=-1.0)
-        middle = np.median(pairs[known], axis=0) if known.any() else np.array([np.nan, np.nan])
-        out[f"skill_{seconds}"] = round(float(1 - middle[0] / middle[1]), 3) if middle[1] > 0 else None
+        pairs = np.column_stack([one.distance[:, column] for one in (own_scores, other_scores)])
+        valid = np.isfinite(pairs).all(axis=1)
+        out[f"p50_{seconds}_m"] = _difference(pairs[valid], own_scores.flight[valid], np.median, better=-1.0)
+        medians = np.median(pairs[valid], axis=0) if valid.any() else np.array([np.nan, np.nan])
+        out[f"skill_{seconds}"] = round(float(1 - medians[0] / medians[1]), 3) if medians[1] > 0 else None
     return out
 
 
 def _difference(
-    pairs: np.ndarray, flight: np.ndarray, middle: Callable[..., Any], *, better: float
+    pairs: np.ndarray, flight: np.ndarray, statistic: Callable[..., Any], *, better: float
 ) -> dict[str, float | str | None]:
     """Return the difference of a statistic (ours minus other), its 95 % interval over flights, and the verdict.
 
@@ -60,16 +69,22 @@ def _difference(
     names = np.unique(flight)
     if not len(names):
         return {"difference": None, "low": None, "high": None, "verdict": ONE_FLIGHT}
-    value = float(np.subtract(*middle(pairs, axis=0)))
+    value = float(np.subtract(*statistic(pairs, axis=0)))
     if len(names) < 2:
         return {"difference": round(value, 2), "low": None, "high": None, "verdict": ONE_FLIGHT}
-    its = [pairs[flight == name] for name in names]
+    by_flight = [pairs[flight == name] for name in names]
     rng = np.random.default_rng(_SEED)
-    drawn = [
-        float(np.subtract(*middle(np.concatenate([its[i] for i in rng.integers(len(its), size=len(its))]), axis=0)))
+    resampled = [
+        float(
+            np.subtract(
+                *statistic(
+                    np.concatenate([by_flight[i] for i in rng.integers(len(by_flight), size=len(by_flight))]), axis=0
+                )
+            )
+        )
         for _ in range(_DRAWS)
     ]
-    low, high = np.percentile(drawn, _SHARES)
+    low, high = np.percentile(resampled, _INTERVAL_PERCENT)
     verdict = MATCHED if low <= 0 <= high else BEATEN if value * better > 0 else WORSE
     return {
         "difference": round(value, 2),

@@ -10,14 +10,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin_worker.evaluation.scoring.case import Case
-from twin_worker.numerics.prediction_errors import LIMIT, along_cross_down, first_passage, least_length, track_frame
+from twin_worker.evaluation.scoring.case import EvaluationCase
+from twin_worker.numerics.prediction_errors import (
+    ERROR_LIMIT,
+    along_cross_down,
+    first_passage,
+    min_path_length,
+    track_frame,
+)
 
 LIMITS = (0.10, 0.05, 0.03)  # relative errors whose first passage is reported [-]
 
 
 @dataclass(frozen=True)
-class Scores:
+class MethodScores:
     """Scores of one method, one row per start.
 
     Attributes:
@@ -34,69 +40,69 @@ class Scores:
 
     ahead: np.ndarray
     flight: np.ndarray
-    made_by: np.ndarray
+    source: np.ndarray
     error: np.ndarray
     distance: np.ndarray
     passages: dict[float, np.ndarray]
-    strict: np.ndarray
+    m2_passages: np.ndarray
     tube: np.ndarray
     horizon: np.ndarray
 
-    def at(self, seconds: float) -> int | None:
+    def column_at(self, seconds: float) -> int | None:
         """Return the column of a look-ahead; None if the grid has none there."""
-        found = np.flatnonzero(np.abs(self.ahead - seconds) < 0.5)
-        return int(found[0]) if len(found) else None
+        columns = np.flatnonzero(np.abs(self.ahead - seconds) < 0.5)
+        return int(columns[0]) if len(columns) else None
 
     @property
     def inside(self) -> np.ndarray:
         """Return whether the flight was inside the tube on all axes, nan unknown, (s, k)."""
-        known = np.isfinite(self.error).all(axis=2) & np.isfinite(self.tube).all(axis=2)
-        return np.where(known, (np.abs(self.error) <= self.tube).all(axis=2), np.nan)
+        valid = np.isfinite(self.error).all(axis=2) & np.isfinite(self.tube).all(axis=2)
+        return np.where(valid, (np.abs(self.error) <= self.tube).all(axis=2), np.nan)
 
-    def part(self, rows: np.ndarray) -> "Scores":
+    def select(self, rows: np.ndarray) -> "MethodScores":
         """Return the scores of these rows."""
-        passages = {limit: found[rows] for limit, found in self.passages.items()}
-        return Scores(
+        passages = {limit: rows_of_limit[rows] for limit, rows_of_limit in self.passages.items()}
+        return MethodScores(
             self.ahead,
             self.flight[rows],
-            self.made_by[rows],
+            self.source[rows],
             self.error[rows],
             self.distance[rows],
             passages,
-            self.strict[rows],
+            self.m2_passages[rows],
             self.tube[rows],
             self.horizon[rows],
         )
 
 
-def score(cases: Sequence[Case], method: str) -> Scores:
+def score_method(cases: Sequence[EvaluationCase], method: str) -> MethodScores:
     """Score one method over starts with the same look-aheads."""
-    told = [case.asked.told[method] for case in cases]
-    flown, path = np.array([case.flown for case in cases]), np.array([one.path for one in told])
-    distance = np.linalg.norm(flown - path, axis=2)
-    ahead = cases[0].asked.ahead
+    forecasts = [case.start.forecasts[method] for case in cases]
+    positions, path = np.array([case.positions for case in cases]), np.array([forecast.path for forecast in forecasts])
+    distance = np.linalg.norm(positions - path, axis=2)
+    ahead = cases[0].start.ahead
     relative = distance / np.array([case.length for case in cases])
-    strict = distance / np.array([_displacement(case) for case in cases])
+    m2_error = distance / np.array([_displacement(case) for case in cases])
     unknown = np.full((len(ahead), 3), np.nan)
-    return Scores(
+    return MethodScores(
         ahead=ahead,
-        flight=np.array([case.asked.flight for case in cases]),
-        made_by=np.array([one.made_by for one in told]),
-        error=along_cross_down(track_frame(path, ahead), flown - path),
+        flight=np.array([case.start.flight for case in cases]),
+        source=np.array([one.source for one in forecasts]),
+        error=along_cross_down(track_frame(path, ahead), positions - path),
         distance=distance,
-        passages={limit: passages(relative, ahead, limit) for limit in LIMITS},
-        strict=passages(strict, ahead, LIMIT),
-        tube=np.array([unknown if one.tube is None else one.tube for one in told]),
-        horizon=np.array([one.horizon_s for one in told]),
+        passages={limit: first_passages(relative, ahead, limit) for limit in LIMITS},
+        m2_passages=first_passages(m2_error, ahead, ERROR_LIMIT),
+        tube=np.array([unknown if one.tube is None else one.tube for one in forecasts]),
+        horizon=np.array([one.horizon_s for one in forecasts]),
     )
 
 
-def _displacement(case: Case) -> np.ndarray:
+def _displacement(case: EvaluationCase) -> np.ndarray:
     """Return the distance from the start, at least two seconds of ground speed, (k,) [m]."""
-    return np.fmax(np.linalg.norm(case.flown - case.flown[0], axis=1), least_length(case.asked.speed))
+    return np.fmax(np.linalg.norm(case.positions - case.positions[0], axis=1), min_path_length(case.start.speed))
 
 
-def passages(relative: np.ndarray, ahead: np.ndarray, limit: float) -> np.ndarray:
+def first_passages(relative: np.ndarray, ahead: np.ndarray, limit: float) -> np.ndarray:
     """Return the first passage of a limit by start and whether it is censored, (s, 2) [s, 0 or 1].
 
     Args:
@@ -105,13 +111,13 @@ def passages(relative: np.ndarray, ahead: np.ndarray, limit: float) -> np.ndarra
         limit: relative error [-]
     """
     out = np.empty((len(relative), 2))
-    for row, one in zip(out, relative, strict=True):
-        known = np.isfinite(one)
-        row[:] = first_passage(one[known] * (LIMIT / limit), ahead[known]) if known.any() else (0.0, True)
+    for row, errors in zip(out, relative, strict=True):
+        valid = np.isfinite(errors)
+        row[:] = first_passage(errors[valid] * (ERROR_LIMIT / limit), ahead[valid]) if valid.any() else (0.0, True)
     return out
 
 
-def quantile(found: np.ndarray, share: float) -> float:
+def passage_quantile(passages: np.ndarray, share: float) -> float:
     """Return the Kaplan-Meier estimate of the time at which a share of the starts has passed [s].
 
     Args:
@@ -120,15 +126,15 @@ def quantile(found: np.ndarray, share: float) -> float:
     Returns:
         the time; the longest follow-up time where fewer passed; nan without starts
     """
-    if not len(found):
+    if not len(passages):
         return float("nan")
-    time, censored = found[np.lexsort((found[:, 1], found[:, 0]))].T
-    left = np.arange(len(time), 0, -1)
-    surviving = np.cumprod(1.0 - (censored == 0) / left)
-    passed = np.flatnonzero(surviving <= 1.0 - share + 1e-12)
-    return float(time[passed[0]] if len(passed) else time[-1])
+    time, censored = passages[np.lexsort((passages[:, 1], passages[:, 0]))].T
+    at_risk = np.arange(len(time), 0, -1)
+    surviving = np.cumprod(1.0 - (censored == 0) / at_risk)
+    reached = np.flatnonzero(surviving <= 1.0 - share + 1e-12)
+    return float(time[reached[0]] if len(reached) else time[-1])
 
 
-def surviving(found: np.ndarray, seconds: float) -> float:
+def survival_at(passages: np.ndarray, seconds: float) -> float:
     """Return the share within the limit at a time up to which all starts were followed [s]; nan without starts."""
-    return float(np.mean(found[:, 0] >= seconds - 1e-6)) if len(found) else float("nan")
+    return float(np.mean(passages[:, 0] >= seconds - 1e-6)) if len(passages) else float("nan")

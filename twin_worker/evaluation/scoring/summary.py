@@ -7,132 +7,137 @@ from typing import Any
 import numpy as np
 import scipy.stats
 
-from twin_worker.evaluation.scoring.case import Case
+from twin_worker.evaluation.scoring.case import EvaluationCase
 from twin_worker.evaluation.scoring.compare import compare
-from twin_worker.evaluation.scoring.score import LIMITS, Scores, quantile, score, surviving
-from twin_worker.evaluation.scoring.truth import WHOLE_S
-from twin_worker.telemetry.flight_phase import MODES
+from twin_worker.evaluation.scoring.score import LIMITS, MethodScores, passage_quantile, score_method, survival_at
+from twin_worker.evaluation.scoring.truth import MIN_EVENT_FREE_S
+from twin_worker.telemetry.flight_phase import PHASES
 
-LOOK_S = (5, 10, 16, 30, 60, 120, 180)  # reported look-aheads, as far as predictions reach [s]
-_HEAD = ("t10", "t5", "t3")
+REPORTED_S = (5, 10, 16, 30, 60, 120, 180)  # reported look-aheads, as far as predictions reach [s]
+_PASSAGE_KEYS = ("t10", "t5", "t3")
 
 
-def summary(cases: Sequence[Case]) -> dict[str, Any]:
+def summarise(cases: Sequence[EvaluationCase]) -> dict[str, Any]:
     """Compute the figures of every method, the comparison with ours, and the excluded starts.
 
     Keys: every method's name; `compare`, by method; `apart`, excluded starts by reason.
     """
-    counted = [case for case in cases if not case.apart]
-    names = list(dict.fromkeys(name for case in counted for name in case.asked.told))
-    whole = [case for case in counted if set(names) == set(case.asked.told)]  # every method on the same starts
-    scores = {name: score(whole, name) for name in names} if whole else {}
-    phases = np.array([case.phase for case in whole])
-    out: dict[str, Any] = {name: figures(found) | {"phases": _phases(found, phases)} for name, found in scores.items()}
+    counted = [case for case in cases if not case.exclusion]
+    names = list(dict.fromkeys(name for case in counted for name in case.start.forecasts))
+    complete = [case for case in counted if set(names) == set(case.start.forecasts)]  # every method on the same starts
+    scores = {name: score_method(complete, name) for name in names} if complete else {}
+    phases = np.array([case.phase for case in complete])
+    out: dict[str, Any] = {
+        name: method_figures(method_scores) | {"phases": _phase_figures(method_scores, phases)}
+        for name, method_scores in scores.items()
+    }
     out["compare"] = compare(scores)
-    out["apart"] = _apart(cases)
+    out["apart"] = _exclusion_figures(cases)
     return out
 
 
-def figures(found: Scores) -> dict[str, Any]:
+def method_figures(method_scores: MethodScores) -> dict[str, Any]:
     """Compute the figures of one method."""
-    look = {str(s): column for s in LOOK_S if (column := found.at(s)) is not None}
-    stand_ins = Counter(found.made_by.tolist())
+    columns = {str(s): column for s in REPORTED_S if (column := method_scores.column_at(s)) is not None}
+    sources = Counter(method_scores.source.tolist())
     out: dict[str, Any] = {}
-    for name, limit in zip(_HEAD, LIMITS, strict=True):
-        out[f"m1_{name}_lq_s"] = _round(quantile(found.passages[limit], 0.25))
-        out[f"m1_{name}_median_s"] = _round(quantile(found.passages[limit], 0.5))
-    out["followed_s"] = _followed(found)
-    out["survive_60"] = _round(surviving(found.passages[LIMITS[0]], WHOLE_S), 3)
-    out["m2_t10_lq_s"] = _round(quantile(found.strict, 0.25))
-    out["p50_m"] = {s: _round(_percentile(found.distance[:, k], 50)) for s, k in look.items()}
-    out["p90_m"] = {s: _round(_percentile(found.distance[:, k], 90)) for s, k in look.items()}
+    for name, limit in zip(_PASSAGE_KEYS, LIMITS, strict=True):
+        out[f"m1_{name}_lq_s"] = _round(passage_quantile(method_scores.passages[limit], 0.25))
+        out[f"m1_{name}_median_s"] = _round(passage_quantile(method_scores.passages[limit], 0.5))
+    out["followed_s"] = _max_followed(method_scores)
+    out["survive_60"] = _round(survival_at(method_scores.passages[LIMITS[0]], MIN_EVENT_FREE_S), 3)
+    out["m2_t10_lq_s"] = _round(passage_quantile(method_scores.m2_passages, 0.25))
+    out["p50_m"] = {s: _round(_percentile(method_scores.distance[:, k], 50)) for s, k in columns.items()}
+    out["p90_m"] = {s: _round(_percentile(method_scores.distance[:, k], 90)) for s, k in columns.items()}
     for i, axis in enumerate(("along", "cross", "vertical")):
-        out[f"{axis}_p50_m"] = {s: _round(_percentile(np.abs(found.error[:, k, i]), 50)) for s, k in look.items()}
-    out |= _trust(found, look)
+        out[f"{axis}_p50_m"] = {
+            s: _round(_percentile(np.abs(method_scores.error[:, k, i]), 50)) for s, k in columns.items()
+        }
+    out |= _region_figures(method_scores, columns)
     return out | {
-        "starts": len(found.flight),
-        "flights": len(set(found.flight.tolist())),
-        "made_by": dict(stand_ins.most_common()),
+        "starts": len(method_scores.flight),
+        "flights": len(set(method_scores.flight.tolist())),
+        "made_by": dict(sources.most_common()),
     }
 
 
-def _trust(found: Scores, look: dict[str, int]) -> dict[str, Any]:
+def _region_figures(method_scores: MethodScores, columns: dict[str, int]) -> dict[str, Any]:
     """Compute coverage and size of the tube, and accuracy of the horizon; null for a method without them."""
-    inside = found.inside
-    by_flight = [inside[found.flight == name] for name in np.unique(found.flight)]
-    worst = {s: min((_mean(rows[:, k]) for rows in by_flight), default=np.nan) for s, k in look.items()}
-    sizes = {s: [_round(_percentile(found.tube[:, k, i], 50)) for i in range(3)] for s, k in look.items()}
-    hit, corr = _horizon(found)
+    inside = method_scores.inside
+    by_flight = [inside[method_scores.flight == name] for name in np.unique(method_scores.flight)]
+    worst = {s: min((_mean(rows[:, k]) for rows in by_flight), default=np.nan) for s, k in columns.items()}
+    sizes = {s: [_round(_percentile(method_scores.tube[:, k, i], 50)) for i in range(3)] for s, k in columns.items()}
+    hit, corr = _horizon_scores(method_scores)
     return {
-        "coverage": {s: _round(_mean(inside[:, k]), 3) for s, k in look.items()},
+        "coverage": {s: _round(_mean(inside[:, k]), 3) for s, k in columns.items()},
         "coverage_worst_flight": {s: _round(value, 3) for s, value in worst.items()},
         "half_axes_m": sizes,
         "horizon_hit_rate": _round(hit, 3),
         "horizon_rank_corr": _round(corr, 3),
-        "horizon_median_s": _round(_percentile(found.horizon, 50)),
+        "horizon_median_s": _round(_percentile(method_scores.horizon, 50)),
     }
 
 
-def _horizon(found: Scores) -> tuple[float, float]:
+def _horizon_scores(method_scores: MethodScores) -> tuple[float, float]:
     """Compute the share that stayed within 10 % up to its horizon, and Spearman's correlation of horizon and passage.
 
     A horizon beyond the follow-up time is evaluated up to that time.
     """
-    known = np.isfinite(found.horizon)
-    if not known.any():
+    valid = np.isfinite(method_scores.horizon)
+    if not valid.any():
         return float("nan"), float("nan")
-    time, censored = found.passages[LIMITS[0]][known].T
-    horizon = found.horizon[known]
-    due = np.where(censored == 1, np.minimum(horizon, time), horizon)
-    hit = float(np.mean(time >= due - 1e-6))
+    time, censored = method_scores.passages[LIMITS[0]][valid].T
+    horizon = method_scores.horizon[valid]
+    required = np.where(censored == 1, np.minimum(horizon, time), horizon)
+    hit = float(np.mean(time >= required - 1e-6))
     if len(set(time.tolist())) < 2 or len(set(horizon.tolist())) < 2:
         return hit, float("nan")
     return hit, float(scipy.stats.spearmanr(time, horizon).statistic)
 
 
-def _phases(found: Scores, phases: np.ndarray) -> dict[str, Any]:
+def _phase_figures(method_scores: MethodScores, phases: np.ndarray) -> dict[str, Any]:
     """Compute passages and errors by flight phase after the start."""
     out = {}
-    for phase in MODES:
+    for phase in PHASES:
         if not (rows := phases == phase).any():
             continue
-        its = found.part(rows)
-        look = {str(s): column for s in LOOK_S if (column := its.at(s)) is not None}
+        phase_scores = method_scores.select(rows)
+        columns = {str(s): column for s in REPORTED_S if (column := phase_scores.column_at(s)) is not None}
         out[phase] = {
             "starts": int(rows.sum()),
-            "m1_t10_lq_s": _round(quantile(its.passages[LIMITS[0]], 0.25)),
-            "followed_s": _followed(its),
-            "survive_60": _round(surviving(its.passages[LIMITS[0]], WHOLE_S), 3),
-            "p50_m": {s: _round(_percentile(its.distance[:, k], 50)) for s, k in look.items()},
-            "p90_m": {s: _round(_percentile(its.distance[:, k], 90)) for s, k in look.items()},
+            "m1_t10_lq_s": _round(passage_quantile(phase_scores.passages[LIMITS[0]], 0.25)),
+            "followed_s": _max_followed(phase_scores),
+            "survive_60": _round(survival_at(phase_scores.passages[LIMITS[0]], MIN_EVENT_FREE_S), 3),
+            "p50_m": {s: _round(_percentile(phase_scores.distance[:, k], 50)) for s, k in columns.items()},
+            "p90_m": {s: _round(_percentile(phase_scores.distance[:, k], 90)) for s, k in columns.items()},
         }
     return out
 
 
-def _apart(cases: Sequence[Case]) -> dict[str, Any]:
+def _exclusion_figures(cases: Sequence[EvaluationCase]) -> dict[str, Any]:
     """Compute the number of excluded starts and the first passages of ours at them, by reason."""
     out = {}
-    for why, n in Counter(case.apart for case in cases if case.apart).most_common():
-        its = score([case for case in cases if case.apart == why], "ours")
-        lower = _round(quantile(its.passages[LIMITS[0]], 0.25))
-        out[why] = {"starts": n, "m1_t10_lq_s": lower, "followed_s": _followed(its)}
+    for reason, n in Counter(case.exclusion for case in cases if case.exclusion).most_common():
+        excluded_scores = score_method([case for case in cases if case.exclusion == reason], "ours")
+        lower = _round(passage_quantile(excluded_scores.passages[LIMITS[0]], 0.25))
+        out[reason] = {"starts": n, "m1_t10_lq_s": lower, "followed_s": _max_followed(excluded_scores)}
     return out
 
 
-def _followed(found: Scores) -> float | None:
+def _max_followed(method_scores: MethodScores) -> float | None:
     """Return the longest follow-up time of any start [s]."""
-    known = np.isfinite(found.distance).any(axis=0)
-    return _round(float(found.ahead[known][-1])) if known.any() else None
+    valid = np.isfinite(method_scores.distance).any(axis=0)
+    return _round(float(method_scores.ahead[valid][-1])) if valid.any() else None
 
 
 def _percentile(values: np.ndarray, share: float) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.percentile(known, share)) if len(known) else float("nan")
+    valid = values[np.isfinite(values)]
+    return float(np.percentile(valid, share)) if len(valid) else float("nan")
 
 
 def _mean(values: np.ndarray) -> float:
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if len(known) else float("nan")
+    valid = values[np.isfinite(values)]
+    return float(valid.mean()) if len(valid) else float("nan")
 
 
 def _round(value: float, digits: int = 2) -> float | None:

@@ -14,16 +14,21 @@ from fleet.physics.dynamics import free_runs
 from fleet.physics.wrench import N_PAR, OFFSETS, WIND
 from fleet.window import Window
 from twin_worker.identification.fixed_wing.derivatives_prior import prior
-from twin_worker.identification.fixed_wing.output_error import Found, Problem, search, segments_of
+from twin_worker.identification.fixed_wing.output_error import (
+    EstimationProblem,
+    EstimationResult,
+    estimate,
+    unbroken_segments,
+)
 
-DISCOUNT = 0.12  # effective fraction of residuals, one in four samples: gusts correlate them [-]
-COLD, WARM = 8, 1  # maximum steps of a first and of a repeated search
+EFFECTIVE_FRACTION = 0.12  # effective fraction of residuals, one in four samples: gusts correlate them [-]
+COLD_STEPS, WARM_STEPS = 8, 1  # maximum steps of a first and of a repeated search
 # retained fraction of earlier information per window [-]
-_FORGET, _FORGET_OFFSETS, _FORGET_WIND = 0.7, 0.5, 0.7
+_RETENTION, _RETENTION_OFFSETS, _RETENTION_WIND = 0.7, 0.5, 0.7
 
 
 @dataclass(frozen=True)
-class Coupled:
+class DerivativesModel:
     """Identified derivatives model of one aircraft.
 
     Attributes:
@@ -38,12 +43,12 @@ class Coupled:
     """
 
     par: np.ndarray
-    at: np.ndarray
-    information: np.ndarray
-    mean: np.ndarray
-    precision: np.ndarray
+    trim_velocity: np.ndarray
+    fisher_information: np.ndarray
+    prior_mean: np.ndarray
+    prior_precision: np.ndarray
     weight: np.ndarray
-    airframe: tuple[np.ndarray, np.ndarray]
+    airframe_prior: tuple[np.ndarray, np.ndarray]
     t0: float
     t1: float
     steps: int
@@ -51,22 +56,28 @@ class Coupled:
     @property
     def covariance(self) -> np.ndarray:
         """Return the covariance of the parameters, (37, 37)."""
-        return np.linalg.inv(self.information + self.precision)
+        return np.linalg.inv(self.fisher_information + self.prior_precision)
 
-    def fly(self, x0: np.ndarray, delta: np.ndarray, dt: float) -> np.ndarray:
+    def free_run(self, x0: np.ndarray, delta: np.ndarray, dt: float) -> np.ndarray:
         """Simulate from x0 with actuator states, (n, 4); return states, (n, 9), nan after leaving the envelope."""
-        return self.fly_each(x0[None], np.zeros(1, np.int64), len(delta), delta, dt)
+        return self.free_run_segments(x0[None], np.zeros(1, np.int64), len(delta), delta, dt)
 
-    def fly_each(self, starts: np.ndarray, begins: np.ndarray, length: int, delta: np.ndarray, dt: float) -> np.ndarray:
+    def free_run_segments(
+        self, starts: np.ndarray, start_rows: np.ndarray, length: int, delta: np.ndarray, dt: float
+    ) -> np.ndarray:
         """Simulate from several rows, `length` rows each; arguments as for `fleet.physics.dynamics.free_runs`."""
         out = np.empty((len(delta), 9))
-        free_runs(starts, begins, length, delta, self.par, self.at, dt, out)
+        free_runs(starts, start_rows, length, delta, self.par, self.trim_velocity, dt, out)
         return out
 
 
 def identify(
-    window: Window, wind: np.ndarray, airframe: Airframe, last: Coupled | None = None, near: Coupled | None = None
-) -> Coupled:
+    window: Window,
+    wind: np.ndarray,
+    airframe: Airframe,
+    prior_model: DerivativesModel | None = None,
+    warm_start: DerivativesModel | None = None,
+) -> DerivativesModel:
     """Identify a derivatives model from one window.
 
     Args:
@@ -78,56 +89,72 @@ def identify(
     Raises:
         ValueError: if the window has too few gap-free rows, or the search fails; wait for more data.
     """
-    segments = segments_of(window.ok, window.dt)
+    segments = unbroken_segments(window.ok, window.dt)
     if not len(segments):
         raise ValueError("identify: found no 2 s of unbroken data, needs them; wait")
     y, delta = window.over_ground, lagged(window.u, window.dt, TAU)
-    mean, precision, at, nominal = _held(window, wind, airframe, last)
-    problem = Problem(y, delta, segments, at, window.dt, DISCOUNT)
-    if near is not None:
-        found = search(problem, near.par, (mean, precision), WARM, near.weight)
+    mean, precision, trim_velocity, nominal = _prior_from(window, wind, airframe, prior_model)
+    problem = EstimationProblem(y, delta, segments, trim_velocity, window.dt, EFFECTIVE_FRACTION)
+    if warm_start is not None:
+        result = estimate(problem, warm_start.par, (mean, precision), WARM_STEPS, warm_start.weight)
     else:
-        found = search(problem, mean, (mean, precision), COLD, None)
-    if near is not None and not _good(found):
-        found = search(problem, mean, (mean, precision), COLD, None)
-    if last is not None and not _good(found):  # the earlier model misleads: restart without it
+        result = estimate(problem, mean, (mean, precision), COLD_STEPS, None)
+    if warm_start is not None and not _is_finite(result):
+        result = estimate(problem, mean, (mean, precision), COLD_STEPS, None)
+    if prior_model is not None and not _is_finite(result):  # the earlier model misleads: restart without it
         return identify(window, wind, airframe)
-    if not _good(found):
+    if not _is_finite(result):
         raise ValueError("identify: found no free run that stays in its envelope, needs one; wait for calmer flight")
     t = window.t
-    return Coupled(
-        found.par, at, found.information, mean, precision, found.weight, nominal, float(t[0]), float(t[-1]), found.steps
+    return DerivativesModel(
+        result.par,
+        trim_velocity,
+        result.fisher_information,
+        mean,
+        precision,
+        result.weight,
+        nominal,
+        float(t[0]),
+        float(t[-1]),
+        result.steps,
     )
 
 
-def _good(found: Found) -> bool:
-    return bool(np.isfinite(found.par).all() and np.isfinite(found.information).all() and np.isfinite(found.cost))
+def _is_finite(result: EstimationResult) -> bool:
+    return bool(
+        np.isfinite(result.par).all() and np.isfinite(result.fisher_information).all() and np.isfinite(result.cost)
+    )
 
 
-def _held(
-    window: Window, wind: np.ndarray, airframe: Airframe, last: Coupled | None
+def _prior_from(
+    window: Window, wind: np.ndarray, airframe: Airframe, prior_model: DerivativesModel | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
     """Return prior mean and precision of the parameters, U0 W0, and the prior from the airframe alone.
 
     Only the information of the last model from before this window counts, discounted, so that no data count twice.
     """
-    if last is None:
+    if prior_model is None:
         ok = window.ok
         air = window.x[ok, :3].mean(axis=0)
-        at = np.array([max(np.linalg.norm(window.x[ok, :3], axis=1).mean(), 1.0), air[2]])
-        mean, sigma = prior(airframe, at, window.u[ok].mean(axis=0), wind)
+        trim_velocity = np.array([max(np.linalg.norm(window.x[ok, :3], axis=1).mean(), 1.0), air[2]])
+        mean, sigma = prior(airframe, trim_velocity, window.u[ok].mean(axis=0), wind)
         precision = np.diag(sigma**-2.0)
-        return mean, precision, at, (mean, precision)
-    nominal, firm = last.airframe
-    moved = float(np.clip((window.t[0] - last.t0) / (last.t1 - last.t0), 0.0, 1.0))
-    root = np.sqrt(_KEEP**moved)
-    before, told = (root[:, None] * each * root for each in (last.precision, moved * last.information))
-    fresh = (1.0 - _FORGET**moved) * firm
-    precision = before + told + fresh
-    mean = np.linalg.solve(precision, before @ last.mean + told @ last.par + fresh @ nominal)
-    return mean, precision, last.at, last.airframe
+        return mean, precision, trim_velocity, (mean, precision)
+    nominal, nominal_precision = prior_model.airframe_prior
+    elapsed = float(np.clip((window.t[0] - prior_model.t0) / (prior_model.t1 - prior_model.t0), 0.0, 1.0))
+    root = np.sqrt(_RETENTION_VECTOR**elapsed)
+    retained, from_data = (
+        root[:, None] * matrix * root
+        for matrix in (prior_model.prior_precision, elapsed * prior_model.fisher_information)
+    )
+    from_airframe = (1.0 - _RETENTION**elapsed) * nominal_precision
+    precision = retained + from_data + from_airframe
+    mean = np.linalg.solve(
+        precision, retained @ prior_model.prior_mean + from_data @ prior_model.par + from_airframe @ nominal
+    )
+    return mean, precision, prior_model.trim_velocity, prior_model.airframe_prior
 
 
-_KEEP = np.full(N_PAR, _FORGET)
-_KEEP[list(OFFSETS)] *= _FORGET_OFFSETS
-_KEEP[WIND:] *= _FORGET_WIND
+_RETENTION_VECTOR = np.full(N_PAR, _RETENTION)
+_RETENTION_VECTOR[list(OFFSETS)] *= _RETENTION_OFFSETS
+_RETENTION_VECTOR[WIND:] *= _RETENTION_WIND

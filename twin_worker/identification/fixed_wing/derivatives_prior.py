@@ -12,7 +12,7 @@ from fleet.airframes import Airframe, derivatives
 from fleet.frames import G
 from fleet.physics.wrench import NAMES, OFFSETS
 
-_DOUBT = {  # added to the derivative's magnitude; the sum is scaled by `doubt` of the airframe
+_SIGMA_TABLE = {  # added to the derivative's magnitude; the sum is scaled by `doubt` of the airframe
     "X": {"0": 2.0, "u": 0.2, "w": 0.3, "de": 1.2, "dt": 1.0, "ww": 0.05},
     "Z": {"0": 3.0, "u": 0.3, "w": 0.3, "q": 0.3, "de": 1.0},
     "M": {"0": 3.0, "u": 0.05, "w": 0.01, "q": 0.1, "de": 0.1, "dt": 1.0},
@@ -20,13 +20,15 @@ _DOUBT = {  # added to the derivative's magnitude; the sum is scaled by `doubt` 
     "L": {"v": 0.01, "p": 0.1, "r": 0.1, "da": 0.1, "dr": 0.1, "0": 2.0},
     "N": {"v": 0.01, "p": 0.1, "r": 0.1, "da": 0.1, "dr": 0.1, "0": 0.5},
 }
-_FLOOR = {f"{row}_{per}": doubt for row, doubts in _DOUBT.items() for per, doubt in doubts.items()}
-_ACROSS = {"L_r": ("L_p", 0.3), "N_p": ("L_p", 0.3), "L_dr": ("L_da", 0.1), "N_da": ("L_da", 0.1)}
-_WIND = 2.0  # standard deviation of the wind estimate [m/s]
-_SPANS = 0.3, 20.0  # valid range [m]
+_SIGMA_FLOOR = {f"{row}_{per}": sigma for row, row_sigmas in _SIGMA_TABLE.items() for per, sigma in row_sigmas.items()}
+_CROSS_TERMS = {"L_r": ("L_p", 0.3), "N_p": ("L_p", 0.3), "L_dr": ("L_da", 0.1), "N_da": ("L_da", 0.1)}
+_WIND_SIGMA = 2.0  # standard deviation of the wind estimate [m/s]
+_SPAN_RANGE = 0.3, 20.0  # valid range [m]
 
 
-def prior(airframe: Airframe, at: np.ndarray, trim: np.ndarray, wind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def prior(
+    airframe: Airframe, trim_velocity: np.ndarray, trim: np.ndarray, wind: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and standard deviation of the parameters of `fleet.physics.wrench`, each (37,).
 
     Args:
@@ -36,24 +38,24 @@ def prior(airframe: Airframe, at: np.ndarray, trim: np.ndarray, wind: np.ndarray
         wind: mean wind, NED, the direction it blows to, (2,) or (3,) [m/s]
     """
     mean = dict.fromkeys(NAMES, 0.0)
-    floor = dict(_FLOOR)
+    floor = dict(_SIGMA_FLOOR)
     if airframe.scale:
-        k = airframe.value["speed"] / at[0]
-        l = airframe.value["b"] / float(np.clip(airframe.span, *_SPANS)) if airframe.span else k
+        k = airframe.value["speed"] / trim_velocity[0]
+        l = airframe.value["b"] / float(np.clip(airframe.span, *_SPAN_RANGE)) if airframe.span else k
         mean |= {n: v * _scale(n, k, l) for n, v in derivatives(airframe, airframe.value["speed"]).items()}
-        floor |= {n: _FLOOR[n] * l for n in ("M_0", "M_dt", "L_0", "N_0")}
+        floor |= {n: _SIGMA_FLOOR[n] * l for n in ("M_0", "M_dt", "L_0", "N_0")}
     else:
-        mean |= derivatives(airframe, float(at[0]))
-    mean["X_0"] = G * at[1] / at[0] - mean["X_dt"] * trim[3] - mean["X_de"] * trim[1]
-    mean["Z_0"] = -G * cos(at[1] / at[0]) - mean["Z_de"] * trim[1]
+        mean |= derivatives(airframe, float(trim_velocity[0]))
+    mean["X_0"] = G * trim_velocity[1] / trim_velocity[0] - mean["X_dt"] * trim[3] - mean["X_de"] * trim[1]
+    mean["Z_0"] = -G * cos(trim_velocity[1] / trim_velocity[0]) - mean["Z_de"] * trim[1]
     mean["M_0"] = -mean["M_de"] * trim[1] - mean["M_dt"] * trim[3]
-    for name, (of, share) in _ACROSS.items():
-        floor[name] += share * abs(mean[of])
+    for name, (main, fraction) in _CROSS_TERMS.items():
+        floor[name] += fraction * abs(mean[main])
     par = np.array([mean[name] for name in NAMES])
-    known = np.abs(par)
-    known[list(OFFSETS)] = 0.0
-    sigma = airframe.value["doubt"] * (known + [floor.get(name, 0.0) for name in NAMES])
-    par[-2:], sigma[-2:] = wind[:2], _WIND
+    magnitude = np.abs(par)
+    magnitude[list(OFFSETS)] = 0.0
+    sigma = airframe.value["doubt"] * (magnitude + [floor.get(name, 0.0) for name in NAMES])
+    par[-2:], sigma[-2:] = wind[:2], _WIND_SIGMA
     return par, sigma
 
 

@@ -11,17 +11,17 @@ import numpy as np
 from fleet.frames import G
 from twin_worker.identification.fixed_wing.attitude_lag import STEP
 
-_OVER = 20  # rows of each mean
+_WINDOW_ROWS = 20  # rows of each mean
 # mean of k [-] and b [rad/s], standard deviation, noise
-_TURN = np.array([1.0, 0.0]), np.array([0.1, 0.02]), 0.03
-_LIFT = np.array([0.0, 0.06]), np.array([1e3, 0.1]), 0.02  # the same of a_0, a_n [rad]
-_POWER = np.array([0.0, np.nan, -0.10, -0.15]), np.array([30.0, 1.0, 0.03, 0.15]), 0.35  # the same of c, SI
-_GLIDE, _STEEPER = 9.0, 1.3  # lift-to-drag ratio; slope of thrust over throttle relative to proportional [-]
-_BANK = 1.3  # bank limit: larger load factors are noise [rad]
+_TURN_PRIOR = np.array([1.0, 0.0]), np.array([0.1, 0.02]), 0.03
+_LIFT_PRIOR = np.array([0.0, 0.06]), np.array([1e3, 0.1]), 0.02  # the same of a_0, a_n [rad]
+_POWER_PRIOR = np.array([0.0, np.nan, -0.10, -0.15]), np.array([30.0, 1.0, 0.03, 0.15]), 0.35  # the same of c, SI
+_GLIDE_RATIO, _THRUST_SLOPE = 9.0, 1.3  # lift-to-drag ratio; slope of thrust over throttle relative to proportional [-]
+_MAX_BANK = 1.3  # bank limit: larger load factors are noise [rad]
 
 
 @dataclass(frozen=True)
-class Flight:
+class PointMassData:
     """Data in rows of `STEP`, all (n,): true airspeed, height, climb rate, angles, throttle;
     then commands: climb rate and airspeed of the route, angles of the autopilot [m/s, m, rad, 0..1].
     """
@@ -43,67 +43,67 @@ class Flight:
 
 
 @dataclass(frozen=True)
-class Ridge:
+class RegressionResult:
     """Result of a regression with a prior: value (k,), covariance (k, k), residual standard deviation."""
 
     value: np.ndarray
     cov: np.ndarray
-    left: float
+    residual_std: float
 
 
-def ridge(X: np.ndarray, y: np.ndarray, prior: tuple[np.ndarray, np.ndarray, float]) -> Ridge:
+def regress_with_prior(X: np.ndarray, y: np.ndarray, prior: tuple[np.ndarray, np.ndarray, float]) -> RegressionResult:
     """Regress y (n,) on X (n, k) with a Gaussian prior; rows overlap, so that `_WINDOW_ROWS` of them count as one."""
-    usual, spread, noise = prior
-    inverse = X.T @ X / _OVER / noise**2 + np.diag(spread**-2.0)
-    cov = np.linalg.inv(inverse)
-    value = cov @ (X.T @ y / _OVER / noise**2 + usual / spread**2)
-    return Ridge(value, cov, float(np.std(y - X @ value)))
+    prior_mean, prior_sigma, noise = prior
+    information = X.T @ X / _WINDOW_ROWS / noise**2 + np.diag(prior_sigma**-2.0)
+    cov = np.linalg.inv(information)
+    value = cov @ (X.T @ y / _WINDOW_ROWS / noise**2 + prior_mean / prior_sigma**2)
+    return RegressionResult(value, cov, float(np.std(y - X @ value)))
 
 
-def mean(x: np.ndarray) -> np.ndarray:
+def moving_mean(x: np.ndarray) -> np.ndarray:
     """Return the moving mean over `_WINDOW_ROWS` steps, (n - _WINDOW_ROWS,)."""
     total = np.concatenate([[0.0], np.cumsum(x)])
-    return ((total[_OVER:] - total[:-_OVER]) / _OVER)[: len(x) - _OVER]
+    return ((total[_WINDOW_ROWS:] - total[:-_WINDOW_ROWS]) / _WINDOW_ROWS)[: len(x) - _WINDOW_ROWS]
 
 
-def slope(x: np.ndarray) -> np.ndarray:
+def moving_slope(x: np.ndarray) -> np.ndarray:
     """Return the slope over `_WINDOW_ROWS` steps, (n - _WINDOW_ROWS,) [1/s]."""
-    return (x[_OVER:] - x[:-_OVER]) / (_OVER * STEP)
+    return (x[_WINDOW_ROWS:] - x[:-_WINDOW_ROWS]) / (_WINDOW_ROWS * STEP)
 
 
-def load(phi: np.ndarray) -> np.ndarray:
+def load_factor(phi: np.ndarray) -> np.ndarray:
     """Return the load factor of a level turn [-]."""
-    return 1.0 / np.cos(np.clip(phi, -_BANK, _BANK))
+    return 1.0 / np.cos(np.clip(phi, -_MAX_BANK, _MAX_BANK))
 
 
-def turning(flight: Flight) -> Ridge:
+def fit_turn_rate(data: PointMassData) -> RegressionResult:
     """Estimate k and b of the turn rate."""
-    X = mean(G * np.tan(np.clip(flight.phi, -_BANK, _BANK)) / np.maximum(flight.V, 5.0))
-    return ridge(np.column_stack([X, np.ones(len(X))]), slope(np.unwrap(flight.psi)), _TURN)
+    X = moving_mean(G * np.tan(np.clip(data.phi, -_MAX_BANK, _MAX_BANK)) / np.maximum(data.V, 5.0))
+    return regress_with_prior(np.column_stack([X, np.ones(len(X))]), moving_slope(np.unwrap(data.psi)), _TURN_PRIOR)
 
 
-def lifting(flight: Flight, V_0: float) -> Ridge:
+def fit_angle_of_attack(data: PointMassData, V_0: float) -> RegressionResult:
     """Estimate a_0 and a_n of the angle of attack."""
-    alpha = flight.theta - np.arcsin(np.clip(flight.h_dot / np.maximum(flight.V, 5.0), -0.6, 0.6))
-    X = mean(load(flight.phi) * (V_0 / np.maximum(flight.V, 5.0)) ** 2 - 1.0)
-    return ridge(np.column_stack([np.ones(len(X)), X]), mean(alpha), _LIFT)
+    alpha = data.theta - np.arcsin(np.clip(data.h_dot / np.maximum(data.V, 5.0), -0.6, 0.6))
+    X = moving_mean(load_factor(data.phi) * (V_0 / np.maximum(data.V, 5.0)) ** 2 - 1.0)
+    return regress_with_prior(np.column_stack([np.ones(len(X)), X]), moving_mean(alpha), _LIFT_PRIOR)
 
 
-def _budget(flight: Flight, t_0: float, V_0: float) -> tuple[np.ndarray, np.ndarray]:
+def _power_regression(data: PointMassData, t_0: float, V_0: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the regressors of c_0 c_t c_v c_n, (n, 4), and the measured excess power, (n,) [m/s2]."""
-    V = mean(flight.V)
-    y = slope(0.5 * flight.V**2 + G * flight.h) / np.maximum(V, 5.0)
-    n = mean(load(flight.phi) ** 2 - 1.0)
-    return np.column_stack([np.ones(len(y)), mean(flight.delta_t) - t_0, V - V_0, n]), y
+    V = moving_mean(data.V)
+    y = moving_slope(0.5 * data.V**2 + G * data.h) / np.maximum(V, 5.0)
+    n = moving_mean(load_factor(data.phi) ** 2 - 1.0)
+    return np.column_stack([np.ones(len(y)), moving_mean(data.delta_t) - t_0, V - V_0, n]), y
 
 
-def missed(flight: Flight, c: np.ndarray, t_0: float, V_0: float) -> np.ndarray:
+def excess_power_residual(data: PointMassData, c: np.ndarray, t_0: float, V_0: float) -> np.ndarray:
     """Return measured minus predicted excess power for c, (4,), (n,) [m/s2]."""
-    X, y = _budget(flight, t_0, V_0)
+    X, y = _power_regression(data, t_0, V_0)
     return y - X @ c  # type: ignore[no-any-return]
 
 
-def power(flight: Flight, t_0: float, V_0: float) -> Ridge:
+def fit_excess_power(data: PointMassData, t_0: float, V_0: float) -> RegressionResult:
     """Estimate c_0, c_t, c_v, c_n of the specific excess power with instrumental variables.
 
     TECS reacts to every gust with throttle, which biases least squares: it returns one to two thirds of the true c_t.
@@ -112,14 +112,14 @@ def power(flight: Flight, t_0: float, V_0: float) -> Ridge:
 
     Source: Soderstrom & Stoica 1989, chapter 8 (instrumental variables in closed loop).
     """
-    X, y = _budget(flight, t_0, V_0)
-    asked = np.column_stack([np.ones(len(y)), mean(flight.climb_c), mean(flight.V_c) - V_0, X[:, 3]])
-    usual, spread, noise = _POWER
-    usual = usual.copy()
+    X, y = _power_regression(data, t_0, V_0)
+    instruments = np.column_stack([np.ones(len(y)), moving_mean(data.climb_c), moving_mean(data.V_c) - V_0, X[:, 3]])
+    prior_mean, prior_sigma, noise = _POWER_PRIOR
+    prior_mean = prior_mean.copy()
     # t_0 balances drag in level flight; thrust grows faster
-    usual[1] = _STEEPER * G / _GLIDE / max(t_0, 0.15)
-    if np.isfinite(asked).all():
-        X = asked @ np.linalg.lstsq(asked, X, rcond=1e-6)[0]
-        return ridge(X, y, (usual, spread, noise))
+    prior_mean[1] = _THRUST_SLOPE * G / _GLIDE_RATIO / max(t_0, 0.15)
+    if np.isfinite(instruments).all():
+        X = instruments @ np.linalg.lstsq(instruments, X, rcond=1e-6)[0]
+        return regress_with_prior(X, y, (prior_mean, prior_sigma, noise))
     X[:, 1:] = 0.0
-    return ridge(X, y, (usual, spread, noise))
+    return regress_with_prior(X, y, (prior_mean, prior_sigma, noise))

@@ -14,18 +14,18 @@ from functools import lru_cache
 import numpy as np
 
 from fleet.physics.wrench import N_PAR
-from twin_worker.identification.fixed_wing.output_error_kernel import GROUP, N_COLUMN, sweep
+from twin_worker.identification.fixed_wing.output_error_kernel import GROUP, N_COLUMN, residuals_and_jacobian
 
 SIGMA = np.array([0.08, 0.08, 0.08, 0.005, 0.005, 0.005, 0.004, 0.004, 0.008])  # minimum residual of each state
 SEGMENT_S = 10.0  # free run [s]
-LEAST_S = 2.0  # shorter segments between gaps are ignored [s]
-LINE = 6  # samples of the line fit of a segment's start state [-]
-_DONE = 1e-3  # relative descent that stops the search [-]
-_TRIES = 6  # maximum damping values per step
+MIN_SEGMENT_S = 2.0  # shorter segments between gaps are ignored [s]
+LINE_SAMPLES = 6  # samples of the line fit of a segment's start state [-]
+_MIN_DESCENT = 1e-3  # relative descent that stops the search [-]
+_MAX_DAMPINGS = 6  # maximum damping values per step
 
 
 @dataclass(frozen=True)
-class Problem:
+class EstimationProblem:
     """Data of one estimation.
 
     Attributes:
@@ -40,13 +40,13 @@ class Problem:
     y: np.ndarray
     delta: np.ndarray
     segments: np.ndarray
-    at: np.ndarray
+    trim_velocity: np.ndarray
     dt: float
-    discount: float
+    effective_fraction: float
 
 
 @dataclass(frozen=True)
-class Found:
+class EstimationResult:
     """Result of an estimation.
 
     Attributes:
@@ -58,15 +58,15 @@ class Found:
     """
 
     par: np.ndarray
-    information: np.ndarray
+    fisher_information: np.ndarray
     weight: np.ndarray
     steps: int
     cost: float
 
 
-def segments_of(ok: np.ndarray, dt: float) -> np.ndarray:
+def unbroken_segments(ok: np.ndarray, dt: float) -> np.ndarray:
     """Split gap-free rows into free runs of an integer number of groups, (m, 2)."""
-    longest, least = (int(seconds / dt) // GROUP * GROUP for seconds in (SEGMENT_S, LEAST_S))
+    longest, least = (int(seconds / dt) // GROUP * GROUP for seconds in (SEGMENT_S, MIN_SEGMENT_S))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], ok, [False]]).astype(int)))
     pieces = []
     for start, stop in edges.reshape(-1, 2):
@@ -77,59 +77,66 @@ def segments_of(ok: np.ndarray, dt: float) -> np.ndarray:
     return np.array(pieces, dtype=np.int64).reshape(-1, 2)
 
 
-def line_start(y: np.ndarray) -> np.ndarray:
+def line_fit_start(y: np.ndarray) -> np.ndarray:
     """Return the first state from a line fit through the first samples, (9,)."""
-    n = min(LINE, len(y))
-    return _line(n) @ y[:n]
+    n = min(LINE_SAMPLES, len(y))
+    return _line_weights(n) @ y[:n]
 
 
-@lru_cache(maxsize=LINE)
-def _line(n: int) -> np.ndarray:
+@lru_cache(maxsize=LINE_SAMPLES)
+def _line_weights(n: int) -> np.ndarray:
     return np.linalg.pinv(np.column_stack([np.ones(n), np.arange(n)]))[0]
 
 
-class _Search:
+class _GaussNewton:
     """Cost, residuals and normal equations at one point."""
 
-    def __init__(self, problem: Problem, par0: np.ndarray, Lambda: np.ndarray) -> None:
+    def __init__(self, problem: EstimationProblem, par0: np.ndarray, Lambda: np.ndarray) -> None:
         self.problem, self.par0, self.Lambda = problem, par0, Lambda
-        flown = [problem.y[a:b] for a, b in problem.segments]
-        self.prior, self.spread = np.array([line_start(y) for y in flown]), np.concatenate(flown).std(axis=0)
+        measured = [problem.y[a:b] for a, b in problem.segments]
+        self.start_prior, self.state_std = (
+            np.array([line_fit_start(y) for y in measured]),
+            np.concatenate(measured).std(axis=0),
+        )
         self.K = 1.0 / SIGMA**2
         lengths = (problem.segments[:, 1] - problem.segments[:, 0]) // GROUP
         self.bounds = np.concatenate([[0], np.cumsum(lengths)])
         self.e, self.J = np.empty((self.bounds[-1], 9)), np.empty((self.bounds[-1], 9, N_COLUMN))
-        self.trial, self.nothing = np.empty_like(self.e), np.empty((0, 9, N_COLUMN))
+        self.trial, self.no_sensitivities = np.empty_like(self.e), np.empty((0, 9, N_COLUMN))
 
-    def fly(self, par: np.ndarray, starts: np.ndarray, W: np.ndarray, slopes: bool) -> float:
+    def simulate(self, par: np.ndarray, starts: np.ndarray, W: np.ndarray, slopes: bool) -> float:
         """Return the cost at a point; with `slopes` store residuals and sensitivities."""
-        one = self.problem
-        e, J = (self.e, self.J) if slopes else (self.trial, self.nothing)
-        squares = sweep(par, starts, one.segments, one.y, one.delta, one.at, one.dt, np.sqrt(W), e, J)
-        off, away = par - self.par0, starts - self.prior
-        return one.discount * squares + float(off @ self.Lambda @ off + (self.K * away**2).sum())
+        problem = self.problem
+        e, J = (self.e, self.J) if slopes else (self.trial, self.no_sensitivities)
+        squares = residuals_and_jacobian(
+            par, starts, problem.segments, problem.y, problem.delta, problem.trim_velocity, problem.dt, np.sqrt(W), e, J
+        )
+        par_offset, start_offset = par - self.par0, starts - self.start_prior
+        return problem.effective_fraction * squares + float(
+            par_offset @ self.Lambda @ par_offset + (self.K * start_offset**2).sum()
+        )
 
-    def weights(self, W: np.ndarray) -> np.ndarray:
+    def update_weights(self, W: np.ndarray) -> np.ndarray:
         """Estimate W from the residuals; rescale residuals and sensitivities."""
-        fresh = 1.0 / np.maximum((self.e**2).mean(axis=0) / W, SIGMA**2)
-        ratio = np.sqrt(fresh / W)
+        W_new = 1.0 / np.maximum((self.e**2).mean(axis=0) / W, SIGMA**2)
+        ratio = np.sqrt(W_new / W)
         self.e *= ratio
         self.J *= ratio[:, None]
-        return fresh
+        return W_new
 
     def cost(self, par: np.ndarray, starts: np.ndarray) -> float:
         """Return the cost of the stored residuals."""
-        off, away = par - self.par0, starts - self.prior
-        return self.problem.discount * float((self.e**2).sum()) + float(
-            off @ self.Lambda @ off + (self.K * away**2).sum()
+        par_offset, start_offset = par - self.par0, starts - self.start_prior
+        return self.problem.effective_fraction * float((self.e**2).sum()) + float(
+            par_offset @ self.Lambda @ par_offset + (self.K * start_offset**2).sum()
         )
 
-    def normal(self, par: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def normal_equations(self, par: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return information and gradient of the parameters, start states eliminated, and the back-substitution.
 
         The back-substitution is the step of each start state and its derivative by the parameter step, (m, 9, 37 + 1).
         """
-        d = self.problem.discount
+        d = self.problem.effective_fraction
         m = len(starts)
         HH, gg = np.empty((m, N_COLUMN, N_COLUMN)), np.empty((m, N_COLUMN))
         for s in range(m):
@@ -138,16 +145,20 @@ class _Search:
         HH *= d
         gg *= d
         inverse = np.linalg.inv(HH[:, N_PAR:, N_PAR:] + np.diag(self.K))
-        cross, rest = HH[:, N_PAR:, :N_PAR], gg[:, N_PAR:] - self.K * (starts - self.prior)
-        back = inverse @ np.concatenate([cross, rest[..., None]], axis=2)
-        H = HH[:, :N_PAR, :N_PAR].sum(axis=0) - np.tensordot(cross, back[..., :-1], ((0, 1), (0, 1)))
-        g = gg[:, :N_PAR].sum(axis=0) - np.tensordot(cross, back[..., -1], ((0, 1), (0, 1)))
-        return H, g - self.Lambda @ (par - self.par0), back
+        cross, start_gradient = HH[:, N_PAR:, :N_PAR], gg[:, N_PAR:] - self.K * (starts - self.start_prior)
+        start_moves = inverse @ np.concatenate([cross, start_gradient[..., None]], axis=2)
+        H = HH[:, :N_PAR, :N_PAR].sum(axis=0) - np.tensordot(cross, start_moves[..., :-1], ((0, 1), (0, 1)))
+        g = gg[:, :N_PAR].sum(axis=0) - np.tensordot(cross, start_moves[..., -1], ((0, 1), (0, 1)))
+        return H, g - self.Lambda @ (par - self.par0), start_moves
 
 
-def search(
-    problem: Problem, par: np.ndarray, prior: tuple[np.ndarray, np.ndarray], steps: int, weight: np.ndarray | None
-) -> Found:
+def estimate(
+    problem: EstimationProblem,
+    par: np.ndarray,
+    prior: tuple[np.ndarray, np.ndarray],
+    steps: int,
+    weight: np.ndarray | None,
+) -> EstimationResult:
     """Minimise the cost from `par` by at most `steps` damped Gauss-Newton steps.
 
     Args:
@@ -159,40 +170,40 @@ def search(
     """
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # sensitivities may overflow before the free run does
-            return _descend(_Search(problem, *prior), par, steps, weight)
+            return _descend(_GaussNewton(problem, *prior), par, steps, weight)
     except np.linalg.LinAlgError:
-        return Found(par, np.zeros((N_PAR, N_PAR)), SIGMA**-2, 0, float("nan"))
+        return EstimationResult(par, np.zeros((N_PAR, N_PAR)), SIGMA**-2, 0, float("nan"))
 
 
-def _descend(look: _Search, par: np.ndarray, steps: int, weight: np.ndarray | None) -> Found:
+def _descend(optimiser: _GaussNewton, par: np.ndarray, steps: int, weight: np.ndarray | None) -> EstimationResult:
     cold = weight is None
-    W = 1.0 / np.maximum(0.05 * look.spread**2, SIGMA**2) if weight is None else weight
-    starts, mu, taken = look.prior.copy(), 1e-3 if cold else 1e-5, 0
-    cost = look.fly(par, starts, W, True)
+    W = 1.0 / np.maximum(0.05 * optimiser.state_std**2, SIGMA**2) if weight is None else weight
+    starts, mu, steps_taken = optimiser.start_prior.copy(), 1e-3 if cold else 1e-5, 0
+    cost = optimiser.simulate(par, starts, W, True)
     H = np.zeros((N_PAR, N_PAR))
     for count in range(steps):
         if not np.isfinite(cost):
             break
         if cold and count in (1, 3):
-            W = look.weights(W)
-            cost = look.cost(par, starts)
-        H, g, back = look.normal(par, starts)
-        lhs = H + look.Lambda
-        for _ in range(_TRIES):
+            W = optimiser.update_weights(W)
+            cost = optimiser.cost(par, starts)
+        H, g, start_moves = optimiser.normal_equations(par, starts)
+        lhs = H + optimiser.Lambda
+        for _ in range(_MAX_DAMPINGS):
             move = np.linalg.solve(lhs + np.diag(mu * np.diag(lhs)), g)
-            to = par + move, starts + back[..., -1] - back[..., :-1] @ move
-            trial = look.fly(*to, W, False)
-            if trial < cost:
+            candidate = par + move, starts + start_moves[..., -1] - start_moves[..., :-1] @ move
+            trial_cost = optimiser.simulate(*candidate, W, False)
+            if trial_cost < cost:
                 break
             mu = max(8 * mu, 1e-3)
         else:
             break
-        (par, starts), mu, taken = to, max(mu / 5, 1e-6), taken + 1
-        fell, cost = cost - trial, trial
-        if (not cold or count > 3) and fell < _DONE * cost:
+        (par, starts), mu, steps_taken = candidate, max(mu / 5, 1e-6), steps_taken + 1
+        descent, cost = cost - trial_cost, trial_cost
+        if (not cold or count > 3) and descent < _MIN_DESCENT * cost:
             break
         if count < steps - 1:
-            cost = look.fly(par, starts, W, True)
+            cost = optimiser.simulate(par, starts, W, True)
     if not cold and np.isfinite(cost):
-        W = 1.0 / np.maximum(0.9 / W + 0.1 * (look.e**2).mean(axis=0) / W, SIGMA**2)
-    return Found(par, H, W, taken, cost if np.isfinite(cost) else float("nan"))
+        W = 1.0 / np.maximum(0.9 / W + 0.1 * (optimiser.e**2).mean(axis=0) / W, SIGMA**2)
+    return EstimationResult(par, H, W, steps_taken, cost if np.isfinite(cost) else float("nan"))

@@ -10,8 +10,8 @@ Source: Jategaonkar 2015, section 4.6 (output error, sensitivity equations); exa
 
 import numpy as np
 
-from fleet.physics.dynamics import N_X, jacobian, lost, step
-from fleet.physics.kernel import bare, kernel
+from fleet.physics.dynamics import N_X, is_diverged, jacobian, step
+from fleet.physics.kernel import kernel, no_alloc_kernel
 from fleet.physics.wrench import N_AERO, N_PAR, ROW, WIND
 
 GROUP = 4  # samples per residual; 2 ** _DOUBLINGS
@@ -19,8 +19,8 @@ _DOUBLINGS = 2
 N_COLUMN = N_PAR + N_X
 
 
-@bare
-def _times(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
+@no_alloc_kernel
+def _matmul(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
     """Compute a b, (9, n), of a (9, 9) and b (9, n); named elements of a row stay in registers, indexed ones do not."""
     for i in range(N_X):
         a0, a1, a2, a3, a4, a5, a6, a7, a8 = a[i]
@@ -35,28 +35,28 @@ def _transition(F: np.ndarray, dt: float, Phi: np.ndarray, Gamma: np.ndarray, wo
 
     Phi = I + F Gamma must be exact, otherwise the equilibrium S = -F^-1 G would drift.
     """
-    square, cube, keep = work[0], work[1], work[2]
-    _times(F, F, square)
-    _times(F, square, cube)
+    square, cube, scratch = work[0], work[1], work[2]
+    _matmul(F, F, square)
+    _matmul(F, square, cube)
     for i in range(N_X):
         for j in range(N_X):
             Gamma[i, j] = dt**2 / 2 * F[i, j] + dt**3 / 6 * square[i, j] + dt**4 / 24 * cube[i, j]
         Gamma[i, i] += dt
     for doubling in range(_DOUBLINGS + 1):
         if doubling:
-            _times(Phi, Gamma, keep)
-            Gamma += keep
-        _times(F, Gamma, Phi)
+            _matmul(Phi, Gamma, scratch)
+            Gamma += scratch
+        _matmul(F, Gamma, Phi)
         for i in range(N_X):
             Phi[i, i] += 1.0
 
 
-@bare
-def _carry(
+@no_alloc_kernel
+def _propagate(
     S: np.ndarray, Phi: np.ndarray, Gamma: np.ndarray, term: np.ndarray, by_wind: np.ndarray, out: np.ndarray
 ) -> None:
     """Compute the sensitivities one group later."""
-    _times(Phi, S, out)
+    _matmul(Phi, S, out)
     for i in range(N_X):
         for a in range(N_AERO):
             out[i, a] += Gamma[i, ROW[a]] * term[a]
@@ -66,13 +66,13 @@ def _carry(
 
 
 @kernel
-def sweep(
+def residuals_and_jacobian(
     par: np.ndarray,
     starts: np.ndarray,
     segments: np.ndarray,
     y: np.ndarray,
     delta: np.ndarray,
-    at: np.ndarray,
+    trim_velocity: np.ndarray,
     dt: float,
     weight: np.ndarray,
     e: np.ndarray,
@@ -116,14 +116,14 @@ def sweep(
             for j in range(GROUP):
                 if 2 * j == GROUP:
                     half[:] = x
-                step(x, delta[k + j], par, at, dt, work)
-            if lost(x):
+                step(x, delta[k + j], par, trim_velocity, dt, work)
+            if is_diverged(x):
                 return np.inf
             if len(J):
                 for i in range(4):
                     mean[i] = delta[k : k + GROUP, i].mean()
-                jacobian(half, mean, par, at, F, by_wind, term)
+                jacobian(half, mean, par, trim_velocity, F, by_wind, term)
                 _transition(F, dt, Phi, Gamma, matrices)
-                _carry(S, Phi, Gamma, term, by_wind, S_next)
+                _propagate(S, Phi, Gamma, term, by_wind, S_next)
                 S, S_next = S_next, S
     return cost

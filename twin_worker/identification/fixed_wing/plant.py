@@ -8,70 +8,72 @@ from fleet.physics.dynamics import rates_of_change
 from fleet.physics.simulate import coupled_plant, linear_plant
 from fleet.physics.wrench import OFFSETS, WIND
 from fleet.window import INPUTS, Window
-from twin_worker.identification.fixed_wing.derivatives_model import Coupled
-from twin_worker.identification.fixed_wing.output_error import LINE
-from twin_worker.identification.linear.linear_model import Axis
+from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
+from twin_worker.identification.fixed_wing.output_error import LINE_SAMPLES
+from twin_worker.identification.linear.linear_model import AxisModel
 
 DYNAMICS, PAPER = "dynamics", "paper"  # derivatives model, two linear axes
-Plant = Coupled | tuple[Axis, Axis]
+Plant = DerivativesModel | tuple[AxisModel, AxisModel]
 
-SETTLE_S = 40.0  # window of the bias correction [s]
-_LEAST_S = 4.0  # minimum window [s]
-_EVERY = 5  # interval of the evaluated rows
-_DRIVEN = np.array([0, 2, 4, 1, 3, 5])  # state that each offset drives, in the order of `OFFSETS`
+BIAS_WINDOW_S = 40.0  # window of the bias correction [s]
+_MIN_WINDOW_S = 4.0  # minimum window [s]
+_ROW_STRIDE = 5  # interval of the evaluated rows
+_DRIVEN_STATE = np.array([0, 2, 4, 1, 3, 5])  # state that each offset drives, in the order of `OFFSETS`
 
 
 def method(plant: Plant) -> str:
     """Return the method name of the model."""
-    return DYNAMICS if isinstance(plant, Coupled) else PAPER
+    return DYNAMICS if isinstance(plant, DerivativesModel) else PAPER
 
 
-def finite(plant: Plant) -> bool:
+def is_finite(plant: Plant) -> bool:
     """Return whether all parameters are finite."""
-    parts = (plant.par,) if isinstance(plant, Coupled) else [axis.D for axis in plant]
+    parts = (plant.par,) if isinstance(plant, DerivativesModel) else [axis.D for axis in plant]
     return all(bool(np.isfinite(part).all()) for part in parts)
 
 
-def settled(plant: Plant, good: Window) -> tuple:
+def bias_corrected(plant: Plant, window: Window) -> tuple:
     """Return the plant for `fleet.physics.simulate` with its recent mean error removed from the offsets.
 
     Args:
         plant: the model
         window: newest telemetry, without gaps
     """
-    newest = max(len(good) - int(SETTLE_S / good.dt), 0)
-    if isinstance(plant, Coupled):  # only the flight that it was identified from
-        newest = max(newest, min(int(np.searchsorted(good.t, plant.t0)), len(good) - int(_LEAST_S / good.dt)))
-    recent = good.part(newest, len(good))
-    if isinstance(plant, Coupled):
-        return coupled_plant(_level(plant, recent), plant.at)
-    return linear_plant(*(part for axis in plant for part in (_centred(axis, recent), axis.means)))
+    first_row = max(len(window) - int(BIAS_WINDOW_S / window.dt), 0)
+    if isinstance(plant, DerivativesModel):  # only the flight that it was identified from
+        first_row = max(
+            first_row, min(int(np.searchsorted(window.t, plant.t0)), len(window) - int(_MIN_WINDOW_S / window.dt))
+        )
+    recent = window.part(first_row, len(window))
+    if isinstance(plant, DerivativesModel):
+        return coupled_plant(_correct_offsets(plant, recent), plant.trim_velocity)
+    return linear_plant(*(part for axis in plant for part in (_correct_constant(axis, recent), axis.means)))
 
 
-def _level(plant: Coupled, recent: Window) -> np.ndarray:
+def _correct_offsets(plant: DerivativesModel, recent: Window) -> np.ndarray:
     """Correct the six offsets so that the mean acceleration of the model equals the measured one."""
     par, y = plant.par.copy(), np.ascontiguousarray(recent.x)
     par[WIND:] = 0.0
     total = np.zeros(9)
-    rows = _add_rates(y, lagged(np.ascontiguousarray(recent.u), recent.dt, TAU), par, plant.at, total)
-    n = min(LINE * 4, len(y) // 2)
-    flown = (y[-n:].mean(axis=0) - y[:n].mean(axis=0)) / ((len(y) - n) * recent.dt)
-    miss = flown - total / rows
-    par[list(OFFSETS)] += miss[_DRIVEN]
+    rows = _add_rates(y, lagged(np.ascontiguousarray(recent.u), recent.dt, TAU), par, plant.trim_velocity, total)
+    n = min(LINE_SAMPLES * 4, len(y) // 2)
+    measured = (y[-n:].mean(axis=0) - y[:n].mean(axis=0)) / ((len(y) - n) * recent.dt)
+    error = measured - total / rows
+    par[list(OFFSETS)] += error[_DRIVEN_STATE]
     return par
 
 
 @nb.njit(cache=True, nogil=True)
-def _add_rates(y: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.ndarray, total: np.ndarray) -> int:
+def _add_rates(y: np.ndarray, delta: np.ndarray, par: np.ndarray, trim_velocity: np.ndarray, total: np.ndarray) -> int:
     """Add x' of every `_ROW_STRIDE`th row to `total`, (9,); return the number of rows."""
-    rate, rows = np.empty(9), range(0, len(y), _EVERY)
+    rate, rows = np.empty(9), range(0, len(y), _ROW_STRIDE)
     for k in rows:
-        rates_of_change(y[k], delta[k], par, at, rate)
+        rates_of_change(y[k], delta[k], par, trim_velocity, rate)
         total += rate
     return len(rows)
 
 
-def _centred(axis: Axis, recent: Window) -> np.ndarray:
+def _correct_constant(axis: AxisModel, recent: Window) -> np.ndarray:
     """Return [A B c] of an axis with c corrected by the mean one-step error."""
     D = axis.physical()
     y = recent.columns(axis.states) - axis.y_mean
@@ -80,7 +82,7 @@ def _centred(axis: Axis, recent: Window) -> np.ndarray:
     return D
 
 
-def acting(good: Window) -> np.ndarray:
+def actuator_state(window: Window) -> np.ndarray:
     """Return the actuator states at the end, in the order of `INPUTS`, (4,)."""
-    assert good.u.shape[1] == len(INPUTS)
-    return lagged(good.u[-50:], good.dt, TAU)[-1]
+    assert window.u.shape[1] == len(INPUTS)
+    return lagged(window.u[-50:], window.dt, TAU)[-1]

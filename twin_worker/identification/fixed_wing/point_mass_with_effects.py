@@ -7,18 +7,18 @@ import numpy as np
 from fleet.physics import point_mass as H
 from fleet.window import Window
 from twin_worker.identification.fixed_wing import attitude_lag
-from twin_worker.identification.fixed_wing.energy_balance import Flight, load, missed
-from twin_worker.identification.fixed_wing.point_mass_model import Hybrid, flight_of
-from twin_worker.numerics.ridge_regression import ridge
-from twin_worker.telemetry.history import History
+from twin_worker.identification.fixed_wing.energy_balance import PointMassData, excess_power_residual, load_factor
+from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel, point_mass_data
+from twin_worker.numerics.ridge_regression import solve_ridge
+from twin_worker.telemetry.history import TelemetryHistory
 
-_LEAST_S = 10.0  # minimum flight for a correction [s]
-_RIDGE = 0.05  # penalty of an increment, as a fraction of its term's norm
-_DOUBT = 0.3  # relative standard deviation of an increment
+_MIN_FIT_S = 10.0  # minimum flight for a correction [s]
+_RIDGE_PENALTY = 0.05  # penalty of an increment, as a fraction of its term's norm
+_INCREMENT_SIGMA = 0.3  # relative standard deviation of an increment
 
 
 @dataclass(frozen=True)
-class Added:
+class EffectIncrements:
     """Increments of the effects, one row per row of the flight.
 
     Attributes:
@@ -33,10 +33,12 @@ class Added:
     air: np.ndarray
     phi: np.ndarray
     throttle: np.ndarray
-    faulty: tuple[bool, bool]
+    servo_faulty: tuple[bool, bool]
 
 
-def extended(known: Hybrid, since: Window, history: History, scale: float, added: Added) -> Hybrid:
+def with_effects(
+    model: PointMassModel, window: Window, history: TelemetryHistory, scale: float, increments: EffectIncrements
+) -> PointMassModel:
     """Apply effects to a model.
 
     Args:
@@ -46,28 +48,30 @@ def extended(known: Hybrid, since: Window, history: History, scale: float, added
         scale: present true over reported airspeed [-]
         increments: increments of the effects
     """
-    body = known.body.copy()
-    power = _power(body, added)
-    body[H.C_0 : H.C_N + 1] += power
-    if since.seconds >= _LEAST_S:
-        flown = flight_of(since, history, scale)
-        for column, faulty in zip((H.WN_PHI, H.WN_THETA), added.faulty, strict=True):
+    parameters = model.parameters.copy()
+    d_power = _power_increments(parameters, increments)
+    parameters[H.C_0 : H.C_N + 1] += d_power
+    if window.seconds >= _MIN_FIT_S:
+        data = point_mass_data(window, history, scale)
+        for column, faulty in zip((H.WN_PHI, H.WN_THETA), increments.servo_faulty, strict=True):
             if faulty:
-                body[column : column + 3] = _lag(flown, column, body[column : column + 3])
-        body[H.C_0] += float(missed(flown, body[H.C_0 : H.C_N + 1], body[H.T_0], body[H.V_0]).mean())
-    cov = known.power.cov + np.diag((_DOUBT * power) ** 2)
-    return Hybrid(body, replace(known.power, cov=cov), float(since.t[-1]))
+                parameters[column : column + 3] = _lag(data, column, parameters[column : column + 3])
+        parameters[H.C_0] += float(
+            excess_power_residual(data, parameters[H.C_0 : H.C_N + 1], parameters[H.T_0], parameters[H.V_0]).mean()
+        )
+    cov = model.excess_power.cov + np.diag((_INCREMENT_SIGMA * d_power) ** 2)
+    return PointMassModel(parameters, replace(model.excess_power, cov=cov), float(window.t[-1]))
 
 
-def _lag(flown: Flight, column: int, near: np.ndarray) -> np.ndarray:
-    command, angle = (flown.phi_c, flown.phi) if column == H.WN_PHI else (flown.theta_c, flown.theta)
-    return attitude_lag.identify(command, angle, near)
+def _lag(data: PointMassData, column: int, warm_start: np.ndarray) -> np.ndarray:
+    command, angle = (data.phi_c, data.phi) if column == H.WN_PHI else (data.theta_c, data.theta)
+    return attitude_lag.identify(command, angle, warm_start)
 
 
-def _power(body: np.ndarray, added: Added) -> np.ndarray:
+def _power_increments(parameters: np.ndarray, increments: EffectIncrements) -> np.ndarray:
     """Return the increments of c_0 c_t c_v c_n: force along the path, regressed on their regressors, (4,)."""
-    V = np.maximum(np.linalg.norm(added.air, axis=1), 1.0)
-    along = (added.force * added.air).sum(axis=1) / V
-    n = load(added.phi)
-    A = np.column_stack([np.ones(len(V)), added.throttle - body[H.T_0], V - body[H.V_0], n * n - 1.0])
-    return ridge(A, along, _RIDGE)
+    V = np.maximum(np.linalg.norm(increments.air, axis=1), 1.0)
+    along = (increments.force * increments.air).sum(axis=1) / V
+    n = load_factor(increments.phi)
+    A = np.column_stack([np.ones(len(V)), increments.throttle - parameters[H.T_0], V - parameters[H.V_0], n * n - 1.0])
+    return solve_ridge(A, along, _RIDGE_PENALTY)

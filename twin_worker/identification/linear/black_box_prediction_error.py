@@ -89,54 +89,56 @@ def squared_errors(
 
 
 @dataclass(frozen=True)
-class _Task:
+class _Parametrisation:
     """Data, and layout of the matrices in the parameter vector."""
 
     y: np.ndarray  # nan where not measured
     w: np.ndarray
     n: int
     m: int  # inputs
-    pushed: bool
-    watches: bool
+    with_bias: bool
+    innovations_form: bool
 
     @property
-    def sizes(self) -> np.ndarray:
+    def offsets(self) -> np.ndarray:
         """Return the first index of C and of x0."""
         dynamic = self.n * (self.n + self.w.shape[1])
         return np.array([dynamic, dynamic + self.y.shape[1] * self.n])
 
     def pack(self, model: StateSpace) -> np.ndarray:
         F, G = model.A, model.B
-        if self.pushed:
+        if self.with_bias:
             G = np.hstack([G, model.c[:, None]])
-        if self.watches:
+        if self.innovations_form:
             F, G = F - model.K @ model.C, np.hstack([G, model.K])
         return np.concatenate([np.hstack([F, G]).ravel(), model.C.ravel(), model.x0])
 
     def matrices(self, par: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        dynamic, C, x0 = np.split(par, self.sizes)
+        dynamic, C, x0 = np.split(par, self.offsets)
         FG = dynamic.reshape(self.n, -1)
         return FG[:, : self.n].copy(), FG[:, self.n :].copy(), C.reshape(-1, self.n).copy(), x0.copy()
 
     def unpack(self, par: np.ndarray) -> StateSpace:
         F, G, C, x0 = self.matrices(par)
-        K = G[:, self.m + self.pushed :] if self.watches else np.zeros((self.n, len(C)))
-        c = G[:, self.m] if self.pushed else np.zeros(self.n)
+        K = G[:, self.m + self.with_bias :] if self.innovations_form else np.zeros((self.n, len(C)))
+        c = G[:, self.m] if self.with_bias else np.zeros(self.n)
         return StateSpace.of(F + K @ C, G[:, : self.m], C, K=K, c=c, x0=x0)
 
 
-def _task(
-    model: StateSpace, y: np.ndarray, u: np.ndarray, ok: np.ndarray | None, *, watches: bool, pushed: bool
-) -> _Task:
+def _parametrise(
+    model: StateSpace, y: np.ndarray, u: np.ndarray, ok: np.ndarray | None, *, innovations_form: bool, with_bias: bool
+) -> _Parametrisation:
     y = np.array(y, float)
     if ok is not None:
         y[~ok] = np.nan
     columns = [u]
-    if pushed:
+    if with_bias:
         columns.append(np.ones((len(u), 1)))
-    if watches:
+    if innovations_form:
         columns.append(np.nan_to_num(y))
-    return _Task(y, np.ascontiguousarray(np.hstack(columns)), model.order, u.shape[1], pushed, watches)
+    return _Parametrisation(
+        y, np.ascontiguousarray(np.hstack(columns)), model.order, u.shape[1], with_bias, innovations_form
+    )
 
 
 def refine_black_box(
@@ -146,7 +148,7 @@ def refine_black_box(
     *,
     ok: np.ndarray | None = None,
     innovations: bool = False,
-    pushed: bool = False,
+    with_bias: bool = False,
     steps: int = 30,
 ) -> StateSpace:
     """Refine every matrix of a model by damped Gauss-Newton; the cost on these data never increases.
@@ -159,51 +161,55 @@ def refine_black_box(
         with_bias: include a constant state bias c
         steps: maximum Gauss-Newton steps
     """
-    task = _task(model, y, u, ok, watches=innovations, pushed=pushed)
-    par = task.pack(model)
-    squares = squared_errors(*task.matrices(par), task.y, task.w)
+    parametrisation = _parametrise(model, y, u, ok, innovations_form=innovations, with_bias=with_bias)
+    par = parametrisation.pack(model)
+    squares = squared_errors(*parametrisation.matrices(par), parametrisation.y, parametrisation.w)
     if not np.isfinite(squares).all():
         return model
     mu, best = 1e-2, float(squares.sum())
-    edge = max(model.radius, 1.0)
+    max_radius = max(model.radius, 1.0)
     for _ in range(steps):
-        _, g, H = normal_equations(*task.matrices(par), task.y, task.w)
-        before = best
+        _, g, H = normal_equations(*parametrisation.matrices(par), parametrisation.y, parametrisation.w)
+        previous = best
         while mu < 1e8:
-            trial = par + _step(g, H, mu)
-            total = float(squared_errors(*task.matrices(trial), task.y, task.w).sum())
-            if total < best and task.unpack(trial).radius <= edge:
+            trial = par + _damped_step(g, H, mu)
+            total = float(squared_errors(*parametrisation.matrices(trial), parametrisation.y, parametrisation.w).sum())
+            if total < best and parametrisation.unpack(trial).radius <= max_radius:
                 par, best, mu = trial, total, max(mu / 8, 1e-9)
                 break
             mu *= 6
-        if before - best < 1e-5 * before:
+        if previous - best < 1e-5 * previous:
             break
-    return task.unpack(par)
+    return parametrisation.unpack(par)
 
 
-def _step(g: np.ndarray, H: np.ndarray, mu: float) -> np.ndarray:
+def _damped_step(g: np.ndarray, H: np.ndarray, mu: float) -> np.ndarray:
     """Solve the damped normal equations after diagonal scaling."""
-    even = 1 / np.sqrt(np.diag(H) + 1e-9 * np.trace(H) / len(H) + 1e-30)
-    scaled = even[:, None] * H * even
+    scaling = 1 / np.sqrt(np.diag(H) + 1e-9 * np.trace(H) / len(H) + 1e-30)
+    scaled = scaling[:, None] * H * scaling
     scaled[np.diag_indices_from(scaled)] += mu
-    return even * scipy.linalg.solve(scaled, even * g, assume_a="pos")
+    return scaling * scipy.linalg.solve(scaled, scaling * g, assume_a="pos")
 
 
 def fit_inputs(
-    model: StateSpace, y: np.ndarray, u: np.ndarray, ok: np.ndarray | None = None, pushed: bool = False
+    model: StateSpace, y: np.ndarray, u: np.ndarray, ok: np.ndarray | None = None, with_bias: bool = False
 ) -> StateSpace:
     """Solve B, c and x0 for given A and C by least squares on the free run.
 
     Source: Huang 2021, eq. 15 with D = 0.
     """
-    task = _task(model, y, u, ok, watches=False, pushed=pushed)
-    rest = replace(model, B=np.zeros((model.order, u.shape[1])), c=np.zeros(model.order), x0=np.zeros(model.order))
-    par = task.pack(rest)
-    squares, g, H = normal_equations(*task.matrices(par), task.y, task.w)
+    parametrisation = _parametrise(model, y, u, ok, innovations_form=False, with_bias=with_bias)
+    zero_input = replace(
+        model, B=np.zeros((model.order, u.shape[1])), c=np.zeros(model.order), x0=np.zeros(model.order)
+    )
+    par = parametrisation.pack(zero_input)
+    squares, g, H = normal_equations(*parametrisation.matrices(par), parametrisation.y, parametrisation.w)
     free = np.ones(len(par), bool)
-    free[: task.sizes[0]] = np.tile(np.arange(model.order + task.w.shape[1]) >= model.order, model.order)
-    free[task.sizes[0] : task.sizes[1]] = False
+    free[: parametrisation.offsets[0]] = np.tile(
+        np.arange(model.order + parametrisation.w.shape[1]) >= model.order, model.order
+    )
+    free[parametrisation.offsets[0] : parametrisation.offsets[1]] = False
     if not np.isfinite(squares).all():
         return model
-    par[free] = _step(g[free], H[np.ix_(free, free)], 1e-10)
-    return task.unpack(par)
+    par[free] = _damped_step(g[free], H[np.ix_(free, free)], 1e-10)
+    return parametrisation.unpack(par)

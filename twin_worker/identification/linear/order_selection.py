@@ -13,17 +13,17 @@ import numpy as np
 
 from twin_worker.identification.linear.black_box_prediction_error import fit_inputs, refine_black_box
 from twin_worker.identification.linear.state_space import StateSpace
-from twin_worker.identification.linear.subspace import candidates, instructive
+from twin_worker.identification.linear.subspace import check_excitation, subspace_states
 
-PASTS = (6, 10, 15, 25)  # tried past horizons [samples]
-_THIRDS = 3
-_SCORE = 20  # members of the ensemble
-_AS_NEAR = 2.0  # largest squared distance, relative to the nearest member [-]
-_LEAST = 30  # minimum samples to estimate the start state of a fold
+PAST_HORIZONS = (6, 10, 15, 25)  # tried past horizons [samples]
+_FOLDS = 3
+_ENSEMBLE_SIZE = 20  # members of the ensemble
+_DISTANCE_RATIO = 2.0  # largest squared distance, relative to the nearest member [-]
+_MIN_START_SAMPLES = 30  # minimum samples to estimate the start state of a fold
 
 
 @dataclass(frozen=True)
-class Recipe:
+class ModelStructure:
     """Structure of a model.
 
     Attributes:
@@ -35,12 +35,12 @@ class Recipe:
 
     order: int
     feedthrough: bool
-    pushed: bool
+    with_bias: bool
     refined: bool
 
 
 @dataclass(frozen=True)
-class Choice:
+class OrderSelection:
     """Result of the order selection.
 
     Attributes:
@@ -50,11 +50,13 @@ class Choice:
     """
 
     model: StateSpace
-    recipe: Recipe
-    committee: tuple[StateSpace, ...]
+    structure: ModelStructure
+    ensemble: tuple[StateSpace, ...]
 
 
-def choose(y: np.ndarray, u: np.ndarray, *, orders: Iterable[int] = range(1, 11), feedthrough: bool = False) -> Choice:
+def select_order(
+    y: np.ndarray, u: np.ndarray, *, orders: Iterable[int] = range(1, 11), feedthrough: bool = False
+) -> OrderSelection:
     """Identify models and select their order by cross-validation.
 
     Args:
@@ -66,70 +68,77 @@ def choose(y: np.ndarray, u: np.ndarray, *, orders: Iterable[int] = range(1, 11)
         ValueError: if the data are too short or not exciting enough for any order.
     """
     n, orders = len(y), tuple(orders)
-    instructive(y, u, np.ones(n, bool))
-    through = (False, True) if feedthrough else (False,)
-    ranked = _ranked(y, u, orders, through)
-    best = set(ranked[:_SCORE])
-    whole = {r: m for r, m in _models(y, u, np.ones(n, bool), orders, through) if r in best}
-    runs = np.array([model.run(u) for model in whole.values()])
-    far = ((runs - np.median(runs, axis=0)) ** 2).sum(axis=(1, 2))
-    near = [recipe for recipe, d in zip(whole, far, strict=True) if d <= _AS_NEAR * far.min()]
-    recipe = min(near, key=lambda r: (r.order, ranked.index(r)))
-    return Choice(whole[recipe], recipe, tuple(whole.values()))
+    check_excitation(y, u, np.ones(n, bool))
+    feedthroughs = (False, True) if feedthrough else (False,)
+    ranking = _rank_structures(y, u, orders, feedthroughs)
+    best = set(ranking[:_ENSEMBLE_SIZE])
+    refitted = {r: m for r, m in _fit_structures(y, u, np.ones(n, bool), orders, feedthroughs) if r in best}
+    runs = np.array([model.run(u) for model in refitted.values()])
+    distances = ((runs - np.median(runs, axis=0)) ** 2).sum(axis=(1, 2))
+    close = [
+        structure for structure, d in zip(refitted, distances, strict=True) if d <= _DISTANCE_RATIO * distances.min()
+    ]
+    recipe = min(close, key=lambda r: (r.order, ranking.index(r)))
+    return OrderSelection(refitted[recipe], recipe, tuple(refitted.values()))
 
 
-def _ranked(y: np.ndarray, u: np.ndarray, orders: tuple[int, ...], through: tuple[bool, ...]) -> list[Recipe]:
+def _rank_structures(
+    y: np.ndarray, u: np.ndarray, orders: tuple[int, ...], feedthroughs: tuple[bool, ...]
+) -> list[ModelStructure]:
     """Rank the structures by the fit of free runs on held-out folds, best first."""
     n = len(y)
-    fits: dict[Recipe, list[float]] = {}
-    for fold in range(_THIRDS):
-        held = slice(fold * n // _THIRDS, (fold + 1) * n // _THIRDS)
+    fits: dict[ModelStructure, list[float]] = {}
+    for fold in range(_FOLDS):
+        fold_rows = slice(fold * n // _FOLDS, (fold + 1) * n // _FOLDS)
         ok = np.ones(n, bool)
-        ok[held] = False
-        for recipe, model in _models(y, u, ok, orders, through):
-            fits.setdefault(recipe, []).append(_fit(model, y[held], u[held]))
-    whole = [recipe for recipe, each in fits.items() if len(each) == _THIRDS]
-    if not whole:
+        ok[fold_rows] = False
+        for structure, model in _fit_structures(y, u, ok, orders, feedthroughs):
+            fits.setdefault(structure, []).append(_fold_fit(model, y[fold_rows], u[fold_rows]))
+    complete = [recipe for recipe, scores in fits.items() if len(scores) == _FOLDS]
+    if not complete:
         raise ValueError(f"order: found {n} samples, too few for order {min(orders)}; record for longer")
-    return sorted(whole, key=lambda recipe: -float(np.mean(fits[recipe])))
+    return sorted(complete, key=lambda recipe: -float(np.mean(fits[recipe])))
 
 
-def _models(
-    y: np.ndarray, u: np.ndarray, ok: np.ndarray, orders: tuple[int, ...], through: tuple[bool, ...]
-) -> Iterator[tuple[Recipe, StateSpace]]:
+def _fit_structures(
+    y: np.ndarray, u: np.ndarray, ok: np.ndarray, orders: tuple[int, ...], feedthroughs: tuple[bool, ...]
+) -> Iterator[tuple[ModelStructure, StateSpace]]:
     """Fit a model of every structure to the rows marked ok."""
-    for feedthrough in through:
+    for feedthrough in feedthroughs:
         w = np.vstack([u[1:], u[-1:]]) if feedthrough else u  # D is B of the input advanced by one sample
-        found = []
-        for past in PASTS:
+        subspaces = []
+        for past in PAST_HORIZONS:
             try:
-                found.append(candidates(y, w, ok, past=past, future=max(past - 2, 6)))
+                subspaces.append(subspace_states(y, w, ok, past=past, future=max(past - 2, 6)))
             except ValueError:  # too few rows for this past horizon
                 continue
         for order in orders:
-            starts = [states.model(order).stabilised() for states in found if order <= len(states.x)]
+            starts = [subspace.model(order).stabilised() for subspace in subspaces if order <= len(subspace.x)]
             if not starts:
                 continue
-            for pushed in (False, True):
-                fitted = [fit_inputs(start, y, w, ok=ok, pushed=pushed) for start in starts]
-                first = min(fitted, key=lambda model: _squares(model, y, w, ok))
-                refined = refine_black_box(first, y, w, ok=ok, pushed=pushed)
-                for model, done in ((first, False), (refined, True)):
-                    yield Recipe(order, feedthrough, pushed, done), _through(model, u[0]) if feedthrough else model
+            for with_bias in (False, True):
+                fitted = [fit_inputs(start, y, w, ok=ok, with_bias=with_bias) for start in starts]
+                first = min(fitted, key=lambda model: _square_error(model, y, w, ok))
+                refined = refine_black_box(first, y, w, ok=ok, with_bias=with_bias)
+                for model, is_refined in ((first, False), (refined, True)):
+                    yield (
+                        ModelStructure(order, feedthrough, with_bias, is_refined),
+                        _undo_input_advance(model, u[0]) if feedthrough else model,
+                    )
 
 
-def _squares(model: StateSpace, y: np.ndarray, u: np.ndarray, ok: np.ndarray) -> float:
+def _square_error(model: StateSpace, y: np.ndarray, u: np.ndarray, ok: np.ndarray) -> float:
     return float(((y - model.run(u))[ok] ** 2).sum())
 
 
-def _through(model: StateSpace, u0: np.ndarray) -> StateSpace:
+def _undo_input_advance(model: StateSpace, u0: np.ndarray) -> StateSpace:
     """Convert a model of advanced inputs to a model with feedthrough: its state is x(k) - B u(k)."""
     return replace(model, B=model.A @ model.B, D=model.C @ model.B, x0=model.x0 - model.B @ u0)
 
 
-def _fit(model: StateSpace, y: np.ndarray, u: np.ndarray) -> float:
+def _fold_fit(model: StateSpace, y: np.ndarray, u: np.ndarray) -> float:
     """Return the mean fit of the outputs over a held-out fold, at least -100 [%]."""
-    first = min(max(_LEAST, len(y) // 10), len(y))
-    y_hat = model.run(u, model.begin(y[:first], u[:first], len(y)))
-    miss = np.linalg.norm(y - y_hat, axis=0) / np.maximum(np.linalg.norm(y - y.mean(axis=0), axis=0), 1e-9)
-    return float(np.mean(np.maximum(100 * (1 - miss), -100.0)))
+    first = min(max(_MIN_START_SAMPLES, len(y) // 10), len(y))
+    y_hat = model.run(u, model.estimate_x0(y[:first], u[:first], len(y)))
+    relative_error = np.linalg.norm(y - y_hat, axis=0) / np.maximum(np.linalg.norm(y - y.mean(axis=0), axis=0), 1e-9)
+    return float(np.mean(np.maximum(100 * (1 - relative_error), -100.0)))

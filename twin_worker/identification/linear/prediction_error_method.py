@@ -9,7 +9,7 @@ import numba as nb
 import numpy as np
 import scipy.linalg
 
-_WORST = 20.0  # errors are clipped to this [scaled units]
+_MAX_ERROR = 20.0  # errors are clipped to this [scaled units]
 
 
 @nb.njit(cache=True, nogil=True)
@@ -53,7 +53,7 @@ def normal_equations(
             S[:] = 0.0
         elif ok[k]:
             for i in range(n):
-                e = _WORST if diverged else min(max(y[k, i] - x[i], -_WORST), _WORST)
+                e = _MAX_ERROR if diverged else min(max(y[k, i] - x[i], -_MAX_ERROR), _MAX_ERROR)
                 cost += W[i] * e * e
                 squares[i] += e * e
                 for a in range(total):
@@ -96,7 +96,7 @@ def refine(
     prior: np.ndarray,
     precision: np.ndarray,
     length: int,
-    discount: float = 0.2,
+    effective_fraction: float = 0.2,
     steps: int = 8,
 ) -> np.ndarray:
     """Refine [A B c] by damped Gauss-Newton on the prediction error of free runs.
@@ -116,26 +116,26 @@ def refine(
     shape, W = D0.shape, np.full(len(D0), 1.0)
     ok = np.ascontiguousarray(ok)
     mu, best = 1e-3, np.inf
-    state = None
+    slopes = None
     for step in range(steps):
-        if state is None:
+        if slopes is None:
             cost, g, H, squares = normal_equations(par.reshape(shape), y, u, ok, W, length)
             if step in (0, 2):  # new weights from the residuals, then a new cost
-                W = discount / np.maximum(squares[:-1] / max(squares[-1], 1.0), 1e-4)
+                W = effective_fraction / np.maximum(squares[:-1] / max(squares[-1], 1.0), 1e-4)
                 cost, g, H, squares = normal_equations(par.reshape(shape), y, u, ok, W, length)
             best = cost + float(Lambda @ (par - par0) ** 2)
-            state = g, H
-        g, H = state
+            slopes = g, H
+        g, H = slopes
         lhs = H + np.diag(Lambda + mu * (np.diag(H) + Lambda))
-        even = 1 / np.sqrt(np.diag(lhs))  # variances differ by orders of magnitude
-        scaled = even[:, None] * lhs * even
-        trial = par + even * scipy.linalg.solve(scaled, even * (g - Lambda * (par - par0)), assume_a="pos")
+        scaling = 1 / np.sqrt(np.diag(lhs))  # variances differ by orders of magnitude
+        scaled = scaling[:, None] * lhs * scaling
+        trial = par + scaling * scipy.linalg.solve(scaled, scaling * (g - Lambda * (par - par0)), assume_a="pos")
         cost, g, H, _ = normal_equations(trial.reshape(shape), y, u, ok, W, length)
         total = cost + float(Lambda @ (trial - par0) ** 2)
         if np.isfinite(total) and total < best:
-            done = best - total < 1e-3 * best
-            par, best, mu, state = trial, total, mu / 5, (None if step == 1 else (g, H))
-            if done:
+            converged = best - total < 1e-3 * best
+            par, best, mu, slopes = trial, total, mu / 5, (None if step == 1 else (g, H))
+            if converged:
                 break
         else:
             mu *= 8

@@ -9,8 +9,8 @@ import numpy as np
 
 from twin_worker.identification.linear.prediction_error_method import free_run
 
-_EDGE = 0.9995  # largest pole radius after stabilisation [-]
-_ECHO = 0.01  # weight of the observability Gramian against the fit [-]
+_MAX_RADIUS = 0.9995  # largest pole radius after stabilisation [-]
+_GRAMIAN_WEIGHT = 0.01  # weight of the observability Gramian against the fit [-]
 _CAP = 1e6  # bound of the observability rows [scaled units]
 
 
@@ -37,11 +37,11 @@ class StateSpace:
     D: np.ndarray
 
     @classmethod
-    def of(cls, A: np.ndarray, B: np.ndarray, C: np.ndarray, **more: np.ndarray) -> "StateSpace":
+    def of(cls, A: np.ndarray, B: np.ndarray, C: np.ndarray, **parts: np.ndarray) -> "StateSpace":
         """Create a model; omitted matrices are zero."""
         (l, n), m = C.shape, B.shape[1]
         zeros = {"K": np.zeros((n, l)), "c": np.zeros(n), "x0": np.zeros(n), "D": np.zeros((l, m))}
-        return cls(A, B, C, **(zeros | more))
+        return cls(A, B, C, **(zeros | parts))
 
     @property
     def order(self) -> int:
@@ -62,7 +62,7 @@ class StateSpace:
 
     def one_step(self, y: np.ndarray, u: np.ndarray, x0: np.ndarray | None = None) -> np.ndarray:
         """Predict every y (N, l) from the samples before it."""
-        watched = StateSpace(
+        predictor = StateSpace(
             A=self.A - self.K @ self.C,
             B=np.hstack([self.B - self.K @ self.D, self.K]),
             C=self.C,
@@ -71,9 +71,9 @@ class StateSpace:
             x0=self.x0,
             D=np.hstack([self.D, np.zeros((len(self.C), len(self.C)))]),
         )
-        return watched.run(np.hstack([u, y]), x0)
+        return predictor.run(np.hstack([u, y]), x0)
 
-    def begin(self, y: np.ndarray, u: np.ndarray, length: int) -> np.ndarray:
+    def estimate_x0(self, y: np.ndarray, u: np.ndarray, length: int) -> np.ndarray:
         """Estimate the state at the first sample by regularised least squares, (n,).
 
         The observability Gramian of the complete run is the regulariser: it prevents an uncertain state from growing
@@ -83,22 +83,22 @@ class StateSpace:
             y, u: the first outputs (k, l) and inputs (k, m) of the run
             length: samples of the complete run
         """
-        rest = y - self.run(u, np.zeros(self.order))
-        seen = np.empty((len(y), *self.C.shape))
-        echo, row = np.zeros((self.order, self.order)), self.C
+        residual = y - self.run(u, np.zeros(self.order))
+        observability = np.empty((len(y), *self.C.shape))
+        gramian, row = np.zeros((self.order, self.order)), self.C
         for k in range(length):
             if k < len(y):
-                seen[k] = row
-            echo += row.T @ row
+                observability[k] = row
+            gramian += row.T @ row
             row = np.clip(row @ self.A, -_CAP, _CAP)
-        rows = seen.reshape(-1, self.order)
-        lhs = rows.T @ rows + _ECHO * len(y) / length * echo
-        return np.linalg.lstsq(lhs, rows.T @ rest.ravel(), rcond=1e-12)[0]
+        rows = observability.reshape(-1, self.order)
+        lhs = rows.T @ rows + _GRAMIAN_WEIGHT * len(y) / length * gramian
+        return np.linalg.lstsq(lhs, rows.T @ residual.ravel(), rcond=1e-12)[0]
 
-    def turned(self, T: np.ndarray) -> "StateSpace":
+    def transformed(self, T: np.ndarray) -> "StateSpace":
         """Return the equivalent model with state T x."""
-        back = np.linalg.inv(T)
-        return StateSpace(T @ self.A @ back, T @ self.B, self.C @ back, T @ self.K, T @ self.c, T @ self.x0, self.D)
+        T_inv = np.linalg.inv(T)
+        return StateSpace(T @ self.A @ T_inv, T @ self.B, self.C @ T_inv, T @ self.K, T @ self.c, T @ self.x0, self.D)
 
     def outputs_as_states(self) -> "StateSpace":
         """Transform the state so that C = I.
@@ -107,16 +107,16 @@ class StateSpace:
             ValueError: if the numbers of states and outputs differ; identify with order = outputs.
         """
         if self.C.shape[0] != self.order:
-            found = f"found {self.order} states and {self.C.shape[0]} outputs"
-            raise ValueError(f"similarity to C = I: {found}, expected equal numbers; identify with order = outputs")
-        return self.turned(self.C + 1e-9 * np.eye(self.order))
+            sizes = f"found {self.order} states and {self.C.shape[0]} outputs"
+            raise ValueError(f"similarity to C = I: {sizes}, expected equal numbers; identify with order = outputs")
+        return self.transformed(self.C + 1e-9 * np.eye(self.order))
 
     def stabilised(self) -> "StateSpace":
         """Mirror poles from outside the unit circle to its inside and limit their radius."""
-        if self.radius <= _EDGE:
+        if self.radius <= _MAX_RADIUS:
             return self
         poles, modes = np.linalg.eig(self.A)
-        size = np.abs(poles)
-        size_new = np.minimum(np.where(size > 1, 1 / size, size), _EDGE)
-        A = np.real(modes * (poles / np.maximum(size, 1e-12) * size_new) @ np.linalg.pinv(modes))
+        modulus = np.abs(poles)
+        new_modulus = np.minimum(np.where(modulus > 1, 1 / modulus, modulus), _MAX_RADIUS)
+        A = np.real(modes * (poles / np.maximum(modulus, 1e-12) * new_modulus) @ np.linalg.pinv(modes))
         return replace(self, A=A)

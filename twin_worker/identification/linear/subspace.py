@@ -16,11 +16,11 @@ from twin_worker.identification.linear.state_space import StateSpace
 
 PAST = 12  # samples of the past in the regression [-]
 FUTURE = 8  # block rows of the observability matrix [-]
-_ALIKE = 1e-8  # minimum fraction of a column that is independent of the others [-]
+_MIN_INDEPENDENCE = 1e-8  # minimum fraction of a column that is independent of the others [-]
 
 
 @dataclass(frozen=True)
-class Candidates:
+class SubspaceStates:
     """States of all orders: the model of order n uses the first n.
 
     Attributes:
@@ -31,7 +31,7 @@ class Candidates:
     """
 
     x: np.ndarray
-    singular: np.ndarray
+    singular_values: np.ndarray
     y: np.ndarray
     u: np.ndarray
     rows: np.ndarray
@@ -47,15 +47,17 @@ class Candidates:
         x, m = self.x[:order], self.u.shape[1]
         C = np.linalg.lstsq(x.T, self.y, rcond=None)[0].T
         e = self.y - (C @ x).T
-        follows = np.flatnonzero(np.diff(self.rows) == 1)
-        regressor = np.hstack([x.T, self.u, e])[follows]
-        solved = np.linalg.lstsq(regressor, x.T[follows + 1], rcond=None)[0].T
-        return StateSpace.of(solved[:, :order], solved[:, order : order + m], C, K=solved[:, order + m :])
+        consecutive = np.flatnonzero(np.diff(self.rows) == 1)
+        regressor = np.hstack([x.T, self.u, e])[consecutive]
+        coefficients = np.linalg.lstsq(regressor, x.T[consecutive + 1], rcond=None)[0].T
+        return StateSpace.of(
+            coefficients[:, :order], coefficients[:, order : order + m], C, K=coefficients[:, order + m :]
+        )
 
 
-def candidates(
+def subspace_states(
     y: np.ndarray, u: np.ndarray, ok: np.ndarray, *, past: int = PAST, future: int = FUTURE, ridge: float = 1e-3
-) -> Candidates:
+) -> SubspaceStates:
     """Estimate the states of all orders up to outputs times `future`.
 
     Args:
@@ -70,20 +72,22 @@ def candidates(
     """
     n = y.shape[1]
     k = n + u.shape[1]
-    before = np.hstack([np.hstack([y[past - i : -i], u[past - i : -i]]) for i in range(1, past + 1)])
-    whole = np.lib.stride_tricks.sliding_window_view(ok, past + 1).all(axis=1) if len(ok) > past else np.zeros(0, bool)
-    if whole.sum() < 3 * past * k:
-        raise ValueError(f"subspace: found {whole.sum()} unbroken rows, needs {3 * past * k}; wait for more")
-    z, target = before[whole], y[past:][whole]
+    past_rows = np.hstack([np.hstack([y[past - i : -i], u[past - i : -i]]) for i in range(1, past + 1)])
+    unbroken = (
+        np.lib.stride_tricks.sliding_window_view(ok, past + 1).all(axis=1) if len(ok) > past else np.zeros(0, bool)
+    )
+    if unbroken.sum() < 3 * past * k:
+        raise ValueError(f"subspace: found {unbroken.sum()} unbroken rows, needs {3 * past * k}; wait for more")
+    z, target = past_rows[unbroken], y[past:][unbroken]
     moment = z.T @ z
     markov = np.linalg.solve(moment + ridge * len(z) * np.eye(z.shape[1]), z.T @ target).T  # [C B~, C A~ B~, ...]
     # block row i of the observability matrix times the reachability matrix: the same coefficients, i steps later
     shifted = [np.hstack([markov[:, i * k :], np.zeros((n, i * k))]) for i in range(future)]
     product = np.vstack(shifted)
-    squared, left = np.linalg.eigh(product @ moment @ product.T)  # of (product z')(product z')', a small matrix
-    squared, left = np.maximum(squared[::-1], 1e-12), left[:, ::-1]
-    x = squared[:, None] ** -0.25 * (left.T @ product @ z.T)  # sqrt(S) V'
-    return Candidates(x, np.sqrt(squared), target, u[past:][whole], np.flatnonzero(whole))
+    squared, left_vectors = np.linalg.eigh(product @ moment @ product.T)  # of (product z')(product z')', a small matrix
+    squared, left_vectors = np.maximum(squared[::-1], 1e-12), left_vectors[:, ::-1]
+    x = squared[:, None] ** -0.25 * (left_vectors.T @ product @ z.T)  # sqrt(S) V'
+    return SubspaceStates(x, np.sqrt(squared), target, u[past:][unbroken], np.flatnonzero(unbroken))
 
 
 def pbsid(
@@ -101,11 +105,11 @@ def pbsid(
         ValueError: if the data are too short or not exciting enough; the message contains the remedy.
     """
     ok = np.ones(len(y), bool) if ok is None else ok
-    instructive(y, u, ok)
-    return candidates(y, u, ok, past=past, future=future).model(order)
+    check_excitation(y, u, ok)
+    return subspace_states(y, u, ok, past=past, future=future).model(order)
 
 
-def instructive(y: np.ndarray, u: np.ndarray, ok: np.ndarray) -> None:
+def check_excitation(y: np.ndarray, u: np.ndarray, ok: np.ndarray) -> None:
     """Check that the data are finite and sufficiently exciting.
 
     Raises:
@@ -117,14 +121,14 @@ def instructive(y: np.ndarray, u: np.ndarray, ok: np.ndarray) -> None:
         if not np.isfinite(data).all():
             column = int(np.argmin(np.isfinite(data).all(axis=0)))
             raise ValueError(f"subspace: {name} {column} is not finite in rows marked as measured; mark them not ok")
-        away = data - data.mean(axis=0) if len(data) else data
-        size = np.linalg.norm(away, axis=0)
-        if not len(data) or (size <= 1e-12 * (1 + np.linalg.norm(data, axis=0))).any():
-            column = int(np.argmin(size))
+        centred = data - data.mean(axis=0) if len(data) else data
+        norms = np.linalg.norm(centred, axis=0)
+        if not len(data) or (norms <= 1e-12 * (1 + np.linalg.norm(data, axis=0))).any():
+            column = int(np.argmin(norms))
             raise ValueError(f"subspace: {name} {column} is constant, expected some motion; excite it or leave it out")
-        left_over = np.abs(np.diag(np.linalg.qr(away / size, mode="r")))
-        if len(away) < away.shape[1] or left_over.min() < _ALIKE:
-            column = int(np.argmin(left_over))
+        independent = np.abs(np.diag(np.linalg.qr(centred / norms, mode="r")))
+        if len(centred) < centred.shape[1] or independent.min() < _MIN_INDEPENDENCE:
+            column = int(np.argmin(independent))
             raise ValueError(f"subspace: {name} {column} repeats the columns before it; leave it out")
 
 
@@ -141,5 +145,5 @@ def subspace(y: np.ndarray, u: np.ndarray, ok: np.ndarray, ridge: float = 1e-3) 
     Raises:
         ValueError: if there are too few gap-free rows; wait for a longer window.
     """
-    model = candidates(y, u, ok, ridge=ridge).model(y.shape[1]).outputs_as_states()
+    model = subspace_states(y, u, ok, ridge=ridge).model(y.shape[1]).outputs_as_states()
     return model.A, model.B

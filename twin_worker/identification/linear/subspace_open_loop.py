@@ -10,7 +10,7 @@ import numpy as np
 
 from twin_worker.identification.linear.black_box_prediction_error import fit_inputs
 from twin_worker.identification.linear.state_space import StateSpace
-from twin_worker.identification.linear.subspace import instructive
+from twin_worker.identification.linear.subspace import check_excitation
 
 DEPTH = 12  # q: block rows of the Hankel matrices [-]
 
@@ -30,18 +30,22 @@ def projection(
         ValueError: if the data are too short or not exciting enough; the message contains the remedy.
     """
     ok = np.ones(len(y), bool) if ok is None else ok
-    instructive(y, u, ok)
+    check_excitation(y, u, ok)
     l, m = y.shape[1], u.shape[1]
     if not 1 <= order <= l * (depth - 1):
         raise ValueError(f"projection: found order {order}, expected 1..{l * (depth - 1)}; lower it or raise the depth")
-    whole = np.lib.stride_tricks.sliding_window_view(ok, depth).all(axis=1) if len(ok) >= depth else np.zeros(0, bool)
-    if whole.sum() < 2 * depth * (l + m):
-        raise ValueError(f"projection: found {whole.sum()} unbroken rows, needs {2 * depth * (l + m)}; wait for more")
-    Y, U = (_hankel(data, depth)[:, whole] for data in (y, u))  # eq. 9
+    unbroken = (
+        np.lib.stride_tricks.sliding_window_view(ok, depth).all(axis=1) if len(ok) >= depth else np.zeros(0, bool)
+    )
+    if unbroken.sum() < 2 * depth * (l + m):
+        raise ValueError(
+            f"projection: found {unbroken.sum()} unbroken rows, needs {2 * depth * (l + m)}; wait for more"
+        )
+    Y, U = (_hankel(data, depth)[:, unbroken] for data in (y, u))  # eq. 9
     # eq. 11-13: projection of Y orthogonal to U by the triangular factor; the projector itself would be N x N
     R = np.asarray(np.linalg.qr(np.vstack([U, Y]).T, mode="r")).T
-    left, singular, _ = np.linalg.svd(R[depth * m :, depth * m :])
-    O = left[:, :order] * np.sqrt(singular[:order])  # eq. 14
+    left_vectors, singular, _ = np.linalg.svd(R[depth * m :, depth * m :])
+    O = left_vectors[:, :order] * np.sqrt(singular[:order])  # eq. 14
     C, A = O[:l], np.linalg.lstsq(O[:-l], O[l:], rcond=None)[0]  # eq. 7
     start = StateSpace.of(A, np.zeros((order, m)), C)
     return fit_inputs(start.stabilised(), y, u, ok=ok)  # eq. 15

@@ -5,7 +5,7 @@ from typing import Any
 from fleet.report.ink import GRID, INK, MUTED
 
 
-def house(ax: Any, title: str) -> None:
+def style_axes(ax: Any, title: str) -> None:
     """Apply title and page colours to a panel."""
     ax.set_title(title, fontsize=9, color=INK)
     ax.tick_params(labelsize=8, colors=MUTED)

@@ -7,45 +7,47 @@ import numpy as np
 from fleet.physics import point_mass as H
 from fleet.window import Window
 from twin_worker.estimation.wind_filter import DRIFT, DRIFT_S, GUST, GUST_S
-from twin_worker.identification.fixed_wing.point_mass_model import Hybrid, airspeed_of
-from twin_worker.prediction.closed_loop import Flown, Situation, Start, at_times
+from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel, airspeed_of
+from twin_worker.prediction.closed_loop import InitialCondition, PredictionContext, Rollout, sample_rollout
 
-_SPEED_ROWS = 8  # rows of 0.1 s in the mean airspeed at the start
-_LOOK_ROWS = 60  # rows of the window that they use
+_AIRSPEED_ROWS = 8  # rows of 0.1 s in the mean airspeed at the start
+_WINDOW_ROWS = 60  # rows of the window that they use
 _GROUND_ROWS, _CLIMB_ROWS = 3, 12  # rows of 0.04 s in the means of ground velocity and climb
-_STEEPEST = 0.5  # largest sine of the path angle at the start [-]
-_NEAREST = 10.0  # minimum reference height of the wind profile [m]
-_NO_CHANCE = np.empty((0, 4))
+_MAX_PATH_SINE = 0.5  # largest sine of the path angle at the start [-]
+_MIN_WIND_HEIGHT = 10.0  # minimum reference height of the wind profile [m]
+_NO_NOISE = np.empty((0, 4))
 
 
-def start_of(now: Situation, good: Window) -> np.ndarray:
+def start_state(context: PredictionContext, window: Window) -> np.ndarray:
     """Return the state at the end of the window, (N_START,)."""
-    _, airspeed = airspeed_of(good.part(max(len(good) - _LOOK_ROWS, 0), len(good)), now.history, now.wind.scale)
-    V = float(airspeed[-_SPEED_ROWS:].mean())
+    _, airspeed = airspeed_of(
+        window.part(max(len(window) - _WINDOW_ROWS, 0), len(window)), context.history, context.wind_filter.scale
+    )
+    V = float(airspeed[-_AIRSPEED_ROWS:].mean())
     out = np.empty(H.N_START)
-    out[:3], out[H.V] = good.p[-1], V
-    out[[H.PHI, H.THETA, H.PSI, H.P_RATE, H.Q_RATE]] = good.x[-1, [6, 7, 8, 3, 4]]
-    climb = -float(good.v[-_CLIMB_ROWS:, 2].mean())
-    out[H.GAMMA] = asin(float(np.clip(climb / max(V, 5.0), -_STEEPEST, _STEEPEST)))
-    out[H.THR] = good.u[-1, 3]
+    out[:3], out[H.V] = window.p[-1], V
+    out[[H.PHI, H.THETA, H.PSI, H.P_RATE, H.Q_RATE]] = window.x[-1, [6, 7, 8, 3, 4]]
+    climb = -float(window.v[-_CLIMB_ROWS:, 2].mean())
+    out[H.GAMMA] = asin(float(np.clip(climb / max(V, 5.0), -_MAX_PATH_SINE, _MAX_PATH_SINE)))
+    out[H.THROTTLE] = window.u[-1, 3]
     return out
 
 
-def air_of(now: Situation, start: np.ndarray) -> np.ndarray:
+def air_state(context: PredictionContext, start: np.ndarray) -> np.ndarray:
     """Return mean wind, drift and biases, (N_AIR,), without the unexplained ground velocity."""
     air = np.zeros(H.N_AIR)
-    air[H.W_N : H.DRIFT_E + 1] = now.wind.state[0][2:6]
-    air[H.SCALE], air[H.D_PSI] = now.wind.scale, now.wind.heading_bias
+    air[H.W_N : H.DRIFT_E + 1] = context.wind_filter.state[0][2:6]
+    air[H.SCALE], air[H.D_PSI] = context.wind_filter.scale, context.wind_filter.heading_bias
     air[[H.DRIFT, H.DRIFT_S, H.REST, H.REST_S]] = DRIFT, DRIFT_S, GUST, GUST_S
-    home = next((item for item in now.onboard.items if item.seq == 0), None)
+    home = next((item for item in context.onboard.items if item.seq == 0), None)
     if home is not None:
-        air[H.GROUND] = now.origin.alt_mm * 1e-3 - home.alt_m
+        air[H.GROUND] = context.origin.alt_mm * 1e-3 - home.alt_m
         height = air[H.GROUND] - start[2]
-        air[H.H_0] = max(height, _NEAREST) if height > 0 else 0.0
+        air[H.H_0] = max(height, _MIN_WIND_HEIGHT) if height > 0 else 0.0
     return air
 
 
-def rest(start: np.ndarray, air: np.ndarray, v: np.ndarray) -> np.ndarray:
+def unexplained_velocity(start: np.ndarray, air: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return the ground velocity v (..., 2) minus airspeed and mean wind, NED [m/s].
 
     Args:
@@ -58,27 +60,29 @@ def rest(start: np.ndarray, air: np.ndarray, v: np.ndarray) -> np.ndarray:
     return v - along - air[..., [H.W_N, H.W_E]] - air[..., [H.DRIFT_N, H.DRIFT_E]]
 
 
-def ground_velocity(good: Window) -> np.ndarray:
+def ground_velocity(window: Window) -> np.ndarray:
     """Return the newest ground velocity, north and east, (2,) [m/s]."""
-    return good.v[-_GROUND_ROWS:, :2].mean(axis=0)
+    return window.v[-_GROUND_ROWS:, :2].mean(axis=0)
 
 
-def begin(now: Situation, good: Window) -> tuple[np.ndarray, np.ndarray]:
+def start_and_air(context: PredictionContext, window: Window) -> tuple[np.ndarray, np.ndarray]:
     """Return state (N_START,) and air (N_AIR,) at the end of the window."""
-    start = start_of(now, good)
-    air = air_of(now, start)
-    air[[H.REST_N, H.REST_E]] = rest(start, air, ground_velocity(good))
-    if now.onboard.instead is not None and now.onboard.instead.speed is not None:
-        start[H.V] = now.onboard.instead.speed
+    start = start_state(context, window)
+    air = air_state(context, start)
+    air[[H.REST_N, H.REST_E]] = unexplained_velocity(start, air, ground_velocity(window))
+    if context.onboard.override is not None and context.onboard.override.speed is not None:
+        start[H.V] = context.onboard.override.speed
     return start, air
 
 
-def over_ground(start: np.ndarray, air: np.ndarray) -> np.ndarray:
+def model_ground_velocity(start: np.ndarray, air: np.ndarray) -> np.ndarray:
     """Return the ground velocity of a start state and its air, north and east, (2,) [m/s]."""
-    return air[[H.REST_N, H.REST_E]] - rest(start, air, np.zeros(2))
+    return air[[H.REST_N, H.REST_E]] - unexplained_velocity(start, air, np.zeros(2))
 
 
-def fly_hybrid(now: Situation, start: Start, found: Hybrid, ahead: np.ndarray) -> Flown:
+def fly_point_mass(
+    context: PredictionContext, initial: InitialCondition, model: PointMassModel, ahead: np.ndarray
+) -> Rollout:
     """Simulate the identified point-mass model; the path is nan beyond its envelope.
 
     Args:
@@ -86,9 +90,9 @@ def fly_hybrid(now: Situation, start: Start, found: Hybrid, ahead: np.ndarray) -
         model: identified model
         ahead: requested look-ahead times, rising, (k,) [s]
     """
-    ctl, par, legs = start.control
-    state, air = begin(now, start.good)
+    ctl, par, legs = initial.synchronised
+    state, air = start_and_air(context, initial.window)
     out = np.empty((int(ahead[-1] / H.STEP) + 2, 3))
     ctl = ctl.copy()
-    done = H.fly(ctl, par, legs, found.body, air, state, _NO_CHANCE, H.STEP, out)
-    return at_times(out[:done], H.STEP, start, ctl, ahead)
+    n_rows = H.simulate_route(ctl, par, legs, model.parameters, air, state, _NO_NOISE, H.STEP, out)
+    return sample_rollout(out[:n_rows], H.STEP, initial, ctl, ahead)

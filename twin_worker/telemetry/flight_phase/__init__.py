@@ -4,19 +4,19 @@ import numpy as np
 
 from fleet.window import Window
 
-MODES = ("climb", "level", "turn", "descent")
-_TURN = 0.2  # minimum mean bank of a turn [rad]
-_CLIMB = 0.7  # minimum mean vertical speed of a climb or descent [m/s]
+PHASES = ("climb", "level", "turn", "descent")
+_TURN_BANK = 0.2  # minimum mean bank of a turn [rad]
+_MIN_CLIMB_RATE = 0.7  # minimum mean vertical speed of a climb or descent [m/s]
 
 
-def mode_of(stretch: Window) -> str:
+def phase_of(window: Window) -> str:
     """Return the phase of a window: turn by mean bank, else climb or descent by mean vertical speed."""
-    bank = float(np.abs(stretch.columns(("phi",))[stretch.ok]).mean())
-    return mode_named(bank, -float(stretch.v[stretch.ok, 2].mean()))
+    bank = float(np.abs(window.columns(("phi",))[window.ok]).mean())
+    return classify_phase(bank, -float(window.v[window.ok, 2].mean()))
 
 
-def mode_named(bank: float, up: float) -> str:
+def classify_phase(bank: float, climb_rate: float) -> str:
     """Return the phase for a mean absolute bank [rad] and a mean vertical speed [m/s]."""
-    if bank > _TURN:
+    if bank > _TURN_BANK:
         return "turn"
-    return "climb" if up > _CLIMB else "descent" if up < -_CLIMB else "level"
+    return "climb" if climb_rate > _MIN_CLIMB_RATE else "descent" if climb_rate < -_MIN_CLIMB_RATE else "level"

@@ -12,15 +12,15 @@ from dataclasses import dataclass, field
 
 from twin_worker.twin.state.schedule import Work
 
-SWEEP_S = 0.05  # heavy work per sweep, CPU [s]
-LEAST_S = 1e-3  # minimum in a late sweep, so that heavy work continues [s]
-EARNED = 0.5  # share of this thread's CPU time for heavy work while sweeps are late [-]
-_GROWS = 1.2  # recovery factor per sweep on time [-]
-_SHARE = {Work.PREDICT: 1.0, Work.IDENTIFY: 0.7, Work.ENSEMBLE: 0.5}  # of the limit [-]
+WORK_PER_SWEEP_S = 0.05  # heavy work per sweep, CPU [s]
+MIN_WORK_S = 1e-3  # minimum in a late sweep, so that heavy work continues [s]
+LATE_CPU_FRACTION = 0.5  # share of this thread's CPU time for heavy work while sweeps are late [-]
+_RECOVERY_FACTOR = 1.2  # recovery factor per sweep on time [-]
+_START_FRACTION = {Work.PREDICT: 1.0, Work.IDENTIFY: 0.7, Work.ENSEMBLE: 0.5}  # of the limit [-]
 
 
 @dataclass
-class Quota:
+class ComputeBudget:
     """Heavy work that may start in one sweep; unlimited by default.
 
     Attributes:
@@ -33,56 +33,59 @@ class Quota:
     """
 
     limit: float = float("inf")
-    most: float = SWEEP_S
-    hurry: bool = False
-    behind: bool = False
-    aside: frozenset[Work] = frozenset()
+    max_limit: float = WORK_PER_SWEEP_S
+    first_prediction_pending: bool = False
+    backlog: bool = False
+    offloaded: frozenset[Work] = frozenset()
     done: Counter[Work] = field(default_factory=Counter)
     refused: Counter[Work] = field(default_factory=Counter)
     _spent: float = 0.0
-    _since: float | None = None  # start of the running work, thread CPU time [s]
-    _late: bool = False  # the previous sweep was late
-    _waits: bool = False  # a rollout was refused in the previous sweep
-    _wanted: bool = False  # a rollout was refused in this sweep
-    _swept: float = float("nan")  # CPU time of this thread at the start of the sweep [s]
+    _work_started: float | None = None  # start of the running work, thread CPU time [s]
+    _last_sweep_late: bool = False  # the previous sweep was late
+    _rollout_was_refused: bool = False  # a rollout was refused in the previous sweep
+    _rollout_refused: bool = False  # a rollout was refused in this sweep
+    _sweep_start_cpu: float = float("nan")  # CPU time of this thread at the start of the sweep [s]
 
     @property
     def limited(self) -> bool:
         """Return whether a limit applies; offline runs have none."""
         return self.limit < float("inf")
 
-    def sweep(self, *, hurry: bool = False) -> None:
+    def begin_sweep(self, *, first_prediction_pending: bool = False) -> None:
         """Begin another sweep."""
-        self.settle()
-        self._waits, self._wanted = self._wanted, False
-        self._spent, self.hurry = max(self._spent - self.limit, 0.0), hurry and self.limited
+        self.end_work()
+        self._rollout_was_refused, self._rollout_refused = self._rollout_refused, False
+        self._spent, self.first_prediction_pending = (
+            max(self._spent - self.limit, 0.0),
+            first_prediction_pending and self.limited,
+        )
 
     def yield_to_telemetry(self, late: bool) -> None:
         """Set the limit to a share of the last sweep's CPU time if it was late; raise it slowly otherwise."""
-        limit, now = min(self.limit, self.most), time.thread_time()
-        used, self._swept, self._late = now - self._swept, now, late
+        limit, now = min(self.limit, self.max_limit), time.thread_time()
+        used, self._sweep_start_cpu, self._last_sweep_late = now - self._sweep_start_cpu, now, late
         if not late:
-            self.limit = min(_GROWS * limit, self.most)
+            self.limit = min(_RECOVERY_FACTOR * limit, self.max_limit)
         elif used == used:
-            self.limit = min(max(EARNED * used, LEAST_S), self.most)
+            self.limit = min(max(LATE_CPU_FRACTION * used, MIN_WORK_S), self.max_limit)
 
-    def settle(self) -> None:
+    def end_work(self) -> None:
         """Stop the measurement of the running work, if any."""
-        if self._since is not None:
-            self._spent += time.thread_time() - self._since
-            self._since = None
+        if self._work_started is not None:
+            self._spent += time.thread_time() - self._work_started
+            self._work_started = None
 
-    def grants(self, work: Work) -> bool:
+    def try_acquire(self, work: Work) -> bool:
         """Return whether due work may start, and start its measurement."""
-        if work in self.aside or (self.behind and self.limited):
+        if work in self.offloaded or (self.backlog and self.limited):
             return False
         if work is Work.RENEW:
             return True
-        self.settle()
-        first = self.hurry or (self._late and self._waits)
-        granted = self._spent < self.limit * _SHARE[work] and not (first and work is not Work.PREDICT)
-        self._wanted |= work is Work.PREDICT and not granted
+        self.end_work()
+        rollouts_only = self.first_prediction_pending or (self._last_sweep_late and self._rollout_was_refused)
+        granted = self._spent < self.limit * _START_FRACTION[work] and not (rollouts_only and work is not Work.PREDICT)
+        self._rollout_refused |= work is Work.PREDICT and not granted
         (self.done if granted else self.refused)[work] += 1
         if granted:
-            self._since = time.thread_time()
+            self._work_started = time.thread_time()
         return granted

@@ -6,16 +6,16 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from twin_worker.estimation.wind_filter import WindFilter
-from twin_worker.identification.fixed_wing.derivatives_model import Coupled
+from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
 from twin_worker.identification.fixed_wing.plant import Plant
-from twin_worker.identification.fixed_wing.point_mass_model import Hybrid
+from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel
 
-EVERY_S = 10.0  # between checkpoints [s]
-MOST = 15  # number of checkpoints kept; covers the telemetry history
+CHECKPOINT_PERIOD_S = 10.0  # between checkpoints [s]
+MAX_CHECKPOINTS = 15  # number of checkpoints kept; covers the telemetry history
 
 
 @dataclass(frozen=True)
-class Mark:
+class Checkpoint:
     """State of one twin at one instant.
 
     Attributes:
@@ -26,13 +26,13 @@ class Mark:
     """
 
     t: float
-    wind: WindFilter
-    plant: Coupled | None
-    hybrid: Hybrid | None
+    wind_filter: WindFilter
+    derivatives_model: DerivativesModel | None
+    point_mass: PointMassModel | None
 
 
 @dataclass(frozen=True)
-class Extension:
+class ActiveEffects:
     """Fault effects added to the active model: their names, and the onset [s since 1970]."""
 
     names: str
@@ -42,12 +42,14 @@ class Extension:
         return f"{self.names} since {datetime.fromtimestamp(self.onset, UTC):%H:%M:%S} UTC"
 
 
-def mark(t: float, wind: WindFilter, plants: tuple[Plant | None, ...], hybrid: Hybrid | None) -> Mark:
+def create_checkpoint(
+    t: float, wind_filter: WindFilter, models: tuple[Plant | None, ...], point_mass: PointMassModel | None
+) -> Checkpoint:
     """Create a checkpoint with the first stability-and-control model among `models`."""
-    coupled = next((one for one in plants if isinstance(one, Coupled)), None)
-    return Mark(t, deepcopy(wind), coupled, hybrid)
+    derivatives_model = next((model for model in models if isinstance(model, DerivativesModel)), None)
+    return Checkpoint(t, deepcopy(wind_filter), derivatives_model, point_mass)
 
 
-def before(marks: Iterable[Mark], t: float) -> Mark | None:
+def latest_before(checkpoints: Iterable[Checkpoint], t: float) -> Checkpoint | None:
     """Return the newest checkpoint before time t [s since 1970]; None if there is none."""
-    return max((one for one in marks if one.t < t), key=lambda one: one.t, default=None)
+    return max((checkpoint for checkpoint in checkpoints if checkpoint.t < t), key=lambda one: one.t, default=None)

@@ -3,33 +3,32 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from fleet.contract import SENTENCES, Event
+from fleet.contract import EVENT_TEXTS, Event
 
 if TYPE_CHECKING:
     from twin_worker.twin.state.state import Twin
 
 
 @dataclass(frozen=True)
-class Note:
+class FlightEvent:
     """An event, its time [s since 1970], and its message with details."""
 
     event: Event
     t: float
-    said: str
+    message: str
 
 
-def note(twin: "Twin", event: Event, t: float, particulars: str = "") -> None:
+def record_event(twin: "Twin", event: Event, t: float, details: str = "") -> None:
     """Record an event and request a new prediction."""
-    said = SENTENCES[event] + (f" ({particulars})" if particulars else "")
-    twin.noted, twin.predict_t = Note(event, t if np.isfinite(t) else 0.0, said), -np.inf
+    twin.prediction.add_event(event, t, EVENT_TEXTS[event] + (f" ({details})" if details else ""))
+    twin.prediction.predict_timer.expire()
 
 
-def void(twin: "Twin", event: Event | None, t: float, particulars: str = "") -> None:
+def invalidate_prediction(twin: "Twin", event: Event | None, t: float, details: str = "") -> None:
     """Invalidate the running prediction as of time `t`; record `event` unless it is None."""
-    twin.since, twin.predict_t, twin.spread_t, twin.base, twin.put_off = t, -np.inf, -np.inf, None, None
-    twin.record.forget()
-    twin.contest.forget()
+    twin.onboard.plan_changed(t)
+    twin.prediction.invalidate()
+    twin.confidence.tracker.censor_open()
+    twin.prediction.selector.clear()
     if event is not None:
-        note(twin, event, t, particulars)
+        record_event(twin, event, t, details)

@@ -4,7 +4,7 @@ import argparse
 from dataclasses import dataclass, fields
 from enum import StrEnum
 
-SOON = 0.9  # share of a period after which dependent work is due, so that jitter does not skip a cycle [-]
+EARLY_FRACTION = 0.9  # share of a period after which dependent work is due, so that jitter does not skip a cycle [-]
 
 
 class Work(StrEnum):
@@ -17,7 +17,7 @@ class Work(StrEnum):
 
 
 @dataclass(frozen=True)
-class Pace:
+class Schedule:
     """Periods of work, and the size of an ensemble.
 
     Attributes:
@@ -38,28 +38,28 @@ class Pace:
 
 
 _LIMITS = {"members": (12, 1000), "span": (10.0, 180.0)}  # of all other fields: `_PERIOD_LIMITS`
-_PERIODS = (0.02, 3600.0)  # [s]
+_PERIOD_LIMITS = (0.02, 3600.0)  # [s]
 
 
-def read_pace(text: str) -> Pace:
+def parse_schedule(text: str) -> Schedule:
     """Parse `--pace predict=2,identify=5,members=50`.
 
     Raises:
         argparse.ArgumentTypeError: when a name or a value is invalid; argparse prints the message.
     """
-    names = [field.name for field in fields(Pace)]
-    found = {}
+    names = [field.name for field in fields(Schedule)]
+    values = {}
     for part in text.split(","):
         name, _, seconds = part.partition("=")
         try:
-            found[name] = float(seconds)
+            values[name] = float(seconds)
         except ValueError:
-            found[name] = float("nan")
-        low, high = _LIMITS.get(name, _PERIODS)
-        if name not in names or not low <= found[name] <= high:
-            said = (
+            values[name] = float("nan")
+        low, high = _LIMITS.get(name, _PERIOD_LIMITS)
+        if name not in names or not low <= values[name] <= high:
+            error_text = (
                 f"found {part!r}, expected one of {', '.join(names)}, {low:g} to {high:g}, e.g. identify=5; correct it"
             )
-            raise argparse.ArgumentTypeError(said)
-    members = int(found.pop("members", Pace.members))
-    return Pace(**found, members=members)  # type: ignore[arg-type]
+            raise argparse.ArgumentTypeError(error_text)
+    members = int(values.pop("members", Schedule.members))
+    return Schedule(**values, members=members)  # type: ignore[arg-type]

@@ -7,25 +7,25 @@ import numpy as np
 
 from fleet.autopilots import copter, greybox
 from fleet.contract import Mission
-from twin_worker.prediction import kinematic as wing
-from twin_worker.prediction.autopilot_parameters import Control, on_rotors
+from twin_worker.prediction import kinematic
+from twin_worker.prediction.autopilot_parameters import ControllerTwin, multirotor_controller
 from twin_worker.prediction.multirotor import fit, rollout
-from twin_worker.prediction.route_override import Instead
-from twin_worker.telemetry.hover_detection import SETTLE_S, lifted
-from twin_worker.telemetry.track import Track, track
+from twin_worker.prediction.route_override import RouteOverride
+from twin_worker.telemetry.hover_detection import SETTLING_S, hovering_mask
+from twin_worker.telemetry.track import Track, resample_track
 from twin_worker.twin.state.state import ROUTE_MODES, Twin
 
-NO_WINGS = ("multirotor", "helicopter")
+WINGLESS = ("multirotor", "helicopter")
 QUADPLANE = "quadplane"
-WINGS = ("fixed_wing", QUADPLANE)
-_BACK_S = 130.0  # flight time used to fit the kinematic models [s]
-_VTOL = (84, 85)  # MAV_CMD: NAV_VTOL_TAKEOFF, NAV_VTOL_LAND
-_RECENT = 11  # rows used for a multirotor's velocity and acceleration
-_STEERED_S = 6.0  # a multirotor in a hold mode that still moves after this time is under manual control [s]
+WINGED = ("fixed_wing", QUADPLANE)
+_FIT_WINDOW_S = 130.0  # flight time used to fit the kinematic models [s]
+_VTOL_COMMANDS = (84, 85)  # MAV_CMD: NAV_VTOL_TAKEOFF, NAV_VTOL_LAND
+_VELOCITY_ROWS = 11  # rows used for a multirotor's velocity and acceleration
+_MANUAL_AFTER_S = 6.0  # a multirotor in a hold mode that still moves after this time is under manual control [s]
 
 
 @dataclass(frozen=True)
-class Flight:
+class PathForecast:
     """A predicted path on the route, or the reason why there is none.
 
     Attributes:
@@ -41,135 +41,170 @@ class Flight:
     law: str
     seq: int
     sentence: str
-    control: Control | None = None
+    control: ControllerTwin | None = None
 
 
-def nothing(sentence: str, seq: int = -1) -> Flight:
+def no_prediction(sentence: str, seq: int = -1) -> PathForecast:
     """Return a forecast without a path, with the reason."""
-    return Flight(None, "", "", seq, sentence)
+    return PathForecast(None, "", "", seq, sentence)
 
 
-def seen(twin: Twin, seconds: float = _BACK_S, *, turned: bool = True) -> Track | None:
+def recent_track(twin: Twin, seconds: float = _FIT_WINDOW_S, *, with_attitude: bool = True) -> Track | None:
     """Return the recent track from positions and velocities; `with_attitude` adds the attitude."""
-    assert twin.origin is not None
-    return track(twin.history, twin.origin, until=twin.history.newest, seconds=seconds, turned=turned)
+    assert twin.telemetry.origin is not None
+    return resample_track(
+        twin.telemetry.history,
+        twin.telemetry.origin,
+        until=twin.telemetry.history.newest,
+        seconds=seconds,
+        with_attitude=with_attitude,
+    )
 
 
-def hangs(twin: Twin) -> bool:
+def is_hovering(twin: Twin) -> bool:
     """Return whether the aircraft hovers on rotors now, or is about to by its mission."""
-    if twin.vehicle in NO_WINGS:
+    if twin.vehicle in WINGLESS:
         return True
     if twin.vehicle != QUADPLANE:
         return False
-    now = twin.history.newest
-    at = np.linspace(now - SETTLE_S, now, 7)
-    if lifted(at, twin.history, twin.received, twin.modes).any():
+    newest = twin.telemetry.history.newest
+    times = np.linspace(newest - SETTLING_S, newest, 7)
+    if hovering_mask(times, twin.telemetry.history, twin.received_params, twin.onboard.mode_changes).any():
         return True
-    item = command_in_force(twin)
-    return twin.status is not None and twin.status.mode in ROUTE_MODES and item in _VTOL
+    command = active_command(twin)
+    return twin.onboard.status is not None and twin.onboard.status.mode in ROUTE_MODES and command in _VTOL_COMMANDS
 
 
-def command_in_force(twin: Twin) -> int:
+def active_command(twin: Twin) -> int:
     """Return the command of the active mission item; 0 unknown."""
-    seq = rollout.item_in_force(twin.history.newest, twin.history.look("leg"), twin.mission)
-    items = twin.mission.items if twin.mission else ()
+    seq = rollout.item_in_force(
+        twin.telemetry.history.newest, twin.telemetry.history.rows_since("leg"), twin.onboard.mission
+    )
+    items = twin.onboard.mission.items if twin.onboard.mission else ()
     return next((item.command for item in items if item.seq == seq), 0) if isfinite(seq) else 0
 
 
-def _board(twin: Twin, flown: Track, instead: Instead | None = None) -> rollout.Onboard:
-    params, mission, autopilot = twin.received, twin.mission, twin.status.autopilot if twin.status else ""
-    if instead is not None:
-        params = params | dict(instead.asked)
-        mission = Mission(uav=twin.uav, t=twin.history.newest, items=instead.items, seq=instead.seq)
-    board = rollout.onboard(
-        mission, params, autopilot, twin.since, origin=twin.origin, flown=flown, prefix=_prefix(twin)
+def _multirotor_config(twin: Twin, recent: Track, override: RouteOverride | None = None) -> rollout.MultirotorConfig:
+    params, mission, autopilot = (
+        twin.received_params,
+        twin.onboard.mission,
+        twin.onboard.status.autopilot if twin.onboard.status else "",
     )
-    return rollout.with_wings(board) if _prefix(twin) else board
+    if override is not None:
+        params = params | dict(override.parameters)
+        mission = Mission(uav=twin.config.uav, t=twin.telemetry.history.newest, items=override.items, seq=override.seq)
+    config = rollout.multirotor_config(
+        mission,
+        params,
+        autopilot,
+        twin.onboard.plan_changed_t,
+        origin=twin.telemetry.origin,
+        flown=recent,
+        prefix=_param_prefix(twin),
+    )
+    return rollout.with_wing_limits(config) if _param_prefix(twin) else config
 
 
-def _prefix(twin: Twin) -> str:
+def _param_prefix(twin: Twin) -> str:
     return "Q_" if twin.vehicle == QUADPLANE else ""
 
 
-def _wing_board(twin: Twin) -> wing.Board:
-    assert twin.origin is not None
-    items = twin.mission.items if twin.mission else ()
-    wind = twin.wind.wind if np.isfinite(twin.wind.t) else None
-    return wing.Board(items, twin.received, twin.since, twin.origin, wind, twin.instead, twin.first_item)
+def _fixed_wing_config(twin: Twin) -> kinematic.KinematicConfig:
+    assert twin.telemetry.origin is not None
+    items = twin.onboard.mission.items if twin.onboard.mission else ()
+    wind = twin.environment.wind.wind if np.isfinite(twin.environment.wind.t) else None
+    return kinematic.KinematicConfig(
+        items,
+        twin.received_params,
+        twin.onboard.plan_changed_t,
+        twin.telemetry.origin,
+        wind,
+        twin.prediction.override,
+        twin.first_item,
+    )
 
 
-def compare_with_flight(twin: Twin) -> None:
+def fit_kinematic_models(twin: Twin) -> None:
     """Fit the parameters of the kinematic models to the last minutes of flight."""
-    if twin.why_no_route() or (twin.vehicle not in NO_WINGS and (twin.vehicle not in WINGS or twin.plant is not None)):
+    if twin.no_route_reason() or (
+        twin.vehicle not in WINGLESS and (twin.vehicle not in WINGED or twin.models.active_model is not None)
+    ):
         return
-    flown = seen(twin)
-    if flown is None or len(flown) < 100:
+    recent = recent_track(twin)
+    if recent is None or len(recent) < 100:
         return
-    seq = rollout.items_in_force(flown.t, twin.history.look("leg"), twin.mission)
-    if twin.vehicle in NO_WINGS:
-        twin.rotor = fit.compare(flown, seq, _board(twin, flown), twin.rotor)
-    elif not hangs(twin):
-        twin.grey = wing.compare(flown, seq, _wing_board(twin), twin.grey)
+    seq = rollout.items_in_force(recent.t, twin.telemetry.history.rows_since("leg"), twin.onboard.mission)
+    if twin.vehicle in WINGLESS:
+        config = _multirotor_config(twin, recent)
+        twin.models.store_multirotor(fit.fit_model(recent, seq, config, twin.models.multirotor))
+    elif not is_hovering(twin):
+        model = kinematic.fit_model(recent, seq, _fixed_wing_config(twin), twin.models.kinematic)
+        twin.models.store_kinematic(model)
 
 
-def fly_kind(twin: Twin, flown: Track, ahead: np.ndarray) -> Flight:
+def predict_without_model(twin: Twin, recent: Track, ahead: np.ndarray) -> PathForecast:
     """Predict the path on the route with the kinematic model of this vehicle class."""
-    whole = flown.whole()
-    if len(whole) < 20:
-        return nothing("less than 2 s of unbroken positions")
-    if hangs(twin):
-        return _fly_rotor(twin, whole, ahead)
-    if twin.vehicle not in WINGS:
-        return nothing(f"vehicle {twin.vehicle}: no controller model available")
-    if why := twin.why_no_route():
-        return nothing(why)
+    unbroken = recent.unbroken_tail()
+    if len(unbroken) < 20:
+        return no_prediction("less than 2 s of unbroken positions")
+    if is_hovering(twin):
+        return _predict_multirotor(twin, unbroken, ahead)
+    if twin.vehicle not in WINGED:
+        return no_prediction(f"vehicle {twin.vehicle}: no controller model available")
+    if reason := twin.no_route_reason():
+        return no_prediction(reason)
     if twin.vehicle == QUADPLANE:
-        hung = np.flatnonzero(lifted(whole.t, twin.history, twin.received, twin.modes))
-        whole = whole.part(int(hung[-1]) + 1 if len(hung) else 0, len(whole))
-    seq = rollout.items_in_force(whole.t, twin.history.look("leg"), twin.mission)
-    made = wing.fly(whole, seq, _wing_board(twin), twin.grey, ahead)
-    if made.path is None:
-        return nothing(made.sentence, made.seq)
-    said = f"{wing.said(twin.grey)}. {made.sentence}".strip(". ")
-    return Flight(made.path, "greybox", greybox.LAW, made.seq, said, made.law)
+        hover_rows = np.flatnonzero(
+            hovering_mask(unbroken.t, twin.telemetry.history, twin.received_params, twin.onboard.mode_changes)
+        )
+        unbroken = unbroken.part(int(hover_rows[-1]) + 1 if len(hover_rows) else 0, len(unbroken))
+    seq = rollout.items_in_force(unbroken.t, twin.telemetry.history.rows_since("leg"), twin.onboard.mission)
+    forecast = kinematic.fly(unbroken, seq, _fixed_wing_config(twin), twin.models.kinematic, ahead)
+    if forecast.path is None:
+        return no_prediction(forecast.sentence, forecast.seq)
+    text = f"{kinematic.describe(twin.models.kinematic)}. {forecast.sentence}".strip(". ")
+    return PathForecast(forecast.path, "greybox", greybox.LAW, forecast.seq, text, forecast.controller)
 
 
-def _at_speed(flown: Track, instead: Instead) -> Track:
+def _with_speed_override(recent: Track, override: RouteOverride) -> Track:
     """Return the track with the overridden speed in its newest rows."""
-    if instead.speed is None:
-        return flown
-    v = flown.v.copy()
-    v[-_RECENT:] = instead.at_speed(v[-1], float(np.nan_to_num(flown.euler[-1, 2])))
-    return replace(flown, v=v)
+    if override.speed is None:
+        return recent
+    v = recent.v.copy()
+    v[-_VELOCITY_ROWS:] = override.scale_to_speed(v[-1], float(np.nan_to_num(recent.euler[-1, 2])))
+    return replace(recent, v=v)
 
 
-def _fly_rotor(twin: Twin, flown: Track, ahead: np.ndarray) -> Flight:
-    mode = twin.status.mode if twin.status else ""
-    board = _board(twin, flown, twin.instead)
-    asked = twin.instead.asked if twin.instead else {}
-    control = on_rotors(twin.received, _prefix(twin), board.limit, asked)
-    if twin.status is None or not twin.status.armed:
-        return nothing("not armed")
+def _predict_multirotor(twin: Twin, recent: Track, ahead: np.ndarray) -> PathForecast:
+    mode = twin.onboard.status.mode if twin.onboard.status else ""
+    config = _multirotor_config(twin, recent, twin.prediction.override)
+    overridden = twin.prediction.override.parameters if twin.prediction.override else {}
+    control = multirotor_controller(twin.received_params, _param_prefix(twin), config.limit, overridden)
+    if twin.onboard.status is None or not twin.onboard.status.armed:
+        return no_prediction("not armed")
     if mode in rollout.HOLD_MODES:
-        if twin.history.newest - twin.since > _STEERED_S and np.linalg.norm(flown.v[-20:].mean(axis=0)) > 1.0:
-            return nothing(f"mode {mode}, but under manual control")
-        still = rollout.hold_still(flown, board, twin.rotor, ahead)
-        return Flight(still, "copter", copter.LAW, -1, f"mode {mode} holds position", control)
-    if mode in rollout.RETURN_MODES and twin.vehicle in NO_WINGS:
-        path = rollout.fly_home(flown, board, twin.rotor, ahead)
-        said = f"returns to launch; {rollout.said(board, twin.rotor)}"
+        if (
+            twin.telemetry.history.newest - twin.onboard.plan_changed_t > _MANUAL_AFTER_S
+            and np.linalg.norm(recent.v[-20:].mean(axis=0)) > 1.0
+        ):
+            return no_prediction(f"mode {mode}, but under manual control")
+        hover_path = rollout.stop_and_hold(recent, config, twin.models.multirotor, ahead)
+        return PathForecast(hover_path, "copter", copter.LAW, -1, f"mode {mode} holds position", control)
+    if mode in rollout.RETURN_MODES and twin.vehicle in WINGLESS:
+        path = rollout.fly_home(recent, config, twin.models.multirotor, ahead)
+        text = f"returns to launch; {rollout.describe(config, twin.models.multirotor)}"
         if path is None:
-            return nothing("home position unknown")
-        return Flight(path, "copter", copter.LAW, -1, said, control)
-    if why := twin.why_no_route():
-        return nothing(why)
-    seq = rollout.items_in_force(flown.t, twin.history.look("leg"), twin.mission)
-    if twin.instead is not None:
-        seq[-1], flown = twin.instead.seq, _at_speed(flown, twin.instead)
-    path, wrong = rollout.fly_route(flown, seq, board, twin.rotor, ahead)
-    at = int(seq[-1]) if np.isfinite(seq[-1]) else -1
+            return no_prediction("home position unknown")
+        return PathForecast(path, "copter", copter.LAW, -1, text, control)
+    if reason := twin.no_route_reason():
+        return no_prediction(reason)
+    seq = rollout.items_in_force(recent.t, twin.telemetry.history.rows_since("leg"), twin.onboard.mission)
+    if twin.prediction.override is not None:
+        seq[-1], recent = twin.prediction.override.seq, _with_speed_override(recent, twin.prediction.override)
+    path, problem = rollout.fly_route(recent, seq, config, twin.models.multirotor, ahead)
+    item = int(seq[-1]) if np.isfinite(seq[-1]) else -1
     if path is None:
-        return nothing(wrong, at)
-    hung = "hovering on rotors; " if twin.vehicle == QUADPLANE else ""
-    said = " ".join(filter(None, (hung + rollout.said(board, twin.rotor), wrong)))
-    return Flight(path, "copter", copter.LAW, at, said, control)
+        return no_prediction(problem, item)
+    hover_text = "hovering on rotors; " if twin.vehicle == QUADPLANE else ""
+    text = " ".join(filter(None, (hover_text + rollout.describe(config, twin.models.multirotor), problem)))
+    return PathForecast(path, "copter", copter.LAW, item, text, control)

@@ -4,138 +4,168 @@ import numpy as np
 
 from fleet.contract import Alert, AlertKind, Prediction
 from fleet.frames import Origin, to_ned
-from twin_worker.alerts.feasibility import Now, ability, achievable
-from twin_worker.alerts.gaussian_forecast import Forecast, forecast
-from twin_worker.alerts.geofence import fence, leaves
-from twin_worker.alerts.ground_clearance import ROTORS_M, WINGS_M, above, sinks
-from twin_worker.alerts.hysteresis import Finding
-from twin_worker.confidence.table_files import GUESSED
-from twin_worker.prediction.closed_loop import unrolled
+from twin_worker.alerts.feasibility import MissionState, feasibility_hazard, read_limits
+from twin_worker.alerts.gaussian_forecast import GaussianForecast, to_gaussian
+from twin_worker.alerts.geofence import geofence_hazard, read_geofence
+from twin_worker.alerts.ground_clearance import (
+    MIN_HEIGHT_ROTORS_M,
+    MIN_HEIGHT_WINGS_M,
+    ground_hazard,
+    height_above_home,
+)
+from twin_worker.alerts.hysteresis import HazardEstimate
+from twin_worker.confidence.table_files import UNCALIBRATED
+from twin_worker.prediction.closed_loop import cached_route
 from twin_worker.prediction.multirotor.rollout import RETURN_MODES
 from twin_worker.twin.state.state import Twin
-from twin_worker.twin.state.vehicle_class import WINGS, hangs
+from twin_worker.twin.state.vehicle_class import WINGED, is_hovering
 
 _SHORT_S, _LONG_S = 10.0, 12.0  # an alert is raised below the first confidence horizon and cleared above the second [s]
-_TOLD = 30  # minimum number of scored predictions; below it, the 90 % horizon comes from the prior table [-]
-_TURNING_S = 15.0  # ground and geofence look-ahead of turn-rate predictions [s]
+_MIN_SCORED = 30  # minimum number of scored predictions; below it, the 90 % horizon comes from the prior table [-]
+_TURN_RATE_REACH_S = 15.0  # ground and geofence look-ahead of turn-rate predictions [s]
 _REACH_S = 90.0  # maximum look-ahead; beyond it, the tube is wider than usual geofence margins [s]
-_GUESSED_S = 30.0  # look-ahead for an uncalibrated tube [s]
-_BETTER_S = 20.0  # on a mission, turn-rate predictions raise alerts only after this time without a better method [s]
-_ACHIEVABLE_EVERY_S = 5.0
-_LANDING = (21, 85, 189)  # MAV_CMD: NAV_LAND, NAV_VTOL_LAND, DO_LAND_START
-_RETURN, _LAST_NAV = 20, 95  # MAV_CMD
-_ABOUT_TO = 3  # navigation items, the active one included, in which a landing suppresses ground alerts [-]
+_DEFAULT_REACH_S = 30.0  # look-ahead for an uncalibrated tube [s]
+_TURN_RATE_GRACE_S = (
+    20.0  # on a mission, turn-rate predictions raise alerts only after this time without a better method [s]
+)
+_FEASIBILITY_PERIOD_S = 5.0
+_LANDING_COMMANDS = (21, 85, 189)  # MAV_CMD: NAV_LAND, NAV_VTOL_LAND, DO_LAND_START
+_RETURN_COMMAND, _LAST_NAV_COMMAND = 20, 95  # MAV_CMD
+_LANDING_LOOKAHEAD = 3  # navigation items, the active one included, in which a landing suppresses ground alerts [-]
 
 
-def link(twin: Twin, now: float, silent: float) -> list[Alert]:
-    """Raise or clear the link alert according to `twin.lost`; `silence_s` since the newest sample [s]."""
-    said = f"no sample for {silent:.1f} s; the twin predicts without telemetry"
-    return twin.ledger.judge(twin.uav, now, Finding(AlertKind.LINK_LOST, float(twin.lost), said, "link back"))
+def link_alerts(twin: Twin, now: float, silence_s: float) -> list[Alert]:
+    """Raise or clear the link alert; `silence_s` since the newest sample [s]."""
+    sentence = f"no sample for {silence_s:.1f} s; the twin predicts without telemetry"
+    return twin.alerts.alarms.update(
+        twin.config.uav,
+        now,
+        HazardEstimate(AlertKind.LINK_LOST, float(twin.telemetry.link_lost), sentence, "link back"),
+    )
 
 
-def watch(twin: Twin, now: float, made: Prediction | None) -> list[Alert]:
+def prediction_alerts(twin: Twin, now: float, prediction: Prediction | None) -> list[Alert]:
     """Evaluate all alerts for the newest prediction at data time `now`; None if there is no prediction."""
-    flight = forecast(made) if made is not None else None
-    _remember_ground(twin)
-    if flight is None or flight.made.method != "imm" or not now >= twin.turning_t:
-        twin.turning_t = now
-    findings = [_unknown(kind) for kind in (AlertKind.GROUND, AlertKind.GEOFENCE)]
-    if flight is not None:
-        guess = flight.made.method == "imm" and not twin.why_no_route() and now - twin.turning_t < _BETTER_S
-        findings = [] if guess else _dangers(twin, flight)
-    if not twin.lost:
-        findings.append(_trust(made))
-        if not twin.achievable_t <= now < twin.achievable_t + _ACHIEVABLE_EVERY_S:
-            twin.achievable_t = now
-            findings.append(_mission(twin, now))
-    return [alert for finding in findings for alert in twin.ledger.judge(twin.uav, now, finding)]
+    gaussian = to_gaussian(prediction) if prediction is not None else None
+    _update_home_fallback(twin)
+    twin.alerts.update_turn_rate(now, only=gaussian is not None and gaussian.prediction.method == "imm")
+    findings = [_not_predicted(kind) for kind in (AlertKind.GROUND, AlertKind.GEOFENCE)]
+    if gaussian is not None:
+        turn_rate_only = (
+            gaussian.prediction.method == "imm"
+            and not twin.no_route_reason()
+            and now - twin.alerts.turn_rate_only_since < _TURN_RATE_GRACE_S
+        )
+        findings = [] if turn_rate_only else _ground_and_geofence(twin, gaussian)
+    if not twin.telemetry.link_lost:
+        findings.append(_short_horizon(prediction))
+        if twin.alerts.feasibility_timer.due(now, _FEASIBILITY_PERIOD_S):
+            twin.alerts.feasibility_timer.restart(now)
+            findings.append(_mission_feasibility(twin, now))
+    return [alert for finding in findings for alert in twin.alerts.alarms.update(twin.config.uav, now, finding)]
 
 
-def _unknown(kind: AlertKind) -> Finding:
-    return Finding(kind, 0.0, "", "no longer predicted")
+def _not_predicted(kind: AlertKind) -> HazardEstimate:
+    return HazardEstimate(kind, 0.0, "", "no longer predicted")
 
 
-def _remember_ground(twin: Twin) -> None:
+def _update_home_fallback(twin: Twin) -> None:
     """Store the disarmed position as a fallback for home, and reset the maximum height."""
-    if twin.status is None or twin.status.armed:
+    if twin.onboard.status is None or twin.onboard.status.armed:
         return
-    twin.peak = -np.inf
-    _, position = twin.history.look("position", twin.history.newest - 2.0)
-    if len(position):
-        twin.stood = Origin(*map(int, position[-1]))
+    _, position = twin.telemetry.history.rows_since("position", twin.telemetry.history.newest - 2.0)
+    twin.alerts.disarmed_at(Origin(*map(int, position[-1])) if len(position) else None)
 
 
 def home(twin: Twin) -> Origin | None:
     """Return home: item 0 of an ArduPilot mission, else the last disarmed position; None if unknown."""
-    items = twin.mission.items if twin.mission is not None else ()
+    items = twin.onboard.mission.items if twin.onboard.mission is not None else ()
     first = next((item for item in items if item.seq == 0), None)
-    ardupilot = twin.status is not None and twin.status.autopilot == "ardupilot"
+    ardupilot = twin.onboard.status is not None and twin.onboard.status.autopilot == "ardupilot"
     if first is None or not ardupilot or not (first.lat_e7 or first.lon_e7) or not abs(first.alt_m) < 1e5:
-        return twin.stood
+        return twin.alerts.home_fallback
     return Origin(first.lat_e7, first.lon_e7, round(first.alt_m * 1e3))
 
 
-def _dangers(twin: Twin, flight: Forecast) -> list[Finding]:
+def _ground_and_geofence(twin: Twin, gaussian: GaussianForecast) -> list[HazardEstimate]:
     """Evaluate ground clearance and geofence; neither without a home position."""
-    base, rotors = home(twin), hangs(twin)
-    if base is None:
-        return [_unknown(AlertKind.GROUND), _unknown(AlertKind.GEOFENCE)]
-    margin = ROTORS_M if rotors else WINGS_M
-    twin.peak = max(twin.peak, float(above(flight, base)[0]))
-    until = flight.made.t + _reach_s(flight.made)
-    found = [_unknown(AlertKind.GROUND)]
-    low = twin.peak <= margin or _lands(twin, rotors)  # still taking off, possibly on rotors
-    if not low:
-        found = [sinks(flight, base, margin, until)]
-    limit = fence(_params(twin))
-    if low:
+    home_origin, on_rotors = home(twin), is_hovering(twin)
+    if home_origin is None:
+        return [_not_predicted(AlertKind.GROUND), _not_predicted(AlertKind.GEOFENCE)]
+    margin = MIN_HEIGHT_ROTORS_M if on_rotors else MIN_HEIGHT_WINGS_M
+    twin.alerts.climbed_to(float(height_above_home(gaussian, home_origin)[0]))
+    until = gaussian.prediction.t + _reach_s(gaussian.prediction)
+    findings = [_not_predicted(AlertKind.GROUND)]
+    near_ground = twin.alerts.max_height_m <= margin or _is_landing(
+        twin, on_rotors
+    )  # still taking off, possibly on rotors
+    if not near_ground:
+        findings = [ground_hazard(gaussian, home_origin, margin, until)]
+    limit = read_geofence(_params(twin))
+    if near_ground:
         limit = limit._replace(floor=-np.inf)
-    return [*found, leaves(flight, limit, base, until) if limit.limits() else _unknown(AlertKind.GEOFENCE)]
+    return [
+        *findings,
+        geofence_hazard(gaussian, limit, home_origin, until)
+        if limit.any_limit()
+        else _not_predicted(AlertKind.GEOFENCE),
+    ]
 
 
-def _reach_s(made: Prediction) -> float:
+def _reach_s(prediction: Prediction) -> float:
     """Return the look-ahead up to which a prediction is used for ground and geofence alerts [s]."""
-    if made.method == "imm":
-        return _TURNING_S
-    return _GUESSED_S if made.calibration.startswith(GUESSED) else _REACH_S
+    if prediction.method == "imm":
+        return _TURN_RATE_REACH_S
+    return _DEFAULT_REACH_S if prediction.calibration.startswith(UNCALIBRATED) else _REACH_S
 
 
-def _lands(twin: Twin, rotors: bool) -> bool:
+def _is_landing(twin: Twin, on_rotors: bool) -> bool:
     """Return whether the aircraft is landing, or is about to by its mode or mission."""
-    mode = twin.status.mode if twin.status is not None else ""
-    if "LAND" in mode or (rotors and mode in RETURN_MODES):
+    mode = twin.onboard.status.mode if twin.onboard.status is not None else ""
+    if "LAND" in mode or (on_rotors and mode in RETURN_MODES):
         return True
-    if twin.why_no_route() or twin.mission is None:
+    if twin.no_route_reason() or twin.onboard.mission is None:
         return False
-    items = sorted(twin.mission.items, key=lambda item: item.seq)
-    ahead = [item.command for item in items if item.seq >= twin.mission.seq]
-    flown = [command for command in ahead if command < _LAST_NAV or command in _LANDING][:_ABOUT_TO]
-    return any(command in _LANDING or (rotors and command == _RETURN) for command in flown)
+    items = sorted(twin.onboard.mission.items, key=lambda item: item.seq)
+    commands = [item.command for item in items if item.seq >= twin.onboard.mission.seq]
+    nav_commands = [command for command in commands if command < _LAST_NAV_COMMAND or command in _LANDING_COMMANDS][
+        :_LANDING_LOOKAHEAD
+    ]
+    return any(command in _LANDING_COMMANDS or (on_rotors and command == _RETURN_COMMAND) for command in nav_commands)
 
 
-def _trust(made: Prediction | None) -> Finding:
+def _short_horizon(prediction: Prediction | None) -> HazardEstimate:
     """Evaluate the confidence horizon of a route prediction, once enough past predictions are scored."""
-    short = 0.0
-    if made is not None and made.method != "imm" and made.held_n >= _TOLD and not made.horizon_open:
-        short = 1.0 if made.horizon_s < _SHORT_S else 0.5 if made.horizon_s < _LONG_S else 0.0
-    said = f"predictions stay within 10 % for only {made.horizon_s if made else 0.0:.0f} s"
-    return Finding(AlertKind.SHORT_HORIZON, short, said, "confidence horizon recovered")
+    level = 0.0
+    if (
+        prediction is not None
+        and prediction.method != "imm"
+        and prediction.coverage_n >= _MIN_SCORED
+        and not prediction.horizon_open
+    ):
+        level = 1.0 if prediction.horizon_s < _SHORT_S else 0.5 if prediction.horizon_s < _LONG_S else 0.0
+    sentence = f"predictions stay within 10 % for only {prediction.horizon_s if prediction else 0.0:.0f} s"
+    return HazardEstimate(AlertKind.SHORT_HORIZON, level, sentence, "confidence horizon recovered")
 
 
-def _mission(twin: Twin, now: float) -> Finding:
+def _mission_feasibility(twin: Twin, now: float) -> HazardEstimate:
     """Evaluate the feasibility of the legs ahead for a fixed wing that follows its mission."""
-    nothing = Finding(AlertKind.NOT_ACHIEVABLE, 0.0, "", "the mission is achievable")
-    _, position = twin.history.look("position", twin.history.newest - 3.0)
-    if twin.vehicle not in WINGS or twin.why_no_route() or hangs(twin) or not len(position):
-        return nothing
-    assert twin.origin is not None and twin.mission is not None
-    if twin.mission.seq < twin.first_item:
-        return nothing
-    p = to_ned(twin.origin, *position[-1:].T)[0]
-    way = unrolled(twin.mission.items, twin.mission.seq, twin.origin, _params(twin), twin.first_item)
-    wind = np.array([*twin.wind.wind[:2], twin.wind.sigma])
-    return achievable(Now(now, p, twin.origin, wind, way), ability(_params(twin), position[-1, 2] * 1e-3))
+    no_alert = HazardEstimate(AlertKind.NOT_ACHIEVABLE, 0.0, "", "the mission is achievable")
+    _, position = twin.telemetry.history.rows_since("position", twin.telemetry.history.newest - 3.0)
+    if twin.vehicle not in WINGED or twin.no_route_reason() or is_hovering(twin) or not len(position):
+        return no_alert
+    assert twin.telemetry.origin is not None and twin.onboard.mission is not None
+    if twin.onboard.mission.seq < twin.first_item:
+        return no_alert
+    p = to_ned(twin.telemetry.origin, *position[-1:].T)[0]
+    route = cached_route(
+        twin.onboard.mission.items, twin.onboard.mission.seq, twin.telemetry.origin, _params(twin), twin.first_item
+    )
+    wind = np.array([*twin.environment.wind.wind[:2], twin.environment.wind.sigma])
+    return feasibility_hazard(
+        MissionState(now, p, twin.telemetry.origin, wind, route), read_limits(_params(twin), position[-1, 2] * 1e-3)
+    )
 
 
 def _params(twin: Twin) -> dict[str, float]:
-    return twin.params.values if twin.params else {}
+    return twin.onboard.params.values if twin.onboard.params else {}

@@ -10,13 +10,15 @@ from fleet.frames import to_ned
 from fleet.physics.kernel import kernel
 from twin_worker.twin.state.state import Twin
 
-LATEST_S = 10.0  # maximum age of the continued rollout [s]
-OVERDUE_S = 150.0  # the same while the next rollout is due and waits for CPU time [s]
-_BACK_S = 10.0  # time constant of the return to the predicted path [s]
+MAX_ROLLOUT_AGE_S = 10.0  # maximum age of the continued rollout [s]
+MAX_OVERDUE_AGE_S = 150.0  # the same while the next rollout is due and waits for CPU time [s]
+_FADE_TIME_S = 10.0  # time constant of the return to the predicted path [s]
 
 
 @kernel
-def shifted(ahead: np.ndarray, path: np.ndarray, passed: float, at: np.ndarray, out: np.ndarray) -> None:
+def shift_to_position(
+    ahead: np.ndarray, path: np.ndarray, elapsed: float, position: np.ndarray, out: np.ndarray
+) -> None:
     """Compute the rest of a path, shifted to the aircraft's current position.
 
     Args:
@@ -25,22 +27,22 @@ def shifted(ahead: np.ndarray, path: np.ndarray, passed: float, at: np.ndarray, 
         position: current position, (3,) [m]
         out: positions at `ahead` from now, (k, 3) [m]; the last at most `elapsed` before the path's end
     """
-    off, k = np.zeros(3), 0
+    offset, k = np.zeros(3), 0
     for i in range(len(out)):
-        t = passed + ahead[i]
+        t = elapsed + ahead[i]
         while k < len(ahead) - 2 and ahead[k + 1] < t:
             k += 1
-        share = min(max((t - ahead[k]) / (ahead[k + 1] - ahead[k]), 0.0), 1.0)
-        fade = exp(-ahead[i] / _BACK_S)
+        fraction = min(max((t - ahead[k]) / (ahead[k + 1] - ahead[k]), 0.0), 1.0)
+        fade = exp(-ahead[i] / _FADE_TIME_S)
         for j in range(3):
-            there = path[k, j] + share * (path[k + 1, j] - path[k, j])
+            nominal = path[k, j] + fraction * (path[k + 1, j] - path[k, j])
             if i == 0:
-                off[j] = at[j] - there
-            out[i, j] = there + fade * off[j]
+                offset[j] = position[j] - nominal
+            out[i, j] = nominal + fade * offset[j]
 
 
 @kernel
-def widened(ahead: np.ndarray, tube: np.ndarray, passed: float, out: np.ndarray) -> None:
+def widen_tube(ahead: np.ndarray, tube: np.ndarray, elapsed: float, out: np.ndarray) -> None:
     """Compute the half-axes at the rollout's age, never below those of a new one.
 
     With e(tau) the rollout's error, of independent increments, and phi = exp(-tau / 10 s), the error from now on is
@@ -54,77 +56,86 @@ def widened(ahead: np.ndarray, tube: np.ndarray, passed: float, out: np.ndarray)
         out: half-axes at `ahead` from now, (k, 3) [m]; the last at most `elapsed` before the tube's end
     Source: Bar-Shalom 2001, section 4.3 (covariance propagation of a process with independent increments).
     """
-    before, later, k = np.zeros(3), np.zeros(3), 0
+    initial, later, k = np.zeros(3), np.zeros(3), 0
     for i in range(-1, len(out)):
-        t = passed + (ahead[i] if i >= 0 else 0.0)
+        t = elapsed + (ahead[i] if i >= 0 else 0.0)
         while k < len(ahead) - 2 and ahead[k + 1] < t:
             k += 1
-        share = min(max((t - ahead[k]) / (ahead[k + 1] - ahead[k]), 0.0), 1.0)
+        fraction = min(max((t - ahead[k]) / (ahead[k + 1] - ahead[k]), 0.0), 1.0)
         for j in range(3):
-            later[j] = tube[k, j] + share * (tube[k + 1, j] - tube[k, j])
+            later[j] = tube[k, j] + fraction * (tube[k + 1, j] - tube[k, j])
         if i < 0:
-            before[:] = later
+            initial[:] = later
             continue
-        fade = exp(-ahead[i] / _BACK_S)
+        fade = exp(-ahead[i] / _FADE_TIME_S)
         for j in range(3):
-            square = later[j] ** 2 - before[j] ** 2 * fade * (2.0 - fade)
-            out[i, j] = max(sqrt(max(square, 0.0)), tube[i, j])
+            variance = later[j] ** 2 - initial[j] ** 2 * fade * (2.0 - fade)
+            out[i, j] = max(sqrt(max(variance, 0.0)), tube[i, j])
 
 
-def renew(twin: Twin) -> list[Message]:
+def extrapolate(twin: Twin) -> list[Message]:
     """Continue the last rollout from the newest position; return nothing if either is missing."""
-    if twin.base is None:
+    if twin.prediction.last_rollout is None:
         return []
-    t, rows = twin.history.look("position", max(twin.base.t, twin.history.newest - 1.0))
-    made = renewed(twin, float(t[-1]), rows[-1]) if len(t) else None
-    if made is None:
+    t, rows = twin.telemetry.history.rows_since(
+        "position", max(twin.prediction.last_rollout.t, twin.telemetry.history.newest - 1.0)
+    )
+    prediction = propagate(twin, float(t[-1]), rows[-1]) if len(t) else None
+    if prediction is None:
         return []
-    if made.origin == twin.origin:
-        twin.record.keep_renewed(made.t, made.method, made.path.numpy(), made.tube.numpy())
-    twin.prediction = made
-    return [made]
+    if prediction.origin == twin.telemetry.origin:
+        twin.confidence.tracker.add_extrapolated(
+            prediction.t, prediction.method, prediction.path.numpy(), prediction.prediction_region_half_axes.numpy()
+        )
+    twin.prediction.publish(prediction)
+    return [prediction]
 
 
-def renewable(twin: Twin, t: float) -> bool:
+def can_propagate(twin: Twin, t: float) -> bool:
     """Return whether a recent rollout with telemetry exists to continue at `t`."""
-    base = twin.base
-    if base is None or twin.lost or twin.broken or base.coast_s:
+    rollout = twin.prediction.last_rollout
+    if rollout is None or twin.telemetry.link_lost or twin.prediction.position_lost or rollout.coast_s:
         return False
-    return t < base.t + (OVERDUE_S if overdue(twin, t) else LATEST_S)
+    return t < rollout.t + (MAX_OVERDUE_AGE_S if rollout_overdue(twin, t) else MAX_ROLLOUT_AGE_S)
 
 
-def overdue(twin: Twin, t: float) -> bool:
+def rollout_overdue(twin: Twin, t: float) -> bool:
     """Return whether the next rollout is due at `t` but was not made because it waits for CPU time."""
-    return t >= twin.predict_t + twin.pace.predict
+    return t >= twin.prediction.predict_timer.last + twin.config.schedule.predict
 
 
-def renewed(twin: Twin, t: float, position: np.ndarray) -> Prediction | None:
+def propagate(twin: Twin, t: float, position: np.ndarray) -> Prediction | None:
     """Return the last rollout continued from a position, (3,) [1e-7 deg, mm] at `t`; the twin is not changed.
 
     The offset d from the path fades:  p(tau) = path(t - t0 + tau) + d exp(-tau / 10 s). The local frame is that of the
     path, since the twin's origin may have moved. The horizon ends at the same time as that of the path.
     """
-    base = twin.base
-    if base is None or twin.origin is None or not renewable(twin, t) or not (passed := t - base.t) > 0.0:
+    rollout = twin.prediction.last_rollout
+    if (
+        rollout is None
+        or twin.telemetry.origin is None
+        or not can_propagate(twin, t)
+        or not (elapsed := t - rollout.t) > 0.0
+    ):
         return None
-    ahead = base.ahead.numpy()
-    n = int(ahead.searchsorted(float(ahead[-1]) - passed, side="right"))
+    ahead = rollout.ahead.numpy()
+    n = int(ahead.searchsorted(float(ahead[-1]) - elapsed, side="right"))
     if n < 2:
         return None
     out, tube = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
-    shifted(ahead, base.path.numpy(), passed, to_ned(base.ned_origin(), *position), out)  # type: ignore[call-arg]
-    widened(ahead, base.tube.numpy(), passed, tube)  # type: ignore[call-arg]
-    coverage, coverage_n = twin.record.coverage_renewed
+    shift_to_position(ahead, rollout.path.numpy(), elapsed, to_ned(rollout.ned_origin(), *position), out)  # type: ignore[call-arg]
+    widen_tube(ahead, rollout.prediction_region_half_axes.numpy(), elapsed, tube)  # type: ignore[call-arg]
+    coverage, coverage_n = twin.confidence.tracker.extrapolated_coverage
     return msgspec.structs.replace(
-        base,
+        rollout,
         t=t,
-        state=twin.state,
-        ahead=Array(base.ahead.dtype, (n,), base.ahead.data[: ahead.itemsize * n]),
+        state=twin.prediction.state,
+        ahead=Array(rollout.ahead.dtype, (n,), rollout.ahead.data[: ahead.itemsize * n]),
         path=Array("<f4", (n, 3), out.tobytes()),
-        tube=Array("<f4", (n, 3), tube.tobytes()),
-        horizon_s=max(base.horizon_s - passed, 0.0),
-        rollout_age_s=base.rollout_age_s + passed,
-        coverage_renewed=coverage,
-        coverage_renewed_n=coverage_n,
+        prediction_region_half_axes=Array("<f4", (n, 3), tube.tobytes()),
+        horizon_s=max(rollout.horizon_s - elapsed, 0.0),
+        rollout_age_s=rollout.rollout_age_s + elapsed,
+        coverage_propagated=coverage,
+        coverage_propagated_n=coverage_n,
         controller=None,
     )

@@ -4,61 +4,59 @@ import numpy as np
 
 from fleet.window import Window
 from twin_worker.identification.fixed_wing.plant import PAPER
-from twin_worker.identification.fixed_wing.point_mass_model import LEAST_S, SEEN_S, identify
-from twin_worker.prediction.autopilot_identification import EVERY_S as LEARN_S
-from twin_worker.prediction.autopilot_identification import learn_law
-from twin_worker.prediction.closed_loop import Flown, set_out
-from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_hybrid
+from twin_worker.identification.fixed_wing.point_mass_model import FIT_WINDOW_S, MIN_FIT_S, identify
+from twin_worker.prediction.autopilot_identification import REPLAY_INTERVAL_S as LEARN_S
+from twin_worker.prediction.autopilot_identification import identify_autopilot
+from twin_worker.prediction.closed_loop import Rollout, synchronise_controller
+from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_point_mass
 from twin_worker.twin.state.state import Twin
 
-EVERY_S = 5.0  # between identifications [s]
-_HELD_S = 20.0  # newest flight, held out [s]
-_AFRESH_S = 60.0  # flight after a fault onset before the model adapted by a diagnosis is replaced [s]
-_CHECK_S = 10.0  # between checks on held-out flight [s]
-_MOST = 0.10  # maximum final error over path length for an active model [-]
-_NEWS = 0.3  # weight of the newest check
+IDENTIFY_PERIOD_S = 5.0  # between identifications [s]
+_HOLD_OUT_S = 20.0  # newest flight, held out [s]
+_REPLACE_AFTER_S = 60.0  # flight after a fault onset before the model adapted by a diagnosis is replaced [s]
+_CHECK_PERIOD_S = 10.0  # between checks on held-out flight [s]
+_MAX_ERROR = 0.10  # maximum final error over path length for an active model [-]
 
 
-def renew(twin: Twin) -> None:
-    """Identify the point-mass model if it is due; `twin.hybrid` is None until its error is low enough."""
-    newest = twin.history.newest
-    if twin.why_no_route() or twin.hybrid_t <= newest < twin.hybrid_t + EVERY_S:
+def update_point_mass(twin: Twin) -> None:
+    """Identify the point-mass model if it is due; `twin.models.point_mass` is None until its error is low enough."""
+    newest = twin.telemetry.history.newest
+    if twin.no_route_reason() or not twin.models.point_mass_timer.due(newest, IDENTIFY_PERIOD_S):
         return
-    window = twin.window(SEEN_S + _HELD_S)
-    if window is not None and not twin.learnt.t <= newest < twin.learnt.t + LEARN_S:
-        learn_law(twin.learnt, twin.autopilot, twin.situation(window))
-    good = window and _whole(window, twin.learn_from)
-    least = LEAST_S + _HELD_S if twin.extended is None else _AFRESH_S
-    if window is None or good is None or len(good) < least / window.dt + 1 or twin.method == PAPER:
+    window = twin.window(FIT_WINDOW_S + _HOLD_OUT_S)
+    replay_t = twin.environment.autopilot.replay_t
+    if window is not None and not replay_t <= newest < replay_t + LEARN_S:
+        identify_autopilot(twin.environment.autopilot, twin.autopilot, twin.situation(window))
+    unbroken = window and _unbroken_part(window, twin.identification.data_from)
+    min_s = MIN_FIT_S + _HOLD_OUT_S if twin.models.active_effect is None else _REPLACE_AFTER_S
+    if window is None or unbroken is None or len(unbroken) < min_s / window.dt + 1 or twin.config.method == PAPER:
         return
-    twin.hybrid_t = newest
-    if not twin.checked_t <= newest < twin.checked_t + _CHECK_S:
-        twin.checked_t = newest
-        strayed = _strays(twin, good)
-        if np.isfinite(strayed):
-            before = twin.strays if np.isfinite(twin.strays) else strayed
-            twin.strays = before + _NEWS * (strayed - before)
-    twin.near_hybrid = identify(good, twin.history, twin.wind.scale, twin.near_hybrid)
-    twin.hybrid = twin.near_hybrid if twin.strays < _MOST else None
+    twin.models.point_mass_timer.restart(newest)
+    if twin.models.holdout_timer.due(newest, _CHECK_PERIOD_S):
+        twin.models.holdout_timer.restart(newest)
+        twin.models.update_holdout_error(_holdout_error(twin, unbroken))
+    warm_start = twin.models.point_mass_warm_start
+    model = identify(unbroken, twin.telemetry.history, twin.environment.wind.scale, warm_start)
+    twin.models.store_point_mass(model, verified=twin.models.point_mass_holdout_error < _MAX_ERROR)
 
 
-def _whole(window: Window, since: float) -> Window:
+def _unbroken_part(window: Window, since: float) -> Window:
     """Return the last part of the window without gaps, from `since` on [s since 1970]."""
-    bad = np.flatnonzero(~(window.ok & (window.t >= since)))
-    return window.part(int(bad[-1]) + 1 if len(bad) else 0, len(window))
+    gaps = np.flatnonzero(~(window.ok & (window.t >= since)))
+    return window.part(int(gaps[-1]) + 1 if len(gaps) else 0, len(window))
 
 
-def _strays(twin: Twin, good: Window) -> float:
+def _holdout_error(twin: Twin, window: Window) -> float:
     """Return the final error of a rollout over held-out flight, divided by its path length [-]."""
-    held = int(_HELD_S / good.dt)
-    known = good.part(0, len(good) - held)
-    now = twin.situation(known)
-    start = set_out(now)
-    if isinstance(start, Flown):
+    n_held_out = int(_HOLD_OUT_S / window.dt)
+    training = window.part(0, len(window) - n_held_out)
+    situation = twin.situation(training)
+    initial = synchronise_controller(situation)
+    if isinstance(initial, Rollout):
         return float("nan")
-    found = identify(known, twin.history, twin.wind.scale, twin.near_hybrid)
-    flown = fly_hybrid(now, start, found, np.array([0.0, _HELD_S]))
-    if flown.path is None:
+    model = identify(training, twin.telemetry.history, twin.environment.wind.scale, twin.models.point_mass_warm_start)
+    rollout = fly_point_mass(situation, initial, model, np.array([0.0, _HOLD_OUT_S]))
+    if rollout.path is None:
         return 1.0
-    way = float(np.linalg.norm(np.diff(good.p[-held:], axis=0), axis=1).sum())
-    return float(np.linalg.norm(flown.path[-1] - good.p[-1])) / max(way, 1.0)
+    path_length = float(np.linalg.norm(np.diff(window.p[-n_held_out:], axis=0), axis=1).sum())
+    return float(np.linalg.norm(rollout.path[-1] - window.p[-1])) / max(path_length, 1.0)

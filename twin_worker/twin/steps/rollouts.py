@@ -3,22 +3,28 @@
 import numpy as np
 
 from fleet.window import Window
-from twin_worker.confidence.calibration_table import law_of_growth
+from twin_worker.confidence.calibration_table import error_growth
 from twin_worker.confidence.tube_and_horizon import AHEAD
 from twin_worker.identification.fixed_wing.plant import DYNAMICS, method
-from twin_worker.numerics.interpolation import straight
-from twin_worker.prediction.closed_loop import Flown, Situation, Start, fly_from, set_out
+from twin_worker.numerics.interpolation import interpolate_rows
+from twin_worker.prediction.closed_loop import (
+    InitialCondition,
+    PredictionContext,
+    Rollout,
+    fly_from,
+    synchronise_controller,
+)
 from twin_worker.prediction.fixed_wing import ensemble
-from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_hybrid
-from twin_worker.twin.state.schedule import SOON, Work
+from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_point_mass
+from twin_worker.twin.state.schedule import EARLY_FRACTION, Work
 from twin_worker.twin.state.state import Twin
-from twin_worker.twin.state.vehicle_class import Flight, nothing
+from twin_worker.twin.state.vehicle_class import PathForecast, no_prediction
 
 HYBRID, BOTH = "hybrid", "both"
-_NEAR_S = 60.0  # look-ahead of the identified dynamics; beyond it the point-mass path continues [s]
+_DYNAMICS_SPAN_S = 60.0  # look-ahead of the identified dynamics; beyond it the point-mass path continues [s]
 
 
-def fly_route(twin: Twin, window: Window, ahead: np.ndarray) -> Flight:
+def predict_route(twin: Twin, window: Window, ahead: np.ndarray) -> PathForecast:
     """Predict the route, or return the reason why this is not possible.
 
     Args:
@@ -26,96 +32,100 @@ def fly_route(twin: Twin, window: Window, ahead: np.ndarray) -> Flight:
         window: newest telemetry
         ahead: look-ahead times from the end of `window`, rising, (k,) [s]
     """
-    now = twin.situation(window)
-    start = set_out(now)
-    if isinstance(start, Flown):
-        return nothing(start.sentence, start.seq)
+    situation = twin.situation(window)
+    initial = synchronise_controller(situation)
+    if isinstance(initial, Rollout):
+        return no_prediction(initial.sentence, initial.seq)
     t = float(window.t[-1])
-    due = twin.contest.due(t)
-    flown, why = paths(twin, (now, start), ahead, due)
-    if not flown:
-        return nothing(why or "no verified model yet", start.seq)
-    if due and len(flown) > 1 and not twin.lost:
-        twin.contest.keep(t, float(np.linalg.norm(start.good.v[-1])), ahead, flown)
-    _spread(twin, (now, start))
-    chosen = twin.contest.best(tuple(flown))
-    sentence = " ".join(filter(None, (twin.contest.said(chosen), start.sentence)))
-    return Flight(flown[chosen], chosen, start.law.law, start.seq, sentence, start.law)
+    due = twin.prediction.selector.is_due(t)
+    candidates, reason = method_paths(twin, (situation, initial), ahead, due)
+    if not candidates:
+        return no_prediction(reason or "no verified model yet", initial.seq)
+    if due and len(candidates) > 1 and not twin.telemetry.link_lost:
+        twin.prediction.selector.add(t, float(np.linalg.norm(initial.window.v[-1])), ahead, candidates)
+    _update_ensemble(twin, (situation, initial))
+    chosen = twin.prediction.selector.best(tuple(candidates))
+    sentence = " ".join(filter(None, (twin.prediction.selector.describe(chosen), initial.sentence)))
+    return PathForecast(candidates[chosen], chosen, initial.controller.law, initial.seq, sentence, initial.controller)
 
 
-def paths(
-    twin: Twin, begin: tuple[Situation, Start], ahead: np.ndarray, due: bool
+def method_paths(
+    twin: Twin, initial: tuple[PredictionContext, InitialCondition], ahead: np.ndarray, due: bool
 ) -> tuple[dict[str, np.ndarray], str]:
     """Return the path of each method, NED (k, 3) [m], and the reason if another failed; `due`: run all methods."""
-    found: dict[str, np.ndarray] = {}
-    why = ""
-    if twin.hybrid is not None and twin.method in (HYBRID, "auto"):
-        flown = fly_hybrid(*begin, twin.hybrid, ahead)
-        found, why = _kept(found, HYBRID, flown), flown.sentence
-    wanted = not found or due or twin.contest.best((BOTH, HYBRID, DYNAMICS)) != HYBRID
-    if twin.plant is not None and twin.method != HYBRID and wanted:
-        near = ahead[: np.searchsorted(ahead, max(_NEAR_S, ahead[0]), side="right")] if found else ahead
-        flown = fly_from(begin[1], twin.plant, near)
-        why = why if found else flown.sentence
-        if flown.path is not None:
-            path = _lengthened(flown.path, found[HYBRID]) if found else flown.path
-            found = {**found, method(twin.plant): path}
-    if len(found) > 1:
-        found[BOTH] = 0.5 * (found[HYBRID] + found[method(twin.plant)])  # type: ignore[arg-type]
-    return found, why
+    by_method: dict[str, np.ndarray] = {}
+    reason = ""
+    if twin.models.point_mass is not None and twin.config.method in (HYBRID, "auto"):
+        rollout = fly_point_mass(*initial, twin.models.point_mass, ahead)
+        by_method, reason = _with_path(by_method, HYBRID, rollout), rollout.sentence
+    needed = not by_method or due or twin.prediction.selector.best((BOTH, HYBRID, DYNAMICS)) != HYBRID
+    if twin.models.active_model is not None and twin.config.method != HYBRID and needed:
+        dynamics_ahead = (
+            ahead[: np.searchsorted(ahead, max(_DYNAMICS_SPAN_S, ahead[0]), side="right")] if by_method else ahead
+        )
+        rollout = fly_from(initial[1], twin.models.active_model, dynamics_ahead)
+        reason = reason if by_method else rollout.sentence
+        if rollout.path is not None:
+            path = _extend_path(rollout.path, by_method[HYBRID]) if by_method else rollout.path
+            by_method = {**by_method, method(twin.models.active_model): path}
+    if len(by_method) > 1:
+        by_method[BOTH] = 0.5 * (by_method[HYBRID] + by_method[method(twin.models.active_model)])  # type: ignore[arg-type]
+    return by_method, reason
 
 
-def _kept(paths: dict[str, np.ndarray], name: str, flown: Flown) -> dict[str, np.ndarray]:
-    return paths if flown.path is None else {**paths, name: flown.path}
+def _with_path(paths: dict[str, np.ndarray], name: str, rollout: Rollout) -> dict[str, np.ndarray]:
+    return paths if rollout.path is None else {**paths, name: rollout.path}
 
 
-def _lengthened(path: np.ndarray, further: np.ndarray) -> np.ndarray:
+def _extend_path(path: np.ndarray, continuation: np.ndarray) -> np.ndarray:
     """Continue `path`, (m, 3), with the increments of `continuation`, (k, 3)."""
     end = len(path)
-    return np.vstack([path, further[end:] + (path[-1] - further[end - 1])])
+    return np.vstack([path, continuation[end:] + (path[-1] - continuation[end - 1])])
 
 
-def _spread(twin: Twin, begin: tuple[Situation, Start]) -> None:
+def _update_ensemble(twin: Twin, initial: tuple[PredictionContext, InitialCondition]) -> None:
     """Run the ensemble if it is due."""
-    t = float(begin[1].good.t[-1])
-    known = twin.spread_t <= t < twin.spread_t + SOON * twin.pace.ensemble and twin.instead is None
-    twin.put_off = None
-    if twin.hybrid is None or known:
+    t = float(initial[1].window.t[-1])
+    due = twin.prediction.ensemble_timer.due(t, EARLY_FRACTION * twin.config.schedule.ensemble)
+    up_to_date = not due and twin.prediction.override is None
+    twin.prediction.defer_ensemble(None)
+    if twin.models.point_mass is None or up_to_date:
         return
-    if not twin.may(Work.ENSEMBLE):
-        twin.put_off = t
+    if not twin.budget_allows(Work.ENSEMBLE):
+        twin.prediction.defer_ensemble(t)
         return
-    _fly_ensemble(twin, begin, t)
+    _run_ensemble(twin, initial, t)
 
 
-def fly_put_off(twin: Twin, seconds: float) -> None:
+def run_deferred_ensemble(twin: Twin, seconds: float) -> None:
     """Run the deferred ensemble from the current state; the schedule of the next one is unchanged.
 
     The ensemble waited for other work; its spread applies from the next prediction on.
     """
-    due, twin.put_off = twin.put_off, None
+    due = twin.prediction.deferred_ensemble_t
+    twin.prediction.defer_ensemble(None)
     window = twin.window(seconds)
-    if due is None or twin.hybrid is None or window is None or not window.ok[-1] or twin.why_no_route():
+    if due is None or twin.models.point_mass is None or window is None or not window.ok[-1] or twin.no_route_reason():
         return
-    now = twin.situation(window)
-    start = set_out(now)
-    if not isinstance(start, Flown):
-        _fly_ensemble(twin, (now, start), due)
+    situation = twin.situation(window)
+    initial = synchronise_controller(situation)
+    if not isinstance(initial, Rollout):
+        _run_ensemble(twin, (situation, initial), due)
 
 
-def _fly_ensemble(twin: Twin, begin: tuple[Situation, Start], t: float) -> None:
+def _run_ensemble(twin: Twin, initial: tuple[PredictionContext, InitialCondition], t: float) -> None:
     """Run the ensemble of time `t`; beyond its span the spread continues by the growth law."""
-    assert twin.hybrid is not None
-    ahead = AHEAD[: AHEAD.searchsorted(twin.pace.span, side="right")]
-    rng = np.random.default_rng((twin.uav, int(t)))
-    found = ensemble.spread(*begin, twin.hybrid, ahead, rng, members=twin.pace.members)
-    if found is not None and len(ahead) < len(AHEAD):
-        law = law_of_growth(HYBRID, AHEAD[len(ahead) - 1 :])
-        found = np.vstack([found, found[-1] * law[1:] / law[0]])
-    twin.spread, twin.spread_t = found, t
+    assert twin.models.point_mass is not None
+    ahead = AHEAD[: AHEAD.searchsorted(twin.config.schedule.span, side="right")]
+    rng = np.random.default_rng((twin.config.uav, int(t)))
+    spread = ensemble.ensemble_std(*initial, twin.models.point_mass, ahead, rng, members=twin.config.schedule.members)
+    if spread is not None and len(ahead) < len(AHEAD):
+        growth = error_growth(HYBRID, AHEAD[len(ahead) - 1 :])
+        spread = np.vstack([spread, spread[-1] * growth[1:] / growth[0]])
+    twin.prediction.store_ensemble(spread, t)
 
 
-def in_force(twin: Twin, method: str, ahead: np.ndarray) -> np.ndarray | None:
+def ensemble_spread(twin: Twin, method_name: str, ahead: np.ndarray) -> np.ndarray | None:
     """Return the spread of the newest ensemble at some look-aheads, (k, 3) [m]; None if it does not apply to `method`.
 
     Args:
@@ -123,6 +133,6 @@ def in_force(twin: Twin, method: str, ahead: np.ndarray) -> np.ndarray | None:
         method: of the prediction
         ahead: rising; beyond the ensemble's end the spread stays constant (k,) [s]
     """
-    if twin.spread is None or method not in (HYBRID, BOTH, DYNAMICS):
+    if twin.prediction.ensemble_spread is None or method_name not in (HYBRID, BOTH, DYNAMICS):
         return None
-    return straight(ahead, AHEAD, twin.spread)
+    return interpolate_rows(ahead, AHEAD, twin.prediction.ensemble_spread)

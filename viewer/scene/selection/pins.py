@@ -5,22 +5,27 @@ from typing import Any
 import numpy as np
 
 from viewer.scene.labels import Tag
-from viewer.store.received.datatime import moment
-from viewer.store.track import placed
-from viewer.theme.events import Event, Kind
+from viewer.store.received.datatime import time_of_day
+from viewer.store.track import positions_at
+from viewer.theme.events import EventKind, TimelineEvent
 from viewer.theme.palette import MARK, Palette, mesh_colour, rgb
 from viewer.theme.shapes import diamond
 
-PINS = 40  # newest markers on the path
-LABELS = 3  # more labels would overlap
-LETTERS = 26  # characters of a label
-CLEAR = 3.0  # distance of a label to the aircraft and other labels [drawn spans of an aircraft]
+MAX_MARKERS = 40  # newest markers on the path
+MAX_LABELS = 3  # more labels would overlap
+MAX_TEXT = 26  # characters of a label
+CLEARANCE = 3.0  # distance of a label to the aircraft and other labels [drawn spans of an aircraft]
 RADIUS = 0.22  # marker radius [drawn spans of an aircraft]
-MINOR = {Kind.ITEM, Kind.MISSION, Kind.SOUND, Kind.DOUBTED}  # frequent: smaller, without label
-MODEL = {Kind.VERIFIED, Kind.NO_MODEL}  # the label shows only the text before the colon
+MINOR_KINDS = {
+    EventKind.ITEM,
+    EventKind.MISSION,
+    EventKind.ACCEPTED,
+    EventKind.UNVERIFIED,
+}  # frequent: smaller, without label
+MODEL_KINDS = {EventKind.VERIFIED, EventKind.NO_MODEL}  # the label shows only the text before the colon
 
 
-class Pins:
+class EventMarkers:
     """Markers of one UAV: a mesh batch of fixed size."""
 
     def __init__(self, scene: Any, palette: Palette) -> None:
@@ -30,17 +35,19 @@ class Pins:
             "/selected/events",
             vertices,
             faces,
-            np.tile([1.0, 0.0, 0.0, 0.0], (PINS, 1)),
-            np.zeros((PINS, 3)),
-            batched_scales=np.zeros(PINS, np.float32),
-            batched_colors=np.zeros((PINS, 3), np.uint8),
+            np.tile([1.0, 0.0, 0.0, 0.0], (MAX_MARKERS, 1)),
+            np.zeros((MAX_MARKERS, 3)),
+            batched_scales=np.zeros(MAX_MARKERS, np.float32),
+            batched_colors=np.zeros((MAX_MARKERS, 3), np.uint8),
             lod="off",
             flat_shading=True,
             cast_shadow=False,
             receive_shadow=False,
         )
 
-    def draw(self, events: tuple[Event, ...], rows: np.ndarray, at: np.ndarray | None, size: float) -> list[Tag]:
+    def draw(
+        self, events: tuple[TimelineEvent, ...], rows: np.ndarray, at: np.ndarray | None, size: float
+    ) -> list[Tag]:
         """Draw events at their positions; return the labels of the newest few.
 
         Args:
@@ -49,23 +56,31 @@ class Pins:
             at: drawn position of the aircraft, (3,) [10 m]
             size: drawn span of an aircraft [10 m]
         """
-        spots = placed(rows, np.array([event.t for event in events]))
-        found = [(event, spot) for event, spot in zip(events, spots, strict=True) if np.isfinite(spot).all()]
-        found = sorted(found, key=lambda one: one[0].kind not in MINOR)[-PINS:]  # major events take precedence
-        where, scales, colours = np.zeros((PINS, 3)), np.zeros(PINS, np.float32), np.zeros((PINS, 3))
-        for k, (event, spot) in enumerate(found):
-            where[k], colours[k] = spot, rgb(self._palette.event(event.kind))
-            scales[k] = RADIUS * size * (0.6 if event.kind in MINOR else 1.0)
-        self._batch.batched_positions, self._batch.batched_scales = where, scales
+        points = positions_at(rows, np.array([event.t for event in events]))
+        located = [(event, point) for event, point in zip(events, points, strict=True) if np.isfinite(point).all()]
+        located = sorted(located, key=lambda entry: entry[0].kind not in MINOR_KINDS)[
+            -MAX_MARKERS:
+        ]  # major events take precedence
+        positions, scales, colours = (
+            np.zeros((MAX_MARKERS, 3)),
+            np.zeros(MAX_MARKERS, np.float32),
+            np.zeros((MAX_MARKERS, 3)),
+        )
+        for k, (event, point) in enumerate(located):
+            positions[k], colours[k] = point, rgb(self._palette.event(event.kind))
+            scales[k] = RADIUS * size * (0.6 if event.kind in MINOR_KINDS else 1.0)
+        self._batch.batched_positions, self._batch.batched_scales = positions, scales
         self._batch.batched_colors = mesh_colour(colours)
         above = np.array([0.0, 0.0, 0.9 * RADIUS * size])
         return [
-            Tag(f"event{event.t}{event.kind}", caption(event), spot + above, "bottom-center")
-            for event, spot in apart(found, at, CLEAR * size)
+            Tag(f"event{event.t}{event.kind}", event_text(event), point + above, "bottom-center")
+            for event, point in labelled_events(located, at, CLEARANCE * size)
         ]
 
 
-def apart(found: list[tuple[Event, np.ndarray]], at: np.ndarray | None, clear: float) -> list[tuple[Event, np.ndarray]]:
+def labelled_events(
+    located: list[tuple[TimelineEvent, np.ndarray]], at: np.ndarray | None, clearance: float
+) -> list[tuple[TimelineEvent, np.ndarray]]:
     """Return the events with a label: the newest with clearance to the aircraft and each other.
 
     Args:
@@ -73,17 +88,21 @@ def apart(found: list[tuple[Event, np.ndarray]], at: np.ndarray | None, clear: f
         at: drawn position of the aircraft, (3,) [10 m]; None when it is not drawn
         clearance: shortest distance [10 m]
     """
-    chosen: list[tuple[Event, np.ndarray]] = []
+    selected: list[tuple[TimelineEvent, np.ndarray]] = []
     taken = [] if at is None else [at]
-    for event, spot in reversed(found):
-        if len(chosen) < LABELS and event.kind not in MINOR and all(np.linalg.norm(spot - x) > clear for x in taken):
-            chosen.append((event, spot))
-            taken.append(spot)
-    return chosen
+    for event, point in reversed(located):
+        if (
+            len(selected) < MAX_LABELS
+            and event.kind not in MINOR_KINDS
+            and all(np.linalg.norm(point - x) > clearance for x in taken)
+        ):
+            selected.append((event, point))
+            taken.append(point)
+    return selected
 
 
-def caption(event: Event) -> str:
+def event_text(event: TimelineEvent) -> str:
     """Describe an event in one short line."""
-    text = event.text.split(":")[0] if event.kind in MODEL else event.text
-    text = text if len(text) <= LETTERS else text[: LETTERS - 1] + "…"
-    return f"{MARK[event.kind]} {text} {moment(event.t)}"
+    text = event.text.split(":")[0] if event.kind in MODEL_KINDS else event.text
+    text = text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 1] + "…"
+    return f"{MARK[event.kind]} {text} {time_of_day(event.t)}"

@@ -6,7 +6,7 @@ SIDES = 20  # corners of one ring
 BAND_SIGMA = 2.1  # half-axes of the simultaneous 90 % region in standard deviations
 
 
-def frame_of(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def path_frame(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the cross and vertical unit vectors along a path (n, 3): two (n, 3); hovering keeps the last direction."""
     run = np.gradient(path, axis=0) if len(path) > 1 else np.zeros_like(path)
     flat = run * [1.0, 1.0, 0.0]
@@ -33,7 +33,7 @@ def rings(path: np.ndarray, axes: np.ndarray, sides: int = SIDES) -> np.ndarray:
     Returns:
         corners, (n, sides, 3) [10 m]
     """
-    cross, up = frame_of(path)
+    cross, up = path_frame(path)
     turn = np.linspace(0, 2 * np.pi, sides, endpoint=False)[None, :, None]
     return (
         path[:, None]
@@ -42,7 +42,7 @@ def rings(path: np.ndarray, axes: np.ndarray, sides: int = SIDES) -> np.ndarray:
     )
 
 
-def skin(n: int, sides: int = SIDES) -> np.ndarray:
+def tube_faces(n: int, sides: int = SIDES) -> np.ndarray:
     """Return the triangles between n rings: (2 (n - 1) sides, 3) indices into the flattened corners."""
     near = np.arange(n - 1)[:, None] * sides + np.arange(sides)
     next_ = np.arange(n - 1)[:, None] * sides + (np.arange(sides) + 1) % sides
@@ -58,12 +58,12 @@ def curtain(path: np.ndarray, ground: float) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([path, foot], axis=1).reshape(-1, 3), faces.astype(np.uint32)
 
 
-def marks(until: float, steps: tuple[float, ...] = (5, 10, 20, 30, 60, 120)) -> list[float]:
+def marked_look_aheads(horizon_s: float, steps: tuple[float, ...] = (5, 10, 20, 30, 60, 120)) -> list[float]:
     """Return the look-aheads to mark [s]: those with enough distance to the horizon."""
-    return [step for step in steps if step < until - max(2.0, 0.12 * until)]
+    return [step for step in steps if step < horizon_s - max(2.0, 0.12 * horizon_s)]
 
 
-def samples(path: np.ndarray, axes: np.ndarray, n: int, seed: int) -> np.ndarray:
+def sample_paths(path: np.ndarray, axes: np.ndarray, n: int, seed: int) -> np.ndarray:
     """Sample paths that the tube contains with its nominal coverage: (n, k, 3).
 
     Cross and vertical offsets are standard normal in units of the half-axes over `BAND_SIGMA` and rotate slowly into
@@ -75,7 +75,7 @@ def samples(path: np.ndarray, axes: np.ndarray, n: int, seed: int) -> np.ndarray
         n: number of paths
         seed: constant per UAV, so that paths do not flicker
     """
-    cross, up = frame_of(path)
+    cross, up = path_frame(path)
     begin, end = np.random.default_rng(seed).standard_normal((2, n, 2, 1))
     turn = np.linspace(0.0, 0.9, len(path))
     offset = (np.cos(turn) * begin + np.sin(turn) * end) / BAND_SIGMA

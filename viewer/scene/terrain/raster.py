@@ -13,7 +13,7 @@ MAX_PIXELS = 80_000_000  # pixels of one file
 SCALE, TIEPOINT, MATRIX, KEYS, NO_DATA = 33550, 33922, 34264, 34735, 42113  # TIFF tags
 MODEL, RASTER_TYPE, PROJECTED = 1024, 1025, 3072  # keys in KEYS
 WORLD = (".wld", ".pgw", ".pngw", ".jgw", ".tfw")
-CURE = "convert it to EPSG:4326 (gdalwarp -t_srs EPSG:4326) or give its bounds: FILE@south,west,north,east"
+REMEDY = "convert it to EPSG:4326 (gdalwarp -t_srs EPSG:4326) or give its bounds: FILE@south,west,north,east"
 
 
 class Raster(NamedTuple):
@@ -24,7 +24,7 @@ class Raster(NamedTuple):
     affine: np.ndarray  # (2, 3): column, row, 1 -> x, y of the pixel centre
     zone: tuple[int, bool] | None = None  # UTM zone and northern hemisphere; None: x, y in degrees
 
-    def at(self, lat_deg: np.ndarray, lon_deg: np.ndarray) -> np.ndarray:
+    def sample(self, lat_deg: np.ndarray, lon_deg: np.ndarray) -> np.ndarray:
         """Interpolate values at positions of any shape, NaN outside; colours have a last axis of 3."""
         from scipy.ndimage import map_coordinates  # deferred import: only needed with terrain
 
@@ -34,14 +34,14 @@ class Raster(NamedTuple):
         outside = (column < -0.5) | (row < -0.5)
         outside |= (column > self.values.shape[1] - 0.5) | (row > self.values.shape[0] - 0.5)
         planes = self.values.reshape(*self.values.shape[:2], -1).astype(np.float32)
-        found = [
+        channels = [
             map_coordinates(planes[..., k], [row, column], order=1, mode="nearest") for k in range(planes.shape[2])
         ]
-        values = np.where(outside[:, None], np.nan, np.stack(found, axis=-1))
+        values = np.where(outside[:, None], np.nan, np.stack(channels, axis=-1))
         return values.reshape((*np.shape(lat_deg), *self.values.shape[2:]))
 
 
-def read(text: str, *, colours: bool) -> Raster:
+def read_raster(text: str, *, colours: bool) -> Raster:
     """Read a raster file.
 
     Args:
@@ -59,7 +59,7 @@ def read(text: str, *, colours: bool) -> Raster:
                     f"{path.name}: found {image.width} x {image.height} pixels, expected <= {MAX_PIXELS:,}; crop it"
                 )
             values = _colours(image) if colours else _heights(image)
-            affine, zone = (_bounded(bounds, image), None) if bounds else _placed(path, image)
+            affine, zone = (_bounded(bounds, image), None) if bounds else _georeference(path, image)
     except (Image.UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, EOFError) as error:
         raise ValueError(f"{path.name}: found no readable raster ({error}), expected GeoTIFF, PNG or JPEG") from None
     except OSError as error:
@@ -72,8 +72,8 @@ def read(text: str, *, colours: bool) -> Raster:
 
 
 def _split(text: str) -> tuple[Path, list[float]]:
-    name, found, numbers = text.rpartition("@")
-    if not found:
+    name, separator, numbers = text.rpartition("@")
+    if not separator:
         return Path(text), []
     try:
         south, west, north, east = (float(x) for x in numbers.split(","))
@@ -99,8 +99,8 @@ def _heights(image: Any) -> np.ndarray:
         missing = float(str(tags.get(NO_DATA, "nan")).strip("\0 "))
     except ValueError:
         missing = np.nan
-    bad = (values == missing) | ~np.isfinite(values) | (np.abs(values) > 9_500)
-    return np.where(bad, np.nan, values)
+    invalid = (values == missing) | ~np.isfinite(values) | (np.abs(values) > 9_500)
+    return np.where(invalid, np.nan, values)
 
 
 def _bounded(bounds: list[float], image: Any) -> np.ndarray:
@@ -109,37 +109,37 @@ def _bounded(bounds: list[float], image: Any) -> np.ndarray:
     return np.array([[dx, 0.0, west + dx / 2], [0.0, dy, north + dy / 2]])
 
 
-def _placed(path: Path, image: Any) -> tuple[np.ndarray, tuple[int, bool] | None]:
+def _georeference(path: Path, image: Any) -> tuple[np.ndarray, tuple[int, bool] | None]:
     """Return affine map and zone from the TIFF tags, else from a world file."""
     tags = dict(getattr(image, "tag_v2", {}))
     if KEYS in tags and (SCALE in tags or MATRIX in tags):
-        return _tagged(path.name, tags)
+        return _tag_georeference(path.name, tags)
     for suffix in WORLD:
-        if (beside := path.with_suffix(suffix)).is_file():
-            a, d, b, e, c, f = (float(x) for x in beside.read_text(encoding="ascii").split()[:6])
+        if (world_file := path.with_suffix(suffix)).is_file():
+            a, d, b, e, c, f = (float(x) for x in world_file.read_text(encoding="ascii").split()[:6])
             return np.array([[a, b, c], [d, e, f]]), None
-    raise ValueError(f"{path.name}: found no georeference, expected a GeoTIFF or a world file; {CURE}")
+    raise ValueError(f"{path.name}: found no georeference, expected a GeoTIFF or a world file; {REMEDY}")
 
 
-def _tagged(name: str, tags: dict[int, Any]) -> tuple[np.ndarray, tuple[int, bool] | None]:
+def _tag_georeference(name: str, tags: dict[int, Any]) -> tuple[np.ndarray, tuple[int, bool] | None]:
     keys = np.array(tags[KEYS][4:], int)
-    told = {int(k[0]): int(k[3]) for k in keys[: len(keys) // 4 * 4].reshape(-1, 4) if k[1] == 0}
-    zone = _zone(name, told)
+    geo_keys = {int(k[0]): int(k[3]) for k in keys[: len(keys) // 4 * 4].reshape(-1, 4) if k[1] == 0}
+    zone = _zone(name, geo_keys)
     if MATRIX in tags:
         matrix = np.array(tags[MATRIX], float).reshape(4, 4)[:2][:, [0, 1, 3]]
     else:
         (dx, dy), (i, j, _, x, y, _) = tags[SCALE][:2], tags[TIEPOINT][:6]
         matrix = np.array([[dx, 0.0, x - i * dx], [0.0, -dy, y + j * dy]], float)
-    if told.get(RASTER_TYPE, 1) == 1:  # pixel corner to pixel centre
+    if geo_keys.get(RASTER_TYPE, 1) == 1:  # pixel corner to pixel centre
         matrix = matrix + np.outer(matrix[:, :2].sum(axis=1) / 2, [0, 0, 1])
     return matrix, zone
 
 
-def _zone(name: str, told: dict[int, int]) -> tuple[int, bool] | None:
-    if told.get(MODEL) == 2:
+def _zone(name: str, geo_keys: dict[int, int]) -> tuple[int, bool] | None:
+    if geo_keys.get(MODEL) == 2:
         return None
-    code = told.get(PROJECTED, 0)
+    code = geo_keys.get(PROJECTED, 0)
     for base, north in ((32600, True), (32700, False), (25800, True)):
         if base < code <= base + 60:
             return code - base, north
-    raise ValueError(f"{name}: found projection EPSG:{code}, expected degrees or UTM on WGS 84; {CURE}")
+    raise ValueError(f"{name}: found projection EPSG:{code}, expected degrees or UTM on WGS 84; {REMEDY}")

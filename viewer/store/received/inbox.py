@@ -9,24 +9,24 @@ from typing import NamedTuple
 
 import msgspec
 
-from fleet.access.roles import SAID
-from fleet.bus.bus_protocol import Letter as Said
+from fleet.access.roles import TOPIC_RULES
+from fleet.bus.bus_protocol import RawMessage as Said
 from fleet.bus.codec import Stamp
 from fleet.contract import Rows, Sample
 
-CROWD = 300  # UAVs above which only the newest sample of each is decoded
-MOST = 40  # queued samples of one UAV; then the newest replaces the last
-MOST_UAVS = 4_000  # UAVs with queued samples: ids are untrusted input
-_LEG = b"\xa3leg\x82"  # msgpack: the key followed by a map (not nil)
+LARGE_FLEET = 300  # UAVs above which only the newest sample of each is decoded
+MAX_QUEUED = 40  # queued samples of one UAV; then the newest replaces the last
+MAX_UAVS = 4_000  # UAVs with queued samples: ids are untrusted input
+_LEG_KEY = b"\xa3leg\x82"  # msgpack: the key followed by a map (not nil)
 
 
-class Leg(msgspec.Struct):
+class LegOnly(msgspec.Struct):
     """Active mission item of a sample."""
 
     leg: Rows
 
 
-class Head(msgspec.Struct, frozen=True):
+class SampleSubset(msgspec.Struct, frozen=True):
     """Fields of a sample that the viewer uses; the others are skipped."""
 
     uav: int
@@ -37,27 +37,29 @@ class Head(msgspec.Struct, frozen=True):
     leg: Rows | None = None
 
 
-_HEAD, _LEG_ALONE = msgspec.msgpack.Decoder(Head), msgspec.msgpack.Decoder(Leg)
-_UNREADABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
+_SUBSET_DECODER, _LEG_DECODER = msgspec.msgpack.Decoder(SampleSubset), msgspec.msgpack.Decoder(LegOnly)
+_DECODE_ERRORS = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 
 
-def read(payload: bytes) -> Head:
+def decode_sample(payload: bytes) -> SampleSubset:
     """Decode the fields of a sample that the viewer uses.
 
     Raises:
         ValueError: when the message is too large or malformed; correct the sender.
     """
-    if len(payload) > SAID[Sample.topic].most:
-        raise ValueError(f"sample: found {len(payload):,} bytes, expected {SAID[Sample.topic].most:,}; send less")
+    if len(payload) > TOPIC_RULES[Sample.topic].max_bytes:
+        raise ValueError(
+            f"sample: found {len(payload):,} bytes, expected {TOPIC_RULES[Sample.topic].max_bytes:,}; send less"
+        )
     try:
-        return _HEAD.decode(payload)
-    except _UNREADABLE as error:
+        return _SUBSET_DECODER.decode(payload)
+    except _DECODE_ERRORS as error:
         raise ValueError(
             f"sample: found {len(payload)} malformed bytes ({str(error)[:80]}), expected msgpack; resend"
         ) from None
 
 
-class Letter:
+class QueuedMessage:
     """Queued payload, its arrival time, monotonic [s], and its fencing token; slots make it cheap to create."""
 
     __slots__ = ("now", "payload", "stamp")
@@ -66,94 +68,98 @@ class Letter:
         self.payload, self.now, self.stamp = payload, now, stamp
 
 
-class Held(NamedTuple):
+class PendingMessages(NamedTuple):
     """Queued messages of one UAV and the arrival time of the first, monotonic [s]."""
 
-    since: float
-    letters: list[Letter]
+    first_received: float
+    messages: list[QueuedMessage]
 
 
 class Inbox:
     """Queue of samples; the caller must own one common lock to fill or empty it."""
 
     def __init__(self) -> None:
-        self.crowd = False
-        self.keen: frozenset[int] = frozenset()  # UAVs of which every sample is kept, also in a large fleet
-        self.lost = 0  # messages without a UAV id, or beyond the limit
-        self._held: dict[int, Held] = {}  # oldest first
-        self._kept: set[int] = set()  # UAVs whose last queued sample changes the mission item
-        self._item: dict[int, bytes] = {}  # last mission item of each UAV
+        self.large_fleet = False
+        self.full_rate_uavs: frozenset[int] = frozenset()  # UAVs of which every sample is kept, also in a large fleet
+        self.dropped = 0  # messages without a UAV id, or beyond the limit
+        self._pending: dict[int, PendingMessages] = {}  # oldest first
+        self._leg_changed_uavs: set[int] = set()  # UAVs whose last queued sample changes the mission item
+        self._last_leg: dict[int, bytes] = {}  # last mission item of each UAV
 
     def put(self, samples: list[Said], now: float) -> None:
         """Queue samples in order of arrival."""
-        crowd, keen, kept = self.crowd, self.keen, self._kept
+        large_fleet, full_rate, leg_changed = self.large_fleet, self.full_rate_uavs, self._leg_changed_uavs
         for uav, payload, _, _ in samples:
             if uav is None:
-                self.lost += 1
+                self.dropped += 1
                 continue
-            news = crowd and _LEG in payload and self._is_news(uav, payload)
-            held = self._held.get(uav)
-            if held is None:
-                if len(self._held) >= MOST_UAVS:
-                    self.lost += 1
+            is_new_leg = large_fleet and _LEG_KEY in payload and self._is_new_leg(uav, payload)
+            pending = self._pending.get(uav)
+            if pending is None:
+                if len(self._pending) >= MAX_UAVS:
+                    self.dropped += 1
                     continue
-                self._held[uav] = Held(now, [Letter(payload, now)])
-            elif (not crowd or uav in keen or uav in kept) and len(held.letters) < MOST:
-                held.letters.append(Letter(payload, now))
+                self._pending[uav] = PendingMessages(now, [QueuedMessage(payload, now)])
+            elif (not large_fleet or uav in full_rate or uav in leg_changed) and len(pending.messages) < MAX_QUEUED:
+                pending.messages.append(QueuedMessage(payload, now))
             else:
-                held.letters[-1] = Letter(payload, now)
-            kept.discard(uav)
-            if news:
-                kept.add(uav)
+                pending.messages[-1] = QueuedMessage(payload, now)
+            leg_changed.discard(uav)
+            if is_new_leg:
+                leg_changed.add(uav)
 
-    def _is_news(self, uav: int, payload: bytes) -> bool:
+    def _is_new_leg(self, uav: int, payload: bytes) -> bool:
         """Return whether a sample changes the mission item; True when it cannot be decoded."""
         try:
-            told = _LEG_ALONE.decode(payload).leg.x
-        except _UNREADABLE:
+            leg = _LEG_DECODER.decode(payload).leg.x
+        except _DECODE_ERRORS:
             return True
-        before = self._item.get(uav)
-        if len(self._item) < MOST_UAVS or before is not None:
-            self._item[uav] = told.data
-        return before != told.data
+        previous = self._last_leg.get(uav)
+        if len(self._last_leg) < MAX_UAVS or previous is not None:
+            self._last_leg[uav] = leg.data
+        return previous != leg.data
 
-    def take(self, uavs: Iterable[int] | None = None) -> Iterator[tuple[int, Letter]]:
+    def take(self, uavs: Iterable[int] | None = None) -> Iterator[tuple[int, QueuedMessage]]:
         """Remove and yield the messages of all or some UAVs, each UAV in order of arrival."""
-        for uav in list(self._held) if uavs is None else uavs:
-            if (held := self._held.pop(uav, None)) is not None:
-                self._kept.discard(uav)
-                yield from ((uav, letter) for letter in held.letters)
+        for uav in list(self._pending) if uavs is None else uavs:
+            if (pending := self._pending.pop(uav, None)) is not None:
+                self._leg_changed_uavs.discard(uav)
+                yield from ((uav, message) for message in pending.messages)
 
-    def waiting(self, before: float) -> list[int]:
+    def waiting_since(self, before: float) -> list[int]:
         """Return the UAVs with a message queued since before a time, monotonic [s]."""
-        found = []
-        for uav, held in self._held.items():
-            if held.since > before:
+        uavs = []
+        for uav, pending in self._pending.items():
+            if pending.first_received > before:
                 break
-            found.append(uav)
-        return found
+            uavs.append(uav)
+        return uavs
 
 
-class Newest:
+class CoalescingQueue:
     """Queue of the newest message per UAV; a message is due `wait_s` after the first one it replaced."""
 
     def __init__(self, wait_s: float) -> None:
         self._wait_s = wait_s
-        self._held: dict[int, tuple[float, Letter]] = {}  # first arrival, monotonic [s]; oldest first
+        self._pending: dict[int, tuple[float, QueuedMessage]] = {}  # first arrival, monotonic [s]; oldest first
 
-    def put(self, uav: int, letter: Letter) -> None:
+    def put(self, uav: int, message: QueuedMessage) -> None:
         """Queue a message in place of the previous one."""
-        held = self._held.get(uav)
-        if held is not None or len(self._held) < MOST_UAVS:
-            self._held[uav] = (held[0] if held is not None else letter.now), letter
+        previous = self._pending.get(uav)
+        if previous is not None or len(self._pending) < MAX_UAVS:
+            self._pending[uav] = (previous[0] if previous is not None else message.now), message
 
     def drop(self, uav: int) -> None:
         """Discard the queued message of a UAV."""
-        self._held.pop(uav, None)
+        self._pending.pop(uav, None)
 
-    def due(self, now: float) -> list[tuple[int, Letter]]:
+    def due(self, now: float) -> list[tuple[int, QueuedMessage]]:
         """Remove and return the messages that are due at `now`, monotonic [s]."""
-        found = []
-        while self._held and (uav := next(iter(self._held))) is not None and self._held[uav][0] + self._wait_s <= now:
-            found.append((uav, self._held.pop(uav)[1]))
-        return found
+        messages = []
+        while (
+            self._pending
+            and (uav := next(iter(self._pending))) is not None
+            and self._pending[uav][0] + self._wait_s <= now
+        ):
+            messages.append((uav, self._pending.pop(uav)[1]))
+        return messages

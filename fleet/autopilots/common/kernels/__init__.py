@@ -5,7 +5,7 @@ from math import atan2, sqrt
 import numba as nb
 
 # no fastmath: nan means "no airspeed sensor"; nothing raises inside
-making = nb.njit(cache=True, error_model="numpy", nogil=True)
+array_kernel = nb.njit(cache=True, error_model="numpy", nogil=True)
 # without arrays: reference counting took half of the run time
 kernel = nb.njit(cache=True, error_model="numpy", nogil=True, _nrt=False)  # type: ignore[call-overload]
 

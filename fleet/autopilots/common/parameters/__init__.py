@@ -5,7 +5,7 @@ from math import isfinite
 from typing import NamedTuple
 
 
-class Row(NamedTuple):
+class ParameterSpec(NamedTuple):
     """One parameter: name, default and range in autopilot units, factor to SI, older names with their factor."""
 
     name: str
@@ -13,7 +13,7 @@ class Row(NamedTuple):
     factor: float
     low: float
     high: float
-    older: tuple[tuple[str, float], ...] = ()  # (older name, older unit in units of the new one)
+    old_names: tuple[tuple[str, float], ...] = ()  # (older name, older unit in units of the new one)
 
 
 def eas2tas(altitude_m: float) -> float:
@@ -22,10 +22,10 @@ def eas2tas(altitude_m: float) -> float:
     return float((1 - 2.25577e-5 * h) ** (-4.25588 / 2))
 
 
-def find(row: Row, given: Mapping[str, float]) -> float | None:
+def lookup(spec: ParameterSpec, values: Mapping[str, float]) -> float | None:
     """Return the value by current or older name; None if it is missing, not finite or out of range."""
-    for name, unit in ((row.name, 1.0), *row.older):
-        value = given.get(name)
-        if value is not None and isfinite(value) and row.low <= value * unit <= row.high:
+    for name, unit in ((spec.name, 1.0), *spec.old_names):
+        value = values.get(name)
+        if value is not None and isfinite(value) and spec.low <= value * unit <= spec.high:
             return value * unit
     return None

@@ -5,16 +5,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.bus.codec import Wire
+from fleet.bus.codec import EncodedMessage
 from fleet.contract import Sample
-from fleet.telemetry.mavlink.arrays.counts import Counts
+from fleet.telemetry.mavlink.arrays.counts import MessageCounters
 from fleet.telemetry.mavlink.arrays.pack import FIELDS
-from fleet.telemetry.mavlink.arrays.row_arbiter import KEPT, REFUSED, new_memory, settle
-from fleet.telemetry.mavlink.arrays.rows import WIDEST, Shelves
+from fleet.telemetry.mavlink.arrays.row_arbiter import ACCEPTED, REJECTED, arbitrate_rows, new_arbiter_state
+from fleet.telemetry.mavlink.arrays.rows import MAX_COLUMNS, PendingRows
 from fleet.telemetry.tables import clock
 
 
-class Laid(NamedTuple):
+class RowBatch(NamedTuple):
     """Rows of many aircraft in order of reception."""
 
     owner: np.ndarray  # number of the aircraft, (n,)
@@ -24,19 +24,19 @@ class Laid(NamedTuple):
     tick: np.ndarray  # time source, (n,)
     field: np.ndarray  # number in `FIELDS`, (n,)
     rank: np.ndarray  # rank of the source, (n,)
-    given: np.ndarray  # number in `FIELDS` of the required active field, or `NO_FIELD`, (n,)
+    requires: np.ndarray  # number in `FIELDS` of the required active field, or `NO_FIELD`, (n,)
 
 
-class Judged(NamedTuple):
+class ArbitrationResult(NamedTuple):
     """Result of the arbitration, by aircraft."""
 
     jumped: np.ndarray  # arrival at the last jump of the clock; nan: none, (m,) [s since 1970]
-    refused: np.ndarray  # number of rejected rows, (m,)
+    rejected: np.ndarray  # number of rejected rows, (m,)
     newest: np.ndarray  # arrival of the last row, (m,) [s since 1970]
     advanced: np.ndarray  # by row: forward re-anchoring step of the clock, mostly 0, (n,) [s]
 
 
-class Flock:
+class AircraftArrays:
     """State of many aircraft, numbered in order of registration.
 
     Args:
@@ -44,42 +44,44 @@ class Flock:
     """
 
     def __init__(self, names: Sequence[str] = ()) -> None:
-        self.counts, self.shelves = Counts(names), Shelves()
+        self.counts, self.pending = MessageCounters(names), PendingRows()
         self.clocks = np.empty((0, *clock.new_clocks().shape))
-        self.look = np.empty(0)  # latest time of the next messages other than rows, (m,) [s since 1970]
-        self._memory = np.empty((0, *new_memory().shape))
+        self.next_due_t = np.empty(0)  # latest time of the next messages other than rows, (m,) [s since 1970]
+        self._arbiter_state = np.empty((0, *new_arbiter_state().shape))
 
-    def add(self, uav: int) -> int:
+    def add_aircraft(self, uav: int) -> int:
         """Add one aircraft; return its number."""
-        self.counts.add()
-        self.shelves.add(uav)
-        self.look = np.append(self.look, -np.inf)
+        self.counts.add_aircraft()
+        self.pending.add_aircraft(uav)
+        self.next_due_t = np.append(self.next_due_t, -np.inf)
         self.clocks = np.concatenate([self.clocks, clock.new_clocks()[None]])
-        self._memory = np.concatenate([self._memory, new_memory()[None]])
+        self._arbiter_state = np.concatenate([self._arbiter_state, new_arbiter_state()[None]])
         return len(self.clocks) - 1
 
-    def reset(self, number: int) -> None:
+    def reset_aircraft(self, number: int) -> None:
         """Reset one aircraft; it has no messages until data arrive."""
         self.counts.reset(number)
-        self.clocks[number], self._memory[number] = clock.new_clocks(), new_memory()
-        self.shelves.refused[number] = 0
-        self.look[number] = np.inf
+        self.clocks[number], self._arbiter_state[number] = clock.new_clocks(), new_arbiter_state()
+        self.pending.dropped[number] = 0
+        self.next_due_t[number] = np.inf
 
-    def judge(self, laid: Laid) -> Judged:
+    def arbitrate(self, batch: RowBatch) -> ArbitrationResult:
         """Assign fleet times to rows and store accepted rows; late, repeated and lower-ranked rows are skipped."""
-        n, many = len(laid.owner), len(self.clocks)
-        t, fate, jumped = np.empty(n), np.empty(n, np.int8), np.full(many, np.nan)
+        n, count = len(batch.owner), len(self.clocks)
+        t, decision, jumped = np.empty(n), np.empty(n, np.int8), np.full(count, np.nan)
         advanced = np.empty(n)
-        order = (laid.owner, laid.tick, laid.raw_s, laid.arrival, laid.field, laid.rank, laid.given)
-        settle(self.clocks, self._memory, *order, t, fate, jumped, advanced)
-        kept = np.flatnonzero(fate == KEPT)
-        key = laid.owner[kept] * len(FIELDS) + laid.field[kept]
-        self.shelves.lay(key, laid.arrival[kept], t[kept], laid.values[kept])
-        newest = np.full(many, np.nan)
-        newest[laid.owner] = laid.arrival
-        return Judged(jumped, np.bincount(laid.owner[fate == REFUSED], minlength=many), newest, advanced)
+        columns = (batch.owner, batch.tick, batch.raw_s, batch.arrival, batch.field, batch.rank, batch.requires)
+        arbitrate_rows(self.clocks, self._arbiter_state, *columns, t, decision, jumped, advanced)
+        accepted = np.flatnonzero(decision == ACCEPTED)
+        key = batch.owner[accepted] * len(FIELDS) + batch.field[accepted]
+        self.pending.add_rows(key, batch.arrival[accepted], t[accepted], batch.values[accepted])
+        newest = np.full(count, np.nan)
+        newest[batch.owner] = batch.arrival
+        return ArbitrationResult(
+            jumped, np.bincount(batch.owner[decision == REJECTED], minlength=count), newest, advanced
+        )
 
-    def lay(self, number: int, field: str, t: np.ndarray, x: np.ndarray) -> None:
+    def add_rows(self, number: int, field: str, t: np.ndarray, x: np.ndarray) -> None:
         """Add rows of one field that already have fleet times.
 
         Args:
@@ -88,15 +90,18 @@ class Flock:
             t: fleet time, increasing and later than all earlier rows, (n,) [s since 1970]
             x: values, (n, k)
         """
-        wide = np.pad(x, ((0, 0), (0, WIDEST - x.shape[1])))
-        self.shelves.lay(np.full(len(t), number * len(FIELDS) + FIELDS.index(field)), t, t, wide)
+        padded = np.pad(x, ((0, 0), (0, MAX_COLUMNS - x.shape[1])))
+        self.pending.add_rows(np.full(len(t), number * len(FIELDS) + FIELDS.index(field)), t, t, padded)
 
     def due(self, now: float) -> list[int]:
         """Return the numbers of aircraft with messages other than rows at `now` [s since 1970]."""
-        return np.flatnonzero(self.look <= now).tolist()
+        return np.flatnonzero(self.next_due_t <= now).tolist()
 
-    def take(self, now: float) -> dict[int, Wire]:
+    def take_samples(self, now: float) -> dict[int, EncodedMessage]:
         """Return the samples of rows received up to `now` [s since 1970], by aircraft number."""
-        self.counts.upto(now)
-        uavs = self.shelves.uavs
-        return {number: Wire(Sample, int(uavs[number]), told, t) for number, told, t in self.shelves.take(now)}
+        self.counts.count_until(now)
+        uavs = self.pending.uavs
+        return {
+            number: EncodedMessage(Sample, int(uavs[number]), payload, t)
+            for number, payload, t in self.pending.take_samples(now)
+        }

@@ -12,23 +12,23 @@ from fleet.contract import COLUMNS, Sample
 Packed = tuple[int, bytes, float]
 """Number of the aircraft, bytes of its `Sample`, the sample's time [s since 1970]."""
 FIELDS = tuple(COLUMNS)
-MOST_ROWS = 2_000  # maximum rows of one field in one message
+MAX_ROWS = 2_000  # maximum rows of one field in one message
 WIDTHS = np.array([len(COLUMNS[field]) for field in FIELDS])
-_WHOLE = {"position", "leg", "target", "gnss"}  # integer fields, <i4; all others are <f4
-WHOLE = np.array([field in _WHOLE for field in FIELDS])
-_MOST_HEAD = 160  # upper limit of the bytes of a field without its numbers
+_INTEGER_FIELDS = {"position", "leg", "target", "gnss"}  # integer fields, <i4; all others are <f4
+IS_INTEGER = np.array([field in _INTEGER_FIELDS for field in FIELDS])
+_MAX_FIELD_HEADER = 160  # upper limit of the bytes of a field without its numbers
 
 
-def _chunks(*told: bytes) -> tuple[np.ndarray, np.ndarray]:
+def _concatenated(*parts: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Concatenate byte strings: bytes, and start of each."""
-    return np.frombuffer(b"".join(told), np.uint8), np.cumsum([0, *map(len, told)])
+    return np.frombuffer(b"".join(parts), np.uint8), np.cumsum([0, *map(len, parts)])
 
 
-_START = encode(Sample(uav=0, t=0.0))
-_NAMES = _chunks(*(encode(field) for field in FIELDS))
-_BEGIN = np.frombuffer(_START[: _START.index(b"\xa3uav") + 4], np.uint8)
+_EMPTY_SAMPLE = encode(Sample(uav=0, t=0.0))
+_FIELD_NAMES = _concatenated(*(encode(field) for field in FIELDS))
+_PREFIX = np.frombuffer(_EMPTY_SAMPLE[: _EMPTY_SAMPLE.index(b"\xa3uav") + 4], np.uint8)
 _T = encode("t")
-_WORDS = _chunks(
+_FRAGMENTS = _concatenated(
     _T + b"\xcb",  # 0: time
     b"\x82" + _T + b"\x83" + encode("dtype") + encode("<f8") + encode("shape") + b"\x91",  # 1: times of rows
     encode("data"),  # 2: before any bytes
@@ -38,15 +38,15 @@ _WORDS = _chunks(
 
 
 @nb.njit(cache=True, nogil=True)
-def _put(out, at, told, start, stop):
-    to, start, n = nb.uint64(at), nb.uint64(start), nb.uint64(stop - start)  # unsigned indices: twice as fast
+def _copy_bytes(out, at, source, start, stop):
+    dest, start, n = nb.uint64(at), nb.uint64(start), nb.uint64(stop - start)  # unsigned indices: twice as fast
     for i in range(n):
-        out[to + i] = told[start + i]
+        out[dest + i] = source[start + i]
     return at + stop - start
 
 
 @nb.njit(cache=True, nogil=True)
-def _number(out, at, value):
+def _write_uint(out, at, value):
     """Write a non-negative integer in the shortest msgpack form."""
     if value < 0x80:
         out[at] = value
@@ -59,7 +59,7 @@ def _number(out, at, value):
 
 
 @nb.njit(cache=True, nogil=True)
-def _data(out, at, size):
+def _write_bin_header(out, at, size):
     """Write the msgpack header of a byte string."""
     if size < 0x100:
         out[at], out[at + 1] = 0xC4, size
@@ -69,36 +69,52 @@ def _data(out, at, size):
 
 
 @nb.njit(cache=True, nogil=True)
-def _field(out, at, times, values, field, whole, words, w):
+def _write_field(out, at, times, values, columns, is_integer, fragments, offsets):
     """Write the rows of one field: times (n,), values (n, 8)."""
-    n, width = len(times), field
-    one, as_float, as_int = np.empty(1), np.empty(1, np.float32), np.empty(1, np.int32)
-    raw, raw_float, raw_int = one.view(np.uint8), as_float.view(np.uint8), as_int.view(np.uint8)
-    at = _data(out, _put(out, _number(out, _put(out, at, words, w[1], w[2]), n), words, w[2], w[3]), 8 * n)
+    n, width = len(times), columns
+    as_double, as_float, as_int = np.empty(1), np.empty(1, np.float32), np.empty(1, np.int32)
+    double_bytes, float_bytes, int_bytes = as_double.view(np.uint8), as_float.view(np.uint8), as_int.view(np.uint8)
+    at = _write_bin_header(
+        out,
+        _copy_bytes(
+            out,
+            _write_uint(out, _copy_bytes(out, at, fragments, offsets[1], offsets[2]), n),
+            fragments,
+            offsets[2],
+            offsets[3],
+        ),
+        8 * n,
+    )
     for i in range(n):
-        one[0] = times[i]
-        at = _put(out, at, raw, 0, 8)
-    at = _put(out, at, words, w[4], w[5]) if whole else _put(out, at, words, w[3], w[4])
-    at = _put(out, _number(out, _number(out, at, n), width), words, w[2], w[3])
-    at = _data(out, at, 4 * width * n)
+        as_double[0] = times[i]
+        at = _copy_bytes(out, at, double_bytes, 0, 8)
+    at = (
+        _copy_bytes(out, at, fragments, offsets[4], offsets[5])
+        if is_integer
+        else _copy_bytes(out, at, fragments, offsets[3], offsets[4])
+    )
+    at = _copy_bytes(out, _write_uint(out, _write_uint(out, at, n), width), fragments, offsets[2], offsets[3])
+    at = _write_bin_header(out, at, 4 * width * n)
     for i in range(n):
         for k in range(width):
-            if whole:
+            if is_integer:
                 as_int[0] = np.int32(values[i, k])
-                at = _put(out, at, raw_int, 0, 4)
+                at = _copy_bytes(out, at, int_bytes, 0, 4)
             else:
                 as_float[0] = values[i, k]
-                at = _put(out, at, raw_float, 0, 4)
+                at = _copy_bytes(out, at, float_bytes, 0, 4)
     return at
 
 
 @nb.njit(cache=True, nogil=True)
-def _samples(out, uavs, start, stop, t, values, widths, whole, begin, names, first, words, w):
+def _write_samples(
+    out, uavs, start, stop, t, values, widths, is_integer, prefix, names, name_offsets, fragments, offsets
+):
     """Write a sample for every aircraft with rows; return owners, end of each in `out`, and sample times."""
     owners, ends, at = np.empty(len(start), np.int64), np.empty(len(start), np.int64), 0
-    ts = np.empty(len(start))
+    sample_t = np.empty(len(start))
     newest = np.empty(1)
-    raw, n = newest.view(np.uint8), 0
+    time_bytes, n = newest.view(np.uint8), 0
     for owner in range(len(start)):
         newest[0] = -np.inf
         for field in range(len(widths)):
@@ -106,24 +122,41 @@ def _samples(out, uavs, start, stop, t, values, widths, whole, begin, names, fir
                 newest[0] = max(newest[0], t[stop[owner, field] - 1])
         if newest[0] == -np.inf:
             continue
-        at = _put(out, _number(out, _put(out, at, begin, 0, len(begin)), uavs[owner]), words, w[0], w[1])
+        at = _copy_bytes(
+            out,
+            _write_uint(out, _copy_bytes(out, at, prefix, 0, len(prefix)), uavs[owner]),
+            fragments,
+            offsets[0],
+            offsets[1],
+        )
         for k in range(8):
-            out[at + k] = raw[7 - k]
+            out[at + k] = time_bytes[7 - k]
         at += 8
         for field in range(len(widths)):
-            at = _put(out, at, names, first[field], first[field + 1])
-            a, b = start[owner, field], stop[owner, field]
-            if a < b:
-                at = _field(out, at, t[a:b], values[a:b], widths[field], whole[field], words, w)
+            at = _copy_bytes(out, at, names, name_offsets[field], name_offsets[field + 1])
+            first_row, end_row = start[owner, field], stop[owner, field]
+            if first_row < end_row:
+                at = _write_field(
+                    out,
+                    at,
+                    t[first_row:end_row],
+                    values[first_row:end_row],
+                    widths[field],
+                    is_integer[field],
+                    fragments,
+                    offsets,
+                )
             else:
                 out[at] = 0xC0
                 at += 1
-        owners[n], ends[n], ts[n] = owner, at, newest[0]
+        owners[n], ends[n], sample_t[n] = owner, at, newest[0]
         n += 1
-    return owners[:n], ends[:n], ts[:n]
+    return owners[:n], ends[:n], sample_t[:n]
 
 
-def samples(uavs: np.ndarray, start: np.ndarray, stop: np.ndarray, t: np.ndarray, values: np.ndarray) -> list[Packed]:
+def pack_samples(
+    uavs: np.ndarray, start: np.ndarray, stop: np.ndarray, t: np.ndarray, values: np.ndarray
+) -> list[Packed]:
     """Encode the rows of all aircraft that have rows.
 
     Args:
@@ -133,9 +166,13 @@ def samples(uavs: np.ndarray, start: np.ndarray, stop: np.ndarray, t: np.ndarray
         values: columns, (n, 8)
     """
     rows = stop - start
-    size = int((rows * (8 + 4 * WIDTHS)).sum()) + (64 + _MOST_HEAD * len(FIELDS)) * int((rows > 0).any(axis=1).sum())
+    size = int((rows * (8 + 4 * WIDTHS)).sum()) + (64 + _MAX_FIELD_HEADER * len(FIELDS)) * int(
+        (rows > 0).any(axis=1).sum()
+    )
     out = np.empty(size, np.uint8)
-    owners, ends, ts = _samples(out, uavs, start, stop, t, values, WIDTHS, WHOLE, _BEGIN, *_NAMES, *_WORDS)
-    told, stops = out[: ends[-1]].tobytes() if len(ends) else b"", ends.tolist()
-    found = zip(owners.tolist(), [0, *stops][:-1], stops, ts.tolist(), strict=True)
-    return [(owner, told[start:stop], t) for owner, start, stop, t in found]
+    owners, ends, sample_t = _write_samples(
+        out, uavs, start, stop, t, values, WIDTHS, IS_INTEGER, _PREFIX, *_FIELD_NAMES, *_FRAGMENTS
+    )
+    payload, stops = out[: ends[-1]].tobytes() if len(ends) else b"", ends.tolist()
+    entries = zip(owners.tolist(), [0, *stops][:-1], stops, sample_t.tolist(), strict=True)
+    return [(owner, payload[start:stop], t) for owner, start, stop, t in entries]

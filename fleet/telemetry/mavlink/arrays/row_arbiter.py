@@ -9,23 +9,23 @@ from fleet.contract import COLUMNS
 from fleet.telemetry.tables import clock as c
 
 FIELDS = tuple(COLUMNS)
-YIELD_S = 3.0  # silence of a source after which a lower-ranked source is used [s]
-SLOWER = 1.5  # a source with a longer relative period is skipped in favour of a faster one
-SMOOTH = 0.1  # weight of the newest interval in the mean period of a source
-RANKS = 4  # number of ranks
+SOURCE_TIMEOUT_S = 3.0  # silence of a source after which a lower-ranked source is used [s]
+MAX_PERIOD_RATIO = 1.5  # a source with a longer relative period is skipped in favour of a faster one
+SMOOTHING = 0.1  # weight of the newest interval in the mean period of a source
+RANK_COUNT = 4  # number of ranks
 # state columns: newest accepted time; by rank: newest time, mean period
-LAST, HEARD, EVERY = 0, 1, 1 + RANKS
+ACCEPTED_T, SOURCE_T, SOURCE_PERIOD = 0, 1, 1 + RANK_COUNT
 NO_FIELD = -1
-KEPT, PASSED_OVER, REFUSED = range(3)
+ACCEPTED, SKIPPED, REJECTED = range(3)
 
 
-def new_memory() -> np.ndarray:
+def new_arbiter_state() -> np.ndarray:
     """Return the initial state of one aircraft, (fields, SOURCE_PERIOD + RANK_COUNT)."""
-    return np.tile([-inf] * (1 + RANKS) + [inf] * RANKS, (len(FIELDS), 1))
+    return np.tile([-inf] * (1 + RANK_COUNT) + [inf] * RANK_COUNT, (len(FIELDS), 1))
 
 
 @nb.njit(cache=True, nogil=True)
-def settle(clocks, memory, owner, ticks, raw_s, arrival, field, rank, given, t, fate, jumped, advanced):
+def arbitrate_rows(clocks, state, owner, ticks, raw_s, arrival, field, rank, requires, t, decision, jumped, advanced):
     """Arbitrate rows in order of reception.
 
     Args:
@@ -41,57 +41,59 @@ def settle(clocks, memory, owner, ticks, raw_s, arrival, field, rank, given, t, 
         advanced: filled with the forward re-anchoring step of the clock at this row, mostly 0, (n,) [s]
     """
     for i in range(len(t)):
-        mine, fields = clocks[owner[i]], memory[owner[i]]
-        known, ahead = _jumps(mine), _advance(mine)
-        t[i] = c.tell(mine, ticks[i], raw_s[i], arrival[i])
-        if _jumps(mine) != known:
+        aircraft_clocks, field_states = clocks[owner[i]], state[owner[i]]
+        jumps_before, advance_before = _jumps(aircraft_clocks), _advance(aircraft_clocks)
+        t[i] = c.message_time(aircraft_clocks, ticks[i], raw_s[i], arrival[i])
+        if _jumps(aircraft_clocks) != jumps_before:
             jumped[owner[i]] = arrival[i]
-        advanced[i] = _advance(mine) - ahead
+        advanced[i] = _advance(aircraft_clocks) - advance_before
         if isnan(t[i]):
-            fate[i] = REFUSED
-        elif given[i] != NO_FIELD and t[i] > fields[given[i], LAST] + YIELD_S:
-            fate[i] = PASSED_OVER
+            decision[i] = REJECTED
+        elif requires[i] != NO_FIELD and t[i] > field_states[requires[i], ACCEPTED_T] + SOURCE_TIMEOUT_S:
+            decision[i] = SKIPPED
         else:
-            fate[i] = _judge(fields[field[i]], rank[i], t[i], ticks[i] == c.NONE)
+            decision[i] = _decide(field_states[field[i]], rank[i], t[i], ticks[i] == c.NONE)
 
 
 @nb.njit(cache=True, nogil=True)
-def _jumps(clocks):
-    return max(clocks[c.BOOT, c.JUMPS], clocks[c.USEC, c.JUMPS], clocks[c.USEC32, c.JUMPS])
+def _jumps(aircraft_clocks):
+    return max(aircraft_clocks[c.BOOT, c.JUMPS], aircraft_clocks[c.USEC, c.JUMPS], aircraft_clocks[c.USEC32, c.JUMPS])
 
 
 @nb.njit(cache=True, nogil=True)
-def _advance(clocks):
-    return max(clocks[c.BOOT, c.ADVANCE], clocks[c.USEC, c.ADVANCE], clocks[c.USEC32, c.ADVANCE])
+def _advance(aircraft_clocks):
+    return max(
+        aircraft_clocks[c.BOOT, c.ADVANCE], aircraft_clocks[c.USEC, c.ADVANCE], aircraft_clocks[c.USEC32, c.ADVANCE]
+    )
 
 
 @nb.njit(cache=True)
-def _judge(memory, rank, t, timeless):
+def _decide(state, rank, t, timeless):
     """Return the decision for one row; a repeated time is no error for messages without time stamp."""
-    heard, every = memory[HEARD:EVERY], memory[EVERY:]
-    step = t - heard[rank]
+    newest, period = state[SOURCE_T:SOURCE_PERIOD], state[SOURCE_PERIOD:]
+    step = t - newest[rank]
     repeated = step <= 0
-    if step >= YIELD_S:
-        every[rank] = inf  # known after its next row
+    if step >= SOURCE_TIMEOUT_S:
+        period[rank] = inf  # known after its next row
     elif not repeated:
-        every[rank] = step if every[rank] == inf else every[rank] + SMOOTH * (step - every[rank])
-    heard[rank] = max(heard[rank], t)
-    if rank != _speaker(heard, every, t):
-        return PASSED_OVER
-    if t > memory[LAST]:
-        memory[LAST] = t
-        return KEPT
-    return REFUSED if repeated and not timeless else PASSED_OVER
+        period[rank] = step if period[rank] == inf else period[rank] + SMOOTHING * (step - period[rank])
+    newest[rank] = max(newest[rank], t)
+    if rank != _preferred_rank(newest, period, t):
+        return SKIPPED
+    if t > state[ACCEPTED_T]:
+        state[ACCEPTED_T] = t
+        return ACCEPTED
+    return REJECTED if repeated and not timeless else SKIPPED
 
 
 @nb.njit(cache=True)
-def _speaker(heard, every, t):
+def _preferred_rank(newest, period, t):
     """Return the highest active rank: received recently, at a period comparable to the fastest source."""
-    busiest = inf
-    for rank in range(RANKS):
-        if t < heard[rank] + YIELD_S:
-            busiest = min(busiest, every[rank])
-    for rank in range(RANKS - 1, -1, -1):
-        if t < heard[rank] + YIELD_S and every[rank] <= SLOWER * busiest:
+    shortest = inf
+    for rank in range(RANK_COUNT):
+        if t < newest[rank] + SOURCE_TIMEOUT_S:
+            shortest = min(shortest, period[rank])
+    for rank in range(RANK_COUNT - 1, -1, -1):
+        if t < newest[rank] + SOURCE_TIMEOUT_S and period[rank] <= MAX_PERIOD_RATIO * shortest:
             return rank
     return 0

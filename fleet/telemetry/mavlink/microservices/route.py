@@ -8,188 +8,193 @@ import msgspec
 
 from fleet.contract import MAX_ITEMS, Item, Mission
 
-NOTHING = 0  # not a MAV_CMD; marks an invalid item
+NO_COMMAND = 0  # not a MAV_CMD; marks an invalid item
 NAV_LAST = 95  # MAV_CMD_NAV_LAST: commands above it have no waypoint
 DO_JUMP = 177
 WAYPOINT = 16
-SPOT, FIRST = 10, 3  # check of a recalled mission: the first 3 of every 10 items are downloaded
+CHECK_STRIDE, CHECK_COUNT = 10, 3  # check of a recalled mission: the first 3 of every 10 items are downloaded
 ACCEPT_S = 3.0  # silence after which an upload without acknowledgement is accepted [s]
-SETTLE_S = 2.0  # silence after which an incomplete list is published [s]
+PARTIAL_AFTER_S = 2.0  # silence after which an incomplete list is published [s]
 
-_MOVED_M = 1.0  # smaller changes of home are ignored [m]
+_MIN_HOME_MOVE_M = 1.0  # smaller changes of home are ignored [m]
 _ABSOLUTE = {3: 0, 6: 5}  # MAV_FRAME: relative to home -> above sea level
 
 _NAMES = ("MISSION_COUNT", "MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_ACK", "MISSION_CLEAR_ALL", "MISSION_CURRENT")
-MESSAGES = frozenset(_NAMES)
+MISSION_MESSAGES = frozenset(_NAMES)
 
 
-class _Draft:
+class _MissionTransfer:
     """A mission transfer in progress, in one direction."""
 
     def __init__(self, count: int | None, now: float) -> None:
         self.count = count
         self.items: dict[int, Item] = {}
         self.notes: dict[int, str] = {}
-        self.guessed: set[int] = set()  # items from the recalled mission
-        self.heard = now
+        self.recalled: set[int] = set()  # items from the recalled mission
+        self.last_arrival = now
 
-    def whole(self) -> bool:
+    def is_complete(self) -> bool:
         return self.count is not None and all(seq in self.items for seq in range(self.count))
 
 
-class RouteBook:
+class MissionCollector:
     """Mission of one aircraft: transfers in both directions, accepted items, current item."""
 
     def __init__(self, uav: int) -> None:
         self.uav = uav
         self.items: tuple[Item, ...] = ()
         self.complete = False
-        self.stale = True  # the mission must be downloaded again
+        self.needs_download = True  # the mission must be downloaded again
         self.seq = -1
         self.count: int | None = None  # item count of the download in progress
         self.rejected = 0
-        self.unproven: set[int] = set()  # recalled items, accepted after a check of a few others
+        self.unconfirmed: set[int] = set()  # recalled items, accepted after a check of a few others
         self._recalled: tuple[Item, ...] = ()
         self._home_m: float | None = None
-        self._sentence = ""
-        self._drafts: dict[bool, _Draft | None] = {False: None, True: None}
+        self._text = ""
+        self._transfers: dict[bool, _MissionTransfer | None] = {False: None, True: None}
         self._changed = False
 
-    def hear(self, message: Any, *, up: bool, now: float) -> None:
+    def process(self, message: Any, *, is_upload: bool, now: float) -> None:
         """Process one mission protocol message; `is_upload` if a ground station sent it to the aircraft."""
         name = message.get_type()
         if name == "MISSION_CURRENT":
-            self._in_force(message.seq)
+            self._set_current(message.seq)
         elif getattr(message, "mission_type", 0) != 0:
             return  # geofence or rally points
         elif name == "MISSION_COUNT":
-            self._open(message.count, up, now)
+            self._start_transfer(message.count, is_upload, now)
         elif name in ("MISSION_ITEM", "MISSION_ITEM_INT"):
-            self._write(message, up, now)
-        elif name == "MISSION_ACK" and not up:
-            self._settle(accepted=message.type == 0)
-        elif name == "MISSION_CLEAR_ALL" and up:
-            self.stale = True
+            self._add_item(message, is_upload, now)
+        elif name == "MISSION_ACK" and not is_upload:
+            self._finish_upload(accepted=message.type == 0)
+        elif name == "MISSION_CLEAR_ALL" and is_upload:
+            self.needs_download = True
 
-    def adopt(self, items: tuple[Item, ...]) -> None:
+    def set_items(self, items: tuple[Item, ...]) -> None:
         """Set a complete mission from an onboard log."""
-        draft = _Draft(len(items), 0.0)
-        draft.items = dict(enumerate(items))
-        self._adopt(draft)
+        transfer = _MissionTransfer(len(items), 0.0)
+        transfer.items = dict(enumerate(items))
+        self._accept(transfer)
 
-    def recall(self, items: tuple[Item, ...]) -> None:
+    def set_recalled(self, items: tuple[Item, ...]) -> None:
         """Set the previous mission; it is reused if the count and a few items are equal."""
         self._recalled = items
 
-    def place_home(self, altitude_m: float) -> None:
+    def set_home_altitude(self, altitude_m: float) -> None:
         """Set the altitude of home above sea level [m], for missions without home item (PX4)."""
-        if isfinite(altitude_m) and (self._home_m is None or abs(altitude_m - self._home_m) > _MOVED_M):
+        if isfinite(altitude_m) and (self._home_m is None or abs(altitude_m - self._home_m) > _MIN_HOME_MOVE_M):
             self._home_m = altitude_m
             self._changed = self._changed or bool(self.items)
 
     def missing(self) -> list[int] | None:
         """Return the missing sequence numbers of the download in progress; None without count."""
-        draft = self._drafts[False]
-        if draft is None or draft.count is None:
+        transfer = self._transfers[False]
+        if transfer is None or transfer.count is None:
             return None
-        return [seq for seq in range(draft.count) if seq not in draft.items]
+        return [seq for seq in range(transfer.count) if seq not in transfer.items]
 
-    def drop_download(self) -> None:
+    def abort_download(self) -> None:
         """Discard a stalled download; the mission must be requested again."""
-        self._drafts[False], self.stale = None, True
+        self._transfers[False], self.needs_download = None, True
 
-    def take(self, now: float) -> Mission | None:
+    def take_update(self, now: float) -> Mission | None:
         """Return the mission if it has changed."""
-        up, down = self._drafts[True], self._drafts[False]
-        if up is not None and up.whole() and now - up.heard > ACCEPT_S:
-            self._settle(accepted=True)
-        if down is not None and not self.complete and down.items and now - down.heard > SETTLE_S:
-            self._show_part(down)
+        upload, download = self._transfers[True], self._transfers[False]
+        if upload is not None and upload.is_complete() and now - upload.last_arrival > ACCEPT_S:
+            self._finish_upload(accepted=True)
+        if (
+            download is not None
+            and not self.complete
+            and download.items
+            and now - download.last_arrival > PARTIAL_AFTER_S
+        ):
+            self._publish_partial(download)
         if not self._changed:
             return None
         self._changed = False
-        sentence = f"uav-{self.uav}: {self._sentence}" if self._sentence else ""
-        items = self.items if self._home_m is None else tuple(_absolute(i, self._home_m) for i in self.items)
+        sentence = f"uav-{self.uav}: {self._text}" if self._text else ""
+        items = self.items if self._home_m is None else tuple(_absolute(item, self._home_m) for item in self.items)
         return Mission(uav=self.uav, t=now, items=items, seq=self.seq, complete=self.complete, sentence=sentence)
 
-    def _in_force(self, seq: int) -> None:
+    def _set_current(self, seq: int) -> None:
         seq = -1 if seq == 65535 else seq
         if seq != self.seq:
             self.seq = seq
             self._changed = self._changed or self.complete or bool(self.items)
 
-    def _open(self, count: int, up: bool, now: float) -> None:
+    def _start_transfer(self, count: int, is_upload: bool, now: float) -> None:
         if count > MAX_ITEMS:
             self.rejected += 1
-            self._say(f"found a mission of {count} items, expected at most {MAX_ITEMS}; shorten it")
+            self._set_text(f"found a mission of {count} items, expected at most {MAX_ITEMS}; shorten it")
             return
-        draft = self._drafts[up]
-        if draft is None or draft.count != count:
-            draft = self._drafts[up] = _Draft(count, now)
-            if not up and count == len(self._recalled):
-                draft.items = {item.seq: item for item in self._recalled if item.seq % SPOT >= FIRST}
-                draft.guessed = set(draft.items)
-        if count == 0 and not up:
-            self._adopt(draft)
+        transfer = self._transfers[is_upload]
+        if transfer is None or transfer.count != count:
+            transfer = self._transfers[is_upload] = _MissionTransfer(count, now)
+            if not is_upload and count == len(self._recalled):
+                transfer.items = {item.seq: item for item in self._recalled if item.seq % CHECK_STRIDE >= CHECK_COUNT}
+                transfer.recalled = set(transfer.items)
+        if count == 0 and not is_upload:
+            self._accept(transfer)
 
-    def _write(self, message: Any, up: bool, now: float) -> None:
-        draft = self._drafts[up]
-        if draft is None and not up and self.complete and message.get_type() == "MISSION_ITEM_INT":
-            return self._compare(message)
-        if draft is None:
-            draft = self._drafts[up] = _Draft(None, now)
-        limit = MAX_ITEMS if draft.count is None else draft.count
+    def _add_item(self, message: Any, is_upload: bool, now: float) -> None:
+        transfer = self._transfers[is_upload]
+        if transfer is None and not is_upload and self.complete and message.get_type() == "MISSION_ITEM_INT":
+            return self._check_item(message)
+        if transfer is None:
+            transfer = self._transfers[is_upload] = _MissionTransfer(None, now)
+        limit = MAX_ITEMS if transfer.count is None else transfer.count
         if message.seq >= limit:
             self.rejected += 1
             return
         item, note = read_item(message)
         self.rejected += bool(note)
-        if draft.guessed and item != self._recalled[item.seq]:
-            draft.items = {seq: known for seq, known in draft.items.items() if seq not in draft.guessed}
-            draft.guessed, self._recalled = set(), ()
-        draft.guessed.discard(item.seq)
-        draft.items[item.seq], draft.heard = item, now
-        draft.notes.pop(item.seq, None)
+        if transfer.recalled and item != self._recalled[item.seq]:
+            transfer.items = {seq: existing for seq, existing in transfer.items.items() if seq not in transfer.recalled}
+            transfer.recalled, self._recalled = set(), ()
+        transfer.recalled.discard(item.seq)
+        transfer.items[item.seq], transfer.last_arrival = item, now
+        transfer.notes.pop(item.seq, None)
         if note:
-            draft.notes[item.seq] = note
-        if not up and draft.whole():
-            self._adopt(draft)
+            transfer.notes[item.seq] = note
+        if not is_upload and transfer.is_complete():
+            self._accept(transfer)
 
-    def _compare(self, message: Any) -> None:
+    def _check_item(self, message: Any) -> None:
         """Compare one item with the complete mission; request a download if it differs."""
-        known = self.items[message.seq : message.seq + 1]
-        if known == (read_item(message)[0],):
-            self.unproven.discard(message.seq)
-        elif known:
-            self.stale = True
+        expected = self.items[message.seq : message.seq + 1]
+        if expected == (read_item(message)[0],):
+            self.unconfirmed.discard(message.seq)
+        elif expected:
+            self.needs_download = True
 
-    def _settle(self, accepted: bool) -> None:
-        draft, self._drafts[True] = self._drafts[True], None
+    def _finish_upload(self, accepted: bool) -> None:
+        transfer, self._transfers[True] = self._transfers[True], None
         if accepted:
-            if draft is not None and draft.whole():
-                self._adopt(draft)
-            self._drafts[False] = None  # the download is of the replaced mission
-            self.stale = True  # the autopilot may change items, e.g. home; download again
+            if transfer is not None and transfer.is_complete():
+                self._accept(transfer)
+            self._transfers[False] = None  # the download is of the replaced mission
+            self.needs_download = True  # the autopilot may change items, e.g. home; download again
 
-    def _adopt(self, draft: _Draft) -> None:
-        items = tuple(draft.items[seq] for seq in range(draft.count or 0))
-        sentence = "; ".join([*draft.notes.values(), *review(items)][:4])
-        if items != self.items or not self.complete or sentence != self._sentence:
-            self.items, self.complete, self._sentence = items, True, sentence
+    def _accept(self, transfer: _MissionTransfer) -> None:
+        items = tuple(transfer.items[seq] for seq in range(transfer.count or 0))
+        text = "; ".join([*transfer.notes.values(), *mission_problems(items)][:4])
+        if items != self.items or not self.complete or text != self._text:
+            self.items, self.complete, self._text = items, True, text
             self._changed = True
-        self._drafts[False] = self._drafts[True] = None
-        self.stale, self.unproven, self._recalled = False, draft.guessed, ()
+        self._transfers[False] = self._transfers[True] = None
+        self.needs_download, self.unconfirmed, self._recalled = False, transfer.recalled, ()
 
-    def _show_part(self, draft: _Draft) -> None:
-        items = tuple(draft.items[seq] for seq in sorted(draft.items))
+    def _publish_partial(self, transfer: _MissionTransfer) -> None:
+        items = tuple(transfer.items[seq] for seq in sorted(transfer.items))
         if items != self.items:
             self.items = items
-            of = "an unknown number of" if draft.count is None else draft.count
-            self._say(f"{len(items)} of {of} mission items arrived; request the mission again")
+            total = "an unknown number of" if transfer.count is None else transfer.count
+            self._set_text(f"{len(items)} of {total} mission items arrived; request the mission again")
 
-    def _say(self, sentence: str) -> None:
-        self._changed = self._changed or sentence != self._sentence
-        self._sentence = sentence
+    def _set_text(self, text: str) -> None:
+        self._changed = self._changed or text != self._text
+        self._text = text
 
 
 def _absolute(item: Item, home_m: float) -> Item:
@@ -203,12 +208,12 @@ def read_item(message: Any) -> tuple[Item, str]:
     """Parse MISSION_ITEM or MISSION_ITEM_INT; an item with a non-finite coordinate gets command 0."""
     scale = 1.0 if message.get_type() == "MISSION_ITEM_INT" else 1e7
     params = [message.param1, message.param2, message.param3, message.param4]
-    place = [message.x * scale, message.y * scale, float(message.z)]
+    coordinates = [message.x * scale, message.y * scale, float(message.z)]
     note = ""
     command = message.command
-    if not all(map(isfinite, place)) or abs(place[0]) > 2**31 or abs(place[1]) > 2**31:
+    if not all(map(isfinite, coordinates)) or abs(coordinates[0]) > 2**31 or abs(coordinates[1]) > 2**31:
         note = f"mission item {message.seq} has an invalid coordinate and is ignored; upload it again"
-        command, place = NOTHING, [0.0, 0.0, 0.0]
+        command, coordinates = NO_COMMAND, [0.0, 0.0, 0.0]
     elif not all(map(isfinite, params[:3])):
         note = f"mission item {message.seq} has a non-finite parameter, set to 0; upload it again"
     p1, p2, p3, p4 = (p if isfinite(p) else 0.0 for p in params)  # param4 = nan is legal: keep the yaw
@@ -220,34 +225,36 @@ def read_item(message: Any) -> tuple[Item, str]:
         param2=p2,
         param3=p3,
         param4=p4,
-        lat_e7=round(place[0]),
-        lon_e7=round(place[1]),
-        alt_m=place[2],
+        lat_e7=round(coordinates[0]),
+        lon_e7=round(coordinates[1]),
+        alt_m=coordinates[2],
     )
     return item, note
 
 
-def review(items: tuple[Item, ...]) -> list[str]:
+def mission_problems(items: tuple[Item, ...]) -> list[str]:
     """Return the problems of a mission: no items, endless jumps, legs of zero length."""
     if not items:
         return ["the mission has no items; upload one"]
-    found = [f"jump of item {item.seq} never reaches a waypoint; upload another target" for item in _endless(items)]
-    places = [item for item in items[1:] if item.command == WAYPOINT and (item.lat_e7 or item.lon_e7)]
-    for a, b in pairwise(places):
-        if (a.lat_e7, a.lon_e7, a.alt_m) == (b.lat_e7, b.lon_e7, b.alt_m):
-            found.append(f"the leg from item {a.seq} to {b.seq} has no length")
-    return found
+    problems = [
+        f"jump of item {item.seq} never reaches a waypoint; upload another target" for item in _endless_jumps(items)
+    ]
+    waypoints = [item for item in items[1:] if item.command == WAYPOINT and (item.lat_e7 or item.lon_e7)]
+    for start, end in pairwise(waypoints):
+        if (start.lat_e7, start.lon_e7, start.alt_m) == (end.lat_e7, end.lon_e7, end.alt_m):
+            problems.append(f"the leg from item {start.seq} to {end.seq} has no length")
+    return problems
 
 
-def _endless(items: tuple[Item, ...]) -> list[Item]:
+def _endless_jumps(items: tuple[Item, ...]) -> list[Item]:
     """Return the jumps that never reach a waypoint: a loop, or a target that does not exist."""
     by_seq = {item.seq: item for item in items}
-    lost = []
+    endless = []
     for jump in (item for item in items if item.command == DO_JUMP):
-        seq, seen = int(jump.param1), {jump.seq}
-        while (item := by_seq.get(seq)) is not None and seq not in seen and item.command > NAV_LAST:
-            seen.add(seq)
+        seq, visited = int(jump.param1), {jump.seq}
+        while (item := by_seq.get(seq)) is not None and seq not in visited and item.command > NAV_LAST:
+            visited.add(seq)
             seq = int(item.param1) if item.command == DO_JUMP else seq + 1
-        if item is None or seq in seen:
-            lost.append(jump)
-    return lost
+        if item is None or seq in visited:
+            endless.append(jump)
+    return endless

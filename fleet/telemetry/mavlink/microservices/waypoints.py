@@ -10,9 +10,9 @@ from pathlib import Path
 
 from fleet.contract import MAX_ITEMS, Item
 
-_HEAD = "QGC WPL 110"
+_HEADER = "QGC WPL 110"
 _COLUMNS = 12
-_MOST_BYTES = 1 << 20
+_MAX_BYTES = 1 << 20
 
 
 def read_waypoints(path: Path) -> tuple[Item, ...]:
@@ -22,12 +22,12 @@ def read_waypoints(path: Path) -> tuple[Item, ...]:
         ValueError: if it is not a mission file, or a line is invalid; the message names the line.
     """
     with path.open("rb") as file:
-        text = file.read(_MOST_BYTES + 1).decode(errors="replace")
+        text = file.read(_MAX_BYTES + 1).decode(errors="replace")
     lines = [line.strip() for line in text.splitlines()]
-    if not lines or " ".join(lines[0].lstrip("\ufeff").split()) != _HEAD:
-        found = lines[0][:40] if lines else "nothing"
+    if not lines or " ".join(lines[0].lstrip("\ufeff").split()) != _HEADER:
+        first_line = lines[0][:40] if lines else "nothing"
         raise ValueError(
-            f"{path.name}: found {found!r} in the first line, expected {_HEAD!r}; save the mission as waypoints"
+            f"{path.name}: found {first_line!r} in the first line, expected {_HEADER!r}; save the mission as waypoints"
         )
     items = tuple(
         _item(path.name, number, line) for number, line in enumerate(lines[1:], start=2) if line and line[0] != "#"
@@ -44,7 +44,7 @@ def _item(name: str, number: int, line: str) -> Item:
     try:
         seq, _, frame, command, *numbers = columns
         p1, p2, p3, p4, lat, lon, alt, _ = map(float, numbers)
-        whole = int(seq), int(frame), int(float(command))
+        integers = int(seq), int(frame), int(float(command))
     except (ValueError, OverflowError):
         raise ValueError(
             f"{name} line {number}: found {line[:60]!r}, expected {_COLUMNS} numbers; save the mission again"
@@ -54,9 +54,9 @@ def _item(name: str, number: int, line: str) -> Item:
             f"{name} line {number}: found {lat}, {lon} at {alt} m, expected a position on earth; correct it"
         )
     return Item(
-        seq=whole[0],
-        frame=whole[1],
-        command=whole[2],
+        seq=integers[0],
+        frame=integers[1],
+        command=integers[2],
         param1=p1,
         param2=p2,
         param3=p3,

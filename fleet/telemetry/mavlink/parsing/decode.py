@@ -9,69 +9,75 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from fleet.telemetry.mavlink.parsing import scan as s
-from fleet.telemetry.mavlink.parsing.objects import objects
-from fleet.telemetry.mavlink.parsing.payload_gather import deal, gather
-from fleet.telemetry.mavlink.parsing.received import Heard, tight
+from fleet.telemetry.mavlink.parsing.objects import message_objects
+from fleet.telemetry.mavlink.parsing.payload_gather import collect_payloads, group_payloads
+from fleet.telemetry.mavlink.parsing.received import ReceivedBytes, compact
 
-MOST_SENDERS = 512  # senders of one link whose incomplete frames are stored
+MAX_SENDERS = 512  # senders of one link whose incomplete frames are stored
 _NAMES = {number: kind.msgname for number, kind in dialect.mavlink_map.items()}
 IDS = {name: number for number, name in _NAMES.items()}
-_KIND = {"c": "S", "b": "i1", "B": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4"}
-_KIND |= {"q": "<i8", "Q": "<u8", "f": "<f4", "d": "<f8"}
+_NUMPY_TYPE = {"c": "S", "b": "i1", "B": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4"}
+_NUMPY_TYPE |= {"q": "<i8", "Q": "<u8", "f": "<f4", "d": "<f8"}
 
 
 class Frames(NamedTuple):
     """Valid frames in order of reception."""
 
     buf: np.ndarray  # bytes that contain the frames, (b,) uint8
-    at: np.ndarray  # `scan.COLUMNS` numbers per frame, (n, 9)
+    headers: np.ndarray  # `scan.COLUMNS` numbers per frame, (n, 9)
     arrival: np.ndarray  # fleet time, (n,) [s since 1970]
     sender: np.ndarray  # number of the sender in `senders`, (n,)
     senders: tuple[Hashable, ...] = (None,)
 
-    def messages(self, which: np.ndarray) -> list[Any]:
+    def messages(self, frame_numbers: np.ndarray) -> list[Any]:
         """Return frames, by number, as message objects like those of pymavlink, (k,)."""
-        found: list[Any] = [None] * len(which)
-        numbers = self.at[which, s.ID]
-        for number in np.unique(numbers).tolist():
-            mine = np.flatnonzero(numbers == number)
-            said, name = which[mine], _NAMES[number]
-            who = self.at[said][:, [s.SYSTEM, s.COMPONENT]].T.tolist()
-            for k, one in zip(mine.tolist(), objects(name, self.fields(said, name).rows, *who), strict=True):
-                found[k] = one
-        return found
+        messages: list[Any] = [None] * len(frame_numbers)
+        ids = self.headers[frame_numbers, s.ID]
+        for message_id in np.unique(ids).tolist():
+            positions = np.flatnonzero(ids == message_id)
+            selected, name = frame_numbers[positions], _NAMES[message_id]
+            addresses = self.headers[selected][:, [s.SYSTEM, s.COMPONENT]].T.tolist()
+            for k, message in zip(
+                positions.tolist(), message_objects(name, self.fields(selected, name).rows, *addresses), strict=True
+            ):
+                messages[k] = message
+        return messages
 
-    def only(self, which: np.ndarray) -> "Frames":
+    def subset(self, selection: np.ndarray) -> "Frames":
         """Return a selection of the frames, by number or mask."""
-        return self._replace(at=self.at[which], arrival=self.arrival[which], sender=self.sender[which])
+        return self._replace(
+            headers=self.headers[selection], arrival=self.arrival[selection], sender=self.sender[selection]
+        )
 
-    def fields(self, which: np.ndarray, name: str) -> "Fields":
+    def fields(self, frame_numbers: np.ndarray, name: str) -> "Fields":
         """Return the fields of frames of one message as arrays."""
-        kind = layout(name)
-        laid = gather(self.buf, self.at[which, s.PAYLOAD], self.at[which, s.SIZE], kind.itemsize)
-        return Fields(laid.view(kind)[:, 0])
+        dtype = layout(name)
+        payloads = collect_payloads(
+            self.buf, self.headers[frame_numbers, s.PAYLOAD], self.headers[frame_numbers, s.SIZE], dtype.itemsize
+        )
+        return Fields(payloads.view(dtype)[:, 0])
 
-    def dealt(self) -> "Dealt":
+    def grouped(self) -> "GroupedFrames":
         """Group all frames by message."""
-        return Dealt(self)
+        return GroupedFrames(self)
 
 
-def joined(parts: Sequence[Frames]) -> Frames:
+def joined_frames(parts: Sequence[Frames]) -> Frames:
     """Join several batches in order."""
     if len(parts) == 1:
         return parts[0]
-    ats, numbers = [], []
-    known: dict[Hashable, int] = {}
-    begin = 0
+    headers, senders = [], []
+    sender_index: dict[Hashable, int] = {}
+    offset = 0
     for part in parts:
-        at = part.at.copy()
-        at[:, [s.START, s.STOP, s.PAYLOAD]] += begin
-        ats.append(at)
-        renumbered = [known.setdefault(sender, len(known)) for sender in part.senders]
-        numbers.append(np.array(renumbered, np.int64)[part.sender])
-        begin += len(part.buf)
+        part_headers = part.headers.copy()
+        part_headers[:, [s.START, s.STOP, s.PAYLOAD]] += offset
+        headers.append(part_headers)
+        new_index = [sender_index.setdefault(sender, len(sender_index)) for sender in part.senders]
+        senders.append(np.array(new_index, np.int64)[part.sender])
+        offset += len(part.buf)
     buf, arrival = np.concatenate([part.buf for part in parts]), np.concatenate([part.arrival for part in parts])
-    return Frames(buf, np.concatenate(ats), arrival, np.concatenate(numbers), tuple(known))
+    return Frames(buf, np.concatenate(headers), arrival, np.concatenate(senders), tuple(sender_index))
 
 
 class Fields:
@@ -92,116 +98,129 @@ _DTYPES: dict[str, np.dtype] = {}
 def layout(name: str) -> np.dtype:
     """Return the wire layout of a message, derived from pymavlink's class."""
     if name not in _DTYPES:
-        kind = dialect.mavlink_map[IDS[name]]
-        tokens = re.findall(r"(\d*)([a-zA-Z])", kind.unpacker.format.lstrip("<"))
-        layout: list[Any] = []
-        for field, (count, letter) in zip(kind.ordered_fieldnames, tokens, strict=True):
-            layout.append((field, f"S{count or 1}") if letter in "cs" else (field, _KIND[letter], (int(count or 1),)))
-        _DTYPES[name] = np.dtype([(f[0], f[1]) if len(f) == 2 or f[2] == (1,) else f for f in layout])
+        message_class = dialect.mavlink_map[IDS[name]]
+        tokens = re.findall(r"(\d*)([a-zA-Z])", message_class.unpacker.format.lstrip("<"))
+        dtype_fields: list[Any] = []
+        for field, (count, letter) in zip(message_class.ordered_fieldnames, tokens, strict=True):
+            dtype_fields.append(
+                (field, f"S{count or 1}") if letter in "cs" else (field, _NUMPY_TYPE[letter], (int(count or 1),))
+            )
+        _DTYPES[name] = np.dtype([(f[0], f[1]) if len(f) == 2 or f[2] == (1,) else f for f in dtype_fields])
     return _DTYPES[name]
 
 
-_ORDER = {_NAMES[number]: kind for kind, number in enumerate(sorted(_NAMES))}
-_KINDS = np.zeros(len(s.EXTRA), np.int64)
-_KINDS[[IDS[name] for name in _ORDER]] = list(_ORDER.values())
-_LAYOUTS = [layout(name) for name in _ORDER]
+_KIND_BY_NAME = {_NAMES[number]: kind for kind, number in enumerate(sorted(_NAMES))}
+_KIND_BY_ID = np.zeros(len(s.EXTRA), np.int64)
+_KIND_BY_ID[[IDS[name] for name in _KIND_BY_NAME]] = list(_KIND_BY_NAME.values())
+_LAYOUTS = [layout(name) for name in _KIND_BY_NAME]
 _WIDTHS = np.array([kind.itemsize for kind in _LAYOUTS])
 
 
-KINDS = tuple(_ORDER)
+MESSAGE_NAMES = tuple(_KIND_BY_NAME)
 """Names of all messages of the dialect, by number."""
 
 
-def kinds(frames: Frames) -> np.ndarray:
+def message_kinds(frames: Frames) -> np.ndarray:
     """Return the index of each frame's message in `MESSAGE_NAMES`, (n,)."""
-    return _KINDS[frames.at[:, s.ID]]
+    return _KIND_BY_ID[frames.headers[:, s.ID]]
 
 
-class Dealt:
+class GroupedFrames:
     """Frames grouped by message, in order of reception."""
 
     def __init__(self, frames: Frames) -> None:
-        self._told, begin, self._which, first = deal(frames.buf, frames.at, _KINDS, _WIDTHS)
-        self._begin, self._first = begin.tolist(), first.tolist()
+        self._payloads, payload_start, self._frame_numbers, frame_start = group_payloads(
+            frames.buf, frames.headers, _KIND_BY_ID, _WIDTHS
+        )
+        self._payload_start, self._frame_start = payload_start.tolist(), frame_start.tolist()
 
     def fields(self, name: str) -> tuple[np.ndarray, Fields]:
         """Return the frames of one message: frame numbers, (k,), and field arrays."""
-        kind = _ORDER[name]
-        told = self._told[self._begin[kind] : self._begin[kind + 1]]
-        return self._which[self._first[kind] : self._first[kind + 1]], Fields(told.view(_LAYOUTS[kind]))
+        kind = _KIND_BY_NAME[name]
+        payload = self._payloads[self._payload_start[kind] : self._payload_start[kind + 1]]
+        return self._frame_numbers[self._frame_start[kind] : self._frame_start[kind + 1]], Fields(
+            payload.view(_LAYOUTS[kind])
+        )
 
     def names(self) -> list[str]:
         """Return the names of the received messages."""
-        return [name for name, kind in _ORDER.items() if self._first[kind] < self._first[kind + 1]]
+        return [name for name, kind in _KIND_BY_NAME.items() if self._frame_start[kind] < self._frame_start[kind + 1]]
 
 
 class Decoder:
     """Find frames in the bytes of many senders; incomplete frames are carried over by sender."""
 
     def __init__(self) -> None:
-        self.counts = np.zeros(s.COUNTS, np.int64)
-        self._carry: OrderedDict[Hashable, bytes] = OrderedDict()
+        self.counts = np.zeros(s.COUNTER_COUNT, np.int64)
+        self._carry: OrderedDict[Hashable, tuple[bytes, int]] = OrderedDict()  # bytes; how they begin, see `scan.scan`
 
     def counters(self) -> Counter[str]:
         """Return the counts of messages, bad_bytes, bad_frames and unknown (frames of messages outside the dialect)."""
         names = ("messages", "bad_bytes", "bad_frames", "unknown")
         return Counter(dict(zip(names, self.counts.tolist(), strict=True)))
 
-    def feed(self, heard: Heard) -> Frames:
+    def decode(self, received: ReceivedBytes) -> Frames:
         """Decode pieces in order of arrival; return the frames they complete."""
-        if self._carry and not self._carry.keys().isdisjoint(heard.senders):
-            return self._joined(heard)
-        found = _room(heard.buf, 0)
-        n = s.straight(heard.buf, heard.start, heard.stop, found, s.EXTRA, s.CRC)
+        if self._carry and not self._carry.keys().isdisjoint(received.senders):
+            return self._decode_joined(received)
+        headers = _empty_headers(received.buf, 0)
+        n = s.scan_clean(received.buf, received.start, received.stop, headers, s.EXTRA, s.CRC)
         if n < 0:
             counts = self.counts.copy()
-            parts = np.stack([heard.start, heard.stop, np.zeros_like(heard.start)], axis=1)
-            found, _, _ = frames_of(heard.buf, parts, counts)
+            parts = np.stack([received.start, received.stop, np.zeros_like(received.start)], axis=1)
+            headers, _, _ = find_frames(received.buf, parts, counts)
             if (parts[:, 0] < parts[:, 1]).any():
-                return self._joined(heard)
+                return self._decode_joined(received)
             self.counts[:] = counts
         else:
             self.counts[s.MESSAGES] += n
-            found = found[:n]
-        part = found[:, s.PART]
-        return Frames(heard.buf, found, heard.arrival[part], heard.sender[part], heard.senders)
+            headers = headers[:n]
+        part = headers[:, s.PIECE]
+        return Frames(received.buf, headers, received.arrival[part], received.sender[part], received.senders)
 
-    def _joined(self, heard: Heard) -> Frames:
+    def _decode_joined(self, received: ReceivedBytes) -> Frames:
         """Decode the joined pieces of each sender, after its carried bytes."""
-        order = np.argsort(heard.sender, kind="stable")
-        told, ends = tight(heard.buf, heard.start[order], (heard.stop - heard.start)[order])
-        last = np.searchsorted(heard.sender[order], np.arange(len(heard.senders)), side="right")
+        order = np.argsort(received.sender, kind="stable")
+        data, ends = compact(received.buf, received.start[order], (received.stop - received.start)[order])
+        last = np.searchsorted(received.sender[order], np.arange(len(received.senders)), side="right")
         stops = np.concatenate([[0], ends])[last]  # end of each sender's bytes
-        carries = [self._carry.pop(sender, b"") for sender in heard.senders]
+        carries, begins = zip(*(self._carry.pop(sender, (b"", 0)) for sender in received.senders), strict=True)
         carried = np.array([len(carry) for carry in carries])
-        grown = np.cumsum(carried)
-        pieces = zip(carries, np.split(told, stops[:-1]), strict=True)
-        buf = np.frombuffer(b"".join(part for carry, mine in pieces for part in (carry, mine.tobytes())), np.uint8)
-        parts = np.stack([np.concatenate([[0], (stops + grown)[:-1]]), stops + grown, carried > 0], axis=1)
-        at, _, _ = frames_of(buf, parts, self.counts)
+        carried_before = np.cumsum(carried)
+        pieces = zip(carries, np.split(data, stops[:-1]), strict=True)
+        buf = np.frombuffer(
+            b"".join(part for carry, sender_data in pieces for part in (carry, sender_data.tobytes())), np.uint8
+        )
+        parts = np.stack([np.concatenate([[0], (stops + carried_before)[:-1]]), stops + carried_before, begins], axis=1)
+        headers, _, _ = find_frames(buf, parts, self.counts)
         for number in np.flatnonzero(parts[:, 0] < parts[:, 1]).tolist():
-            self._remember(heard.senders[number], buf[parts[number, 0] : parts[number, 1]].tobytes())
-        sender = at[:, s.PART]
-        arrival = heard.arrival[order][np.searchsorted(ends, at[:, s.STOP] - grown[sender])]
+            begin, end, how = parts[number].tolist()
+            self._store_carry(received.senders[number], (buf[begin:end].tobytes(), how))
+        sender = headers[:, s.PIECE]
+        # A frame wholly in the carried bytes (inside a false start) gets the arrival of its sender's first bytes of the
+        # batch: its own is not stored, and its position here would be in the bytes of another sender.
+        first = np.concatenate([[0], stops[:-1]]) + 1
+        frame_ends = np.maximum(headers[:, s.STOP] - carried_before[sender], first[sender])
+        arrival = received.arrival[order][np.searchsorted(ends, frame_ends)]
         order = np.argsort(arrival, kind="stable")
-        return Frames(buf, at[order], arrival[order], sender[order], heard.senders)
+        return Frames(buf, headers[order], arrival[order], sender[order], received.senders)
 
-    def _remember(self, sender: Hashable, rest: bytes) -> None:
+    def _store_carry(self, sender: Hashable, rest: tuple[bytes, int]) -> None:
         self._carry[sender] = rest
-        if len(self._carry) > MOST_SENDERS:
-            self.counts[s.BAD_BYTES] += len(self._carry.popitem(last=False)[1])
+        if len(self._carry) > MAX_SENDERS:
+            self.counts[s.BAD_BYTES] += len(self._carry.popitem(last=False)[1][0])
 
 
-def frames_of(
+def find_frames(
     buf: np.ndarray, parts: np.ndarray, counts: np.ndarray, prefix: int = 0, last_t: float = np.nan
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Run `scan.scan` on `buf`; return frames (n, 9), their stamps (n,) [us] and the newest stamp [us]."""
-    found = _room(buf, prefix)
-    times = np.empty(len(found) if prefix else 0)
-    n, last_t = s.scan(buf, parts, prefix, last_t, found, times, counts, s.EXTRA, s.CRC)
-    return found[:n], times[:n], last_t
+    headers = _empty_headers(buf, prefix)
+    times = np.empty(len(headers) if prefix else 0)
+    n, last_t = s.scan(buf, parts, prefix, last_t, headers, times, counts, s.EXTRA, s.CRC)
+    return headers[:n], times[:n], last_t
 
 
-def _room(buf: np.ndarray, prefix: int) -> np.ndarray:
+def _empty_headers(buf: np.ndarray, prefix: int) -> np.ndarray:
     """Return an empty header array for the maximum number of frames in `buf`."""
     return np.empty((len(buf) // (8 + prefix) + 1, s.COLUMNS), np.int64)

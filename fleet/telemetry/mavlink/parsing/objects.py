@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 
-class _Said:
+class _MessageBase:
     """Base of all message objects, with pymavlink's interface."""
 
     __slots__ = ()
@@ -28,12 +28,12 @@ class _Said:
 
 
 @cache
-def _kind(name: str, fields: tuple[str, ...]) -> type:
-    plain = namedtuple(name, (*fields, "system", "component"))  # type: ignore[misc]
-    return type(name, (_Said, plain), {"__slots__": (), "NAME": name})
+def _message_class(name: str, fields: tuple[str, ...]) -> type:
+    fields_class = namedtuple(name, (*fields, "system", "component"))  # type: ignore[misc]
+    return type(name, (_MessageBase, fields_class), {"__slots__": (), "NAME": name})
 
 
-def objects(name: str, rows: np.ndarray, systems: Sequence[int], components: Sequence[int]) -> list[Any]:
+def message_objects(name: str, rows: np.ndarray, systems: Sequence[int], components: Sequence[int]) -> list[Any]:
     """Create a message object for every row of field values.
 
     Args:
@@ -42,15 +42,18 @@ def objects(name: str, rows: np.ndarray, systems: Sequence[int], components: Seq
         systems, components: MAVLink ids of the senders, n numbers
     """
     names = rows.dtype.names or ()
-    kind, texts = _kind(name, names), [k for k, field in enumerate(names) if rows.dtype[field].kind == "S"]
-    told = rows.tolist()
-    if texts:
-        told = [_read(row, texts) for row in told]
-    return [kind(*row, *who) for row, *who in zip(told, systems, components, strict=True)]
+    message_class, text_columns = (
+        _message_class(name, names),
+        [column for column, field in enumerate(names) if rows.dtype[field].kind == "S"],
+    )
+    values = rows.tolist()
+    if text_columns:
+        values = [_decode_texts(row, text_columns) for row in values]
+    return [message_class(*row, *address) for row, *address in zip(values, systems, components, strict=True)]
 
 
-def _read(row: tuple[Any, ...], texts: list[int]) -> list[Any]:
+def _decode_texts(row: tuple[Any, ...], text_columns: list[int]) -> list[Any]:
     fields = list(row)
-    for k in texts:
-        fields[k] = fields[k].split(b"\0", 1)[0].decode("ascii", errors="replace")
+    for column in text_columns:
+        fields[column] = fields[column].split(b"\0", 1)[0].decode("ascii", errors="replace")
     return fields

@@ -24,7 +24,7 @@ Piece = tuple[float, Hashable, bytes]
 """(arrival, fleet time [s since 1970]; sender; received bytes)."""
 
 
-class Heard(NamedTuple):
+class ReceivedBytes(NamedTuple):
     """Pieces of bytes in order of arrival."""
 
     buf: np.ndarray  # bytes that contain the pieces, (b,) uint8
@@ -35,42 +35,44 @@ class Heard(NamedTuple):
     senders: tuple[Hashable, ...] = (None,)
 
     @classmethod
-    def of(cls, pieces: Sequence[Piece]) -> "Heard":
+    def from_pieces(cls, pieces: Sequence[Piece]) -> "ReceivedBytes":
         """Concatenate pieces."""
-        number: dict[Hashable, int] = {}
-        sender = np.array([number.setdefault(who, len(number)) for _, who, _ in pieces], np.int64)
+        sender_index: dict[Hashable, int] = {}
+        sender = np.array([sender_index.setdefault(source, len(sender_index)) for _, source, _ in pieces], np.int64)
         stop = np.cumsum(np.array([len(data) for _, _, data in pieces], np.int64))
         buf = np.frombuffer(b"".join(data for _, _, data in pieces), np.uint8)
         start = np.concatenate([np.zeros(1, np.int64), stop])[:-1]
-        return cls(buf, start, stop, np.array([t for t, _, _ in pieces], float), sender, tuple(number))
+        return cls(buf, start, stop, np.array([t for t, _, _ in pieces], float), sender, tuple(sender_index))
 
 
-def merged(parts: Sequence[Heard]) -> Heard:
+def merge_received(parts: Sequence[ReceivedBytes]) -> ReceivedBytes:
     """Concatenate several batches of received bytes."""
     if len(parts) == 1:
         return parts[0]
-    number: dict[Hashable, int] = {}
-    buf, start, stop, sender, shift = [], [], [], [], 0
+    sender_index: dict[Hashable, int] = {}
+    buf, start, stop, sender, offset = [], [], [], [], 0
     for part in parts:
-        renamed = np.array([number.setdefault(who, len(number)) for who in part.senders], np.int64)
+        new_index = np.array(
+            [sender_index.setdefault(merged_sender, len(sender_index)) for merged_sender in part.senders], np.int64
+        )
         buf.append(part.buf)
-        start.append(part.start + shift)
-        stop.append(part.stop + shift)
-        sender.append(renamed[part.sender])
-        shift += len(part.buf)
+        start.append(part.start + offset)
+        stop.append(part.stop + offset)
+        sender.append(new_index[part.sender])
+        offset += len(part.buf)
     arrival = np.concatenate([part.arrival for part in parts])
-    told, begins, ends, who = map(np.concatenate, (buf, start, stop, sender))
-    return Heard(told, begins, ends, arrival, who, tuple(number))
+    merged_buf, merged_start, merged_stop, who = map(np.concatenate, (buf, start, stop, sender))
+    return ReceivedBytes(merged_buf, merged_start, merged_stop, arrival, who, tuple(sender_index))
 
 
 @nb.njit(cache=True, nogil=True)
-def tight(buf, start, length):
+def compact(buf, start, length):
     """Copy pieces to a contiguous buffer: bytes, (b,) uint8, and end of each piece, (n,)."""
     stop = np.cumsum(length)
     out = np.empty(stop[-1] if len(stop) else 0, np.uint8)
-    at = 0
+    dest = 0
     for i in range(len(start)):
         for k in range(length[i]):
-            out[at + k] = buf[start[i] + k]
-        at += length[i]
+            out[dest + k] = buf[start[i] + k]
+        dest += length[i]
     return out, stop

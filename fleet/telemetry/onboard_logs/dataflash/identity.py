@@ -3,13 +3,13 @@
 import re
 
 from fleet.telemetry.mavlink.heartbeat import FIXED_WING, HELICOPTER, MULTIROTOR, QUADPLANE, UNKNOWN
-from fleet.telemetry.mavlink.onboard_log import Said
+from fleet.telemetry.mavlink.onboard_log import OnboardEvent
 from fleet.telemetry.onboard_logs.dataflash.records import Records
 
 _FIRMWARE = re.compile(r"\b(?:Ardu|APM:)(Plane|Copter|Rover|Sub)\b.*V?\d")
-_PLANE_HAS = {"TRIM_ARSPD_CM", "AIRSPEED_CRUISE", "LIM_ROLL_CD", "ROLL_LIMIT_DEG", "TECS_CLMB_MAX"}
-_COPTER_HAS = {"FRAME", "FRAME_CLASS", "ANGLE_MAX", "PILOT_THR_FILT", "WPNAV_SPEED"}
-_TELLING = {"MAV_SYSID", "SYSID_THISMAV", "Q_ENABLE"} | _PLANE_HAS | _COPTER_HAS
+_PLANE_PARAMS = {"TRIM_ARSPD_CM", "AIRSPEED_CRUISE", "LIM_ROLL_CD", "ROLL_LIMIT_DEG", "TECS_CLMB_MAX"}
+_COPTER_PARAMS = {"FRAME", "FRAME_CLASS", "ANGLE_MAX", "PILOT_THR_FILT", "WPNAV_SPEED"}
+_IDENTIFYING_PARAMS = {"MAV_SYSID", "SYSID_THISMAV", "Q_ENABLE"} | _PLANE_PARAMS | _COPTER_PARAMS
 
 
 class Identity:
@@ -22,16 +22,19 @@ class Identity:
         self._names: set[str] = set()
         self.firmware = ""
 
-    def look(self, block: list[Records], said: list[Said]) -> None:
+    def update(self, block: list[Records], events: list[OnboardEvent]) -> None:
         """Evaluate a block."""
         self._names.update(
-            f"{r.form.name}.{c}" for r in block for c in r.form.columns if r.form.name in ("CTUN", "MOT")
+            f"{records.format_.name}.{column}"
+            for records in block
+            for column in records.format_.columns
+            if records.format_.name in ("CTUN", "MOT")
         )
-        for s in said:
-            if s.what == "param" and s.value[0] in _TELLING:
-                self._params[s.value[0]] = s.value[1]
-            elif s.what == "text":
-                self._hear(s.value[1])
+        for event in events:
+            if event.kind == "param" and event.value[0] in _IDENTIFYING_PARAMS:
+                self._params[event.value[0]] = event.value[1]
+            elif event.kind == "text":
+                self._update_from_text(event.value[1])
 
     @property
     def system(self) -> int:
@@ -42,22 +45,22 @@ class Identity:
     @property
     def vehicle(self) -> str:
         """Return the vehicle type as in `Status.vehicle`."""
-        kind = self._kind or self._guess()
+        kind = self._kind or self._kind_from_columns()
         if kind == "Plane":
             return QUADPLANE if self._params.get("Q_ENABLE", 0.0) > 0 else FIXED_WING
         if kind == "Copter":
             return HELICOPTER if "HELI" in self._frame.upper() else MULTIROTOR
         return UNKNOWN
 
-    def _hear(self, text: str) -> None:
-        if (found := _FIRMWARE.search(text)) and not self.firmware:
-            self._kind, self.firmware = found[1], text
+    def _update_from_text(self, text: str) -> None:
+        if (match := _FIRMWARE.search(text)) and not self.firmware:
+            self._kind, self.firmware = match[1], text
         if text.startswith("Frame:") and not self._frame:
             self._frame = text
 
-    def _guess(self) -> str:
+    def _kind_from_columns(self) -> str:
         """Derive the vehicle type from its specific log columns and parameters."""
-        if "CTUN.NavRoll" in self._names or self._params.keys() & _PLANE_HAS:
+        if "CTUN.NavRoll" in self._names or self._params.keys() & _PLANE_PARAMS:
             return "Plane"
         copter = any(name.startswith("MOT.") for name in self._names) or "CTUN.ThrIn" in self._names
-        return "Copter" if copter or "CTUN.ABst" in self._names or self._params.keys() & _COPTER_HAS else ""
+        return "Copter" if copter or "CTUN.ABst" in self._names or self._params.keys() & _COPTER_PARAMS else ""

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from fleet.contract import MAX_ITEMS, Item
 from fleet.telemetry.mavlink.heartbeat import FIXED_WING, HELICOPTER, MULTIROTOR, QUADPLANE
-from fleet.telemetry.mavlink.onboard_log import Said
+from fleet.telemetry.mavlink.onboard_log import OnboardEvent
 from fleet.telemetry.onboard_logs.dataflash.records import Records
 
 SEVERITY_TEXT, SEVERITY_ERROR = 6, 3  # as in STATUSTEXT: information, error
@@ -77,153 +77,158 @@ _SUBSYSTEMS = {
 _ABSOLUTE, _RELATIVE = 0, 3  # MAV_FRAME
 
 
-class Talk:
+class EventExtractor:
     """Extract the events of one pass, block by block."""
 
     def __init__(self, vehicle: str) -> None:
         self._modes: dict[int, str] = mavutil.mode_mapping_bynumber(_MAV_TYPE.get(vehicle, -1)) or {}
         self._mode = ""
         self._armed: bool | None = None
-        self._mission = _Mission()
-        self._tellers: dict[str, Callable[[Records], Iterator[Said]]] = {
-            "MODE": self._tell_modes,
-            "ARM": self._tell_arming,
-            "STAT": self._tell_arming,
-            "EV": _tell_events,
-            "ERR": _tell_errors,
-            "MSG": _tell_texts,
-            "PARM": _tell_parameters,
-            "CMD": self._mission.tell,
+        self._mission = _MissionExtractor()
+        self._extractors: dict[str, Callable[[Records], Iterator[OnboardEvent]]] = {
+            "MODE": self._mode_events,
+            "ARM": self._arming_events,
+            "STAT": self._arming_events,
+            "EV": _flight_events,
+            "ERR": _error_events,
+            "MSG": _text_events,
+            "PARM": _parameter_events,
+            "CMD": self._mission.events,
         }
 
-    def take(self, block: list[Records], last: bool = False) -> list[Said]:
+    def extract(self, block: list[Records], last: bool = False) -> list[OnboardEvent]:
         """Return the events of a block in time order."""
-        said = [s for r in block if (tell := self._tellers.get(r.form.name)) is not None for s in _heard(tell, r)]
+        events = [
+            event
+            for records in block
+            if (extractor := self._extractors.get(records.format_.name)) is not None
+            for event in _extract(extractor, records)
+        ]
         if last:
-            said += self._mission.end()
-        return [s for s in sorted(said, key=lambda s: s.t) if self._is_news(s)]
+            events += self._mission.finish()
+        return [s for s in sorted(events, key=lambda s: s.t) if self._is_change(s)]
 
-    def carried_out(self, records: Records) -> Records:
+    def executed_items(self, records: Records) -> Records:
         """Return the CMD messages of executed items, without mission lists."""
-        return records.taken(self._mission.carried_out(records))
+        return records.select(self._mission.executed_mask(records))
 
-    def _is_news(self, said: Said) -> bool:
-        if said.what == "armed":
-            known, self._armed = self._armed, said.value
-            return known is not said.value
-        if said.what == "mode":
-            before, self._mode = self._mode, said.value
-            return before != said.value
+    def _is_change(self, event: OnboardEvent) -> bool:
+        if event.kind == "armed":
+            previous, self._armed = self._armed, event.value
+            return previous is not event.value
+        if event.kind == "mode":
+            previous_mode, self._mode = self._mode, event.value
+            return previous_mode != event.value
         return True
 
-    def _tell_modes(self, r: Records) -> Iterator[Said]:
-        words = r.texts("Mode") if r.has("Mode") else [""] * len(r)
-        numbers = r.ModeNum if r.has("ModeNum") else r.Mode
-        for t, word, number in zip(r.t, words, numbers, strict=True):
-            named = bool(word) and not word.lstrip("-").isdigit()
-            if named or math.isfinite(number):
-                name = word if named else self._modes.get(int(number), f"Mode({int(number)})")
-                yield Said(float(t), "mode", name.upper() if named else name)
+    def _mode_events(self, records: Records) -> Iterator[OnboardEvent]:
+        names = records.texts("Mode") if records.has("Mode") else [""] * len(records)
+        numbers = records.ModeNum if records.has("ModeNum") else records.Mode
+        for t, logged_name, number in zip(records.t, names, numbers, strict=True):
+            has_name = bool(logged_name) and not logged_name.lstrip("-").isdigit()
+            if has_name or math.isfinite(number):
+                name = logged_name if has_name else self._modes.get(int(number), f"Mode({int(number)})")
+                yield OnboardEvent(float(t), "mode", name.upper() if has_name else name)
 
-    def _tell_arming(self, r: Records) -> Iterator[Said]:
-        states = r.ArmState if r.has("ArmState") else r.Armed
-        for t, state in zip(r.t, states, strict=True):
+    def _arming_events(self, records: Records) -> Iterator[OnboardEvent]:
+        states = records.ArmState if records.has("ArmState") else records.Armed
+        for t, state in zip(records.t, states, strict=True):
             if state in (0, 1):
-                yield Said(float(t), "armed", bool(state))
+                yield OnboardEvent(float(t), "armed", bool(state))
 
 
-def _heard(tell: Callable[[Records], Iterator[Said]], records: Records) -> list[Said]:
+def _extract(extractor: Callable[[Records], Iterator[OnboardEvent]], records: Records) -> list[OnboardEvent]:
     try:
-        return list(tell(records))
+        return list(extractor(records))
     except (AttributeError, ValueError):  # columns of another ArduPilot release
         return []
 
 
-def _tell_events(r: Records) -> Iterator[Said]:
-    for t, event in zip(r.t, r.Id, strict=True):
-        if event in (_ARMED, _DISARMED):
-            yield Said(float(t), "armed", bool(event == _ARMED))
-        if math.isfinite(event):
-            words = _EVENTS.get(int(event), "of unknown meaning")
-            yield Said(float(t), "text", (SEVERITY_TEXT, f"EV {int(event)} {words}"))
+def _flight_events(records: Records) -> Iterator[OnboardEvent]:
+    for t, event_id in zip(records.t, records.Id, strict=True):
+        if event_id in (_ARMED, _DISARMED):
+            yield OnboardEvent(float(t), "armed", bool(event_id == _ARMED))
+        if math.isfinite(event_id):
+            meaning = _EVENTS.get(int(event_id), "of unknown meaning")
+            yield OnboardEvent(float(t), "text", (SEVERITY_TEXT, f"EV {int(event_id)} {meaning}"))
 
 
-def _tell_errors(r: Records) -> Iterator[Said]:
-    for t, subsystem, code in zip(r.t, r.Subsys, r.ECode, strict=True):
+def _error_events(records: Records) -> Iterator[OnboardEvent]:
+    for t, subsystem, code in zip(records.t, records.Subsys, records.ECode, strict=True):
         if math.isfinite(subsystem) and math.isfinite(code):
-            words = _SUBSYSTEMS.get(int(subsystem), "unknown")
-            text = f"ERR subsystem {int(subsystem)} code {int(code)} ({words})"
-            yield Said(float(t), "text", (SEVERITY_ERROR, text))
+            name = _SUBSYSTEMS.get(int(subsystem), "unknown")
+            text = f"ERR subsystem {int(subsystem)} code {int(code)} ({name})"
+            yield OnboardEvent(float(t), "text", (SEVERITY_ERROR, text))
 
 
-def _tell_texts(r: Records) -> Iterator[Said]:
-    for t, text in zip(r.t, r.texts("Message"), strict=True):
+def _text_events(records: Records) -> Iterator[OnboardEvent]:
+    for t, text in zip(records.t, records.texts("Message"), strict=True):
         if text.startswith(("Throttle armed", "Throttle disarmed", "Arming motors", "Disarming motors")):
-            yield Said(float(t), "armed", "disarm" not in text.lower())
+            yield OnboardEvent(float(t), "armed", "disarm" not in text.lower())
         if text:
-            yield Said(float(t), "text", (SEVERITY_TEXT, text))
+            yield OnboardEvent(float(t), "text", (SEVERITY_TEXT, text))
 
 
-def _tell_parameters(r: Records) -> Iterator[Said]:
-    for t, name, value in zip(r.t, r.texts("Name"), r.Value, strict=True):
+def _parameter_events(records: Records) -> Iterator[OnboardEvent]:
+    for t, name, value in zip(records.t, records.texts("Name"), records.Value, strict=True):
         if _NAME.fullmatch(name) and math.isfinite(value):
-            yield Said(float(t), "param", (name, float(value)))
+            yield OnboardEvent(float(t), "param", (name, float(value)))
 
 
-class _Mission:
+class _MissionExtractor:
     """Evaluate CMD: a sequence from item 0 (home) to the end is a mission list; any other CMD is an executed item."""
 
     def __init__(self) -> None:
         self._items: dict[int, Item] = {}
-        self._next: int | None = None  # next item of the list in progress
+        self._next_seq: int | None = None  # next item of the list in progress
         self._t = 0.0
-        self._last: tuple[Item, ...] = ()
+        self._latest: tuple[Item, ...] = ()
         self._listed: dict[int, np.ndarray] = {}  # by id of this block's records: mask of list items
 
-    def tell(self, r: Records) -> Iterator[Said]:
-        self._listed = {id(r): np.zeros(len(r), bool)}
-        total = r.CTot
-        for i, (t, item) in enumerate(zip(r.t, _items(r), strict=True)):
+    def events(self, records: Records) -> Iterator[OnboardEvent]:
+        self._listed = {id(records): np.zeros(len(records), bool)}
+        item_total = records.CTot
+        for i, (t, item) in enumerate(zip(records.t, _items(records), strict=True)):
             if item is None:
                 continue
             if item.seq == 0:
-                yield from self.end()
-                self._next = 0
-            if item.seq != self._next:
+                yield from self.finish()
+                self._next_seq = 0
+            if item.seq != self._next_seq:
                 continue
-            self._listed[id(r)][i] = True
+            self._listed[id(records)][i] = True
             self._items[item.seq] = item
-            self._next, self._t = item.seq + 1, float(t)
-            if self._next >= total[i] or self._next >= MAX_ITEMS:
-                yield from self.end()
+            self._next_seq, self._t = item.seq + 1, float(t)
+            if self._next_seq >= item_total[i] or self._next_seq >= MAX_ITEMS:
+                yield from self.finish()
 
-    def carried_out(self, r: Records) -> np.ndarray:
-        return ~self._listed.get(id(r), np.zeros(len(r), bool))
+    def executed_mask(self, records: Records) -> np.ndarray:
+        return ~self._listed.get(id(records), np.zeros(len(records), bool))
 
-    def end(self) -> Iterator[Said]:
-        items, self._items, self._next = tuple(self._items.values()), {}, None
-        if items and items != self._last:
-            self._last = items
-            yield Said(self._t, "mission", items)
+    def finish(self) -> Iterator[OnboardEvent]:
+        items, self._items, self._next_seq = tuple(self._items.values()), {}, None
+        if items and items != self._latest:
+            self._latest = items
+            yield OnboardEvent(self._t, "mission", items)
 
 
-def _items(r: Records) -> Iterator[Item | None]:
+def _items(records: Records) -> Iterator[Item | None]:
     names = ("CNum", "CId", "Prm1", "Prm2", "Prm3", "Prm4", "Lat", "Lng", "Alt", "Frame")
-    n = len(r)
-    columns = [getattr(r, name).tolist() if r.has(name) else [None] * n for name in names]
+    n = len(records)
+    columns = [getattr(records, name).tolist() if records.has(name) else [None] * n for name in names]
     for values in zip(*columns, strict=True):
         yield _item(values)
 
 
 def _item(values: tuple[Any, ...]) -> Item | None:
-    if not all(v is None or math.isfinite(v) for v in values[:2] + values[6:]):
+    if not all(value is None or math.isfinite(value) for value in values[:2] + values[6:]):
         return None
     seq, command, *params, lat, lon, alt, frame = values
     if not 0 <= seq < MAX_ITEMS or abs(lat) > 90 or abs(lon) > 180:
         return None
     if frame is None:  # not logged before 2016: home is absolute, other items are relative
         frame = _ABSOLUTE if seq == 0 else _RELATIVE
-    p1, p2, p3, p4 = (0.0 if p is None or not math.isfinite(p) else p for p in params)
+    p1, p2, p3, p4 = (0.0 if param is None or not math.isfinite(param) else param for param in params)
     return Item(
         seq=int(seq),
         command=int(command),

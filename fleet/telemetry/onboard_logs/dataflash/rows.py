@@ -5,65 +5,69 @@ from collections.abc import Iterator
 import numpy as np
 
 from fleet.frames import wrap
-from fleet.telemetry.mavlink.onboard_log import Table
+from fleet.telemetry.mavlink.onboard_log import FieldRows
 from fleet.telemetry.onboard_logs.dataflash.records import Records
-from fleet.telemetry.tables.dataflash import ANGLES, PARTS, RATES, ROWS, TABLE, believable, field_of
-from fleet.telemetry.tables.row import Row
+from fleet.telemetry.tables.dataflash import ANGLES, PARTS, RATES, ROWS, TABLE, field_of, is_plausible
+from fleet.telemetry.tables.row import FieldSource
 
-NEAR_S = 0.5  # maximum time between the parts of one row [s]
-WAIT_S = 1.0  # maximum wait of a row for its other parts [s]
-USEFUL = 0.2  # minimum row count of a source, relative to the fastest source of its field
+MAX_PART_GAP_S = 0.5  # maximum time between the parts of one row [s]
+PART_WAIT_S = 1.0  # maximum wait of a row for its other parts [s]
+MIN_SHARE = 0.2  # minimum row count of a source, relative to the fastest source of its field
 
 Series = tuple[np.ndarray, np.ndarray]  # times (n,), values (n, k)
 
 
-def read(row: Row, records: Records) -> Series | None:
+def read_rows(row: FieldSource, records: Records) -> Series | None:
     """Return times and values of a table row applied to these messages; None if it does not apply."""
     with np.errstate(all="ignore"):  # invalid numbers are rejected below
         try:
             columns = np.stack(row.columns(records), axis=-1)
-            which = np.ones(len(records), bool) if row.when is None else np.asarray(row.when(records), bool)
+            valid = np.ones(len(records), bool) if row.when is None else np.asarray(row.when(records), bool)
         except AttributeError:
             return None
-        which &= believable(row.field, columns)
-    return records.t[which], columns[which]
+        valid &= is_plausible(row.field, columns)
+    return records.t[valid], columns[valid]
 
 
-class Survey:
+class SourceSelector:
     """Count the rows of each source to select the best one."""
 
     def __init__(self) -> None:
         self._counts: dict[int, int] = {}
 
-    def look(self, block: list[Records]) -> None:
+    def count(self, block: list[Records]) -> None:
         """Count the rows of a block."""
         for records in block:
-            for row in ROWS.get(records.form.name, ()):
-                if (found := read(row, records)) is not None:
-                    self._counts[id(row)] = self._counts.get(id(row), 0) + len(found[0])
+            for row in ROWS.get(records.format_.name, ()):
+                if (rows := read_rows(row, records)) is not None:
+                    self._counts[id(row)] = self._counts.get(id(row), 0) + len(rows[0])
 
-    def chosen(self) -> dict[str, Row]:
+    def select(self) -> dict[str, FieldSource]:
         """Return the active source of highest rank for each part."""
-        best: dict[str, Row] = {}
-        most: dict[str, int] = {}
+        best_source: dict[str, FieldSource] = {}
+        max_rows: dict[str, int] = {}
         for row in TABLE:
-            most[row.field] = max(most.get(row.field, 0), self._counts.get(id(row), 0))
+            max_rows[row.field] = max(max_rows.get(row.field, 0), self._counts.get(id(row), 0))
         for row in TABLE:
-            n = self._counts.get(id(row), 0)
-            if n and n >= USEFUL * most[row.field] and (row.field not in best or best[row.field].rank < row.rank):
-                best[row.field] = row
-        return best
+            row_count = self._counts.get(id(row), 0)
+            if (
+                row_count
+                and row_count >= MIN_SHARE * max_rows[row.field]
+                and (row.field not in best_source or best_source[row.field].rank < row.rank)
+            ):
+                best_source[row.field] = row
+        return best_source
 
 
-class Rows:
+class RowBuilder:
     """Convert blocks to rows, for one pass over a log."""
 
-    def __init__(self, sources: dict[str, Row]) -> None:
+    def __init__(self, sources: dict[str, FieldSource]) -> None:
         self._sources = sources
-        self._joints = {field: joint for field in PARTS if (joint := _joint(field, sources)) is not None}
+        self._joiners = {field: joiner for field in PARTS if (joiner := _part_joiner(field, sources)) is not None}
         self._newest: dict[str, float] = {}  # newest time of each part [s]
 
-    def take(self, block: list[Records], newest: float, last: bool = False) -> Table:
+    def add_block(self, block: list[Records], newest: float, last: bool = False) -> FieldRows:
         """Return the rows completed by a block.
 
         Args:
@@ -71,31 +75,31 @@ class Rows:
             newest: newest time in the log so far [s]
             last: whether this is the last block
         """
-        table: Table = {}
+        table: FieldRows = {}
         for part, row in self._sources.items():
-            t, values = self._rising(part, _all(row, block))
-            joint = self._joints.get(field_of(part))
-            if joint is not None:
-                joint.add(part, t, values)
+            t, values = self._monotonic(part, _read_all(row, block))
+            joiner = self._joiners.get(field_of(part))
+            if joiner is not None:
+                joiner.add(part, t, values)
             elif field_of(part) not in PARTS and len(t):
                 table[part] = (t, values)
-        for field, joint in self._joints.items():
-            t, values = joint.settle(float("inf") if last else newest - WAIT_S)
+        for field, joiner in self._joiners.items():
+            t, values = joiner.join_until(float("inf") if last else newest - PART_WAIT_S)
             if len(t):
                 table[field] = (t, values)
         return table
 
-    def _rising(self, part: str, found: list[Series]) -> Series:
-        if not found:
+    def _monotonic(self, part: str, series: list[Series]) -> Series:
+        if not series:
             return np.zeros(0), np.zeros((0, 1))
-        t = np.concatenate([t for t, _ in found])
-        values = np.concatenate([v for _, v in found])
+        t = np.concatenate([t for t, _ in series])
+        values = np.concatenate([part_values for _, part_values in series])
         newest = self._newest.get(part, float("-inf"))
-        before, after = np.append(newest, t[:-1]), np.append(t[1:], float("inf"))
-        sound = (t == np.maximum(np.minimum(before, after), np.minimum(np.maximum(before, after), t))) | (
-            after < before
-        )
-        t, values = t[sound], values[sound]
+        previous, following = np.append(newest, t[:-1]), np.append(t[1:], float("inf"))
+        plausible = (
+            t == np.maximum(np.minimum(previous, following), np.minimum(np.maximum(previous, following), t))
+        ) | (following < previous)
+        t, values = t[plausible], values[plausible]
         rising = t > np.maximum.accumulate(np.append(newest, t))[:-1]
         t, values = t[rising], values[rising]
         if len(t):
@@ -103,17 +107,17 @@ class Rows:
         return t, values
 
 
-def _all(row: Row, block: list[Records]) -> list[Series]:
-    found = (read(row, records) for records in block if records.form.name == row.message)
-    return [series for series in found if series is not None and len(series[0])]
+def _read_all(row: FieldSource, block: list[Records]) -> list[Series]:
+    results = (read_rows(row, records) for records in block if records.format_.name == row.message)
+    return [series for series in results if series is not None and len(series[0])]
 
 
-def _joint(field: str, sources: dict[str, Row]) -> "_Joint | None":
+def _part_joiner(field: str, sources: dict[str, FieldSource]) -> "_PartJoiner | None":
     missing = {part for part, _ in PARTS[field]} - set(sources)
-    return _Joint(field, derive=RATES in missing) if missing <= {RATES} else None
+    return _PartJoiner(field, derive=RATES in missing) if missing <= {RATES} else None
 
 
-class _Joint:
+class _PartJoiner:
     """Join the parts of one field, interpolated to the times of the first part."""
 
     def __init__(self, field: str, derive: bool) -> None:
@@ -125,44 +129,48 @@ class _Joint:
     def add(self, part: str, t: np.ndarray, values: np.ndarray) -> None:
         if not len(t):
             return
-        self._series[part] = _joined(self._series[part], (t, values))
+        self._series[part] = _concatenated(self._series[part], (t, values))
         if self._derive and part == ANGLES:
-            angles = _joined(self._angles, (t, values))
-            self._series[RATES] = _joined(self._series[RATES], rates_between(*angles))
+            angles = _concatenated(self._angles, (t, values))
+            self._series[RATES] = _concatenated(self._series[RATES], rates_between(*angles))
             self._angles = (angles[0][-1:], angles[1][-1:])
 
-    def settle(self, until: float) -> Series:
+    def join_until(self, until: float) -> Series:
         lead, others = self._parts[0][0], [part for part, _ in self._parts[1:]]
         t, values = self._series[lead]
-        known = [self._series[part][0] for part in others]
-        until = max(until, min((s[-1] for s in known if len(s)), default=until)) if all(map(len, known)) else until
+        part_times = [self._series[part][0] for part in others]
+        until = (
+            max(until, min((times[-1] for times in part_times if len(times)), default=until))
+            if all(map(len, part_times))
+            else until
+        )
         n = int(np.searchsorted(t, until, side="right"))
-        columns, near = [values[:n]], np.ones(n, bool)
+        columns, complete = [values[:n]], np.ones(n, bool)
         for part in others:
-            added, close = _interpolated(t[:n], *self._series[part])
-            columns.append(added)
-            near &= close
+            interpolated, is_near = _interpolate(t[:n], *self._series[part])
+            columns.append(interpolated)
+            complete &= is_near
         self._series[lead] = (t[n:], values[n:])
-        self._forget(others, t[n - 1] if n else until)
-        return t[:n][near], np.concatenate(columns, axis=1)[near]
+        self._discard_before(others, t[n - 1] if n else until)
+        return t[:n][complete], np.concatenate(columns, axis=1)[complete]
 
-    def _forget(self, others: list[str], before: float) -> None:
+    def _discard_before(self, others: list[str], before: float) -> None:
         for part in others:
             t, values = self._series[part]
             start = max(int(np.searchsorted(t, before)) - 1, 0)
             self._series[part] = (t[start:], values[start:])
 
 
-def _joined(a: Series, b: Series) -> Series:
+def _concatenated(a: Series, b: Series) -> Series:
     return np.concatenate([a[0], b[0]]), np.concatenate([a[1], b[1]])
 
 
-def _interpolated(at: np.ndarray, t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _interpolate(query_t: np.ndarray, t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if not len(t):
-        return np.zeros((len(at), values.shape[1])), np.zeros(len(at), bool)
-    after = np.searchsorted(t, at)
-    gap = np.minimum(np.abs(t[np.minimum(after, len(t) - 1)] - at), np.abs(at - t[np.maximum(after - 1, 0)]))
-    return np.stack([np.interp(at, t, column) for column in values.T], axis=-1), gap <= NEAR_S
+        return np.zeros((len(query_t), values.shape[1])), np.zeros(len(query_t), bool)
+    after = np.searchsorted(t, query_t)
+    gap = np.minimum(np.abs(t[np.minimum(after, len(t) - 1)] - query_t), np.abs(query_t - t[np.maximum(after - 1, 0)]))
+    return np.stack([np.interp(query_t, t, column) for column in values.T], axis=-1), gap <= MAX_PART_GAP_S
 
 
 def rates_between(t: np.ndarray, angles: np.ndarray) -> Series:
@@ -179,7 +187,7 @@ def rates_between(t: np.ndarray, angles: np.ndarray) -> Series:
     """
     dt = np.diff(t)
     turn = wrap(np.diff(angles, axis=0))
-    near = dt <= NEAR_S
+    near = dt <= MAX_PART_GAP_S
     phi_dot, theta_dot, psi_dot = (turn[near] / dt[near, None]).T
     phi, theta = (angles[:-1, :2] + 0.5 * turn[:, :2])[near].T
     p = phi_dot - psi_dot * np.sin(theta)
@@ -188,7 +196,7 @@ def rates_between(t: np.ndarray, angles: np.ndarray) -> Series:
     return (t[:-1] + 0.5 * dt)[near], np.stack([p, q, r], axis=-1)
 
 
-def origins(sources: dict[str, Row]) -> Iterator[str]:
+def derived_fields(sources: dict[str, FieldSource]) -> Iterator[str]:
     """Describe the fields that are derived without a direct source."""
     if ANGLES in sources and RATES not in sources:
         yield "attitude: no gyroscope in this log; p, q, r are differences of the angles"

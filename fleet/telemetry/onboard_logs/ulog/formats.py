@@ -9,15 +9,15 @@ SIZES = {
     **dict.fromkeys(("int32_t", "uint32_t", "float"), 4),
     **dict.fromkeys(("int64_t", "uint64_t", "double"), 8),
 }
-_LARGEST = 0xFFFF - 2  # bytes of one row
-_LARGEST_WANTED = 4096  # bytes of one row of a topic in the table; PX4 stays below 2000
-_MOST_TOPICS = 2000  # maximum subscriptions of one file
-_DEEPEST = 8  # maximum nesting of formats
-_MOST_FIELDS = 999  # maximum fields of one format
-_MOST_DECLARED = 50_000  # maximum fields of all formats; PX4 declares about 10,000
-_MOST_COLUMNS = 50_000  # maximum numbers per row, summed over all wanted topics
-_MOST_ATTEMPTS = 10_000  # maximum subscriptions parsed, valid or not
-_LONGEST_NAME = 100
+_MAX_ROW = 0xFFFF - 2  # bytes of one row
+_MAX_WANTED_ROW = 4096  # bytes of one row of a topic in the table; PX4 stays below 2000
+_MAX_TOPICS = 2000  # maximum subscriptions of one file
+_MAX_DEPTH = 8  # maximum nesting of formats
+_MAX_FIELDS = 999  # maximum fields of one format
+_MAX_DECLARED = 50_000  # maximum fields of all formats; PX4 declares about 10,000
+_MAX_COLUMNS = 50_000  # maximum numbers per row, summed over all wanted topics
+_MAX_ATTEMPTS = 10_000  # maximum subscriptions parsed, valid or not
+_MAX_NAME = 100
 _NAME = re.compile(rb"[A-Za-z_]\w{0,99}")
 _FORMAT_TEXT = re.compile(rb"[A-Za-z_]\w{0,99}:[\w \[\];]*")
 _FIELD = re.compile(rb"(\w{1,60})(?:\[(\d{1,5})\])? (\w{1,60})")  # no two parts can match the same bytes
@@ -25,17 +25,17 @@ _KEY = re.compile(rb"(\w+)(?:\[(\d+)\])? ([\w./@-]+)")
 _CONTROL = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1a\x1c-\x1f\x7f]")  # escape is allowed: it colours texts
 
 
-class Topic(NamedTuple):
+class Subscription(NamedTuple):
     """One subscription: size of its rows and offset of their time stamp."""
 
     name: str
-    least: int  # bytes of a row without trailing padding
-    most: int  # bytes with padding
-    stamp_at: int
+    min_size: int  # bytes of a row without trailing padding
+    max_size: int  # bytes with padding
+    stamp_offset: int
     wanted: bool
 
 
-def readable(text: bytes) -> bool:
+def is_readable(text: bytes) -> bool:
     """Return whether bytes contain no control characters."""
     return _CONTROL.search(text) is None
 
@@ -44,7 +44,7 @@ class Formats:
     """Declared formats and subscribed topics."""
 
     def __init__(self, wanted: frozenset[str]) -> None:
-        self.topics: dict[int, Topic] = {}
+        self.topics: dict[int, Subscription] = {}
         self._wanted = wanted
         self._fields: dict[bytes, list[tuple[bytes, int, bytes]]] = {}
         self._extents: dict[tuple[bytes, int], tuple[int, int] | None] = {}  # cached, by type and remaining depth
@@ -55,8 +55,8 @@ class Formats:
         name, colon, fields = body.partition(b":")
         if not colon or len(body) >= 0xFFFF or _NAME.fullmatch(name) is None:
             return False
-        parts = _parts(fields)
-        return 0 < len(parts) <= _MOST_FIELDS and all(_FIELD.fullmatch(part) for part in parts)
+        parts = _split_fields(fields)
+        return 0 < len(parts) <= _MAX_FIELDS and all(_FIELD.fullmatch(part) for part in parts)
 
     def is_value(self, body: bytes) -> bool:
         """Return whether the bytes are a key and a value of the key's type."""
@@ -66,22 +66,22 @@ class Formats:
         if key is None or key[1].decode() not in SIZES:
             return False
         size = SIZES[key[1].decode()] * int(key[2] or 1)
-        return len(body) - 1 - body[0] == size and (key[1] != b"char" or readable(body[1 + body[0] :].rstrip(b"\0")))
+        return len(body) - 1 - body[0] == size and (key[1] != b"char" or is_readable(body[1 + body[0] :].rstrip(b"\0")))
 
-    def knows(self, name: bytes) -> bool:
+    def is_declared(self, name: bytes) -> bool:
         """Return whether a format of this name is declared."""
         return name in self._fields
 
-    def learn(self, body: bytes) -> bool:
+    def declare(self, body: bytes) -> bool:
         """Declare a format; reject a repeated name or too many fields; return whether it was accepted."""
         name, _, fields = body.partition(b":")
-        parts = [match.groups() for part in _parts(fields) if (match := _FIELD.fullmatch(part))]
-        found = [(kind, max(int(n or 1), 1), field) for kind, n, field in parts]
-        unique = len({field for _, _, field in found}) == len(found)
-        if not unique or name in self._fields or self._declared + len(found) > _MOST_DECLARED:
+        parts = [match.groups() for part in _split_fields(fields) if (match := _FIELD.fullmatch(part))]
+        declared = [(kind, max(int(length or 1), 1), field) for kind, length, field in parts]
+        unique = len({field for _, _, field in declared}) == len(declared)
+        if not unique or name in self._fields or self._declared + len(declared) > _MAX_DECLARED:
             return False
-        self._declared += len(found)
-        self._fields[name] = found
+        self._declared += len(declared)
+        self._fields[name] = declared
         self._extents.clear()
         return True
 
@@ -89,35 +89,35 @@ class Formats:
         """Add a subscription; return whether its rows are wanted and readable."""
         number = int.from_bytes(body[1:3], "little")
         self._attempts += 1
-        if number in self.topics or len(self.topics) >= _MOST_TOPICS or self._attempts > _MOST_ATTEMPTS:
+        if number in self.topics or len(self.topics) >= _MAX_TOPICS or self._attempts > _MAX_ATTEMPTS:
             return False
         name = body[3:]
         fields = self._fields[name]
-        size = self._size(name, _DEEPEST)
+        size = self._size(name, _MAX_DEPTH)
         stamp_at = 0
-        for kind, n, field in fields:
+        for kind, length, field in fields:
             if field == b"timestamp":
                 break
-            stamp_at += n * (self._size(kind, _DEEPEST) or 0)
+            stamp_at += length * (self._size(kind, _MAX_DEPTH) or 0)
         stamped = any(field == b"timestamp" and kind == b"uint64_t" and n == 1 for kind, n, field in fields)
         if not size or not stamped:
             return False
         padding = 0
-        for kind, n, field in reversed(fields):
+        for kind, length, field in reversed(fields):
             if not field.startswith(b"_padding"):
                 break
-            padding += n * (self._size(kind, _DEEPEST) or 0)
-        _, columns = self._extent(name, _DEEPEST) or (0, 0)
-        wanted = name.decode() in self._wanted and size <= _LARGEST_WANTED
-        wanted = wanted and self._columns + columns <= _MOST_COLUMNS
+            padding += length * (self._size(kind, _MAX_DEPTH) or 0)
+        _, columns = self._extent(name, _MAX_DEPTH) or (0, 0)
+        wanted = name.decode() in self._wanted and size <= _MAX_WANTED_ROW
+        wanted = wanted and self._columns + columns <= _MAX_COLUMNS
         self._columns += columns if wanted else 0
-        self.topics[number] = Topic(name.decode(), size - padding, size, stamp_at, wanted)
+        self.topics[number] = Subscription(name.decode(), size - padding, size, stamp_at, wanted)
         return wanted
 
     def _size(self, kind: bytes, depth: int) -> int | None:
         """Return the size of a type [bytes]; None if it is unknown, too large or recursive."""
-        found = self._extent(kind, depth)
-        return None if found is None else found[0]
+        extent = self._extent(kind, depth)
+        return None if extent is None else extent[0]
 
     def _extent(self, kind: bytes, depth: int) -> tuple[int, int] | None:
         """Return the size of a type [bytes] and its number of values, cached by depth."""
@@ -125,24 +125,24 @@ class Formats:
             return SIZES[kind.decode()], 1
         if depth == 0 or kind not in self._fields:
             return None
-        at = kind, depth
-        if at not in self._extents:
-            self._extents[at] = self._summed(kind, depth)
-        return self._extents[at]
+        cache_key = kind, depth
+        if cache_key not in self._extents:
+            self._extents[cache_key] = self._sum_extents(kind, depth)
+        return self._extents[cache_key]
 
-    def _summed(self, kind: bytes, depth: int) -> tuple[int, int] | None:
+    def _sum_extents(self, kind: bytes, depth: int) -> tuple[int, int] | None:
         size = columns = 0
-        for part, n, _ in self._fields[kind]:
-            found = self._extent(part, depth - 1)
-            if found is None or not found[0]:
+        for field_type, length, _ in self._fields[kind]:
+            extent = self._extent(field_type, depth - 1)
+            if extent is None or not extent[0]:
                 return None
-            size, columns = size + n * found[0], columns + n * found[1]
-            if size > _LARGEST:
+            size, columns = size + length * extent[0], columns + length * extent[1]
+            if size > _MAX_ROW:
                 return None
         return size, columns
 
 
-def could_be(kind: int, raw: bytearray, begin: int, end: int) -> tuple[bool, int]:
+def is_possible_body(kind: int, raw: bytearray, begin: int, end: int) -> tuple[bool, int]:
     """Return whether bytes may be the body of a message, and the number of examined bytes, without a copy.
 
     Args:
@@ -161,14 +161,14 @@ def could_be(kind: int, raw: bytearray, begin: int, end: int) -> tuple[bool, int
         control = _CONTROL.search(raw, first, end)
         return control is None, (control.start() if control else end) - first
     if kind in b"AIPMQORSB":
-        return _short(kind, raw, begin, end), 0
+        return _is_possible_short(kind, raw, begin, end), 0
     return True, 0
 
 
-def _short(kind: int, raw: bytearray, begin: int, end: int) -> bool:
+def _is_possible_short(kind: int, raw: bytearray, begin: int, end: int) -> bool:
     """Return whether a body may be a subscription, a value or a marker, by a quick test."""
     if kind == ord("A"):
-        return 3 < end - begin <= 3 + _LONGEST_NAME
+        return 3 < end - begin <= 3 + _MAX_NAME
     if kind in b"ORSB":
         return end - begin == {"O": 2, "R": 2, "S": 8}.get(chr(kind))
     at = begin + (kind in b"MQ")
@@ -177,6 +177,6 @@ def _short(kind: int, raw: bytearray, begin: int, end: int) -> bool:
     return _KEY.fullmatch(raw, at + 1, at + 1 + raw[at]) is not None
 
 
-def _parts(fields: bytes) -> list[bytes]:
+def _split_fields(fields: bytes) -> list[bytes]:
     """Split the fields of a format; the last semicolon is optional."""
     return fields.removesuffix(b";").split(b";")

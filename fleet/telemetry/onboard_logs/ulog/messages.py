@@ -7,37 +7,37 @@ from typing import Any
 import numpy as np
 
 from fleet.telemetry.mavlink import heartbeat
-from fleet.telemetry.mavlink.onboard_log import Said
+from fleet.telemetry.mavlink.onboard_log import OnboardEvent
 from fleet.telemetry.onboard_logs.ulog.topic import Topic
-from fleet.telemetry.tables.ulog import ARMED, AUTOSTART, TRANSITIONS, VEHICLE_TYPE, mode
+from fleet.telemetry.tables.ulog import ARMED, AUTOSTART, TRANSITIONS, VEHICLE_TYPE, mode_name
 
-_EARLIEST_US, _LATEST_US = 1.2e15, 4e15  # plausible GPS time: 2008 to 2096
-_GRADES = ((192, " RC"), (128, " beta"), (64, " alpha"))  # last byte of ver_sw_release; 255 is a release
+_MIN_UTC_US, _MAX_UTC_US = 1.2e15, 4e15  # plausible GPS time: 2008 to 2096
+_RELEASE_TYPES = ((192, " RC"), (128, " beta"), (64, " alpha"))  # last byte of ver_sw_release; 255 is a release
 _INFO = 6  # severity of generated texts
 
 Topics = Mapping[str, Topic]
 
 
-def system(params: Mapping[str, float], topics: Topics) -> int:
+def system_id(params: Mapping[str, float], topics: Topics) -> int:
     """Return the MAVLink system id, 1 if not in the log."""
-    said = params.get("MAV_SYS_ID", _latest(topics, "system_id"))
-    return int(said) if said is not None and 1 <= said <= 255 else 1
+    value = params.get("MAV_SYS_ID", _most_common(topics, "system_id"))
+    return int(value) if value is not None and 1 <= value <= 255 else 1
 
 
-def vehicle(params: Mapping[str, float], topics: Topics) -> str:
+def vehicle_kind(params: Mapping[str, float], topics: Topics) -> str:
     """Return the vehicle type as in `Status.vehicle`."""
-    if _latest(topics, "is_vtol"):
+    if _most_common(topics, "is_vtol"):
         return heartbeat.QUADPLANE
-    for mav_type in (_latest(topics, "system_type"), params.get("MAV_TYPE")):
+    for mav_type in (_most_common(topics, "system_type"), params.get("MAV_TYPE")):
         kind = heartbeat.vehicle(SimpleNamespace(type=int(mav_type or 0)))
         if kind != heartbeat.UNKNOWN:
             return kind
-    rotary = _latest(topics, "is_rotary_wing")  # until 1.8
+    rotary = _most_common(topics, "is_rotary_wing")  # until 1.8
     if rotary is not None:
         return heartbeat.MULTIROTOR if rotary else heartbeat.FIXED_WING
-    told = VEHICLE_TYPE.get(int(_latest(topics, "vehicle_type") or 0))
-    start = int(params.get("SYS_AUTOSTART", 0))
-    return told or next((kind for ids, kind in AUTOSTART if start in ids), heartbeat.UNKNOWN)
+    by_type = VEHICLE_TYPE.get(int(_most_common(topics, "vehicle_type") or 0))
+    autostart = int(params.get("SYS_AUTOSTART", 0))
+    return by_type or next((kind for ids, kind in AUTOSTART if autostart in ids), heartbeat.UNKNOWN)
 
 
 def release(info: Mapping[str, Any]) -> tuple[int, int]:
@@ -46,16 +46,16 @@ def release(info: Mapping[str, Any]) -> tuple[int, int]:
     return (number >> 24 & 0xFF, number >> 16 & 0xFF) if isinstance(number, int) and number > 0 else (99, 0)
 
 
-def firmware(info: Mapping[str, Any]) -> str:
+def firmware_text(info: Mapping[str, Any]) -> str:
     """Return the firmware text, or an empty string."""
     number = info.get("ver_sw_release")
     if isinstance(number, int) and number > 0:
-        grade = next((word for least, word in _GRADES if least <= number & 0xFF < 255), "")
-        return f"PX4 v{number >> 24 & 0xFF}.{number >> 16 & 0xFF}.{number >> 8 & 0xFF}{grade}"
+        suffix = next((name for threshold, name in _RELEASE_TYPES if threshold <= number & 0xFF < 255), "")
+        return f"PX4 v{number >> 24 & 0xFF}.{number >> 16 & 0xFF}.{number >> 8 & 0xFF}{suffix}"
     return f"PX4 {info['ver_sw'][:10]}" if info.get("ver_sw") else ""
 
 
-def epoch(topics: Topics) -> float | None:
+def gps_epoch(topics: Topics) -> float | None:
     """Return fleet time minus log time [s] from GPS time; late by the receiver delay of 0.1 s.
 
     `time_ref_utc` is not usable: it is the time zone of the logger.
@@ -63,25 +63,33 @@ def epoch(topics: Topics) -> float | None:
     for name in ("vehicle_gps_position", "sensor_gps"):
         if name in topics and hasattr(topics[name], "time_utc_usec"):
             utc = topics[name].time_utc_usec
-            told = (utc > _EARLIEST_US) & (utc < _LATEST_US)
-            if told.any():
-                return float(np.median(utc[told] * 1e-6 - topics[name].t[told]))
+            valid = (utc > _MIN_UTC_US) & (utc < _MAX_UTC_US)
+            if valid.any():
+                return float(np.median(utc[valid] * 1e-6 - topics[name].t[valid]))
     return None
 
 
-def said_by_topics(topics: Topics, version: tuple[int, int]) -> list[Said]:
+def topic_events(topics: Topics, version: tuple[int, int]) -> list[OnboardEvent]:
     """Return the changes of mode, arming and VTOL state."""
-    said: list[Said] = []
+    events: list[OnboardEvent] = []
     status = topics.get("vehicle_status")
     if status is not None and hasattr(status, "nav_state"):
-        said += [Said(t, "mode", mode(int(state), version)) for t, state in _changes(status.t, status.nav_state)]
+        events += [
+            OnboardEvent(t, "mode", mode_name(int(state), version)) for t, state in _changes(status.t, status.nav_state)
+        ]
     if status is not None and hasattr(status, "arming_state"):
-        said += [Said(t, "armed", bool(a)) for t, a in _changes(status.t, status.arming_state == ARMED)]
+        events += [
+            OnboardEvent(t, "armed", bool(is_armed)) for t, is_armed in _changes(status.t, status.arming_state == ARMED)
+        ]
     vtol = topics.get("vtol_vehicle_status")
     if vtol is not None:
         changes = _changes(vtol.t, _phase(vtol))
-        said += [Said(t, "text", (_INFO, f"VTOL: {TRANSITIONS[int(p)]}")) for t, p in changes if int(p) in TRANSITIONS]
-    return said
+        events += [
+            OnboardEvent(t, "text", (_INFO, f"VTOL: {TRANSITIONS[int(phase)]}"))
+            for t, phase in changes
+            if int(phase) in TRANSITIONS
+        ]
+    return events
 
 
 def _phase(vtol: Topic) -> np.ndarray:
@@ -94,14 +102,14 @@ def _phase(vtol: Topic) -> np.ndarray:
 
 
 def _changes(t: np.ndarray, values: np.ndarray) -> list[tuple[float, Any]]:
-    at = np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1]])) if len(t) else np.array([], int)
-    return [(float(t[i]), values[i]) for i in at[:_MOST_CHANGES]]
+    indices = np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1]])) if len(t) else np.array([], int)
+    return [(float(t[i]), values[i]) for i in indices[:_MAX_CHANGES]]
 
 
-_MOST_CHANGES = 1000  # maximum events of one kind per log
+_MAX_CHANGES = 1000  # maximum events of one kind per log
 
 
-def _latest(topics: Topics, field: str) -> float | None:
+def _most_common(topics: Topics, field: str) -> float | None:
     """Return the most common value of a vehicle_status field, to ignore damaged rows."""
     status = topics.get("vehicle_status")
     if status is None or not hasattr(status, field):

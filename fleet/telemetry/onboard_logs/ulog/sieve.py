@@ -13,35 +13,35 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import IO
 
-from fleet.telemetry.onboard_logs.ulog.formats import Formats, could_be, readable
+from fleet.telemetry.onboard_logs.ulog.formats import Formats, is_possible_body, is_readable
 
 MAGIC = b"ULog\x01\x12\x35"
 HEADER = 16  # bytes: magic, version, start stamp
-LARGEST = 1 << 29  # maximum bytes read of one file
-HOPELESS = 1 << 26  # bytes without a valid message that end reading
-JUMP_US = 60_000_000  # larger time jumps need confirmation [us]
-LATEST_US = 1 << 52  # later stamps are invalid [us]
-COMPANY = 20  # consecutive stamps that confirm a time jump
+MAX_FILE_BYTES = 1 << 29  # maximum bytes read of one file
+MAX_SILENT_BYTES = 1 << 26  # bytes without a valid message that end reading
+MAX_JUMP_US = 60_000_000  # larger time jumps need confirmation [us]
+MAX_STAMP_US = 1 << 52  # later stamps are invalid [us]
+MIN_AGREEING = 20  # consecutive stamps that confirm a time jump
 _BLOCK = 1 << 20
-_WIDEST = 3 + 0xFFFF  # bytes of the longest message
+_MAX_MESSAGE = 3 + 0xFFFF  # bytes of the longest message
 _SYNC = b"\x2f\x73\x13\x20\x25\x0c\xbb\x12"
 _TYPES = frozenset(b"ABCDFILMOPQRS")
-_A_TYPE = re.compile(rb"[ABCDFILMOPQRS]")
-_PASSED = frozenset(b"ACDFILOP")  # types that pyulog requires
+_TYPE_BYTE = re.compile(rb"[ABCDFILMOPQRS]")
+_PASSED_TYPES = frozenset(b"ACDFILOP")  # types that pyulog requires
 _DATA = ord("D")
 _LEVELS = frozenset(b"01234567")
-_head = struct.Struct("<HB").unpack_from
-_short = struct.Struct("<H").unpack_from
-_stamp = struct.Struct("<Q").unpack_from
-_MOST_PLACES = 8  # damaged positions reported
-_MOST_SLOW = 2_000_000  # maximum number of messages parsed individually
-_MOST_WANTED = 1 << 27  # bytes of wanted rows: 30 min at the highest rates, else 2 h
-_MOST_SMALL = dict.fromkeys(b"CILOP", (20000, 1 << 22))  # maximum messages of a type and their bytes
-_MOST_SEARCHED = 2_000_000_000  # maximum search cost: bytes examined, plus `_SEARCH_COST` per position
-_PLACE = 1000
+_read_header = struct.Struct("<HB").unpack_from
+_read_uint16 = struct.Struct("<H").unpack_from
+_read_stamp = struct.Struct("<Q").unpack_from
+_MAX_PLACES = 8  # damaged positions reported
+_MAX_SLOW = 2_000_000  # maximum number of messages parsed individually
+_MAX_WANTED_BYTES = 1 << 27  # bytes of wanted rows: 30 min at the highest rates, else 2 h
+_KIND_LIMITS = dict.fromkeys(b"CILOP", (20000, 1 << 22))  # maximum messages of a type and their bytes
+_MAX_SEARCHED = 2_000_000_000  # maximum search cost: bytes examined, plus `_SEARCH_COST` per position
+_SEARCH_COST = 1000
 
 
-class Sieve:
+class UlogFilter:
     """File object for pyulog: a header, then only valid messages."""
 
     def __init__(self, opener: Callable[[], IO[bytes]], wanted: frozenset[str], skipped: list[str]) -> None:
@@ -49,17 +49,17 @@ class Sieve:
         self.formats = Formats(wanted)
         self.messages = 0  # valid messages, wanted or not
         self._skipped, self._file = skipped, opener()
-        self._raw, self._at, self._base, self._ended = bytearray(), 0, 0, False  # base: file offset of raw[0]
-        self._good, self._read_at = bytearray(), 0
-        self._source = self._walk()
+        self._buffer, self._at, self._base, self._ended = bytearray(), 0, 0, False  # base: file offset of raw[0]
+        self._passed, self._read_at = bytearray(), 0
+        self._batches = self._parse()
         self._restarts: list[int] = []
-        self._now_us: int | None = None
-        self._strangers = 0
+        self._newest_us: int | None = None
+        self._jumped_count = 0
         self._dropped: Counter[str] = Counter()
         self._places = 0
         self._damage: list[int] | None = None  # start, end
         self._in_data = False
-        self._slow = self._wanted = self._searched = 0  # running totals of the limits `_MAX_…`
+        self._slow_count = self._wanted_bytes = self._searched_bytes = 0  # running totals of the limits `_MAX_…`
         self._small: Counter[int] = Counter()
         self._small_bytes: Counter[int] = Counter()
 
@@ -67,14 +67,14 @@ class Sieve:
 
     def read(self, n: int) -> bytes:
         """Return the next `n` bytes, fewer at the end."""
-        while len(self._good) - self._read_at < n:
-            batch = next(self._source, None)
+        while len(self._passed) - self._read_at < n:
+            batch = next(self._batches, None)
             if batch is None:
                 break
-            del self._good[: max(self._read_at - _WIDEST, 0)]  # pyulog seeks back by one message
-            self._read_at = min(self._read_at, _WIDEST)
-            self._good += batch
-        data = bytes(self._good[self._read_at : self._read_at + n])
+            del self._passed[: max(self._read_at - _MAX_MESSAGE, 0)]  # pyulog seeks back by one message
+            self._read_at = min(self._read_at, _MAX_MESSAGE)
+            self._passed += batch
+        data = bytes(self._passed[self._read_at : self._read_at + n])
         self._read_at += len(data)
         return data
 
@@ -95,21 +95,21 @@ class Sieve:
 
     def _fill(self, need: int) -> bool:
         """Buffer at least `need` bytes from here on; return whether the file has them."""
-        while len(self._raw) - self._at < need and not self._ended:
-            del self._raw[: self._at]
+        while len(self._buffer) - self._at < need and not self._ended:
+            del self._buffer[: self._at]
             self._base, self._at = self._base + self._at, 0
-            self._raw += self._block()
-        return len(self._raw) - self._at >= need
+            self._buffer += self._block()
+        return len(self._buffer) - self._at >= need
 
     def _block(self) -> bytes:
-        room = LARGEST - self._base - len(self._raw)
+        remaining = MAX_FILE_BYTES - self._base - len(self._buffer)
         try:
-            block = self._file.read(min(_BLOCK, room)) if room > 0 else b""
+            block = self._file.read(min(_BLOCK, remaining)) if remaining > 0 else b""
         except (OSError, EOFError, lzma.LZMAError, zlib.error) as error:
             block = b""
-            self._say(f"the file is damaged ({error}); the data before are used")
-        if room <= 0:
-            self._say(f"it is longer than {LARGEST >> 20} MiB, the rest was not read; split it")
+            self._add_message(f"the file is damaged ({error}); the data before are used")
+        if remaining <= 0:
+            self._add_message(f"it is longer than {MAX_FILE_BYTES >> 20} MiB, the rest was not read; split it")
         self._ended = not block
         return block
 
@@ -119,89 +119,100 @@ class Sieve:
 
     # --- parsing ---
 
-    def _walk(self) -> Iterator[bytes]:
+    def _parse(self) -> Iterator[bytes]:
         yield self._header()
-        out, good = bytearray(), self._offset
+        batch, last_good = bytearray(), self._offset
         while self._fill(3):
-            if why := self._too_much():
-                self._say(f"{why} up to byte {self._offset}, the rest was not read; split it")
+            if limit := self._limit_reached():
+                self._add_message(f"{limit} up to byte {self._offset}, the rest was not read; split it")
                 break
-            message = self._run()
+            message = self._skip_good_rows()
             if not message and self._fill(3):
-                message = self._next()
+                message = self._next_message()
             if message is None:
-                if self._offset - good > HOPELESS:
-                    self._say(f"{HOPELESS >> 20} MiB without a message from byte {good} on, the rest was not read")
+                if self._offset - last_good > MAX_SILENT_BYTES:
+                    self._add_message(
+                        f"{MAX_SILENT_BYTES >> 20} MiB without a message from byte {last_good} on, the rest "
+                        "was not read"
+                    )
                     break
                 continue
-            good = self._offset
-            out += message
-            if len(out) >= 1 << 16:
-                yield bytes(out)
-                out.clear()
-        yield bytes(out)
+            last_good = self._offset
+            batch += message
+            if len(batch) >= 1 << 16:
+                yield bytes(batch)
+                batch.clear()
+        yield bytes(batch)
         self._report()
 
-    def _too_much(self) -> str:
+    def _limit_reached(self) -> str:
         """Return the limit that ends reading, or an empty string."""
-        if self._wanted > _MOST_WANTED:
-            return f"over {_MOST_WANTED >> 20} MiB of rows of required topics"
-        if self._slow > _MOST_SLOW:
-            return f"over {_MOST_SLOW:,} messages other than rows"
-        return "too many invalid messages" if self._searched > _MOST_SEARCHED else ""
+        if self._wanted_bytes > _MAX_WANTED_BYTES:
+            return f"over {_MAX_WANTED_BYTES >> 20} MiB of rows of required topics"
+        if self._slow_count > _MAX_SLOW:
+            return f"over {_MAX_SLOW:,} messages other than rows"
+        return "too many invalid messages" if self._searched_bytes > _MAX_SEARCHED else ""
 
     def _header(self) -> bytes:
-        whole = self._fill(HEADER)
-        head = bytes(self._raw[:HEADER])
-        if whole and head.startswith(MAGIC):
-            self.start_us = _stamp(head, 8)[0]
+        complete = self._fill(HEADER)
+        head = bytes(self._buffer[:HEADER])
+        if complete and head.startswith(MAGIC):
+            self.start_us = _read_stamp(head, 8)[0]
             self._at = HEADER
         elif head:
-            self._say(f"begins with {head[:7].hex(' ')}, expected {MAGIC.hex(' ')} of a ULog; searched for messages")
-        self._now_us = self.start_us if 0 < self.start_us < LATEST_US else None
+            self._add_message(
+                f"begins with {head[:7].hex(' ')}, expected {MAGIC.hex(' ')} of a ULog; searched for messages"
+            )
+        self._newest_us = self.start_us if 0 < self.start_us < MAX_STAMP_US else None
         return MAGIC + b"\x01" + struct.pack("<Q", self.start_us)
 
-    def _run(self) -> bytes | None:
+    def _skip_good_rows(self) -> bytes | None:
         """Skip valid rows and return the wanted ones; optimised, because a log is nearly all rows."""
-        raw, at, end, topics, now = self._raw, self._at, len(self._raw), self.formats.topics, self._now_us
+        buffer, at, end, topics, newest = (
+            self._buffer,
+            self._at,
+            len(self._buffer),
+            self.formats.topics,
+            self._newest_us,
+        )
         out = bytearray()
-        if self._restarts or now is None:
+        if self._restarts or newest is None:
             return b""
-        while at + 5 <= end and raw[at + 2] == _DATA:
-            topic = topics.get(raw[at + 3] | raw[at + 4] << 8)
-            size = raw[at] | raw[at + 1] << 8
-            if topic is None or at + 3 + size > end or size != topic.least + 2:
+        while at + 5 <= end and buffer[at + 2] == _DATA:
+            topic = topics.get(buffer[at + 3] | buffer[at + 4] << 8)
+            size = buffer[at] | buffer[at + 1] << 8
+            if topic is None or at + 3 + size > end or size != topic.min_size + 2:
                 break
             if topic.wanted:
-                stamp = _stamp(raw, at + 5 + topic.stamp_at)[0]
-                if not -JUMP_US < stamp - now < JUMP_US:
+                stamp = _read_stamp(buffer, at + 5 + topic.stamp_offset)[0]
+                if not -MAX_JUMP_US < stamp - newest < MAX_JUMP_US:
                     break
-                if stamp > now:
-                    now = stamp
-                out += raw[at : at + 3 + size]
+                if stamp > newest:
+                    newest = stamp
+                out += buffer[at : at + 3 + size]
             at += 3 + size
             self.messages += 1
-        self._wanted += len(out)
+        self._wanted_bytes += len(out)
         if at > self._at:
-            self._tell_damage()
-            self._at, self._now_us = at, now
-            self._strangers = 0 if out else self._strangers  # rows of unwanted topics have no checked time
+            self._report_damage()
+            self._at, self._newest_us = at, newest
+            self._jumped_count = 0 if out else self._jumped_count  # rows of unwanted topics have no checked time
         return bytes(out)
 
-    def _next(self) -> bytes | None:
+    def _next_message(self) -> bytes | None:
         """Skip one message or damage; return the bytes to pass, empty for none; None for damage."""
-        self._slow += 1
-        size, kind = _head(self._raw, self._at)
+        self._slow_count += 1
+        size, kind = _read_header(self._buffer, self._at)
         end = self._offset + 3 + size
         if self._restarts and end > self._restarts[0]:
             return self._restart()
         if kind in _TYPES and self._fill(3 + size):
-            body = bytes(self._raw[self._at + 3 : self._at + 3 + size])
-            passed = self._judge(kind, body)
+            body = bytes(self._buffer[self._at + 3 : self._at + 3 + size])
+            passed = self._filter_message(kind, body)
             if passed is not None:
                 self._at += 3 + size
                 self.messages += 1
-                self._tell_damage()
+                self._report_damage()
                 return passed
         if self.messages and self._is_foreign(kind, size) and self._followed(3 + size):
             self._at += 3 + size
@@ -220,58 +231,58 @@ class Sieve:
     def _is_foreign(self, kind: int, size: int) -> bool:
         """Return whether it may be a valid message of an unknown type, or of a topic with a lost format."""
         if kind == _DATA and size > 2 and self._fill(5):
-            return _short(self._raw, self._at + 3)[0] not in self.formats.topics
+            return _read_uint16(self._buffer, self._at + 3)[0] not in self.formats.topics
         return size > 0 and kind not in _TYPES
 
     def _followed(self, length: int) -> bool:
-        return self._fill(length + 3) and self._raw[self._at + length + 2] in _TYPES
+        return self._fill(length + 3) and self._buffer[self._at + length + 2] in _TYPES
 
     def _resync(self) -> None:
         """Skip to the next valid message, at most one buffer further."""
-        since = self._offset
-        self._fill(_WIDEST)
-        found = len(self._raw) - 2 if len(self._raw) - self._at > 2 else len(self._raw)
-        for hit in _A_TYPE.finditer(self._raw, self._at + 3):
-            at = hit.start() - 2
-            size, kind = _head(self._raw, at)
-            if at + 3 + size > len(self._raw):
+        start = self._offset
+        self._fill(_MAX_MESSAGE)
+        next_start = len(self._buffer) - 2 if len(self._buffer) - self._at > 2 else len(self._buffer)
+        for match in _TYPE_BYTE.finditer(self._buffer, self._at + 3):
+            at = match.start() - 2
+            size, kind = _read_header(self._buffer, at)
+            if at + 3 + size > len(self._buffer):
                 if not self._ended:
-                    found = at
+                    next_start = at
                     break
                 continue
-            good, looked = could_be(kind, self._raw, at + 3, at + 3 + size)
-            self._searched += looked + _PLACE
-            if good and _is_good(kind, bytes(self._raw[at + 3 : at + 3 + size]), self.formats):
-                found = at
+            is_possible, examined = is_possible_body(kind, self._buffer, at + 3, at + 3 + size)
+            self._searched_bytes += examined + _SEARCH_COST
+            if is_possible and _is_valid(kind, bytes(self._buffer[at + 3 : at + 3 + size]), self.formats):
+                next_start = at
                 break
-            self._searched += size if good else 0
-            if self._searched > _MOST_SEARCHED:
-                found = at
+            self._searched_bytes += size if is_possible else 0
+            if self._searched_bytes > _MAX_SEARCHED:
+                next_start = at
                 break
-        self._at = max(found, self._at + 1)
-        if self._ended and len(self._raw) - self._at < 3:
-            self._at = len(self._raw)
-        self._dropped["damaged bytes"] += self._offset - since
-        self._damage = [self._damage[0] if self._damage else since, self._offset]
+        self._at = max(next_start, self._at + 1)
+        if self._ended and len(self._buffer) - self._at < 3:
+            self._at = len(self._buffer)
+        self._dropped["damaged bytes"] += self._offset - start
+        self._damage = [self._damage[0] if self._damage else start, self._offset]
 
-    def _tell_damage(self) -> None:
+    def _report_damage(self) -> None:
         if self._damage:
             self._places += 1
-            if self._places <= _MOST_PLACES:
-                self._say(f"bytes {self._damage[0]} to {self._damage[1]} are damaged and were skipped")
+            if self._places <= _MAX_PLACES:
+                self._add_message(f"bytes {self._damage[0]} to {self._damage[1]} are damaged and were skipped")
             self._damage = None
 
-    def _judge(self, kind: int, body: bytes) -> bytes | None:
+    def _filter_message(self, kind: int, body: bytes) -> bytes | None:
         """Return the bytes to pass: empty for a valid unwanted message, None for an invalid one."""
         if kind == _DATA:
             return self._data(body)
         if kind == ord("B") and self.messages == 0 and 40 <= len(body) < 100:  # only valid as the first message
             self._flags(body)
             return b""
-        if not _is_good(kind, body, self.formats):
+        if not _is_valid(kind, body, self.formats):
             return None
         if kind == ord("F") and not self._in_data:
-            if not self.formats.learn(body):
+            if not self.formats.declare(body):
                 return b""
         elif kind == ord("A"):
             self._in_data = True
@@ -279,64 +290,64 @@ class Sieve:
                 return b""
         elif kind == ord("F"):
             return b""
-        if kind in _MOST_SMALL:
+        if kind in _KIND_LIMITS:
             self._small[kind] += 1
             self._small_bytes[kind] += len(body)
-            if self._small[kind] > _MOST_SMALL[kind][0] or self._small_bytes[kind] > _MOST_SMALL[kind][1]:
+            if self._small[kind] > _KIND_LIMITS[kind][0] or self._small_bytes[kind] > _KIND_LIMITS[kind][1]:
                 self._dropped[f"messages of kind {chr(kind)} beyond the limit"] += 1
                 return b""
-        return struct.pack("<HB", len(body), kind) + body if kind in _PASSED else b""
+        return struct.pack("<HB", len(body), kind) + body if kind in _PASSED_TYPES else b""
 
     def _data(self, body: bytes) -> bytes | None:
-        topic = self.formats.topics.get(_short(body)[0]) if len(body) > 2 else None
-        if topic is None or not topic.least <= len(body) - 2 <= topic.most:
+        topic = self.formats.topics.get(_read_uint16(body)[0]) if len(body) > 2 else None
+        if topic is None or not topic.min_size <= len(body) - 2 <= topic.max_size:
             return None
         if not topic.wanted:
             return b""
-        if not self._in_time(_stamp(body, 2 + topic.stamp_at)[0]):
+        if not self._is_continuous(_read_stamp(body, 2 + topic.stamp_offset)[0]):
             self._dropped[f"rows of {topic.name} with an implausible stamp"] += 1
             return b""
-        self._wanted += topic.least + 5
-        return struct.pack("<HB", topic.least + 2, _DATA) + body[: topic.least + 2]
+        self._wanted_bytes += topic.min_size + 5
+        return struct.pack("<HB", topic.min_size + 2, _DATA) + body[: topic.min_size + 2]
 
-    def _in_time(self, stamp: int) -> bool:
+    def _is_continuous(self, stamp: int) -> bool:
         """Return whether a stamp continues from the last one; enough consecutive jumps set a new time."""
-        if stamp < LATEST_US and (self._now_us is None or abs(stamp - self._now_us) < JUMP_US):
-            self._now_us = stamp if self._now_us is None else max(stamp, self._now_us)
-            self._strangers = 0
+        if stamp < MAX_STAMP_US and (self._newest_us is None or abs(stamp - self._newest_us) < MAX_JUMP_US):
+            self._newest_us = stamp if self._newest_us is None else max(stamp, self._newest_us)
+            self._jumped_count = 0
             return True
-        self._strangers += stamp < LATEST_US
-        if self._strangers >= COMPANY:
-            self._now_us, self._strangers = stamp, 0
+        self._jumped_count += stamp < MAX_STAMP_US
+        if self._jumped_count >= MIN_AGREEING:
+            self._newest_us, self._jumped_count = stamp, 0
         return False
 
     def _flags(self, body: bytes) -> None:
         if body[8] & ~1 or any(body[9:16]):
-            self._say("its flags require a newer reader; it was read anyway")
+            self._add_message("its flags require a newer reader; it was read anyway")
         if body[8] & 1:
-            self._restarts = sorted(o for o in struct.unpack("<3Q", body[16:40]) if o > self._offset)
+            self._restarts = sorted(offset for offset in struct.unpack("<3Q", body[16:40]) if offset > self._offset)
 
-    def _say(self, sentence: str) -> None:
+    def _add_message(self, sentence: str) -> None:
         self._skipped.append(sentence)
 
     def _report(self) -> None:
-        self._tell_damage()
-        if self._places > _MOST_PLACES:
-            self._say(f"… and {self._places - _MOST_PLACES} more damaged ranges")
-        for what, n in self._dropped.most_common(_MOST_PLACES):
-            self._say(f"{n} {what} skipped")
+        self._report_damage()
+        if self._places > _MAX_PLACES:
+            self._add_message(f"… and {self._places - _MAX_PLACES} more damaged ranges")
+        for kind, count in self._dropped.most_common(_MAX_PLACES):
+            self._add_message(f"{count} {kind} skipped")
 
 
-def _is_good(kind: int, body: bytes, formats: Formats) -> bool:
+def _is_valid(kind: int, body: bytes, formats: Formats) -> bool:
     """Return whether the bytes are valid for their message type."""
     if kind == _DATA:
-        topic = formats.topics.get(_short(body)[0]) if len(body) > 2 else None
-        return topic is not None and topic.least <= len(body) - 2 <= topic.most
+        topic = formats.topics.get(_read_uint16(body)[0]) if len(body) > 2 else None
+        return topic is not None and topic.min_size <= len(body) - 2 <= topic.max_size
     if kind in b"LC":
         text = 9 if kind == ord("L") else 11
-        return len(body) >= text and body[0] in _LEVELS and readable(body[text:])
+        return len(body) >= text and body[0] in _LEVELS and is_readable(body[text:])
     if kind == ord("A"):
-        return len(body) > 3 and readable(body[3:]) and formats.knows(body[3:])
+        return len(body) > 3 and is_readable(body[3:]) and formats.is_declared(body[3:])
     if kind == ord("F"):
         return formats.is_format(body)
     if kind in b"IP":

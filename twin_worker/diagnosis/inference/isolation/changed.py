@@ -8,15 +8,21 @@ from scipy.signal import lfilter
 
 from fleet.effects import Onset
 from twin_worker.diagnosis.data.smooth import STEP_S
-from twin_worker.diagnosis.inference.isolation.isolate import PRICE, WELL, gates_of, normals, solved
-from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
+from twin_worker.diagnosis.inference.isolation.isolate import (
+    MIN_R2,
+    PARAMETER_COST,
+    normal_equations,
+    onset_gates,
+    solve_onsets,
+)
+from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 from twin_worker.diagnosis.model import equations as eq
-from twin_worker.diagnosis.model.baseline import CHANNELS, SHOWN_BY
-from twin_worker.diagnosis.model.residual import Terms
+from twin_worker.diagnosis.model.baseline import CHANNEL_OF, CHANNELS
+from twin_worker.diagnosis.model.residual import EquationTerms
 
 _AIR_LAG_S = 4.0  # time constant of a partly blocked pressure line
-_APART_S = 25.0  # least length of data before and after the onset
-_NOBODYS = {  # terms without an effect: damping, stability, cross-coupled surface, moving loads
+_MIN_SIDE_S = 25.0  # least length of data before and after the onset
+_UNCATALOGUED_TERMS = {  # terms without an effect: damping, stability, cross-coupled surface, moving loads
     "L": ("beta", "p", "r", "delta_r"),
     "M": ("q", "c_x"),
     "N": ("beta", "p", "r", "delta_a"),
@@ -26,7 +32,7 @@ Gain = tuple[float, float]
 """Gain less the parameter cost, and onset [s]."""
 
 
-class Equation:
+class ChannelEquation:
     """Whitened regressors of one channel.
 
     Args:
@@ -35,78 +41,80 @@ class Equation:
         terms: name -> time series, (n,)
     """
 
-    def __init__(self, sight: Sight, channel: str, terms: dict[str, np.ndarray]) -> None:
+    def __init__(self, whitened: WhitenedResiduals, channel: str, terms: dict[str, np.ndarray]) -> None:
         c = CHANNELS.index(channel)
         self.channel, self.names = channel, tuple(terms)
-        laid = np.zeros((len(sight.case.t), len(CHANNELS), len(terms)))
-        laid[:, c] = np.transpose(list(terms.values()))
-        white = sight.noise.whiten(laid)[:, c] * sight.ok[:, None]
+        slopes = np.zeros((len(whitened.modelled.t), len(CHANNELS), len(terms)))
+        slopes[:, c] = np.transpose(list(terms.values()))
+        white = whitened.noise.whiten(slopes)[:, c] * whitened.ok[:, None]
         self._J = (white / (np.linalg.norm(white, axis=0) + 1e-12))[:, None, :]
-        self._sight = copy(sight)  # this channel alone; the nuisance information of the other channels stays
-        self._sight.e, self._sight.Jn = sight.e[:, [c]], sight.Jn[:, [c]]
+        self._whitened = copy(whitened)  # this channel alone; the nuisance information of the other channels stays
+        self._whitened.e, self._whitened.Jn = whitened.e[:, [c]], whitened.Jn[:, [c]]
 
-    def all_of_it(self) -> Gain:
+    def gain_of_all(self) -> Gain:
         """Return the gain of freeing all terms from the best onset."""
-        return _since(self._sight, self._J)
+        return _step_gain(self._whitened, self._J)
 
-    def in_flight(self) -> Gain:
+    def gain_in_flight(self) -> Gain:
         """Return the gain of a step at the best onset with all terms free throughout, whatever the calibration."""
-        return _since(_freed(self._sight, self._J), self._J, _APART_S)
+        return _step_gain(_with_free_terms(self._whitened, self._J), self._J, _MIN_SIDE_S)
 
-    def one_by_one(self) -> Iterator[tuple[str, Gain]]:
+    def gain_per_term(self) -> Iterator[tuple[str, Gain]]:
         """Yield the gain of freeing each single term that has no effect in the catalogue."""
-        equation = next((name for name, channel in SHOWN_BY.items() if channel == self.channel), "")
+        equation = next((name for name, channel in CHANNEL_OF.items() if channel == self.channel), "")
         for k, name in enumerate(self.names):
-            if name in (*_NOBODYS.get(equation, ()), _SLOW, _RATE):
-                yield name, _since(self._sight, self._J[:, :, [k]])
+            if name in (*_UNCATALOGUED_TERMS.get(equation, ()), _SLOW, _RATE):
+                yield name, _step_gain(self._whitened, self._J[:, :, [k]])
 
 
-def equations_of(sight: Sight) -> Iterator[Equation]:
+def channel_equations(whitened: WhitenedResiduals) -> Iterator[ChannelEquation]:
     """Yield every sufficiently calibrated channel with the terms that may change."""
-    made = sight.case.terms(sight.granted)
-    for equation, channel in SHOWN_BY.items():
-        if sight.base.r2.get(equation, 1.0) > WELL:
-            own = made.terms[equation] * made.scale.get(equation, 1.0)
-            yield Equation(sight, channel, dict(zip(eq.TERMS[equation], own, strict=False)) | _more(channel, made))
-    flow = made.flow
-    even = np.ones_like(flow.Va)
-    if "Va" in sight.case.flight.readings:
+    eq_terms = whitened.modelled.equation_terms(whitened.conditions)
+    for equation, channel in CHANNEL_OF.items():
+        if whitened.base.r2.get(equation, 1.0) > MIN_R2:
+            own = eq_terms.regressors[equation] * eq_terms.scale.get(equation, 1.0)
+            yield ChannelEquation(
+                whitened, channel, dict(zip(eq.TERMS[equation], own, strict=False)) | _extra_terms(channel, eq_terms)
+            )
+    flow = eq_terms.flow
+    constant = np.ones_like(flow.Va)
+    if "Va" in whitened.modelled.flight.readings:
         late = _lagged(flow.Va, _AIR_LAG_S) - flow.Va
-        yield Equation(sight, "airspeed", {"1": even, "Va": flow.Va, _SLOW: late})
+        yield ChannelEquation(whitened, "airspeed", {"1": constant, "Va": flow.Va, _SLOW: late})
     for channel, rate in (("gyro_roll", flow.p), ("gyro_pitch", flow.q), ("gyro_yaw", flow.r)):
-        yield Equation(sight, channel, {"1": even, _RATE: rate})
+        yield ChannelEquation(whitened, channel, {"1": constant, _RATE: rate})
 
 
-def _since(sight: Sight, J: np.ndarray, apart_s: float = 0.0) -> Gain:
+def _step_gain(whitened: WhitenedResiduals, J: np.ndarray, margin_s: float = 0.0) -> Gain:
     """Return gain and onset of a step in terms, (n, 1, k), at least `margin_s` from both ends [s]."""
-    t = sight.case.t
-    rows, whens = gates_of(t, Onset.STEP)
-    gain, _ = solved(sight, *normals(sight, J, rows, Onset.STEP))
-    gain = np.where((t[rows] > t[0] + apart_s) & (t[rows] < t[-1] - apart_s), gain, 0.0)
+    t = whitened.modelled.t
+    onset_rows, onsets = onset_gates(t, Onset.STEP)
+    gain, _ = solve_onsets(whitened, *normal_equations(whitened, J, onset_rows, Onset.STEP))
+    gain = np.where((t[onset_rows] > t[0] + margin_s) & (t[onset_rows] < t[-1] - margin_s), gain, 0.0)
     best = int(np.argmax(gain))
-    return float(gain[best]) - PRICE * J.shape[2], whens[best].t0
+    return float(gain[best]) - PARAMETER_COST * J.shape[2], onsets[best].t0
 
 
-def _freed(sight: Sight, J: np.ndarray) -> Sight:
+def _with_free_terms(whitened: WhitenedResiduals, J: np.ndarray) -> WhitenedResiduals:
     """Return a copy with terms, (n, 1, k), added to the nuisances, free throughout the flight."""
-    out = copy(sight)
-    out.Jn = np.concatenate([sight.Jn, J], axis=2)
-    between = np.einsum("tci,tcj->ij", sight.Jn, J)
+    out = copy(whitened)
+    out.Jn = np.concatenate([whitened.Jn, J], axis=2)
+    cross = np.einsum("tci,tcj->ij", whitened.Jn, J)
     own = np.einsum("tci,tcj->ij", J, J) + 1e-6 * np.eye(J.shape[2])
-    out.Ann = np.block([[sight.Ann, between], [between.T, own]])
-    out.bn = np.concatenate([sight.bn, -np.einsum("tci,tc->i", J, sight.e)])
+    out.Ann = np.block([[whitened.Ann, cross], [cross.T, own]])
+    out.bn = np.concatenate([whitened.bn, -np.einsum("tci,tc->i", J, whitened.e)])
     return out
 
 
-def _more(channel: str, made: Terms) -> dict[str, np.ndarray]:
+def _extra_terms(channel: str, eq_terms: EquationTerms) -> dict[str, np.ndarray]:
     """Return non-aerodynamic terms of a channel: thrust, and loads that shift under specific force."""
-    f_x, f_y, _ = made.aside["f"]
-    more = {"force_x": {"thrust": made.terms["T"][0]}, "roll": {"f_y": f_y}, "pitch": {"f_x": f_x}}
-    return more.get(channel, {})
+    f_x, f_y, _ = eq_terms.intermediate["f"]
+    extra = {"force_x": {"thrust": eq_terms.regressors["T"][0]}, "roll": {"f_y": f_y}, "pitch": {"f_x": f_x}}
+    return extra.get(channel, {})
 
 
 def _lagged(x: np.ndarray, tau: float) -> np.ndarray:
     """Filter x, (n,), by a first-order lag of time constant tau [s]."""
-    kept = np.exp(-STEP_S / tau)
-    out: np.ndarray = lfilter([1.0 - kept], [1.0, -kept], x, zi=[kept * x[0]])[0]
+    decay = np.exp(-STEP_S / tau)
+    out: np.ndarray = lfilter([1.0 - decay], [1.0, -decay], x, zi=[decay * x[0]])[0]
     return out

@@ -6,112 +6,118 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.effects import Effect, Onset, catalogue
-from twin_worker.diagnosis.data.fault_hypothesis import ALWAYS, Guess, When
-from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
+from twin_worker.diagnosis.data.fault_hypothesis import ALWAYS, FaultHypothesis, OnsetProfile
+from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 from twin_worker.diagnosis.model.baseline import Baseline
 
-PRICE = 9.0  # gain that each parameter must add [-]
-WELL = 0.6  # share of variance explained from which an equation counts as calibrated
+PARAMETER_COST = 9.0  # gain that each parameter must add [-]
+MIN_R2 = 0.6  # share of variance explained from which an equation counts as calibrated
 _SURFACE = {"aileron": "L", "elevator": "M", "rudder": "N"}
 _SHOWS_IN = {"roll": "L", "pitch": "M", "yaw": "N", "thrust": "X", "drag": "X", "lift": "alpha"}
 _EDGE_S = 15.0, 20.0  # no onset closer to the start and the end of the flight [s]
-_EVERY = 5  # rows between two tested onsets, unless the onset is resolved to the row
+_ONSET_STRIDE = 5  # rows between two tested onsets, unless the onset is resolved to the row
 _RAMPS_S = (20.0, 40.0, 60.0, 90.0, 130.0)
 _BUMPS_S = (3.0, 5.0, 8.0, 14.0, 25.0, 45.0)
 
 
 @dataclass(frozen=True)
-class Found:
+class ScoredHypothesis:
     """A hypothesis and its gain: decrease of the whitened sum of squares."""
 
     gain: float
-    guess: Guess
+    hypothesis: FaultHypothesis
 
     @property
     def kind(self) -> str:
         """Return `label|onset kind`, the key of `Baseline.chance`."""
-        return f"{self.guess.label}|{self.guess.when.kind}"
+        return f"{self.hypothesis.label}|{self.hypothesis.onset.kind}"
 
     @property
-    def worth(self) -> float:
+    def net_gain(self) -> float:
         """Return the gain less the cost of its parameters."""
-        return self.gain - PRICE * self.guess.size
+        return self.gain - PARAMETER_COST * self.hypothesis.degrees_of_freedom
 
 
-def scan(sight: Sight) -> list[Found]:
+def scan(whitened: WhitenedResiduals) -> list[ScoredHypothesis]:
     """Return the best hypothesis of every effect, target and kind of onset, best first."""
     out = []
-    for effect, of in candidates(sight):
-        out += _by_start(sight, effect, of) if effect.starts else _by_slope(sight, effect, of)
-    return sorted(out, key=lambda found: -found.worth)
+    for effect, target in candidates(whitened):
+        out += (
+            _scan_by_start(whitened, effect, target)
+            if effect.initial_guesses
+            else _scan_by_slope(whitened, effect, target)
+        )
+    return sorted(out, key=lambda scored: -scored.net_gain)
 
 
-def candidates(sight: Sight) -> Iterator[tuple[Effect, str]]:
+def candidates(whitened: WhitenedResiduals) -> Iterator[tuple[Effect, str]]:
     """Yield every effect and target that the calibration covers, except effects on the variance alone."""
     for effect in catalogue().values():
         if not effect.variance:
-            for of in effect.of or ("",):
-                if covered(sight.base, effect, of):
-                    yield effect, of
+            for target in effect.targets or ("",):
+                if covered(whitened.base, effect, target):
+                    yield effect, target
 
 
-def covered(base: Baseline, effect: Effect, of: str) -> bool:
+def covered(base: Baseline, effect: Effect, target: str) -> bool:
     """Return whether the equation that an effect acts on is sufficiently calibrated."""
     if effect.channel in ("gyro", "imu"):
         return base.vane  # an estimator's rates and velocity no longer contain the fault
-    equation = _SURFACE.get(of) or _SHOWS_IN.get(effect.channel)
-    return equation is None or base.r2.get(equation, 1.0) > WELL
+    equation = _SURFACE.get(target) or _SHOWS_IN.get(effect.channel)
+    return equation is None or base.r2.get(equation, 1.0) > MIN_R2
 
 
-def _by_slope(sight: Sight, effect: Effect, of: str) -> list[Found]:
+def _scan_by_slope(whitened: WhitenedResiduals, effect: Effect, target: str) -> list[ScoredHypothesis]:
     step = np.array([p.step for p in effect.parameters])
-    nothing = Guess(effect, of, (0.0,) * effect.size)
-    plain = sight.plain_slopes(nothing, step)
-    J = sight.whole(plain)
+    zero = FaultHypothesis(effect, target, (0.0,) * effect.n_parameters)
+    raw_slopes = whitened.residual_slopes(zero, step)
+    J = whitened.whiten_slopes(raw_slopes)
     scale = np.sqrt((J**2).sum(axis=(0, 1)))
     if not (scale > 1e-9).all():
         return []
     J = J / scale
-    sharp = (
-        sight.base.vane and Onset.STEP in effect.onsets
+    by_row = (
+        whitened.base.vane and Onset.STEP in effect.onsets
     )  # a force derived from the velocity does not resolve the first rows
-    jumps = sight.begun(plain) / scale if sharp else None
+    onset_slopes = whitened.whiten_onset_slopes(raw_slopes) / scale if by_row else None
     out = []
     for kind in effect.onsets:
-        gates, whens = gates_of(sight.case.t, kind, 1 if sharp else _EVERY)
+        gates, onsets = onset_gates(whitened.modelled.t, kind, 1 if by_row else _ONSET_STRIDE)
         if not len(gates):
             continue
-        sums = normals(sight, J, gates, kind)
-        if kind is Onset.STEP and jumps is not None:
-            sums = _begun(sight, J, jumps, gates, sums)
-        gain, x = solved(sight, *sums)
+        sums = normal_equations(whitened, J, gates, kind)
+        if kind is Onset.STEP and onset_slopes is not None:
+            sums = _with_onset_slopes(whitened, J, onset_slopes, gates, sums)
+        gain, x = solve_onsets(whitened, *sums)
         best = int(np.argmax(gain))
-        out.append(Found(float(gain[best]), nothing.at(x[best] / scale, whens[best])))
+        out.append(ScoredHypothesis(float(gain[best]), zero.with_parameters(x[best] / scale, onsets[best])))
     return out
 
 
-def gates_of(t: np.ndarray, kind: Onset, every: int = _EVERY) -> tuple[np.ndarray, list[When]]:
+def onset_gates(t: np.ndarray, kind: Onset, stride: int = _ONSET_STRIDE) -> tuple[np.ndarray, list[OnsetProfile]]:
     """Return the gates (m, n) to test and their onset profiles; for steps, rows (m,), `stride` apart, replace gates."""
     first, last = t[0] + _EDGE_S[0], t[-1] - _EDGE_S[1]
     if kind is Onset.ALWAYS:
         return np.ones((1, len(t))), [ALWAYS]
     if kind is Onset.STEP:
-        rows = np.flatnonzero((t > first) & (t < last))[::every]
-        return rows, [When(kind, float(t[i])) for i in rows]
+        onset_rows = np.flatnonzero((t > first) & (t < last))[::stride]
+        return onset_rows, [OnsetProfile(kind, float(t[i])) for i in onset_rows]
     lengths = _RAMPS_S if kind is Onset.RAMP else _BUMPS_S
-    whens = []
+    onsets = []
     for T in lengths:
-        apart = 10.0 if kind is Onset.RAMP else max(T / 6, 1.0)
+        spacing = 10.0 if kind is Onset.RAMP else max(T / 6, 1.0)
         end = last - 10.0 if kind is Onset.RAMP else t[-1] - T
-        whens += [When(kind, float(t0), T) for t0 in np.arange(t[0] + 5.0, end, apart)]
-    return np.stack([when.gate(t) for when in whens]) if whens else np.empty((0, len(t))), whens
+        onsets += [OnsetProfile(kind, float(t0), T) for t0 in np.arange(t[0] + 5.0, end, spacing)]
+    return np.stack([onset.gate(t) for onset in onsets]) if onsets else np.empty((0, len(t))), onsets
 
 
-def normals(sight: Sight, J: np.ndarray, gates: np.ndarray, kind: Onset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def normal_equations(
+    whitened: WhitenedResiduals, J: np.ndarray, gates: np.ndarray, kind: Onset
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sum the normal equations of slopes J, (n, c, k), per onset: (m, k, k), (m, k), (m, k, nuisances)."""
     A = np.einsum("tci,tcj->tij", J, J)
-    b = -np.einsum("tci,tc->ti", J, sight.e)
-    C = np.einsum("tci,tcj->tij", J, sight.Jn)
+    b = -np.einsum("tci,tc->ti", J, whitened.e)
+    C = np.einsum("tci,tcj->tij", J, whitened.Jn)
     if kind is Onset.STEP:
         return tuple(np.cumsum(x[::-1], axis=0)[::-1][gates] for x in (A, b, C))  # type: ignore[return-value]
     flat = [x.reshape(len(x), -1) for x in (A, b, C)]
@@ -119,25 +125,31 @@ def normals(sight: Sight, J: np.ndarray, gates: np.ndarray, kind: Onset) -> tupl
     return tuple(s.reshape(len(gates), *x.shape[1:]) for s, x in zip(sums, (A, b, C), strict=True))  # type: ignore[return-value]
 
 
-def _begun(
-    sight: Sight, J: np.ndarray, jumps: np.ndarray, rows: np.ndarray, sums: tuple[np.ndarray, ...]
+def _with_onset_slopes(
+    whitened: WhitenedResiduals,
+    J: np.ndarray,
+    onset_slopes: np.ndarray,
+    onset_rows: np.ndarray,
+    sums: tuple[np.ndarray, ...],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Replace the first two rows after each step by `onset_slopes`, (2, n, c, k), which start from zero."""
     A, b, C = sums
-    for late, jump in enumerate(jumps):
-        at = rows + late
-        new, old, e, Jn = jump[at], J[at], sight.e[at], sight.Jn[at]
+    for offset, slopes in enumerate(onset_slopes):
+        index = onset_rows + offset
+        new, old, e, Jn = slopes[index], J[index], whitened.e[index], whitened.Jn[index]
         A = A + np.einsum("mci,mcj->mij", new, new) - np.einsum("mci,mcj->mij", old, old)
         b = b - np.einsum("mci,mc->mi", new - old, e)
         C = C + np.einsum("mci,mcj->mij", new - old, Jn)
     return A, b, C
 
 
-def solved(sight: Sight, A: np.ndarray, b: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def solve_onsets(
+    whitened: WhitenedResiduals, A: np.ndarray, b: np.ndarray, C: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Solve for the gain (m,) and the parameters (m, k) of each onset, the nuisances free within their spread."""
-    inverse = np.linalg.inv(sight.Ann)
+    inverse = np.linalg.inv(whitened.Ann)
     A = A - C @ inverse @ np.swapaxes(C, 1, 2)
-    b = b - C @ (inverse @ sight.bn)
+    b = b - C @ (inverse @ whitened.bn)
     k = A.shape[1]
     trace = np.einsum("mii->m", A)
     A = A + (1e-9 * trace + 1e-12)[:, None, None] * np.eye(k)
@@ -145,22 +157,25 @@ def solved(sight: Sight, A: np.ndarray, b: np.ndarray, C: np.ndarray) -> tuple[n
     return (b * x).sum(axis=1), x
 
 
-def _by_start(sight: Sight, effect: Effect, of: str) -> list[Found]:
+def _scan_by_start(whitened: WhitenedResiduals, effect: Effect, target: str) -> list[ScoredHypothesis]:
     """Scan the start values of an effect without a slope at zero; a step gains the sum over the rows after it."""
-    out: dict[Onset, Found] = {}
-    before = (sight.e**2).sum(axis=1)
-    t = sight.case.t
-    rows = np.flatnonzero((t > t[0] + _EDGE_S[0]) & (t < t[-1] - _EDGE_S[1]))
-    for start in effect.starts:
-        guess = Guess(effect, of, start)
-        gain = before - (sight.clipped((guess,)) ** 2).sum(axis=1)
-        since = np.cumsum(gain[::-1])[::-1][rows]
-        i = int(np.argmax(since))
-        tried = {
-            Onset.ALWAYS: Found(float(gain.sum()), guess),
-            Onset.STEP: Found(float(since[i]), guess.at(np.array(start), When(Onset.STEP, float(t[rows[i]])))),
+    out: dict[Onset, ScoredHypothesis] = {}
+    before = (whitened.e**2).sum(axis=1)
+    t = whitened.modelled.t
+    onset_rows = np.flatnonzero((t > t[0] + _EDGE_S[0]) & (t < t[-1] - _EDGE_S[1]))
+    for start in effect.initial_guesses:
+        hypothesis = FaultHypothesis(effect, target, start)
+        gain = before - (whitened.clipped((hypothesis,)) ** 2).sum(axis=1)
+        tail_gain = np.cumsum(gain[::-1])[::-1][onset_rows]
+        i = int(np.argmax(tail_gain))
+        options = {
+            Onset.ALWAYS: ScoredHypothesis(float(gain.sum()), hypothesis),
+            Onset.STEP: ScoredHypothesis(
+                float(tail_gain[i]),
+                hypothesis.with_parameters(np.array(start), OnsetProfile(Onset.STEP, float(t[onset_rows[i]]))),
+            ),
         }
-        for kind, found in tried.items():
-            if kind in effect.onsets and (kind not in out or found.gain > out[kind].gain):
-                out[kind] = found
+        for kind, scored in options.items():
+            if kind in effect.onsets and (kind not in out or scored.gain > out[kind].gain):
+                out[kind] = scored
     return list(out.values())

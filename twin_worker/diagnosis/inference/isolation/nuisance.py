@@ -10,15 +10,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleet.effects import Effect, Parameter, Stage, catalogue
-from twin_worker.diagnosis.data.fault_hypothesis import ALWAYS, Guess
+from twin_worker.diagnosis.data.fault_hypothesis import ALWAYS, FaultHypothesis
 
-_SHARE = 0.03  # least spread of a derivative without a fast accelerometer [-]
-WIDEST = 4.0  # largest estimated spread over its floor
-RELEASED = 2.5  # spreads beyond which a difference is no longer a nuisance
-SOUND = 3.3  # the same for sensor biases, which data sheets specify
+_SHARE_FLOOR = 0.03  # least spread of a derivative without a fast accelerometer [-]
+MAX_SPREAD_RATIO = 4.0  # largest estimated spread over its floor
+RELEASE_SIGMAS = 2.5  # spreads beyond which a difference is no longer a nuisance
+SENSOR_RELEASE_SIGMAS = 3.3  # the same for sensor biases, which data sheets specify
 
-WAVES = 3  # cosine harmonics of a slow drift
-_WANDERS = {  # drift during a flight: effect -> floor of the drift over the floor of the mean
+DRIFT_HARMONICS = 3  # cosine harmonics of a slow drift
+_DRIFT_FLOORS = {  # drift during a flight: effect -> floor of the drift over the floor of the mean
     "accel_bias": 0.4,
     "gyro_bias": 0.3,
     "heading_bias": 0.25,
@@ -44,9 +44,9 @@ SCATTER = Effect(
     parameters=(Parameter("x", "-", "offset", step=0.01, low=-1.0, high=1.0),),
     act=_act,
     examples=((0.01,),),
-    of=(*_SHARES, *_OFFSETS),
+    targets=(*_SHARES, *_OFFSETS),
 )
-LAPSE = replace(SCATTER, name="lapse", act=lambda flow, x: {"baro": x * flow.height / 100.0}, of=())
+LAPSE = replace(SCATTER, name="lapse", act=lambda flow, x: {"baro": x * flow.height / 100.0}, targets=())
 DENSITY = replace(SCATTER, stage=Stage.AIR)
 
 
@@ -63,40 +63,40 @@ class Nuisance:
 
     name: str
     effect: Effect
-    of: str
+    target: str
     index: int
     floor: float
     step: float
 
-    def guess(self, x: float) -> Guess:
+    def hypothesis(self, x: float) -> FaultHypothesis:
         """Return the effect with this parameter at x and the others at zero."""
-        par = [0.0] * self.effect.size
+        par = [0.0] * self.effect.n_parameters
         par[self.index] = x
-        return Guess(self.effect, self.of, tuple(par), ALWAYS)
+        return FaultHypothesis(self.effect, self.target, tuple(par), ALWAYS)
 
     @property
-    def sensor(self) -> bool:
+    def is_sensor_bias(self) -> bool:
         """Return whether this is a sensor bias."""
         return self.effect.name in ("accel_bias", "gyro_bias", "heading_bias", "imu_misalignment")
 
     @property
-    def released(self) -> float:
+    def release_sigmas(self) -> float:
         """Return the number of spreads beyond which this is no longer a nuisance."""
-        return SOUND if self.sensor else RELEASED
+        return SENSOR_RELEASE_SIGMAS if self.is_sensor_bias else RELEASE_SIGMAS
 
     @property
-    def scatter(self) -> bool:
+    def is_unbounded(self) -> bool:
         """Return whether no effect in the catalogue can explain this difference, so that it stays a nuisance."""
-        return self.of == "side" or self.name in ("baro", "lapse")
+        return self.target == "side" or self.name in ("baro", "lapse")
 
     @property
-    def weather(self) -> bool:
+    def is_wind(self) -> bool:
         """Return whether this is wind, of which any amount may be nominal."""
         return self.effect.name in ("wind_steady", "wind_shear")
 
 
 @dataclass(frozen=True)
-class Wander:
+class DriftMode:
     """Slow drift of one nuisance: a cosine with some half waves over the flight.
 
     Attributes:
@@ -107,43 +107,43 @@ class Wander:
     """
 
     name: str
-    of: int
-    wave: int
+    nuisance_index: int
+    half_waves: int
     floor: float
 
 
-def wanders(known: Sequence[Nuisance], vane: bool) -> tuple[Wander, ...]:
+def drift_modes(nuisances: Sequence[Nuisance], vane: bool) -> tuple[DriftMode, ...]:
     """List the drift modes of all drifting nuisances; none without a fast accelerometer, where noise covers them."""
     return tuple(
-        Wander(f"{n.name}~{wave}", k, wave, _WANDERS[n.effect.name] * n.floor)
-        for k, n in enumerate(known)
-        if n.effect.name in _WANDERS
-        for wave in range(1, WAVES + 1)
+        DriftMode(f"{n.name}~{half_waves}", k, half_waves, _DRIFT_FLOORS[n.effect.name] * n.floor)
+        for k, n in enumerate(nuisances)
+        if n.effect.name in _DRIFT_FLOORS
+        for half_waves in range(1, DRIFT_HARMONICS + 1)
         if vane
     )
 
 
-def wandering(columns: np.ndarray, several: Sequence[Wander], t: np.ndarray) -> np.ndarray:
+def drift_slopes(columns: np.ndarray, modes: Sequence[DriftMode], t: np.ndarray) -> np.ndarray:
     """Return the slopes of drift modes, (n, c, modes), from those of the nuisances, (n, c, nuisances), at t (n,)."""
     share = (t - t[0]) / max(t[-1] - t[0], 1e-9)
-    waves = np.sqrt(2.0) * np.cos(np.pi * np.outer(share, [one.wave for one in several]))
-    return columns[:, :, [one.of for one in several]] * waves[:, None, :]
+    waves = np.sqrt(2.0) * np.cos(np.pi * np.outer(share, [mode.half_waves for mode in modes]))
+    return columns[:, :, [mode.nuisance_index for mode in modes]] * waves[:, None, :]
 
 
-def nuisances(vane: bool) -> tuple[Nuisance, ...]:
+def list_nuisances(vane: bool) -> tuple[Nuisance, ...]:
     """List all nuisances; without a fast accelerometer also the less accurate derivatives."""
-    known = catalogue()
+    effects = catalogue()
     out = []
 
-    def add(name: str, floor: float, of: tuple[str, ...] = ("",)) -> None:
-        effect = known[name]
-        for one in of:
+    def add(name: str, floor: float, targets: tuple[str, ...] = ("",)) -> None:
+        effect = effects[name]
+        for target in targets:
             for k, parameter in enumerate(effect.parameters):
-                label = ":".join(filter(None, (name, one, parameter.name)))
-                out.append(Nuisance(label, effect, one, k, floor, 0.3 * parameter.step))
+                label = ":".join(filter(None, (name, target, parameter.name)))
+                out.append(Nuisance(label, effect, target, k, floor, 0.3 * parameter.step))
 
-    add("accel_bias", 0.04, known["accel_bias"].of)
-    add("gyro_bias", 0.0015, known["gyro_bias"].of)
+    add("accel_bias", 0.04, effects["accel_bias"].targets)
+    add("gyro_bias", 0.0015, effects["gyro_bias"].targets)
     add("heading_bias", 0.012)
     add("wind_steady", 0.35)
     add("wind_shear", 0.2)
@@ -159,9 +159,12 @@ def nuisances(vane: bool) -> tuple[Nuisance, ...]:
         "rho": 0.003,
         "side": 0.05,
     }
-    out += [Nuisance(of, DENSITY if of == "rho" else SCATTER, of, 0, floors[of], floors[of]) for of in _OFFSETS]
-    out.append(Nuisance("baro", known["baro_bias"], "", 0, _QNH_M, 1.0))
+    out += [
+        Nuisance(target, DENSITY if target == "rho" else SCATTER, target, 0, floors[target], floors[target])
+        for target in _OFFSETS
+    ]
+    out.append(Nuisance("baro", effects["baro_bias"], "", 0, _QNH_M, 1.0))
     out.append(Nuisance("lapse", LAPSE, "", 0, _LAPSE, 0.5))
     if not vane:
-        out += [Nuisance(of, SCATTER, of, 0, _SHARE, _SHARE) for of in _SHARES]
+        out += [Nuisance(target, SCATTER, target, 0, _SHARE_FLOOR, _SHARE_FLOOR) for target in _SHARES]
     return tuple(out)

@@ -3,95 +3,105 @@
 import numpy as np
 
 from fleet.effects import Onset, Stage
-from twin_worker.diagnosis.data.fault_hypothesis import Guess
-from twin_worker.diagnosis.inference.isolation.isolate import Found
-from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
+from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
+from twin_worker.diagnosis.inference.isolation.isolate import ScoredHypothesis
+from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 
-_ROUNDS = 5
-_ENOUGH = 0.5  # gain below which fitting stops
-_MOVES_S = (8.0, 4.0, 2.0, 1.0, 0.5, 0.2)
+_ITERATIONS = 5
+_MIN_GAIN = 0.5  # gain below which fitting stops
+_ONSET_STEPS_S = (8.0, 4.0, 2.0, 1.0, 0.5, 0.2)
 # search steps for the onset of a sensor jump
-_NEAR_S, _NEARER_S = np.arange(-2.0, 2.1, 0.2), np.arange(-0.16, 0.17, 0.04)
-_TURNS = {Onset.BUMP: 3}  # rounds of onset search and fit: a misplaced bump is fitted too small at first
-_STRETCH = (1.5, 1.2, 1.1)
+_COARSE_STEPS_S, _FINE_STEPS_S = np.arange(-2.0, 2.1, 0.2), np.arange(-0.16, 0.17, 0.04)
+_ALTERNATIONS = {Onset.BUMP: 3}  # rounds of onset search and fit: a misplaced bump is fitted too small at first
+_STRETCH_FACTORS = (1.5, 1.2, 1.1)
 
 
-def refine(sight: Sight, guess: Guess, rounds: int = _ROUNDS, move: bool = True) -> Found:
+def refine(
+    whitened: WhitenedResiduals, hypothesis: FaultHypothesis, iterations: int = _ITERATIONS, move_onset: bool = True
+) -> ScoredHypothesis:
     """Return the fitted hypothesis with its gain; `move_onset` also fits its onset."""
-    before = sight.cost(())
-    now = sight.cost((guess,))
-    if now > before:
-        half = guess.at(0.5 * np.array(guess.par))
-        now, guess = min((now, guess), (sight.cost((half,)), half), key=lambda found: found[0])
-    guess, now = _newton(sight, guess, now, rounds)
-    for _ in range(_TURNS.get(guess.when.kind, 1) if move else 0):
-        moved, cost = _onset(sight, guess, now)
-        if moved is guess:
+    before = whitened.cost(())
+    best_cost = whitened.cost((hypothesis,))
+    if best_cost > before:
+        half = hypothesis.with_parameters(0.5 * np.array(hypothesis.par))
+        best_cost, hypothesis = min((best_cost, hypothesis), (whitened.cost((half,)), half), key=lambda pair: pair[0])
+    hypothesis, best_cost = _gauss_newton(whitened, hypothesis, best_cost, iterations)
+    for _ in range(_ALTERNATIONS.get(hypothesis.onset.kind, 1) if move_onset else 0):
+        moved, cost = _search_onset(whitened, hypothesis, best_cost)
+        if moved is hypothesis:
             break
-        guess, now = _newton(sight, moved, cost, 2)
-    return Found(before - now, guess)
+        hypothesis, best_cost = _gauss_newton(whitened, moved, cost, 2)
+    return ScoredHypothesis(before - best_cost, hypothesis)
 
 
-def _newton(sight: Sight, guess: Guess, now: float, rounds: int) -> tuple[Guess, float]:
-    for _ in range(rounds):
-        A, b = normal(sight, guess)
+def _gauss_newton(
+    whitened: WhitenedResiduals, hypothesis: FaultHypothesis, best_cost: float, iterations: int
+) -> tuple[FaultHypothesis, float]:
+    for _ in range(iterations):
+        A, b = normal_at(whitened, hypothesis)
         change = np.linalg.solve(A + 1e-6 * np.diag(np.diag(A)) + 1e-12 * np.eye(len(b)), b)
         gained = 0.0
         for share in (1.0, 0.5, 0.2):
-            trial = guess.at(np.array(guess.par) + share * change)
-            cost = sight.cost((trial,))
-            if cost < now - 1e-6:
-                guess, gained, now = trial, now - cost, cost
+            trial = hypothesis.with_parameters(np.array(hypothesis.par) + share * change)
+            cost = whitened.cost((trial,))
+            if cost < best_cost - 1e-6:
+                hypothesis, gained, best_cost = trial, best_cost - cost, cost
                 break
-        if gained < _ENOUGH:
+        if gained < _MIN_GAIN:
             break
-    return guess, now
+    return hypothesis, best_cost
 
 
-def steps(guess: Guess) -> np.ndarray:
+def slope_steps(hypothesis: FaultHypothesis) -> np.ndarray:
     """Return finite-difference steps at a hypothesis, (k,)."""
-    return np.array([0.3 * max(p.step, 0.1 * abs(x)) for p, x in zip(guess.effect.parameters, guess.par, strict=True)])
+    return np.array(
+        [0.3 * max(p.step, 0.1 * abs(x)) for p, x in zip(hypothesis.effect.parameters, hypothesis.par, strict=True)]
+    )
 
 
-def normal(sight: Sight, guess: Guess) -> tuple[np.ndarray, np.ndarray]:
+def normal_at(whitened: WhitenedResiduals, hypothesis: FaultHypothesis) -> tuple[np.ndarray, np.ndarray]:
     """Return the normal equations at a hypothesis, nuisances profiled out, (k, k) and (k,)."""
-    J = sight.slopes(guess, steps(guess))
-    e = sight.clipped((guess,))
-    C = np.einsum("tci,tcj->ij", J, sight.Jn)
-    A = np.einsum("tci,tcj->ij", J, J) - C @ np.linalg.solve(sight.Ann, C.T)
-    bn = -np.einsum("tci,tc->i", sight.Jn, e)
-    b = -np.einsum("tci,tc->i", J, e) - C @ np.linalg.solve(sight.Ann, bn)
+    J = whitened.slopes(hypothesis, slope_steps(hypothesis))
+    e = whitened.clipped((hypothesis,))
+    C = np.einsum("tci,tcj->ij", J, whitened.Jn)
+    A = np.einsum("tci,tcj->ij", J, J) - C @ np.linalg.solve(whitened.Ann, C.T)
+    bn = -np.einsum("tci,tc->i", whitened.Jn, e)
+    b = -np.einsum("tci,tc->i", J, e) - C @ np.linalg.solve(whitened.Ann, bn)
     return A, b
 
 
-def _jump(sight: Sight, guess: Guess, now: float) -> tuple[Guess, float]:
+def _search_jump(
+    whitened: WhitenedResiduals, hypothesis: FaultHypothesis, best_cost: float
+) -> tuple[FaultHypothesis, float]:
     """Search the onset of a sensor jump on a fine grid: its slope is visible only at the exact sample."""
-    for moves in (_NEAR_S, _NEARER_S):
-        trials = [guess.at(np.array(guess.par), guess.when.moved(dt)) for dt in moves]
-        costs = [sight.cost((trial,)) for trial in trials]
+    for moves in (_COARSE_STEPS_S, _FINE_STEPS_S):
+        trials = [hypothesis.with_parameters(np.array(hypothesis.par), hypothesis.onset.shifted(dt)) for dt in moves]
+        costs = [whitened.cost((trial,)) for trial in trials]
         k = int(np.argmin(costs))
-        if costs[k] < now:
-            guess, now = trials[k], costs[k]
-    return guess, now
+        if costs[k] < best_cost:
+            hypothesis, best_cost = trials[k], costs[k]
+    return hypothesis, best_cost
 
 
-def _onset(sight: Sight, guess: Guess, now: float) -> tuple[Guess, float]:
+def _search_onset(
+    whitened: WhitenedResiduals, hypothesis: FaultHypothesis, best_cost: float
+) -> tuple[FaultHypothesis, float]:
     """Shift the onset and scale the duration while the cost decreases."""
-    if guess.when.kind is Onset.ALWAYS:
-        return guess, now
-    best = guess
-    if guess.effect.stage is Stage.SENSOR and guess.when.kind is Onset.STEP:
-        best, now = _jump(sight, guess, now)
-    for move in _MOVES_S:
+    if hypothesis.onset.kind is Onset.ALWAYS:
+        return hypothesis, best_cost
+    best = hypothesis
+    if hypothesis.effect.stage is Stage.SENSOR and hypothesis.onset.kind is Onset.STEP:
+        best, best_cost = _search_jump(whitened, hypothesis, best_cost)
+    for move in _ONSET_STEPS_S:
         for dt in (move, -move):
-            trial = best.at(np.array(best.par), best.when.moved(dt))
-            cost = sight.cost((trial,))
-            if cost < now - 1e-9:
-                best, now = trial, cost
-    if guess.when.kind is not Onset.STEP:
-        for by in (*_STRETCH, *(1 / s for s in _STRETCH)):
-            trial = best.at(np.array(best.par), best.when.stretched(by))
-            cost = sight.cost((trial,))
-            if cost < now - 1e-9:
-                best, now = trial, cost
-    return best, now
+            trial = best.with_parameters(np.array(best.par), best.onset.shifted(dt))
+            cost = whitened.cost((trial,))
+            if cost < best_cost - 1e-9:
+                best, best_cost = trial, cost
+    if hypothesis.onset.kind is not Onset.STEP:
+        for by in (*_STRETCH_FACTORS, *(1 / s for s in _STRETCH_FACTORS)):
+            trial = best.with_parameters(np.array(best.par), best.onset.stretched(by))
+            cost = whitened.cost((trial,))
+            if cost < best_cost - 1e-9:
+                best, best_cost = trial, cost
+    return best, best_cost

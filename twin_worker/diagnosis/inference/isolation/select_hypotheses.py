@@ -7,33 +7,33 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.effects import Stage
-from twin_worker.diagnosis.data.fault_hypothesis import Guess
-from twin_worker.diagnosis.inference.isolation.isolate import PRICE, Found, scan
+from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
+from twin_worker.diagnosis.inference.isolation.isolate import PARAMETER_COST, ScoredHypothesis, scan
 from twin_worker.diagnosis.inference.isolation.refine import refine
-from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
+from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 from twin_worker.diagnosis.model.baseline import CHANNELS
 
-MOST = 3  # effects per flight
-_TRIED = 12  # hypotheses refined per step
-_LEAST, _LEAST_COARSE = 150.0, 400.0  # least gain of the first effect, with and without fast accelerometer
-_CANCEL = 1.5  # limit of the relative contribution above which effects cancel each other
-_SECOND = 250.0  # least gain of every further effect
-_NEAR = 0.6  # share of the best score from which the onset is refined
-_CHANCE, _CHANCE_COARSE = 1.5, 1.2  # multiple of the gain that nominal flights reach by chance
+MAX_EFFECTS = 3  # effects per flight
+_N_REFINED = 12  # hypotheses refined per step
+_MIN_GAIN, _MIN_GAIN_COARSE = 150.0, 400.0  # least gain of the first effect, with and without fast accelerometer
+_CANCEL_RATIO = 1.5  # limit of the relative contribution above which effects cancel each other
+_MIN_FURTHER_GAIN = 250.0  # least gain of every further effect
+_REFINE_SHARE = 0.6  # share of the best score from which the onset is refined
+_CHANCE_FACTOR, _CHANCE_FACTOR_COARSE = 1.5, 1.2  # multiple of the gain that nominal flights reach by chance
 # share of the other effects' gain per channel that counts as their error; least share of the first effect's gain
-_SHARE, _SHARE_COARSE = 0.03, 0.25
-_OWN = 0.1  # least share of the gain without nuisances
-_NEXT = 0.02  # score tie within which the simpler hypothesis wins
+_ERROR_SHARE, _FURTHER_SHARE_COARSE = 0.03, 0.25
+_MIN_OWN_SHARE = 0.1  # least share of the gain without nuisances
+_TIE_SHARE = 0.02  # score tie within which the simpler hypothesis wins
 # score tie within which hypotheses are inseparable: with fast accelerometer; without, where model errors are larger
-_FINE, _COARSE = 0.06, 0.15
-_GUSTS = 1.2, 1.5  # variance ratio of the air channels: least, median
-_LEAST_TIE, _WIDEST_TIE = 20.0, 300.0
+_RIVAL_SHARE, _RIVAL_SHARE_COARSE = 0.06, 0.15
+_GUST_RATIOS = 1.2, 1.5  # variance ratio of the air channels: least, median
+_MIN_TIE, _MAX_TIE = 20.0, 300.0
 
-Say = Callable[[str], None]
+ReportProgress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Named:
+class SelectedEffect:
     """One selected effect.
 
     Attributes:
@@ -41,11 +41,13 @@ class Named:
         rivals: hypotheses with equal explanatory power, best first
     """
 
-    found: Found
-    rivals: tuple[Found, ...]
+    scored: ScoredHypothesis
+    rivals: tuple[ScoredHypothesis, ...]
 
 
-def decide(sight: Sight, weather: tuple[Guess, ...], say: Say = lambda word: None) -> tuple[list[Named], list[Found]]:
+def select_hypotheses(
+    whitened: WhitenedResiduals, weather: tuple[FaultHypothesis, ...], progress: ReportProgress = lambda message: None
+) -> tuple[list[SelectedEffect], list[ScoredHypothesis]]:
     """Select the effects that explain the flight; return them and the first ranking. Modifies `whitened`.
 
     Args:
@@ -53,53 +55,59 @@ def decide(sight: Sight, weather: tuple[Guess, ...], say: Say = lambda word: Non
         weather: hypotheses included throughout
         progress: callback for progress messages
     """
-    named: list[Named] = []
-    ranking: list[Found] = []
-    first = Joint(sight)
-    while len(named) < MOST:
-        say(f"effect {len(named) + 1}")
-        found = best(sight, [one.found.guess for one in named])
-        ranking = ranking or found
-        beside = Beside(sight, named, first.borne(named))
-        found = [one for one in found if beside.earned(one) and believable(sight, one.guess)]
-        if not found:
+    named: list[SelectedEffect] = []
+    ranking: list[ScoredHypothesis] = []
+    joint = JointGain(whitened)
+    while len(named) < MAX_EFFECTS:
+        progress(f"effect {len(named) + 1}")
+        candidates = best_hypotheses(whitened, [selected.scored.hypothesis for selected in named])
+        ranking = ranking or candidates
+        gain_test = GainTest(whitened, named, joint.channel_gain(named))
+        candidates = [
+            scored for scored in candidates if gain_test.passes(scored) and is_plausible(whitened, scored.hypothesis)
+        ]
+        if not candidates:
             break
-        more = [*named, choose(sight, found)]
-        if len(more) > 1:
-            more = _again(sight, more, weather)
-            if not first.better(more, named):
+        extended = [*named, select_simplest(whitened, candidates)]
+        if len(extended) > 1:
+            extended = _reselect(whitened, extended, weather)
+            if not joint.accepts(extended, named):
                 break
-        named = more
-        sight.grant((*weather, *(one.found.guess for one in named)))
+        named = extended
+        whitened.condition_on((*weather, *(selected.scored.hypothesis for selected in named)))
     return named, ranking
 
 
-class Joint:
+class JointGain:
     """Joint gain of several effects, under the same initial conditions."""
 
-    def __init__(self, sight: Sight) -> None:
-        self._sight = copy(sight)
-        self._none, self._bare = self._sight.cost(()), self._sight.powers(())
+    def __init__(self, whitened: WhitenedResiduals) -> None:
+        self._whitened = copy(whitened)
+        self._no_effect_cost, self._no_effect_channels = self._whitened.cost(()), self._whitened.channel_cost(())
 
-    def gain(self, named: list[Named]) -> float:
+    def gain(self, named: list[SelectedEffect]) -> float:
         """Return the joint gain."""
-        return self._none - self._sight.cost([one.found.guess for one in named])
+        return self._no_effect_cost - self._whitened.cost([selected.scored.hypothesis for selected in named])
 
-    def borne(self, named: list[Named]) -> np.ndarray:
+    def channel_gain(self, named: list[SelectedEffect]) -> np.ndarray:
         """Return the joint gain by channel, (c,)."""
-        return self._bare - self._sight.powers([one.found.guess for one in named])
+        return self._no_effect_channels - self._whitened.channel_cost(
+            [selected.scored.hypothesis for selected in named]
+        )
 
-    def better(self, more: list[Named], fewer: list[Named]) -> bool:
+    def accepts(self, extended: list[SelectedEffect], current: list[SelectedEffect]) -> bool:
         """Return whether a further effect adds enough gain, without effects that cancel each other."""
-        gain = self.gain(more)
-        without = min(self.gain([one for one in more if one is not left]) for left in more)
-        cancelling = gain - without > _CANCEL * gain
-        before = self.borne(fewer)
-        gained = min(gain - self.gain(fewer), beyond(self._sight, self.borne(more) - before, before))
-        return not cancelling and gained > needed(self._sight, fewer, more[-1].found)
+        gain = self.gain(extended)
+        without = min(self.gain([selected for selected in extended if selected is not omitted]) for omitted in extended)
+        cancelling = gain - without > _CANCEL_RATIO * gain
+        before = self.channel_gain(current)
+        gained = min(
+            gain - self.gain(current), excess_gain(self._whitened, self.channel_gain(extended) - before, before)
+        )
+        return not cancelling and gained > required_gain(self._whitened, current, extended[-1].scored)
 
 
-class Beside:
+class GainTest:
     """Test whether a further hypothesis adds enough gain to the selected effects.
 
     Args:
@@ -108,139 +116,169 @@ class Beside:
         channel_gain: their joint gain by channel, (c,)
     """
 
-    def __init__(self, sight: Sight, named: list[Named], borne: np.ndarray) -> None:
-        self._sight, self._named, self._borne = sight, named, borne
-        self._before = sight.powers(())
+    def __init__(self, whitened: WhitenedResiduals, named: list[SelectedEffect], channel_gain: np.ndarray) -> None:
+        self._whitened, self._named, self._channel_gain = whitened, named, channel_gain
+        self._before = whitened.channel_cost(())
 
-    def earned(self, found: Found) -> bool:
+    def passes(self, scored: ScoredHypothesis) -> bool:
         """Return whether a hypothesis exceeds the required gain beyond the model errors of the selected effects."""
-        least = needed(self._sight, self._named, found)
-        if not self._named or found.gain <= least:
-            return found.gain > least
-        own = self._before - self._sight.powers((found.guess,))
-        return beyond(self._sight, own, self._borne) > least
+        threshold = required_gain(self._whitened, self._named, scored)
+        if not self._named or scored.gain <= threshold:
+            return scored.gain > threshold
+        own = self._before - self._whitened.channel_cost((scored.hypothesis,))
+        return excess_gain(self._whitened, own, self._channel_gain) > threshold
 
 
-def beyond(sight: Sight, own: np.ndarray, borne: np.ndarray) -> float:
+def excess_gain(whitened: WhitenedResiduals, own: np.ndarray, others_gain: np.ndarray) -> float:
     """Return the gain of a hypothesis beyond the errors of the others, which are a share of their gain per channel.
 
     Args:
         own, others_gain: gain of the hypothesis and of the others by channel, (c,)
     """
-    share = _SHARE if sight.base.vane else 0.0
-    return float(np.maximum(own - share * np.maximum(borne, 0.0), 0.0).sum())
+    share = _ERROR_SHARE if whitened.base.vane else 0.0
+    return float(np.maximum(own - share * np.maximum(others_gain, 0.0), 0.0).sum())
 
 
-def best(sight: Sight, beside: Sequence[Guess]) -> list[Found]:
+def best_hypotheses(whitened: WhitenedResiduals, selected: Sequence[FaultHypothesis]) -> list[ScoredHypothesis]:
     """Scan all hypotheses and refine the most promising; best first."""
-    taken = {guess.label for guess in beside}
-    tried: list[Found] = []
-    for found in scan(sight):
-        if found.guess.label in taken or found.gain < 40.0:
+    taken = {hypothesis.label for hypothesis in selected}
+    candidates: list[ScoredHypothesis] = []
+    for scored in scan(whitened):
+        if scored.hypothesis.label in taken or scored.gain < 40.0:
             continue
-        if sum(other.guess.label == found.guess.label for other in tried) < 2:
-            tried.append(found)
-        if len(tried) >= _TRIED:
+        if sum(other.hypothesis.label == scored.hypothesis.label for other in candidates) < 2:
+            candidates.append(scored)
+        if len(candidates) >= _N_REFINED:
             break
-    fitted = [refine(sight, found.guess, move=False) for found in tried]
+    fitted = [refine(whitened, scored.hypothesis, move_onset=False) for scored in candidates]
     if not fitted:
         return []
-    least = _NEAR * max(rank(sight, one) for one in fitted)
+    least = _REFINE_SHARE * max(penalised_gain(whitened, refined) for refined in fitted)
     # a slightly misplaced bump gains little before its onset is fitted: the score of the scan counts too
-    near = [max(rank(sight, one), found.worth) > least for one, found in zip(fitted, tried, strict=True)]
-    moved = [refine(sight, one.guess) if good else one for one, good in zip(fitted, near, strict=True)]
-    return sorted(moved, key=lambda one: -rank(sight, one))
+    promising = [
+        max(penalised_gain(whitened, refined), scored.net_gain) > least
+        for refined, scored in zip(fitted, candidates, strict=True)
+    ]
+    moved = [
+        refine(whitened, refined.hypothesis) if good else refined
+        for refined, good in zip(fitted, promising, strict=True)
+    ]
+    return sorted(moved, key=lambda refined: -penalised_gain(whitened, refined))
 
 
-def rank(sight: Sight, found: Found) -> float:
+def penalised_gain(whitened: WhitenedResiduals, scored: ScoredHypothesis) -> float:
     """Return the gain less the parameter costs; without fast accelerometer, less a share per extra parameter too."""
-    extra = found.guess.effect.price - 1
-    share = 0.0 if sight.base.vane else _COARSE * extra
-    return found.gain * (1.0 - share) - PRICE * found.guess.size
+    extra = scored.hypothesis.effect.degrees_of_freedom - 1
+    share = 0.0 if whitened.base.vane else _RIVAL_SHARE_COARSE * extra
+    return scored.gain * (1.0 - share) - PARAMETER_COST * scored.hypothesis.degrees_of_freedom
 
 
-def tie(sight: Sight, found: Found) -> float:
+def tie_margin(whitened: WhitenedResiduals, scored: ScoredHypothesis) -> float:
     """Return the score difference within which two hypotheses are inseparable."""
-    if not sight.base.vane:
-        return max(_LEAST_TIE, _COARSE * found.gain)
-    return max(_LEAST_TIE, _NEXT * found.gain, min(_FINE * found.gain, _WIDEST_TIE))
+    if not whitened.base.vane:
+        return max(_MIN_TIE, _RIVAL_SHARE_COARSE * scored.gain)
+    return max(_MIN_TIE, _TIE_SHARE * scored.gain, min(_RIVAL_SHARE * scored.gain, _MAX_TIE))
 
 
-def choose(sight: Sight, found: list[Found]) -> Named:
+def select_simplest(whitened: WhitenedResiduals, candidates: list[ScoredHypothesis]) -> SelectedEffect:
     """Select the hypothesis with the fewest parameters among the best ties; the others become its rivals."""
-    first = found[0]
-    near = [one for one in found if rank(sight, one) > rank(sight, first) - max(_LEAST_TIE, _NEXT * first.gain)]
-    chosen = min(near, key=lambda one: (one.guess.size, -rank(sight, one)))
-    rivals: dict[str, Found] = {}
-    for one in found:
-        if rank(sight, one) < rank(sight, first) - tie(sight, first):
+    first = candidates[0]
+    ties = [
+        scored
+        for scored in candidates
+        if penalised_gain(whitened, scored) > penalised_gain(whitened, first) - max(_MIN_TIE, _TIE_SHARE * first.gain)
+    ]
+    chosen = min(ties, key=lambda scored: (scored.hypothesis.degrees_of_freedom, -penalised_gain(whitened, scored)))
+    rivals: dict[str, ScoredHypothesis] = {}
+    for scored in candidates:
+        if penalised_gain(whitened, scored) < penalised_gain(whitened, first) - tie_margin(whitened, first):
             continue
-        if one.guess.effect.name != chosen.guess.effect.name:
-            rivals.setdefault(one.guess.effect.name, one)
-    return Named(chosen, tuple(rivals.values()))
+        if scored.hypothesis.effect.name != chosen.hypothesis.effect.name:
+            rivals.setdefault(scored.hypothesis.effect.name, scored)
+    return SelectedEffect(chosen, tuple(rivals.values()))
 
 
-def needed(sight: Sight, named: list[Named], found: Found) -> float:
+def required_gain(whitened: WhitenedResiduals, named: list[SelectedEffect], scored: ScoredHypothesis) -> float:
     """Return the least gain of a hypothesis, from the chance gain and a share of the first effect's gain."""
-    known = sight.base.chance
-    chance = _CHANCE_COARSE * known.get(found.kind, 0.0)
-    if sight.base.vane:
-        chance = _CHANCE * max((x for kind, x in known.items() if _akin(kind, found.guess)), default=0.0)
-    least = _LEAST if sight.base.vane else _LEAST_COARSE
+    chance_gains = whitened.base.chance
+    chance = _CHANCE_FACTOR_COARSE * chance_gains.get(scored.kind, 0.0)
+    if whitened.base.vane:
+        chance = _CHANCE_FACTOR * max(
+            (x for kind, x in chance_gains.items() if _is_related(kind, scored.hypothesis)), default=0.0
+        )
+    least = _MIN_GAIN if whitened.base.vane else _MIN_GAIN_COARSE
     if not named:
         return max(least, chance)
-    return max(_SECOND, chance) if sight.base.vane else max(least, chance, _SHARE_COARSE * named[0].found.gain)
+    return (
+        max(_MIN_FURTHER_GAIN, chance)
+        if whitened.base.vane
+        else max(least, chance, _FURTHER_SHARE_COARSE * named[0].scored.gain)
+    )
 
 
-def _akin(kind: str, guess: Guess) -> bool:
+def _is_related(kind: str, hypothesis: FaultHypothesis) -> bool:
     """Return whether a chance gain applies to a hypothesis: same effect, or same surface."""
     label = kind.partition("|")[0]
-    return label == guess.label or (guess.effect.stage is Stage.DELTA and label.endswith(f":{guess.of}"))
+    return label == hypothesis.label or (
+        hypothesis.effect.stage is Stage.DELTA and label.endswith(f":{hypothesis.target}")
+    )
 
 
-def believable(sight: Sight, guess: Guess) -> bool:
+def is_plausible(whitened: WhitenedResiduals, hypothesis: FaultHypothesis) -> bool:
     """Return whether a hypothesis exceeds sensor tolerances and minimum values, not by nuisances alone."""
     bounds = {
-        n.index: n.released * max(sight.base.spread.get(n.name, n.floor), n.floor)
-        for n in sight.nuisances
-        if n.sensor and (n.effect.name, n.of) == (guess.effect.name, guess.of)
+        n.index: n.release_sigmas * max(whitened.base.spread.get(n.name, n.floor), n.floor)
+        for n in whitened.nuisances
+        if n.is_sensor_bias and (n.effect.name, n.target) == (hypothesis.effect.name, hypothesis.target)
     }
-    if bounds and all(abs(x) < bounds[k] for k, x in enumerate(guess.par)):
+    if bounds and all(abs(x) < bounds[k] for k, x in enumerate(hypothesis.par)):
         return False
-    if any(abs(x) < p.least for p, x in zip(guess.effect.parameters, guess.par, strict=True)):
+    if any(abs(x) < p.least for p, x in zip(hypothesis.effect.parameters, hypothesis.par, strict=True)):
         return False
-    return _own(sight, guess) > _OWN
+    return _own_share(whitened, hypothesis) > _MIN_OWN_SHARE
 
 
-def _own(sight: Sight, guess: Guess) -> float:
+def _own_share(whitened: WhitenedResiduals, hypothesis: FaultHypothesis) -> float:
     """Return the share of the gain that is due to parameters other than nuisances."""
-    aside = np.array([p.aside for p in guess.effect.parameters])
-    if not aside.any():
+    is_nuisance = np.array([p.nuisance for p in hypothesis.effect.parameters])
+    if not is_nuisance.any():
         return 1.0
-    none, all_of_it = sight.cost(()), sight.cost((guess,))
-    alone = sight.cost((guess.at(np.where(aside, guess.par, 0.0)),))
-    return (alone - all_of_it) / max(none - all_of_it, 1e-9)
+    base_cost, full_cost = whitened.cost(()), whitened.cost((hypothesis,))
+    own_cost = whitened.cost((hypothesis.with_parameters(np.where(is_nuisance, hypothesis.par, 0.0)),))
+    return (own_cost - full_cost) / max(base_cost - full_cost, 1e-9)
 
 
-def _again(sight: Sight, named: list[Named], weather: tuple[Guess, ...]) -> list[Named]:
+def _reselect(
+    whitened: WhitenedResiduals, named: list[SelectedEffect], weather: tuple[FaultHypothesis, ...]
+) -> list[SelectedEffect]:
     """Reselect each effect given the others, because the first selection ignored later effects."""
     for i in range(len(named)):
-        others = [one.found.guess for k, one in enumerate(named) if k != i]
-        sight.grant((*weather, *others))
-        found = [one for one in best(sight, others) if believable(sight, one.guess)]
-        kept = refine(sight, named[i].found.guess)
-        if found:
-            named[i] = choose(sight, sorted([kept, *found], key=lambda one: -rank(sight, one)))
+        others = [selected.scored.hypothesis for k, selected in enumerate(named) if k != i]
+        whitened.condition_on((*weather, *others))
+        candidates = [
+            scored for scored in best_hypotheses(whitened, others) if is_plausible(whitened, scored.hypothesis)
+        ]
+        refitted = refine(whitened, named[i].scored.hypothesis)
+        if candidates:
+            named[i] = select_simplest(
+                whitened, sorted([refitted, *candidates], key=lambda scored: -penalised_gain(whitened, scored))
+            )
     return named
 
 
-def turbulent(sight: Sight) -> tuple[float, float]:
+def turbulence_evidence(whitened: WhitenedResiduals) -> tuple[float, float]:
     """Return gain and variance ratio of gusts: sideslip, lift and airspeed scatter more, the sensor channels do not."""
-    kept = [CHANNELS.index(name) for name in ("side", "lift", "airspeed")]
-    calm = [CHANNELS.index(name) for name in ("gps_x", "gps_y", "gps_z", "gyro_roll", "gyro_pitch", "gyro_yaw")]
-    left = sight.left() / sight.base.usual
-    ratio = left[kept]
-    if ratio.min() < _GUSTS[0] or np.median(ratio) < _GUSTS[1] or left[calm].mean() > _GUSTS[1]:
+    air_channels = [CHANNELS.index(name) for name in ("side", "lift", "airspeed")]
+    other_channels = [
+        CHANNELS.index(name) for name in ("gps_x", "gps_y", "gps_z", "gyro_roll", "gyro_pitch", "gyro_yaw")
+    ]
+    mean_square = whitened.mean_square() / whitened.base.usual
+    ratio = mean_square[air_channels]
+    if (
+        ratio.min() < _GUST_RATIOS[0]
+        or np.median(ratio) < _GUST_RATIOS[1]
+        or mean_square[other_channels].mean() > _GUST_RATIOS[1]
+    ):
         return 0.0, 1.0
-    rows = int(sight.ok.sum())
-    return float(sum(rows * (x - 1 - np.log(x)) for x in ratio)), float(np.median(ratio))
+    n_rows = int(whitened.ok.sum())
+    return float(sum(n_rows * (x - 1 - np.log(x)) for x in ratio)), float(np.median(ratio))

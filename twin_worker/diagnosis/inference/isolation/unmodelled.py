@@ -8,13 +8,13 @@ coefficients without an effect in the catalogue compete with the named effects d
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from twin_worker.diagnosis.inference.isolation.changed import equations_of
-from twin_worker.diagnosis.inference.isolation.tones import tones
-from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
+from twin_worker.diagnosis.inference.isolation.changed import channel_equations
+from twin_worker.diagnosis.inference.isolation.tones import find_tones
+from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 from twin_worker.diagnosis.model.baseline import Baseline
 
 
-class Rule(NamedTuple):
+class EvidenceRule(NamedTuple):
     """Thresholds of one kind of evidence.
 
     Attributes:
@@ -24,25 +24,25 @@ class Rule(NamedTuple):
         gain_share, gain_share_high: least share of the gain of the named effects; the latter if a channel stays high
     """
 
-    least: float
-    chance: float
-    against: float
-    beside: float
-    loud: float
+    min_gain: float
+    chance_factor: float
+    limit_factor: float
+    gain_share: float
+    gain_share_high: float
 
 
 RULES = {
-    "odd": Rule(450.0, 3.0, 2.0, 0.5, 0.25),  # the whole equation changed, given the named effects
-    "shift": Rule(240.0, 2.4, 1.5, 0.05, 0.05),  # the equation changed in flight, given the named effects
-    "one": Rule(165.0, 3.0, 1.0, 0.9, 0.9),  # one coefficient changed, without the named effects
-    "tone": Rule(200.0, 2.0, 1.0, 0.0, 0.0),  # a tone, given the named effects
+    "odd": EvidenceRule(450.0, 3.0, 2.0, 0.5, 0.25),  # the whole equation changed, given the named effects
+    "shift": EvidenceRule(240.0, 2.4, 1.5, 0.05, 0.05),  # the equation changed in flight, given the named effects
+    "one": EvidenceRule(165.0, 3.0, 1.0, 0.9, 0.9),  # one coefficient changed, without the named effects
+    "tone": EvidenceRule(200.0, 2.0, 1.0, 0.0, 0.0),  # a tone, given the named effects
 }
 
 
-class Odd(NamedTuple):
+class Anomaly(NamedTuple):
     """Gain of a changed equation less its cost, or power ratio of a tone, with channel, onset [s], rule and term."""
 
-    worth: float
+    net_gain: float
     channel: str
     t0: float
     rule: str = "odd"
@@ -56,16 +56,16 @@ class Odd(NamedTuple):
     def limit(self, base: Baseline) -> float:
         """Return the least gain that exceeds chance."""
         rule = RULES[self.rule]
-        return max(rule.least, rule.chance * base.chance.get(self.kind, 0.0))
+        return max(rule.min_gain, rule.chance_factor * base.chance.get(self.kind, 0.0))
 
-    def counts(self, base: Baseline, gained: float, loud: bool) -> bool:
+    def is_unexplained(self, base: Baseline, named_gain: float, still_high: bool) -> bool:
         """Return whether the named effects, with total gain `named_gain` (0: none), do not explain the anomaly."""
         rule = RULES[self.rule]
-        least = (rule.loud if loud else rule.beside) * gained
-        return self.worth > max((rule.against if gained else 1.0) * self.limit(base), least)
+        least = (rule.gain_share_high if still_high else rule.gain_share) * named_gain
+        return self.net_gain > max((rule.limit_factor if named_gain else 1.0) * self.limit(base), least)
 
 
-def oddities(sight: Sight, plain: Sight) -> list[Odd]:
+def find_anomalies(whitened: WhitenedResiduals, unconditioned: WhitenedResiduals) -> list[Anomaly]:
     """Return the gain of a changed equation and the tone of every channel, best first.
 
     Without a fast accelerometer the equations are too uncertain: the list is empty.
@@ -74,18 +74,22 @@ def oddities(sight: Sight, plain: Sight) -> list[Odd]:
         whitened: residuals conditioned on the named effects
         unconditioned: residuals without the named effects
     """
-    if not sight.base.vane:
+    if not whitened.base.vane:
         return []
-    held = sight.held()  # no nuisance released
-    out = [Odd(*tone, "tone") for tone in tones(held)]
-    for one in equations_of(held):
-        for rule, (worth, t0) in (("odd", one.all_of_it()), ("shift", one.in_flight())):
-            out.append(Odd(worth, one.channel, t0, rule))
-    for one in equations_of(plain):
-        out += [Odd(worth, one.channel, t0, "one", name) for name, (worth, t0) in one.one_by_one()]
-    return sorted(out, key=lambda odd: -odd.worth)
+    bounded = whitened.with_nuisance_priors()  # no nuisance released
+    out = [Anomaly(*tone, "tone") for tone in find_tones(bounded)]
+    for equation in channel_equations(bounded):
+        for rule, (net_gain, t0) in (("odd", equation.gain_of_all()), ("shift", equation.gain_in_flight())):
+            out.append(Anomaly(net_gain, equation.channel, t0, rule))
+    for equation in channel_equations(unconditioned):
+        out += [
+            Anomaly(net_gain, equation.channel, t0, "one", name) for name, (net_gain, t0) in equation.gain_per_term()
+        ]
+    return sorted(out, key=lambda anomaly: -anomaly.net_gain)
 
 
-def strange(odds: Sequence[Odd], base: Baseline, gained: float, loud: bool) -> Odd | None:
+def first_unexplained(
+    anomalies: Sequence[Anomaly], base: Baseline, named_gain: float, still_high: bool
+) -> Anomaly | None:
     """Return the first anomaly that the named effects do not explain; `still_high`: a channel stays above its limit."""
-    return next((odd for odd in odds if odd.counts(base, gained, loud)), None)
+    return next((anomaly for anomaly in anomalies if anomaly.is_unexplained(base, named_gain, still_high)), None)

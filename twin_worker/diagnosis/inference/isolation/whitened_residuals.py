@@ -6,29 +6,29 @@ from dataclasses import replace
 
 import numpy as np
 
-from twin_worker.diagnosis.data.fault_hypothesis import Guess
+from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
 from twin_worker.diagnosis.inference.isolation.nuisance import (
-    RELEASED,
+    RELEASE_SIGMAS,
     Nuisance,
-    nuisances,
-    wandering,
-    wanders,
+    drift_modes,
+    drift_slopes,
+    list_nuisances,
 )
-from twin_worker.diagnosis.model.baseline import CHANNELS, is_weather
-from twin_worker.diagnosis.model.residual import Case
+from twin_worker.diagnosis.model.baseline import CHANNELS, wind_is_nominal
+from twin_worker.diagnosis.model.residual import ModelledFlight
 
 CLIP = 6.0  # clipping limit of whitened residuals [-]
-_JUMPS = 100.0  # for the barometer: its noise drifts, so that a lasting jump is one large whitened residual
-_WIDE = 3.0  # the limit is at least this multiple of the channel's scatter on this flight
-_TIGHT = 1e14  # precision of a nuisance that is fixed at zero
-_QUIETEST = 0.45  # least scatter relative to nominal flights
-_SURGE = 1.3  # largest scatter of the axial force where wind is nominal
-_LOUDEST = 3.0  # largest scatter of the air channels where wind is nominal
-_AIR = [CHANNELS.index(name) for name in ("force_x", "side", "lift", "roll", "pitch", "yaw", "airspeed")]
-_AIR += [CHANNELS.index(name) for name in ("gps_x", "gps_y", "gps_z")]
+_BARO_CLIP = 100.0  # for the barometer: its noise drifts, so that a lasting jump is one large whitened residual
+_SCATTER_CLIP = 3.0  # the limit is at least this multiple of the channel's scatter on this flight
+_FIXED_PRECISION = 1e14  # precision of a nuisance that is fixed at zero
+_MIN_SCATTER = 0.45  # least scatter relative to nominal flights
+_MAX_AXIAL_SCATTER = 1.3  # largest scatter of the axial force where wind is nominal
+_MAX_SCATTER = 3.0  # largest scatter of the air channels where wind is nominal
+_AIR_CHANNELS = [CHANNELS.index(name) for name in ("force_x", "side", "lift", "roll", "pitch", "yaw", "airspeed")]
+_AIR_CHANNELS += [CHANNELS.index(name) for name in ("gps_x", "gps_y", "gps_z")]
 
 
-class Sight:
+class WhitenedResiduals:
     """Whitened residuals of one flight, conditioned on hypotheses.
 
     Args:
@@ -36,26 +36,26 @@ class Sight:
         conditions: hypotheses included in all residuals
     """
 
-    def __init__(self, case: Case, granted: tuple[Guess, ...] = ()) -> None:
-        self.case, self.base = case, case.base
-        ok = case.ok.copy()
-        ok[2:] &= case.ok[1:-1] & case.ok[:-2]
+    def __init__(self, modelled: ModelledFlight, conditions: tuple[FaultHypothesis, ...] = ()) -> None:
+        self.modelled, self.base = modelled, modelled.base
+        ok = modelled.ok.copy()
+        ok[2:] &= modelled.ok[1:-1] & modelled.ok[:-2]
         ok[:2] = False
         self.ok = ok
-        self.noise = self._scaled()
-        self.weather = is_weather(self.base)
-        self.nuisances: tuple[Nuisance, ...] = nuisances(self.base.vane)
-        self.wanders = wanders(self.nuisances, self.base.vane)
+        self.noise = self._scaled_noise()
+        self.wind_nominal = wind_is_nominal(self.base)
+        self.nuisances: tuple[Nuisance, ...] = list_nuisances(self.base.vane)
+        self.drift_modes = drift_modes(self.nuisances, self.base.vane)
         self.clip = np.full(len(CHANNELS), CLIP)
         if self.base.vane:
-            self.clip[CHANNELS.index("baro")] = _JUMPS
-        self.granted = granted
+            self.clip[CHANNELS.index("baro")] = _BARO_CLIP
+        self.conditions = conditions
         if self.ok.any():
-            scatter = 1.4826 * np.median(np.abs(self.whitened(())[self.ok]), axis=0)
-            self.clip = np.maximum(self.clip, _WIDE * scatter)
-        self._lay()
+            scatter = 1.4826 * np.median(np.abs(self.residuals(())[self.ok]), axis=0)
+            self.clip = np.maximum(self.clip, _SCATTER_CLIP * scatter)
+        self._update()
 
-    def part(self, span: np.ndarray) -> "Sight":
+    def part(self, span: np.ndarray) -> "WhitenedResiduals":
         """Return a copy restricted to the rows of `span`, (n,) bool."""
         out = copy(self)
         out.ok = self.ok & span
@@ -64,113 +64,113 @@ class Sight:
         out._profile()
         return out
 
-    def _scaled(self):  # type: ignore[no-untyped-def]
+    def _scaled_noise(self):  # type: ignore[no-untyped-def]
         """Scale the noise to the scatter of this flight: down for all channels, up only where wind is nominal."""
         noise = self.base.noise
-        e = noise.whiten(self.case.residuals())[self.ok]
+        e = noise.whiten(self.modelled.residuals())[self.ok]
         if not len(e):
             return noise
         scatter = 1.4826 * np.median(np.abs(e - np.median(e, axis=0)), axis=0)
         highest = np.ones(len(CHANNELS))
-        if is_weather(self.base):
-            highest[_AIR] = _LOUDEST
+        if wind_is_nominal(self.base):
+            highest[_AIR_CHANNELS] = _MAX_SCATTER
             if self.base.vane:  # gusts hardly affect the axial force; engine surges do
-                highest[CHANNELS.index("force_x")] = _SURGE
-        return replace(noise, sigma=noise.sigma * np.clip(scatter, _QUIETEST, highest))
+                highest[CHANNELS.index("force_x")] = _MAX_AXIAL_SCATTER
+        return replace(noise, sigma=noise.sigma * np.clip(scatter, _MIN_SCATTER, highest))
 
-    def whitened(self, guesses: Sequence[Guess]) -> np.ndarray:
+    def residuals(self, hypotheses: Sequence[FaultHypothesis]) -> np.ndarray:
         """Return whitened residuals with the conditions and these hypotheses, zero on invalid rows, (n, c)."""
-        return self._white(self.case, guesses)
+        return self._residuals_of(self.modelled, hypotheses)
 
-    def _white(self, case: Case, guesses: Sequence[Guess]) -> np.ndarray:
-        e = self.noise.whiten(case.residuals((*self.granted, *guesses)))
+    def _residuals_of(self, modelled: ModelledFlight, hypotheses: Sequence[FaultHypothesis]) -> np.ndarray:
+        e = self.noise.whiten(modelled.residuals((*self.conditions, *hypotheses)))
         e[~self.ok] = 0.0
         return e
 
-    def clipped(self, guesses: Sequence[Guess]) -> np.ndarray:
+    def clipped(self, hypotheses: Sequence[FaultHypothesis]) -> np.ndarray:
         """Return `residuals` limited to `clip`, (n, c)."""
-        return np.clip(self.whitened(guesses), -self.clip, self.clip)
+        return np.clip(self.residuals(hypotheses), -self.clip, self.clip)
 
-    def grant(self, granted: tuple[Guess, ...]) -> None:
+    def condition_on(self, conditions: tuple[FaultHypothesis, ...]) -> None:
         """Set the hypotheses that all following residuals include."""
-        if granted != self.granted:
-            self.granted = granted
-            self._lay()
+        if conditions != self.conditions:
+            self.conditions = conditions
+            self._update()
 
-    def _lay(self) -> None:
+    def _update(self) -> None:
         """Compute residuals and nuisance slopes under the current conditions."""
-        self.raw = self.whitened(())
+        self.raw = self.residuals(())
         self.e = np.clip(self.raw, -self.clip, self.clip)
-        steps = [self.whitened((n.guess(n.step),)) for n in self.nuisances]
+        steps = [self.residuals((n.hypothesis(n.step),)) for n in self.nuisances]
         own = np.stack([(e - self.raw) / n.step for e, n in zip(steps, self.nuisances, strict=True)], axis=2)
-        others = [self._varied(k)[:, :, None] - self.raw[:, :, None] for k in range(len(self.base.others))]
-        self.Jn = np.concatenate([own, wandering(own, self.wanders, self.case.t), *others], axis=2)
+        others = [self._residuals_varied(k)[:, :, None] - self.raw[:, :, None] for k in range(len(self.base.others))]
+        self.Jn = np.concatenate([own, drift_slopes(own, self.drift_modes, self.modelled.t), *others], axis=2)
         self._profile()
 
-    def _varied(self, k: int) -> np.ndarray:
+    def _residuals_varied(self, k: int) -> np.ndarray:
         """Return the whitened residuals under the k-th varied coefficients, (n, c)."""
-        return self._white(Case(self.case.flight, self.base.varied(k), like=self.case), ())
+        return self._residuals_of(ModelledFlight(self.modelled.flight, self.base.varied(k), template=self.modelled), ())
 
     def _profile(self) -> None:
         """Estimate the nuisances; fix those beyond their spread at zero, so that hypotheses explain them."""
-        more = np.ones(len(self.base.others))
-        slow = np.array([self.base.spread.get(one.name, one.floor) for one in self.wanders])
-        self.precision = np.array([*(1.0 / self._spread(n) ** 2 for n in self.nuisances), *slow**-2.0, *more])
-        self.usual = self.precision.copy()
-        free = np.array([n.scatter or (self.weather and n.weather) for n in self.nuisances])
-        free = np.concatenate([free, np.zeros(len(slow) + len(more), bool)])
+        extra = np.ones(len(self.base.others))
+        drift_spreads = np.array([self.base.spread.get(mode.name, mode.floor) for mode in self.drift_modes])
+        self.precision = np.array([*(1.0 / self._spread(n) ** 2 for n in self.nuisances), *drift_spreads**-2.0, *extra])
+        self.prior_precision = self.precision.copy()
+        free = np.array([n.is_unbounded or (self.wind_nominal and n.is_wind) for n in self.nuisances])
+        free = np.concatenate([free, np.zeros(len(drift_spreads) + len(extra), bool)])
         flat = self.Jn.reshape(-1, self.Jn.shape[2])
         G, self.bn = flat.T @ flat, -flat.T @ self.e.ravel()
         for _ in range(6):
             self.Ann = G + np.diag(self.precision)
             self.xn = np.linalg.solve(self.Ann, self.bn)
-            held = self.precision < 0.1 * _TIGHT
-            past = np.abs(self.xn) * np.sqrt(self.precision) * held * ~free / self._bounds(len(more))
-            worst = int(np.argmax(past))
-            if past[worst] < 1.0:
+            unreleased = self.precision < 0.1 * _FIXED_PRECISION
+            excess = np.abs(self.xn) * np.sqrt(self.precision) * unreleased * ~free / self._bounds(len(extra))
+            worst = int(np.argmax(excess))
+            if excess[worst] < 1.0:
                 break
-            self.precision[worst] = _TIGHT
+            self.precision[worst] = _FIXED_PRECISION
 
-    def held(self) -> "Sight":
+    def with_nuisance_priors(self) -> "WhitenedResiduals":
         """Return a copy in which every nuisance has its prior spread and none is fixed at zero."""
         out = copy(self)
-        out.Ann = self.Ann - np.diag(self.precision) + np.diag(self.usual)
+        out.Ann = self.Ann - np.diag(self.precision) + np.diag(self.prior_precision)
         out.xn = np.linalg.solve(out.Ann, self.bn)
         return out
 
-    def _bounds(self, more: int) -> np.ndarray:
+    def _bounds(self, n_extra: int) -> np.ndarray:
         """Return the number of spreads at which each nuisance is released, (nuisances + drift modes + n_extra,)."""
-        own = [n.released for n in self.nuisances]
-        return np.array([*own, *(own[one.of] for one in self.wanders), *more * [RELEASED]])
+        own = [n.release_sigmas for n in self.nuisances]
+        return np.array([*own, *(own[mode.nuisance_index] for mode in self.drift_modes), *n_extra * [RELEASE_SIGMAS]])
 
     def _spread(self, n: Nuisance) -> float:
         spread = self.base.spread.get(n.name, n.floor)
-        return max(spread, 2.5) if self.weather and n.effect.name == "wind_steady" else spread
+        return max(spread, 2.5) if self.wind_nominal and n.effect.name == "wind_steady" else spread
 
-    def cost(self, guesses: Sequence[Guess]) -> float:
+    def cost(self, hypotheses: Sequence[FaultHypothesis]) -> float:
         """Return the sum of squares with these hypotheses, the nuisances profiled out."""
-        return self.cost_of(self.clipped(guesses))
+        return self.cost_of(self.clipped(hypotheses))
 
     def cost_of(self, e: np.ndarray) -> float:
         """Return the sum of squares of whitened residuals, the nuisances profiled out."""
         b = -np.einsum("tci,tc->i", self.Jn, e)
         return float((e * e).sum() - b @ np.linalg.solve(self.Ann, b))
 
-    def powers(self, guesses: Sequence[Guess]) -> np.ndarray:
+    def channel_cost(self, hypotheses: Sequence[FaultHypothesis]) -> np.ndarray:
         """Return the sum of squares of each channel with these hypotheses, the nuisances profiled out, (c,)."""
-        e = self.clipped(guesses)
-        left = e - self.Jn @ np.linalg.solve(self.Ann, np.einsum("tci,tc->i", self.Jn, e))
-        return np.asarray((left * left).sum(axis=0))
+        e = self.clipped(hypotheses)
+        profiled = e - self.Jn @ np.linalg.solve(self.Ann, np.einsum("tci,tc->i", self.Jn, e))
+        return np.asarray((profiled * profiled).sum(axis=0))
 
-    def slopes(self, guess: Guess, step: np.ndarray) -> np.ndarray:
+    def slopes(self, hypothesis: FaultHypothesis, step: np.ndarray) -> np.ndarray:
         """Return the derivative of the whitened residuals with respect to the parameters of a hypothesis, (n, c, k)."""
-        return self.whole(self.plain_slopes(guess, step))
+        return self.whiten_slopes(self.residual_slopes(hypothesis, step))
 
-    def whole(self, J: np.ndarray) -> np.ndarray:
+    def whiten_slopes(self, J: np.ndarray) -> np.ndarray:
         """Whiten slopes of the residuals, (n, c, k)."""
         return self.noise.whiten(J) * self.ok[:, None, None]
 
-    def begun(self, J: np.ndarray) -> np.ndarray:
+    def whiten_onset_slopes(self, J: np.ndarray) -> np.ndarray:
         """Whiten slopes, (n, c, k), as if the effect started at each row; return its first two rows, (2, n, c, k).
 
         Slowly drifting noise hides lasting changes: a step is then visible only in its first rows.
@@ -180,21 +180,21 @@ class Sight:
         second[1:] -= ar[:, :1] * J[:-1] / sigma
         return np.stack([first, second]) * self.ok[None, :, None, None]
 
-    def plain_slopes(self, guess: Guess, step: np.ndarray) -> np.ndarray:
+    def residual_slopes(self, hypothesis: FaultHypothesis, step: np.ndarray) -> np.ndarray:
         """Return the derivative of the raw residuals with respect to the parameters of a hypothesis, (n, c, k)."""
-        here = self.case.residuals((*self.granted, guess))
+        reference = self.modelled.residuals((*self.conditions, hypothesis))
         out = []
         for k, h in enumerate(step):
-            par = np.array(guess.par)
-            moved = guess.at(par + h * np.eye(len(par))[k])
+            par = np.array(hypothesis.par)
+            moved = hypothesis.with_parameters(par + h * np.eye(len(par))[k])
             h = moved.par[k] - par[k]
             if not h:  # at the upper bound
-                moved = guess.at(par - step[k] * np.eye(len(par))[k])
+                moved = hypothesis.with_parameters(par - step[k] * np.eye(len(par))[k])
                 h = moved.par[k] - par[k]
-            out.append((self.case.residuals((*self.granted, moved)) - here) / (h or 1.0))
+            out.append((self.modelled.residuals((*self.conditions, moved)) - reference) / (h or 1.0))
         return np.stack(out, axis=2)
 
-    def left(self) -> np.ndarray:
+    def mean_square(self) -> np.ndarray:
         """Return the mean square of each whitened channel, the nuisances profiled out, (c,)."""
         e = self.e + self.Jn @ self.xn
         return (e[self.ok] ** 2).mean(axis=0) if self.ok.any() else np.zeros(len(CHANNELS))

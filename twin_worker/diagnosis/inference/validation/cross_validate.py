@@ -5,20 +5,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.effects import Onset, Stage
-from twin_worker.diagnosis.data.fault_hypothesis import Guess
+from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
 from twin_worker.diagnosis.inference.isolation.refine import refine
-from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
+from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 from twin_worker.diagnosis.inference.validation.force_prediction import blocks
 
-HELD = 0.03  # least relative drop of the held-out rms residual for a named effect
+MIN_RMS_DROP = 0.03  # least relative drop of the held-out rms residual for a named effect
 _JUMP_S = 2.0  # a sensor jump is visible within this time of its onset
-_SHORT_S, _PASSES = 2.0, 0.01  # block length for transient effects; least gate value at which they act
-SHOWS = 1.15  # least ratio of mean square to usual of a channel that takes part
-_TAKEN = 0.95  # or largest share of the mean square that remains on the blocks of the fit
+_SHORT_S, _MIN_GATE = 2.0, 0.01  # block length for transient effects; least gate value at which they act
+MIN_CHANNEL_RATIO = 1.15  # least ratio of mean square to usual of a channel that takes part
+_MAX_REMAINING = 0.95  # or largest share of the mean square that remains on the blocks of the fit
 
 
 @dataclass(frozen=True)
-class Proof:
+class CrossValidation:
     """Held-out evidence.
 
     Attributes:
@@ -29,16 +29,18 @@ class Proof:
 
     before: float
     after: float
-    fitted: tuple[Guess, ...]
-    kept: tuple[float, ...]
+    fitted: tuple[FaultHypothesis, ...]
+    held_out_gains: tuple[float, ...]
 
     @property
-    def gain(self) -> float:
+    def rms_drop(self) -> float:
         """Return the relative drop of the rms residual."""
         return 1.0 - self.after / self.before if self.before > 0 else 0.0
 
 
-def held_out(sight: Sight, guesses: tuple[Guess, ...], shows: np.ndarray) -> Proof:
+def fit_and_validate(
+    whitened: WhitenedResiduals, hypotheses: tuple[FaultHypothesis, ...], channel_ratio: np.ndarray
+) -> CrossValidation:
     """Fit the effects on even blocks and evaluate them on odd blocks.
 
     Args:
@@ -46,45 +48,47 @@ def held_out(sight: Sight, guesses: tuple[Guess, ...], shows: np.ndarray) -> Pro
         hypotheses: as fitted on the whole flight
         channel_ratio: mean square of each channel over its usual, (c,)
     """
-    weather = sight.granted
-    even, odd = (sight.part(_half(sight, guesses, odd=side)) for side in (False, True))
-    fitted = list(guesses)
-    for _ in range(1 + (len(guesses) > 1)):
-        for i, guess in enumerate(fitted):
-            even.grant((*weather, *(g for k, g in enumerate(fitted) if k != i)))
-            fitted[i] = refine(even, guess, rounds=3, move=False).guess
-    even.grant(weather)
-    unexplained = _powers(even)
-    even.grant((*weather, *fitted))
-    use = (shows > SHOWS) | (_powers(even) < _TAKEN * unexplained)
-    use = use if use.any() else np.ones_like(use)
+    weather = whitened.conditions
+    even, odd = (whitened.part(_half_rows(whitened, hypotheses, odd=side)) for side in (False, True))
+    fitted = list(hypotheses)
+    for _ in range(1 + (len(hypotheses) > 1)):
+        for i, hypothesis in enumerate(fitted):
+            even.condition_on((*weather, *(g for k, g in enumerate(fitted) if k != i)))
+            fitted[i] = refine(even, hypothesis, iterations=3, move_onset=False).hypothesis
+    even.condition_on(weather)
+    unexplained = _mean_squares(even)
+    even.condition_on((*weather, *fitted))
+    used = (channel_ratio > MIN_CHANNEL_RATIO) | (_mean_squares(even) < _MAX_REMAINING * unexplained)
+    used = used if used.any() else np.ones_like(used)
     cost = odd.cost(fitted)
-    kept = tuple(2.0 * (odd.cost([g for k, g in enumerate(fitted) if k != i]) - cost) for i in range(len(fitted)))
-    before = _rms(odd, use)
-    odd.grant((*weather, *fitted))
-    return Proof(before, _rms(odd, use), tuple(fitted), kept)
+    held_out_gains = tuple(
+        2.0 * (odd.cost([g for k, g in enumerate(fitted) if k != i]) - cost) for i in range(len(fitted))
+    )
+    before = _rms(odd, used)
+    odd.condition_on((*weather, *fitted))
+    return CrossValidation(before, _rms(odd, used), tuple(fitted), held_out_gains)
 
 
-def _half(sight: Sight, guesses: tuple[Guess, ...], odd: bool) -> np.ndarray:
+def _half_rows(whitened: WhitenedResiduals, hypotheses: tuple[FaultHypothesis, ...], odd: bool) -> np.ndarray:
     """Return the rows of one half, (n,) bool.
 
     Transient effects use shorter blocks while they act. Sensor jumps use every second row around the onset, because
     slow noise hides them elsewhere.
     """
-    t = sight.case.t
-    if all(guess.when.kind is Onset.BUMP for guess in guesses):
-        passing = np.any([guess.when.gate(t) > _PASSES for guess in guesses], axis=0)
+    t = whitened.modelled.t
+    if all(hypothesis.onset.kind is Onset.BUMP for hypothesis in hypotheses):
+        passing = np.any([hypothesis.onset.gate(t) > _MIN_GATE for hypothesis in hypotheses], axis=0)
         return passing & ((np.floor(t / _SHORT_S) % 2 == 1) == odd)
-    jumps = [g.when.t0 for g in guesses if g.effect.stage is Stage.SENSOR and g.when.kind is Onset.STEP]
+    jumps = [g.onset.t0 for g in hypotheses if g.effect.stage is Stage.SENSOR and g.onset.kind is Onset.STEP]
     near = np.any([np.abs(t - t0) < _JUMP_S for t0 in jumps], axis=0) if jumps else np.zeros(len(t), bool)
     return np.where(near, (np.arange(len(t)) % 2 == 1) == odd, blocks(t, odd=odd))
 
 
-def _powers(sight: Sight) -> np.ndarray:
+def _mean_squares(whitened: WhitenedResiduals) -> np.ndarray:
     """Return the mean square of each channel, the nuisances profiled out, (c,)."""
-    e = (sight.e + sight.Jn @ sight.xn)[sight.ok]
+    e = (whitened.e + whitened.Jn @ whitened.xn)[whitened.ok]
     return (e**2).mean(axis=0) if e.size else np.zeros(e.shape[1])
 
 
-def _rms(sight: Sight, use: np.ndarray) -> float:
-    return float(np.sqrt(_powers(sight)[use].mean()))
+def _rms(whitened: WhitenedResiduals, used: np.ndarray) -> float:
+    return float(np.sqrt(_mean_squares(whitened)[used].mean()))

@@ -4,51 +4,54 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from twin_worker.diagnosis.data.fault_hypothesis import Guess
-from twin_worker.diagnosis.data.flight import Flight
-from twin_worker.diagnosis.data.smooth import DT, STEP_S, thinned
-from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
+from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
+from twin_worker.diagnosis.data.flight import FlightData
+from twin_worker.diagnosis.data.smooth import DT, STEP_S, decimated
+from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 
 _BANK, _SLOPE = np.radians(20.0), np.radians(3.0)
 _FAST, _SLOW = 1.06, 0.94  # of the usual airspeed
 _RATE_S = 1.0  # interval of command changes
-_BUSY = 85  # percentile of those changes
-_LEAST_S = 6.0  # least duration of a manoeuvre on this flight
-_TELLING = 1.3  # least ratio to the mean of the flight for a recommendation
-_ENOUGH = 150.0  # squared whitened difference that separates two hypotheses
+_BUSY_PERCENTILE = 85  # percentile of those changes
+_MIN_DURATION_S = 6.0  # least duration of a manoeuvre on this flight
+_MIN_DENSITY_RATIO = 1.3  # least ratio to the mean of the flight for a recommendation
+_REQUIRED_POWER = 150.0  # squared whitened difference that separates two hypotheses
 _LONGEST_S = 600.0
 
 
-def manoeuvre(sight: Sight, one: Guess, other: Guess) -> str:
+def recommend_manoeuvre(whitened: WhitenedResiduals, hypothesis: FaultHypothesis, rival: FaultHypothesis) -> str:
     """Describe the manoeuvre with which the next diagnosis separates two hypotheses."""
-    power = _power(sight, one, other)
-    density = {name: float(power[rows].mean()) / STEP_S for name, rows in _flown(sight)}
-    usual = float(power[sight.ok].mean()) / STEP_S
+    power = _difference_power(whitened, hypothesis, rival)
+    density = {name: float(power[mask].mean()) / STEP_S for name, mask in _long_manoeuvres(whitened)}
+    mean_density = float(power[whitened.ok].mean()) / STEP_S
     best = max(density, key=lambda name: density[name], default="")
-    if not best or _ENOUGH / max(density[best], 1e-9) > _LONGEST_S:
+    if not best or _REQUIRED_POWER / max(density[best], 1e-9) > _LONGEST_S:
         return "no manoeuvre of this flight separates them: vary speed, throttle and bank beyond this flight"
-    seconds = _ENOUGH / density[best]
-    if density[best] < _TELLING * usual:
+    seconds = _REQUIRED_POWER / density[best]
+    if density[best] < _MIN_DENSITY_RATIO * mean_density:
         return f"no manoeuvre of this flight separates them better than the others: record {seconds:.0f} s more"
-    return f"{best}: {density[best] / usual:.1f} times the mean information of this flight; fly {seconds:.0f} s of it"
+    return (
+        f"{best}: {density[best] / mean_density:.1f} times the mean information of this flight; fly {seconds:.0f} "
+        "s of it"
+    )
 
 
-def _power(sight: Sight, one: Guess, other: Guess) -> np.ndarray:
+def _difference_power(whitened: WhitenedResiduals, hypothesis: FaultHypothesis, rival: FaultHypothesis) -> np.ndarray:
     """Return the squared whitened difference of two hypotheses, the nuisances profiled out, (n,)."""
-    d = sight.whitened((one,)) - sight.whitened((other,))
-    hidden = np.linalg.solve(sight.Ann, np.einsum("tci,tc->i", sight.Jn, d))
-    return ((d - sight.Jn @ hidden) ** 2).sum(axis=1)
+    d = whitened.residuals((hypothesis,)) - whitened.residuals((rival,))
+    hidden = np.linalg.solve(whitened.Ann, np.einsum("tci,tc->i", whitened.Jn, d))
+    return ((d - whitened.Jn @ hidden) ** 2).sum(axis=1)
 
 
-def _flown(sight: Sight) -> Iterator[tuple[str, np.ndarray]]:
+def _long_manoeuvres(whitened: WhitenedResiduals) -> Iterator[tuple[str, np.ndarray]]:
     """Yield each manoeuvre of sufficient duration with its rows, (n,) bool."""
-    for name, rows in _manoeuvres(sight.case.flight):
-        rows = thinned(rows) & sight.ok
-        if rows.sum() * STEP_S >= _LEAST_S:
-            yield name, rows
+    for name, mask in _manoeuvres(whitened.modelled.flight):
+        mask = decimated(mask) & whitened.ok
+        if mask.sum() * STEP_S >= _MIN_DURATION_S:
+            yield name, mask
 
 
-def _manoeuvres(flight: Flight) -> Iterator[tuple[str, np.ndarray]]:
+def _manoeuvres(flight: FlightData) -> Iterator[tuple[str, np.ndarray]]:
     """Yield each manoeuvre with its rows on the grid of the flight, (n,) bool."""
     r = flight.readings
     speed = np.hypot(np.hypot(r["v_n"], r["v_e"]), r["v_d"])
@@ -62,4 +65,4 @@ def _manoeuvres(flight: Flight) -> Iterator[tuple[str, np.ndarray]]:
     steps = round(_RATE_S / DT)
     for k, name in enumerate(("aileron doublets", "elevator doublets", "rudder doublets", "throttle steps")):
         change = np.abs(flight.commands - np.roll(flight.commands, steps, axis=0))[:, k]
-        yield name, (change > np.percentile(change[flight.ok], _BUSY)) & (change > 0.0)
+        yield name, (change > np.percentile(change[flight.ok], _BUSY_PERCENTILE)) & (change > 0.0)

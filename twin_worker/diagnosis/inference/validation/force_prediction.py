@@ -10,17 +10,17 @@ from itertools import product
 
 import numpy as np
 
-from twin_worker.diagnosis.data.fault_hypothesis import Guess
+from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
 from twin_worker.diagnosis.model import equations as eq
-from twin_worker.diagnosis.model.residual import RHO_0, Case, Terms, valued
-from twin_worker.diagnosis.model.simulate import lift_of
+from twin_worker.diagnosis.model.residual import RHO_0, EquationTerms, ModelledFlight, evaluate_equation
+from twin_worker.diagnosis.model.simulate import solve_c_z
 
 LIFT = ("velocity", "pitch")
 SIDE = ("velocity", "roll", "yaw")
 PRESSURE = ("velocity", "airspeed")
 BLOCK_S = 10.0
-_ROUNDS = 4  # of the pitching moment equation, whose drag depends on lift
-_STEEP = 0.35  # limit of the predicted sideslip [rad]
+_ITERATIONS = 4  # of the pitching moment equation, whose drag depends on lift
+_MAX_SIDESLIP = 0.35  # limit of the predicted sideslip [rad]
 
 
 def blocks(t: np.ndarray, odd: bool) -> np.ndarray:
@@ -37,42 +37,50 @@ class Forces:
     model: np.ndarray
 
 
-def forces(case: Case, weather: tuple[Guess, ...], fitted: tuple[Guess, ...]) -> Forces:
+def predict_forces(
+    modelled: ModelledFlight, weather: tuple[FaultHypothesis, ...], fitted: tuple[FaultHypothesis, ...]
+) -> Forces:
     """Predict forces without and with effects, from the sources with the largest error drop on even blocks."""
-    before, after = case.terms(weather), case.terms((*weather, *fitted))
-    measured = before.aside["f"].T
-    ways = [w for w in product(LIFT, SIDE, PRESSURE) if w[2] == "velocity" or "Va" in case.flight.readings]
+    before, after = modelled.equation_terms(weather), modelled.equation_terms((*weather, *fitted))
+    measured = before.intermediate["f"].T
+    sources = [
+        combination
+        for combination in product(LIFT, SIDE, PRESSURE)
+        if combination[2] == "velocity" or "Va" in modelled.flight.readings
+    ]
     if not fitted:
-        told = tell(case, before, ways[0])
-        return Forces(measured, told, told)
-    even = case.ok & blocks(case.t, odd=False)
+        predicted = predict_force(modelled, before, sources[0])
+        return Forces(measured, predicted, predicted)
+    even = modelled.ok & blocks(modelled.t, odd=False)
 
-    def gained(way: tuple[str, str, str]) -> float:
-        errors = [((tell(case, made, way) - measured)[even] ** 2).mean() for made in (before, after)]
+    def error_drop(source: tuple[str, str, str]) -> float:
+        errors = [
+            ((predict_force(modelled, eq_terms, source) - measured)[even] ** 2).mean() for eq_terms in (before, after)
+        ]
         return float(1.0 - np.sqrt(errors[1] / max(errors[0], 1e-12)))
 
-    best = max(ways, key=gained)
-    return Forces(measured, tell(case, before, best), tell(case, after, best))
+    best = max(sources, key=error_drop)
+    return Forces(measured, predict_force(modelled, before, best), predict_force(modelled, after, best))
 
 
-def rms(case: Case, error: np.ndarray) -> float:
+def rms(modelled: ModelledFlight, error: np.ndarray) -> float:
     """Return the rms of an error, (n, 3), on valid held-out rows."""
-    rows = case.ok & blocks(case.t, odd=True) & np.isfinite(error).all(axis=1)
-    return float(np.sqrt((error[rows] ** 2).mean())) if rows.any() else float("nan")
+    mask = modelled.ok & blocks(modelled.t, odd=True) & np.isfinite(error).all(axis=1)
+    return float(np.sqrt((error[mask] ** 2).mean())) if mask.any() else float("nan")
 
 
-def tell(case: Case, made: Terms, way: tuple[str, str, str]) -> np.ndarray:
+def predict_force(modelled: ModelledFlight, eq_terms: EquationTerms, source: tuple[str, str, str]) -> np.ndarray:
     """Predict specific force, (n, 3) [m/s2], from `eq_terms` without its accelerometer."""
-    base, body, flow, add = case.base, case.base.card.body, made.flow, made.add
+    base, body, flow, add = modelled.base, modelled.base.card.body, eq_terms.flow, eq_terms.add
     q_bar = flow.q_bar
-    if way[2] == "airspeed":
-        q_bar = 0.5 * RHO_0 * (made.measured["airspeed"] / base.airspeed) ** 2
+    if source[2] == "airspeed":
+        q_bar = 0.5 * RHO_0 * (eq_terms.measured["airspeed"] / base.airspeed) ** 2
     q_S = q_bar * body.S
     hats = flow.p * body.b / (2 * flow.Va), flow.q * body.c / (2 * flow.Va), flow.r * body.b / (2 * flow.Va)
-    d_a, d_e, d_r = made.aside["delta"][:3]
-    T = (base.coef["T"] @ made.terms["T"]) * (1.0 + add.get("thrust", 0.0))
+    d_a, d_e, d_r = eq_terms.intermediate["delta"][:3]
+    T = (base.coef["T"] @ eq_terms.regressors["T"]) * (1.0 + add.get("thrust", 0.0))
     A, B = base.coef["alpha"], base.coef["beta"]
-    c_z = lift_of(A, flow.alpha - A[0] - A[3] * hats[1] - A[5] * d_e)
+    c_z = solve_c_z(A, flow.alpha - A[0] - A[3] * hats[1] - A[5] * d_e)
     beta = flow.beta
 
     def axial(c_z: np.ndarray) -> np.ndarray:
@@ -82,21 +90,21 @@ def tell(case: Case, made: Terms, way: tuple[str, str, str]) -> np.ndarray:
         clean = base.coef["X"] @ eq.force_terms(c_z, d_e, beta)
         return clean + lift * np.sin(alpha) - add.get("C_D", 0.0) * np.cos(alpha)  # type: ignore[no-any-return]
 
-    if way[0] == "pitch":
+    if source[0] == "pitch":
         M = base.coef["M"]
-        rest = (made.measured["M"] - T * M[-1] - add.get("M", 0.0)) / (q_S * body.c) - add.get("C_m", 0.0)
+        rest = (eq_terms.measured["M"] - T * M[-1] - add.get("M", 0.0)) / (q_S * body.c) - add.get("C_m", 0.0)
         rest = rest - M[0] - M[2] * hats[1] - M[3] * d_e
         shift = add.get("x_cg", 0.0) / body.c
-        for _ in range(_ROUNDS):
+        for _ in range(_ITERATIONS):
             c_z = (rest - M[5] * c_z**2 - M[6] * (axial(c_z) + T / q_S)) / (M[1] + shift)
-    if way[1] != "velocity":
-        name = {"roll": "L", "yaw": "N"}[way[1]]
+    if source[1] != "velocity":
+        name = {"roll": "L", "yaw": "N"}[source[1]]
         terms = eq.lateral_terms(np.zeros_like(c_z), (hats[0], hats[2]), (d_a, d_r), c_z)
-        rest = (made.measured[name] - add.get(name, 0.0)) / (q_S * body.b) - add.get(f"C_{name.lower()}", 0.0)
-        rest = rest - valued(base, {}, name, terms)
+        rest = (eq_terms.measured[name] - add.get(name, 0.0)) / (q_S * body.b) - add.get(f"C_{name.lower()}", 0.0)
+        rest = rest - evaluate_equation(base, {}, name, terms)
         rest = rest + (add.get("y_cg", 0.0) / body.b * c_z if name == "L" else 0.0)
-        beta = np.clip(rest / base.coef[name][1], -_STEEP, _STEEP)
+        beta = np.clip(rest / base.coef[name][1], -_MAX_SIDESLIP, _MAX_SIDESLIP)
     c_y = (beta - B[0] - B[2] * hats[0] - B[3] * hats[2] - B[4] * d_r) / B[1]
     lift = add.get("lift", 0.0) * -c_z + add.get("C_L", 0.0)
     force = np.stack([q_S * axial(c_z) + T, q_S * (c_y + add.get("C_Y", 0.0)), q_S * (c_z - lift)], axis=1)
-    return force / np.broadcast_to(made.aside["mass"], c_z.shape)[:, None]
+    return force / np.broadcast_to(eq_terms.intermediate["mass"], c_z.shape)[:, None]

@@ -1,0 +1,174 @@
+"""Received state of one aircraft: telemetry, what the autopilot reports, and what is estimated of the environment."""
+
+from collections import deque
+
+import msgspec
+import numpy as np
+
+from fleet.airframes.airframe import ServoMap, servo_map
+from fleet.contract import Mission, Params, Sample, Status
+from fleet.frames import Origin
+from twin_worker.estimation.wind_filter import WindFilter, update_from_history
+from twin_worker.prediction.autopilot_identification import AutopilotEstimate
+from twin_worker.telemetry.arrival_delay import ArrivalDelay
+from twin_worker.telemetry.history import TelemetryHistory
+from twin_worker.telemetry.resample import Resampler
+from twin_worker.twin.state.flight_phase import FlightPhase
+
+_MODE_CHANGES = 64  # kept
+_TICK_S = 1.0  # between updates of the wind filter [s]
+_LATE_S = 10.0  # velocities older than this come too late for the wind [s]
+
+
+class Telemetry(msgspec.Struct):
+    """Telemetry rows, the local frame, and the times of the loop.
+
+    Attributes:
+        history: rows of the last minutes
+        resampler: the same, equally spaced
+        origin: of the local frame; None before the first position
+        servo_map: servo outputs to control inputs
+        delay: of telemetry behind the gateway's clock
+        data_t: newest time in any message, on the time axis of telemetry [s since 1970]
+        last_step_t: data time of the last step of the loop [s since 1970]
+        link_lost: no telemetry arrives
+        link_restored_t: when it last arrived again [s since 1970]
+        rejected_rows: rows left out, because they were implausible
+    """
+
+    history: TelemetryHistory = msgspec.field(default_factory=TelemetryHistory)
+    resampler: Resampler = msgspec.field(default_factory=Resampler)
+    origin: Origin | None = None
+    servo_map: ServoMap = msgspec.field(default_factory=lambda: servo_map({}))
+    delay: ArrivalDelay = msgspec.field(default_factory=ArrivalDelay)
+    data_t: float = -np.inf
+    last_step_t: float = -np.inf
+    link_lost: bool = False
+    link_restored_t: float = -np.inf
+    rejected_rows: int = 0
+
+    def add(self, sample: Sample) -> None:
+        """Append the rows of a sample; its first plausible position is the origin."""
+        self.rejected_rows += self.history.add(sample)
+        if self.origin is None and sample.position is not None:
+            self.origin = _first_position(self.history)
+
+    def advance(self, t: float, *, back: bool = False) -> None:
+        """Advance data time to `t` [s since 1970]; only with `back` it may decrease."""
+        self.data_t = t if back else max(self.data_t, t)
+
+    def step(self, now: float) -> None:
+        """ConfidenceTracker a step of the loop at `now`."""
+        self.last_step_t = now
+
+    def set_link(self, lost: bool, now: float) -> None:
+        """ConfidenceTracker that the link was lost or restored at `now`."""
+        self.link_lost = lost
+        self.link_restored_t = self.link_restored_t if lost else now
+
+    def set_origin(self, origin: Origin) -> None:
+        """Move the local frame."""
+        self.origin = origin
+
+    def set_servo_map(self, values: dict[str, float]) -> None:
+        """Derive the servo map from autopilot parameters."""
+        self.servo_map = servo_map(values)
+
+    def reset_clock(self) -> None:
+        """Forget all rows: the new time may be earlier than the old one."""
+        self.history.clear()
+        self.resampler.clear()
+        self.data_t = self.last_step_t = self.link_restored_t = -np.inf
+        self.delay = ArrivalDelay(self.delay.gateway_t)
+
+    def shift_clock(self, step: float) -> None:
+        """Date all rows `step` later [s]: the gateway re-anchored the aircraft's clock."""
+        newest = self.history.newest
+        arrived = self.delay.gateway_t - newest < 0.5 * step  # the first sample with new times came before the status
+        self.history.shift_times(newest - 0.5 * step if arrived else np.inf, step)
+        self.resampler.clear()
+        self.link_restored_t += step
+
+
+def _first_position(history: TelemetryHistory) -> Origin | None:
+    """Return the first position that is on earth; None before any."""
+    for lat, lon, alt in history.rows("position")[1]:
+        if abs(lat) <= 9e8 and abs(lon) <= 1.8e9 and abs(alt) <= 1e8:
+            return Origin(int(lat), int(lon), int(alt))
+    return None
+
+
+class OnboardState(msgspec.Struct):
+    """What the autopilot reports of itself.
+
+    Attributes:
+        status: the newest
+        mission: the newest
+        params: the newest
+        mode_changes: (time [s since 1970], mode), oldest first
+        plan_changed_t: last change of mode, mission or parameters [s since 1970]
+    """
+
+    status: Status | None = None
+    mission: Mission | None = None
+    params: Params | None = None
+    mode_changes: deque[tuple[float, str]] = msgspec.field(default_factory=lambda: deque(maxlen=_MODE_CHANGES))
+    plan_changed_t: float = -np.inf
+
+    def set_status(self, status: Status, *, record: bool = True) -> None:
+        """Store a status; with `record` also its mode, where that is new."""
+        if record and (self.status is None or status.mode != self.status.mode):
+            self.mode_changes.append((status.t, status.mode))
+        self.status = status
+
+    def set_mission(self, mission: Mission) -> None:
+        """Store a mission."""
+        self.mission = mission
+
+    def set_params(self, params: Params) -> None:
+        """Store parameters."""
+        self.params = params
+
+    def plan_changed(self, t: float) -> None:
+        """ConfidenceTracker a change of mode, mission or parameters at `t` [s since 1970]."""
+        self.plan_changed_t = t
+
+    def shift_clock(self, step: float, plan_changed_t: float) -> None:
+        """Shift all changes by `step` [s]; the newest was at `plan_changed_t` by the new clock [s since 1970]."""
+        self.mode_changes = deque(((t + step, mode) for t, mode in self.mode_changes), maxlen=_MODE_CHANGES)
+        self.plan_changed_t = plan_changed_t
+
+
+class Environment(msgspec.Struct):
+    """What is estimated beside the model: wind, flight phase, and the autopilot's law.
+
+    Attributes:
+        wind: the wind filter
+        wind_t: time of the newest row it has used [s since 1970]
+        flight_phase: flying, landed, landing
+        autopilot: law and parameters identified from flight
+    """
+
+    wind: WindFilter = msgspec.field(default_factory=WindFilter)
+    wind_t: float = -np.inf
+    flight_phase: FlightPhase = msgspec.field(default_factory=FlightPhase)
+    autopilot: AutopilotEstimate = msgspec.field(default_factory=AutopilotEstimate)
+
+    def update_wind(self, history: TelemetryHistory) -> None:
+        """Update the wind filter with new rows, once a second."""
+        if history.newest - self.wind_t >= _TICK_S:
+            since = max(self.wind_t, history.newest - _LATE_S)
+            self.wind_t = update_from_history(self.wind, history, self.wind_t, since)
+
+    def set_wind(self, wind: WindFilter, t: float) -> None:
+        """Replace the wind filter by one that has used the rows up to `t` [s since 1970]."""
+        self.wind, self.wind_t = wind, t
+
+    def reset_clock(self) -> None:
+        """Forget times: the new time may be earlier than the old one."""
+        self.wind.t = self.wind_t = -np.inf
+        self.flight_phase = FlightPhase()
+
+    def shift_clock(self, step: float) -> None:
+        """Date the wind `step` later [s]."""
+        self.wind.t, self.wind_t = self.wind.t + step, self.wind_t + step

@@ -1,0 +1,222 @@
+"""Identified state of one aircraft: the newest identification, and the models that may predict."""
+
+from collections import deque
+
+import msgspec
+import numpy as np
+
+from fleet.contract import Model, Outcome, Verdict
+from twin_worker.estimation.wind_filter import WindFilter
+from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
+from twin_worker.identification.fixed_wing.plant import Plant
+from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel
+from twin_worker.prediction.kinematic import KinematicModel
+from twin_worker.prediction.multirotor.rollout import MultirotorModel
+from twin_worker.twin.state.checkpoint import (
+    CHECKPOINT_PERIOD_S,
+    MAX_CHECKPOINTS,
+    ActiveEffects,
+    Checkpoint,
+    create_checkpoint,
+)
+from twin_worker.twin.state.timer import Timer
+from twin_worker.validation.forecast_shrinkage import Shrinkage
+
+_NEWEST_WEIGHT = 0.3  # of the newest rollout in a model's error [-]
+
+
+class Identification(msgspec.Struct):
+    """The newest identification.
+
+    Attributes:
+        verdict: on the newest model
+        warm_start: newest model, verified or not: the next search begins there
+        prior_model: newest verified model: the prior of the next
+        message: newest model published
+        shrinkage: weights of model and persistence, by look-ahead
+        data_from: telemetry before is not used [s since 1970]
+        tries: identifications since the last conclusive verdict
+        timer: of identifications
+        fresh_start: of searches that do not begin at `warm_start`
+        published: of messages that repeat a verdict
+    """
+
+    verdict: Verdict
+    warm_start: DerivativesModel | None = None
+    prior_model: DerivativesModel | None = None
+    message: Model | None = None
+    shrinkage: Shrinkage = msgspec.field(default_factory=Shrinkage)
+    data_from: float = -np.inf
+    tries: int = 0
+    timer: Timer = msgspec.field(default_factory=Timer)
+    fresh_start: Timer = msgspec.field(default_factory=Timer)
+    published: Timer = msgspec.field(default_factory=Timer)
+
+    def conclude(self, verdict: Verdict) -> None:
+        """Store the verdict on the newest model, or why there is none."""
+        self.verdict = verdict
+        if verdict.outcome in (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST, Outcome.NOT_IDENTIFIABLE):
+            self.tries = 0
+
+    def count_try(self) -> None:
+        """Count a try that begins elsewhere than the one before."""
+        self.tries += 1
+
+    def store(self, model: DerivativesModel) -> None:
+        """Store the newest model."""
+        self.warm_start = model
+
+    def store_prior(self, model: DerivativesModel | None) -> None:
+        """Store the newest verified model."""
+        self.prior_model = model
+
+    def publish(self, message: Model, t: float) -> None:
+        """Store the message of `t` [s since 1970]."""
+        self.message = message
+        self.published.restart(t)
+
+    def restore(self, message: Model, verdict: Verdict, model: DerivativesModel) -> None:
+        """Store a verified model that another worker published."""
+        self.message, self.verdict, self.prior_model = message, verdict, model
+
+    def restart(self, data_from: float, prior_model: DerivativesModel | None) -> None:
+        """Use telemetry from `data_from` on only [s since 1970], with another prior."""
+        self.data_from, self.prior_model, self.warm_start = data_from, prior_model, None
+        self.published.expire()
+
+    def reset_clock(self) -> None:
+        """Forget models and times: the new time may be earlier than the old one."""
+        self.restart(-np.inf, None)
+        self.timer.expire()
+
+    def shift_clock(self, step: float) -> None:
+        """Date the data `step` later [s]."""
+        self.data_from += step
+
+
+class VerifiedModel(msgspec.Struct):
+    """A verified model, and its error in closed loop over the newest held-out data.
+
+    Attributes:
+        plant: the model
+        verdict: the one that verified it
+        t: end of the data it was verified on [s since 1970]
+        closed_loop_error: mean on the route, smoothed over the identifications [m]; nan before any route, inf where it
+            diverged
+    """
+
+    plant: Plant
+    verdict: Verdict
+    t: float
+    closed_loop_error: float
+
+    def update_error(self, error: float) -> None:
+        """Include the error of one more rollout [m]; nan, where there was no route, changes nothing."""
+        if not np.isnan(error):
+            before, w = self.closed_loop_error, _NEWEST_WEIGHT
+            self.closed_loop_error = error if np.isnan(before) else (1 - w) * before + w * error
+
+    def sort_key(self) -> tuple[bool, float]:
+        """Return the key that sorts by error; models that never flew a route come last, the newest of them first."""
+        error = self.closed_loop_error
+        return (True, -self.t) if np.isnan(error) else (False, error)
+
+
+class ModelBank(msgspec.Struct):
+    """Every model that may predict.
+
+    Attributes:
+        active_model: the identified model that predicts; None before any was verified
+        active_verdict: the one that verified it
+        verified_models: candidates, best first
+        scored: timer of rollouts of the candidates
+        point_mass: verified point-mass model; None before any
+        point_mass_warm_start: newest, verified or not
+        point_mass_holdout_error: end error over held-out flight, of the path length [-]
+        point_mass_timer: of its identification
+        holdout_timer: of rollouts over held-out flight
+        active_effect: missing physics that was added to the models
+        checkpoints: of the last minutes
+        multirotor, kinematic: models that need no identification
+    """
+
+    active_model: Plant | None = None
+    active_verdict: Verdict | None = None
+    verified_models: list[VerifiedModel] = msgspec.field(default_factory=list)
+    scored: Timer = msgspec.field(default_factory=Timer)
+    point_mass: PointMassModel | None = None
+    point_mass_warm_start: PointMassModel | None = None
+    point_mass_holdout_error: float = float("nan")
+    point_mass_timer: Timer = msgspec.field(default_factory=Timer)
+    holdout_timer: Timer = msgspec.field(default_factory=Timer)
+    active_effect: ActiveEffects | None = None
+    checkpoints: deque[Checkpoint] = msgspec.field(default_factory=lambda: deque(maxlen=MAX_CHECKPOINTS))
+    multirotor: MultirotorModel = msgspec.field(default_factory=MultirotorModel)
+    kinematic: KinematicModel = msgspec.field(default_factory=KinematicModel)
+
+    def add(self, candidate: VerifiedModel) -> None:
+        """Add a candidate."""
+        self.verified_models.append(candidate)
+
+    def select(self, most: int) -> VerifiedModel | None:
+        """Sort the candidates by error, keep `most` of those that did not diverge, and activate the best."""
+        finite = [one for one in self.verified_models if not np.isinf(one.closed_loop_error)]
+        self.verified_models = sorted(finite, key=VerifiedModel.sort_key)[:most]
+        if not self.verified_models:
+            return None
+        best = self.verified_models[0]
+        self.active_model, self.active_verdict = best.plant, best.verdict
+        return best
+
+    def activate(self, candidate: VerifiedModel) -> None:
+        """Make a verified model the only candidate and the active one."""
+        self.active_model, self.active_verdict = candidate.plant, candidate.verdict
+        self.verified_models = [candidate]
+
+    def adopt(self, other: "ModelBank", effect: ActiveEffects) -> None:
+        """Use the fixed-wing models of `other`, which contain `effect`."""
+        self.active_model, self.active_verdict = other.active_model, other.active_verdict
+        self.verified_models = other.verified_models
+        self.point_mass, self.point_mass_warm_start = other.point_mass, other.point_mass_warm_start
+        self.active_effect = effect
+
+    def update_holdout_error(self, error: float) -> None:
+        """Include the error of one more rollout of the point mass [-]; nan changes nothing."""
+        if np.isfinite(error):
+            before = self.point_mass_holdout_error if np.isfinite(self.point_mass_holdout_error) else error
+            self.point_mass_holdout_error = before + _NEWEST_WEIGHT * (error - before)
+
+    def store_point_mass(self, model: PointMassModel, *, verified: bool) -> None:
+        """Store the newest point-mass model; it predicts where it is verified."""
+        self.point_mass_warm_start = model
+        self.point_mass = model if verified else None
+
+    def store_multirotor(self, model: MultirotorModel) -> None:
+        """Store the newest multirotor model."""
+        self.multirotor = model
+
+    def store_kinematic(self, model: KinematicModel) -> None:
+        """Store the newest kinematic model."""
+        self.kinematic = model
+
+    def set_effect(self, effect: ActiveEffects | None) -> None:
+        """Store which missing physics is in the models."""
+        self.active_effect = effect
+
+    def checkpoint(self, t: float, wind: WindFilter, prior_model: DerivativesModel | None) -> None:
+        """Store a checkpoint of time `t` [s since 1970], where the last one is older than the period."""
+        last = self.checkpoints[-1].t if self.checkpoints else -np.inf
+        if np.isfinite(t) and not last <= t < last + CHECKPOINT_PERIOD_S:
+            self.checkpoints.append(create_checkpoint(t, wind, (prior_model, self.active_model), self.point_mass))
+
+    def reset_clock(self) -> None:
+        """Forget checkpoints and times: the new time may be earlier than the old one."""
+        for timer in (self.scored, self.point_mass_timer, self.holdout_timer):
+            timer.expire()
+        self.active_effect = None
+        self.checkpoints.clear()
+
+    def shift_clock(self, step: float) -> None:
+        """Date the candidates `step` later [s]; checkpoints of the old time are useless."""
+        self.verified_models = [msgspec.structs.replace(one, t=one.t + step) for one in self.verified_models]
+        self.checkpoints.clear()
