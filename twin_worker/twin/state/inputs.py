@@ -58,11 +58,11 @@ class Telemetry(msgspec.Struct):
         self.data_t = t if back else max(self.data_t, t)
 
     def step(self, now: float) -> None:
-        """ConfidenceTracker a step of the loop at `now`."""
+        """Record a step of the loop at `now`."""
         self.last_step_t = now
 
     def set_link(self, lost: bool, now: float) -> None:
-        """ConfidenceTracker that the link was lost or restored at `now`."""
+        """Record that the link was lost or restored at `now`."""
         self.link_lost = lost
         self.link_restored_t = self.link_restored_t if lost else now
 
@@ -130,7 +130,7 @@ class OnboardState(msgspec.Struct):
         self.params = params
 
     def plan_changed(self, t: float) -> None:
-        """ConfidenceTracker a change of mode, mission or parameters at `t` [s since 1970]."""
+        """Record a change of mode, mission or parameters at `t` [s since 1970]."""
         self.plan_changed_t = t
 
     def shift_clock(self, step: float, plan_changed_t: float) -> None:

@@ -147,15 +147,15 @@ class AlertingState(msgspec.Struct):
     max_height_m: float = -np.inf
 
     def update_turn_rate(self, now: float, *, only: bool) -> None:
-        """ConfidenceTracker whether the prediction of `now` is a turn rate alone."""
+        """Record whether the prediction of `now` is a turn rate alone."""
         if not only or not now >= self.turn_rate_only_since:
             self.turn_rate_only_since = now
 
     def disarmed_at(self, place: Origin | None) -> None:
-        """ConfidenceTracker that the aircraft stands disarmed, and where if that is known."""
+        """Record that the aircraft stands disarmed, and where if that is known."""
         self.max_height_m = -np.inf
         self.home_fallback = place or self.home_fallback
 
     def climbed_to(self, height_m: float) -> None:
-        """ConfidenceTracker a height above home [m]."""
+        """Record a height above home [m]."""
         self.max_height_m = max(self.max_height_m, height_m)
