@@ -60,6 +60,8 @@ def defined(tree: ast.AST) -> Iterator[tuple[str, int]]:
             yield node.attr, node.lineno
         elif isinstance(node, ast.ExceptHandler | ast.MatchAs) and node.name:
             yield node.name, node.lineno
+        elif isinstance(node, ast.alias) and node.asname:
+            yield node.asname, node.lineno
 
 
 def words(identifier: str) -> list[str]:
@@ -155,6 +157,7 @@ def test_every_exception_is_needed() -> None:
         "self.stray_m = 0",
         "for kept in (): ...",
         "MOST_HELD = 3",
+        "from fleet import contract as told",
         "def _asWasToldBefore(): ...",
     ],
 )

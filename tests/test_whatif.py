@@ -157,29 +157,20 @@ def test_every_answer_is_quick(winged, hovered):
 # --- neither aircraft nor twin change --------------------------------------------------------------------------------
 
 
+def may_change(twin) -> tuple:
+    """What an answer sets on its copy of the twin."""
+    onboard, prediction = twin.onboard, twin.prediction
+    timers = prediction.predict_timer.last, prediction.controller_timer.last
+    return onboard.plan_changed_t, onboard.status, onboard.mission, timers, prediction.override, prediction.latest
+
+
 def test_a_question_leaves_the_twin_as_it_was(holder, twin):
     before, kept = encode(usual(twin)), len(twin.confidence.tracker.open_start_times)
-    state = (
-        twin.onboard.plan_changed_t,
-        twin.prediction.predict_timer.last,
-        twin.prediction.controller_timer.last,
-        twin.prediction.override,
-        twin.prediction.latest,
-        twin.onboard.status,
-        twin.onboard.mission,
-    )
+    state = may_change(twin)
     asking = WhatIf(speed=18.0, wind=(9.0, 0.0), start=WhatIfStart(lat_e7=1, lon_e7=2, alt_mm=3), seq=3)
     found = holder.bus.get_one(Prediction, 1, msgspec.msgpack.encode(asking))
     assert found is not None and found[1].epoch == 9
-    assert state == (
-        twin.onboard.plan_changed_t,
-        twin.prediction.predict_timer.last,
-        twin.prediction.controller_timer.last,
-        twin.prediction.override,
-        twin.prediction.latest,
-        twin.onboard.status,
-        twin.onboard.mission,
-    )
+    assert state == may_change(twin)
     assert len(twin.confidence.tracker.open_start_times) == kept and encode(usual(twin)) == before
 
 

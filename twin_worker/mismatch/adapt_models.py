@@ -15,8 +15,7 @@ from fleet.physics.wrench import NAMES, WIND, L, M, N, X, Y, Z, terms
 from fleet.window import Window
 from twin_worker.estimation.wind_filter import WindFilter, update_from_history
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
-from twin_worker.identification.fixed_wing.point_mass_with_effects import EffectIncrements
-from twin_worker.identification.fixed_wing.point_mass_with_effects import with_effects as extended_hybrid
+from twin_worker.identification.fixed_wing.point_mass_with_effects import EffectIncrements, with_effects
 from twin_worker.mismatch.effect_increments import EffectOutputs
 from twin_worker.numerics.ridge_regression import solve_ridge
 from twin_worker.prediction.closed_loop import Rollout, synchronise_controller
@@ -122,7 +121,7 @@ def _adapted_copy(twin: Twin, outputs: EffectOutputs, checkpoint: Checkpoint) ->
             outputs.actual[:, 3],
             (bool(faulty[0]), bool(faulty[1])),
         )
-        point_mass = extended_hybrid(
+        point_mass = with_effects(
             checkpoint.point_mass, after_onset, twin.telemetry.history, adapted.environment.wind.scale, added
         )
         adapted.models.store_point_mass(point_mass, verified=True)

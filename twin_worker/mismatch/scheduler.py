@@ -6,8 +6,7 @@ import numpy as np
 
 from fleet.contract import DiagnosisOutcome, Mismatch, Outcome
 from twin_worker.diagnosis.data.card import UNKNOWN, AircraftCard
-from twin_worker.diagnosis.inference.report import Report
-from twin_worker.diagnosis.inference.report import ReportOutcome as Result
+from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.model.baseline import Baseline
 from twin_worker.mismatch.job import DiagnosisJob, DiagnosisResult, TelemetryRows, telemetry_rows
 from twin_worker.mismatch.messages import mark_unconfirmed, mismatch_message, shift_times
@@ -150,8 +149,8 @@ class DiagnosisState:
         """Return whether the previous diagnosis agrees with this report."""
         if self.last_report is None:
             return False
-        if report.outcome is Result.UNKNOWN:
-            return self.last_report.outcome is not Result.NONE
+        if report.outcome is ReportOutcome.UNKNOWN:
+            return self.last_report.outcome is not ReportOutcome.NONE
         names = {
             name for finding in self.last_report.findings for name in (finding.hypothesis.effect.name, *finding.rivals)
         }

@@ -25,7 +25,7 @@ from twin_worker.identification.linear.linear_model import AXES, identify_axis
 from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.numerics.prediction_errors import AHEAD
 from twin_worker.ownership.history_decoder import decode_history
-from twin_worker.telemetry.history import TelemetryHistory as Telemetry
+from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.resample import Resampler
 from twin_worker.twin.state.flight_phase import speed_extremes
 from twin_worker.twin.steps.extrapolate import shift_to_position, widen_tube
@@ -122,7 +122,7 @@ def _run_history_decoder() -> None:
 def _run_telemetry(window: Window) -> None:
     """Resample telemetry, hold an input, and score a prediction."""
     positions = to_geodetic(_HOME, window.p).astype(float)
-    history = Telemetry()
+    history = TelemetryHistory()
     for name, rows in (("attitude", window.x[:, 3:]), ("velocity", window.v), ("position", positions)):
         history.replace_rows(name, window.t, rows)
     history.replace_rows("servo", window.t, np.full((len(window), 8), 1500.0))

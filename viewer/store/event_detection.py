@@ -13,6 +13,7 @@ from fleet.contract import (
     AlertKey,
     AlertKind,
     DiagnosisOutcome,
+    Event,
     Item,
     Link,
     Mismatch,
@@ -23,7 +24,6 @@ from fleet.contract import (
     Status,
     Verdict,
 )
-from fleet.contract import Event as Happened
 from viewer.store.mission_items import ITEM_NAMES
 from viewer.store.received.inbox import SampleSubset
 from viewer.theme.events import LATEST, MAX_ALERTS, EventKind, TimelineEvent
@@ -190,15 +190,15 @@ def _model(state: DetectorState, model: Model) -> Detection:
 
 
 _PREDICTION_EVENTS = {  # events in predictions; other messages report modes, missions and the link sooner
-    Happened.PARAMETERS: EventKind.PARAMETERS,
-    Happened.TAKE_OFF: EventKind.TAKE_OFF,
-    Happened.LANDING: EventKind.LANDING,
-    Happened.TOUCH_DOWN: EventKind.GROUND,
-    Happened.COASTING_EXPIRED: EventKind.TELEMETRY_LOST,
-    Happened.POSITION_LOST: EventKind.TELEMETRY_LOST,
-    Happened.POSITION_RESTORED: EventKind.TELEMETRY_RESTORED,
-    Happened.CLOCK: EventKind.FRAME,
-    Happened.ORIGIN: EventKind.FRAME,
+    Event.PARAMETERS: EventKind.PARAMETERS,
+    Event.TAKE_OFF: EventKind.TAKE_OFF,
+    Event.LANDING: EventKind.LANDING,
+    Event.TOUCH_DOWN: EventKind.GROUND,
+    Event.COASTING_EXPIRED: EventKind.TELEMETRY_LOST,
+    Event.POSITION_LOST: EventKind.TELEMETRY_LOST,
+    Event.POSITION_RESTORED: EventKind.TELEMETRY_RESTORED,
+    Event.CLOCK: EventKind.FRAME,
+    Event.ORIGIN: EventKind.FRAME,
 }
 
 

@@ -14,7 +14,6 @@ from fleet.effects import Body
 
 _REQUIRED = ("m", "S", "b", "c", "Ixx", "Iyy", "Izz", "Ixz")
 _MAX_VALUE = 1e6
-_THROWS = ("aileron", "elevator", "throttle", "rudder")
 
 
 @dataclass(frozen=True)

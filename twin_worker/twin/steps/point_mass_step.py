@@ -5,8 +5,7 @@ import numpy as np
 from fleet.window import Window
 from twin_worker.identification.fixed_wing.plant import PAPER
 from twin_worker.identification.fixed_wing.point_mass_model import FIT_WINDOW_S, MIN_FIT_S, identify
-from twin_worker.prediction.autopilot_identification import REPLAY_INTERVAL_S as LEARN_S
-from twin_worker.prediction.autopilot_identification import identify_autopilot
+from twin_worker.prediction.autopilot_identification import REPLAY_INTERVAL_S, identify_autopilot
 from twin_worker.prediction.closed_loop import Rollout, synchronise_controller
 from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_point_mass
 from twin_worker.twin.state.state import Twin
@@ -25,7 +24,7 @@ def update_point_mass(twin: Twin) -> None:
         return
     window = twin.window(FIT_WINDOW_S + _HOLD_OUT_S)
     replay_t = twin.environment.autopilot.replay_t
-    if window is not None and not replay_t <= newest < replay_t + LEARN_S:
+    if window is not None and not replay_t <= newest < replay_t + REPLAY_INTERVAL_S:
         identify_autopilot(twin.environment.autopilot, twin.autopilot, twin.situation(window))
     unbroken = window and _unbroken_part(window, twin.identification.data_from)
     min_s = MIN_FIT_S + _HOLD_OUT_S if twin.models.active_effect is None else _REPLACE_AFTER_S

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import msgspec
 
 from fleet.access.roles import TOPIC_RULES
-from fleet.bus.bus_protocol import RawMessage as Said
+from fleet.bus.bus_protocol import RawMessage
 from fleet.bus.codec import Stamp
 from fleet.contract import Rows, Sample
 
@@ -86,7 +86,7 @@ class Inbox:
         self._leg_changed_uavs: set[int] = set()  # UAVs whose last queued sample changes the mission item
         self._last_leg: dict[int, bytes] = {}  # last mission item of each UAV
 
-    def put(self, samples: list[Said], now: float) -> None:
+    def put(self, samples: list[RawMessage], now: float) -> None:
         """Queue samples in order of arrival."""
         large_fleet, full_rate, leg_changed = self.large_fleet, self.full_rate_uavs, self._leg_changed_uavs
         for uav, payload, _, _ in samples:
