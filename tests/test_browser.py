@@ -31,6 +31,7 @@ ARGS = [*PLAIN, "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 IN_SCENE = "window.__viserMutable && window.__viserMutable.nodeRefFromName['/fleet/vehicles']"
 NODES = "Object.keys(window.__viserMutable.nodeRefFromName).length"
 SHOWN = "name => [...document.querySelectorAll('.uav .head h1')].some(e => e.textContent === name)"
+PATIENCE_MS = 60_000  # a busy machine is slow, and nothing here is about speed
 SCHEME = "name => document.documentElement.dataset.mantineColorScheme === name"
 PROJECT = """n => {
   const m = window.__viserMutable; let batch = null;
@@ -92,7 +93,7 @@ class Viewer:
 
     def kill(self) -> None:
         self.process.kill()
-        self.process.communicate(timeout=10)
+        self.process.communicate(timeout=60)
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +150,7 @@ def page(chromium: str, cable: Cable, errors: list[str], tmp_path_factory: pytes
         one = context.pages[0]
         one.on("pageerror", lambda error: errors.append(f"{error} {error.stack}"))
         one.goto(f"http://127.0.0.1:{cable.port}/?fixedDpr=0.5")
-        one.wait_for_function(IN_SCENE, timeout=30_000)
+        one.wait_for_function(IN_SCENE, timeout=PATIENCE_MS)
         yield one
         context.close()
 
@@ -162,14 +163,14 @@ def colours(page) -> int:
     return len(np.unique(pixels // 16, axis=0))
 
 
-def selected(page, name: str, timeout: int = 8_000) -> None:
+def selected(page, name: str, timeout: int = PATIENCE_MS) -> None:
     """Wait until the right panel shows a UAV."""
     page.wait_for_function(SHOWN, arg=name, timeout=timeout)
 
 
 def test_the_page_draws_the_fleet(page, errors: list[str]) -> None:
     assert page.evaluate("document.createElement('canvas').getContext('webgl2') !== null")
-    page.get_by_text(f"{UAVS} UAVs").wait_for(timeout=10_000)
+    page.get_by_text(f"{UAVS} UAVs").wait_for(timeout=PATIENCE_MS)
     for _ in range(20):  # the first frames of a software renderer take their time
         if (found := colours(page)) > 6:
             break
@@ -178,7 +179,7 @@ def test_the_page_draws_the_fleet(page, errors: list[str]) -> None:
 
 
 def test_few_nodes_whatever_the_fleet(page) -> None:
-    page.wait_for_function(f"{NODES} > 25", timeout=10_000)
+    page.wait_for_function(f"{NODES} > 25", timeout=PATIENCE_MS)
     assert page.evaluate(NODES) <= 46
 
 
@@ -210,12 +211,12 @@ def test_what_happened_is_listed_and_marked_in_one_batch(page, errors: list[str]
     page.locator('tr[data-uav="7"]').click()
     selected(page, "UAV-007")
     for kind, words in (("mode", "AUTO"), ("armed", "armed"), ("verified", "model verified"), ("mission", "11 items")):
-        page.locator(f'.uav .event[data-kind="{kind}"]', has_text=words).wait_for(timeout=8_000)
+        page.locator(f'.uav .event[data-kind="{kind}"]', has_text=words).wait_for(timeout=PATIENCE_MS)
     before = page.evaluate(NODES)
     assert page.evaluate("'/selected/events' in window.__viserMutable.nodeRefFromName")
     page.locator('tr[data-uav="1"]').click()  # its model was never verified
     selected(page, "UAV-001")
-    page.locator('.uav .event[data-kind="no model"]', has_text="no model yet: starved").wait_for(timeout=8_000)
+    page.locator('.uav .event[data-kind="no model"]', has_text="no model yet: starved").wait_for(timeout=PATIENCE_MS)
     assert page.locator('.uav .event[data-kind="verified"]').count() == 0
     assert page.evaluate(NODES) == before and errors == []
 
@@ -223,7 +224,7 @@ def test_what_happened_is_listed_and_marked_in_one_batch(page, errors: list[str]
 def test_ctrl_k_finds_and_selects(page) -> None:
     page.keyboard.press("Control+k")
     page.get_by_placeholder("Search commands...").fill("UAV-015")
-    page.locator(".mantine-Spotlight-action[data-selected]", has_text="UAV-015").wait_for(timeout=8_000)
+    page.locator(".mantine-Spotlight-action[data-selected]", has_text="UAV-015").wait_for(timeout=PATIENCE_MS)
     page.keyboard.press("Enter")
     selected(page, "UAV-015")
 
@@ -232,7 +233,7 @@ def test_hostile_words_stay_words(page, errors: list[str]) -> None:
     page.locator(f'tr[data-uav="{EVIL}"]').click()
     selected(page, f"UAV-{EVIL:03d}")
     for place in (".uav .say", ".uav .event"):
-        page.locator(place, has_text=HOSTILE).first.wait_for(timeout=8_000)
+        page.locator(place, has_text=HOSTILE).first.wait_for(timeout=PATIENCE_MS)
     assert page.locator("img[src='x']").count() == 0
     assert page.evaluate("window.pwned") is None
     assert errors == []
@@ -242,26 +243,26 @@ def test_letters_without_end_and_places_that_are_none_break_nothing(page, errors
     for uav, words in ((LONG, "y" * 400), (ABROAD, "km from the scene origin"), (NOWHERE, "mean fit")):
         page.locator(f'tr[data-uav="{uav}"]').dispatch_event("pointerdown")
         selected(page, f"UAV-{uav:03d}")
-        page.locator(".uav .say", has_text=words).first.wait_for(timeout=8_000)
+        page.locator(".uav .say", has_text=words).first.wait_for(timeout=PATIENCE_MS)
     assert max(page.evaluate("[...document.querySelectorAll('.uav .say')].map(e => e.innerText.length)")) < 700
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth") and errors == []
 
 
 def test_another_time_is_shown_and_now_again(page, errors: list[str]) -> None:
     page.get_by_role("button", name="Pause").click()
-    page.get_by_text("Not live: showing").wait_for(timeout=8_000)
+    page.get_by_text("Not live: showing").wait_for(timeout=PATIENCE_MS)
     at = page.locator(".time b.now")
     paused, bar = at.inner_text(), page.locator(".strip").bounding_box()
     page.mouse.click(bar["x"] + 0.5 * bar["width"], bar["y"] + 0.5 * bar["height"])
-    page.wait_for_function("t => document.querySelector('.time b.now').innerText < t", arg=paused, timeout=8_000)
-    page.get_by_text("predicted").first.wait_for(timeout=8_000)
+    page.wait_for_function("t => document.querySelector('.time b.now').innerText < t", arg=paused, timeout=PATIENCE_MS)
+    page.get_by_text("predicted").first.wait_for(timeout=PATIENCE_MS)
     then = at.inner_text()
     page.get_by_role("button", name="1 s ▸").click()
-    page.wait_for_function("t => document.querySelector('.time b.now').innerText > t", arg=then, timeout=8_000)
+    page.wait_for_function("t => document.querySelector('.time b.now').innerText > t", arg=then, timeout=PATIENCE_MS)
     page.get_by_role("button", name="4×").click()
-    page.get_by_text("playing 4×").wait_for(timeout=8_000)
+    page.get_by_text("playing 4×").wait_for(timeout=PATIENCE_MS)
     page.get_by_role("button", name="● Live").click()
-    page.wait_for_function("!document.querySelector('.then')", timeout=8_000)
+    page.wait_for_function("!document.querySelector('.then')", timeout=PATIENCE_MS)
     assert page.evaluate(NODES) <= 48 and errors == []
 
 
@@ -272,15 +273,15 @@ def test_colours_are_the_page_s_own_and_a_reload_brings_all_back(page, errors: l
     for light in (True, False):
         page.get_by_role("tab", name="Display").click()
         page.get_by_label("Light colours").click()
-        page.wait_for_function(SCHEME, arg="light" if light else "dark", timeout=8_000)
-        page.wait_for_function(f"{NODES} == {nodes}", timeout=8_000)
+        page.wait_for_function(SCHEME, arg="light" if light else "dark", timeout=PATIENCE_MS)
+        page.wait_for_function(f"{NODES} == {nodes}", timeout=PATIENCE_MS)
         selected(page, "UAV-012")
         if light:
             page.reload()
-            page.wait_for_function(IN_SCENE, timeout=30_000)
-            page.wait_for_function(SCHEME, arg="light", timeout=8_000)
+            page.wait_for_function(IN_SCENE, timeout=PATIENCE_MS)
+            page.wait_for_function(SCHEME, arg="light", timeout=PATIENCE_MS)
             selected(page, "UAV-012")
-            page.get_by_text(f"{UAVS} UAVs").wait_for(timeout=10_000)
+            page.get_by_text(f"{UAVS} UAVs").wait_for(timeout=PATIENCE_MS)
     page.get_by_role("tab", name="Fleet").click()
     assert errors == []
 
@@ -300,20 +301,20 @@ def test_what_it_costs(page, viewer: Viewer, cable: Cable, record_property) -> N
 
 def test_a_pulled_cable_is_announced_and_the_page_comes_back(page, cable: Cable) -> None:
     cable.pull()
-    page.wait_for_function(BANNER, arg="visible", timeout=12_000)
+    page.wait_for_function(BANNER, arg="visible", timeout=PATIENCE_MS)
     cable.put_back()
     page.bring_to_front()
-    page.wait_for_function(f"!({BANNER})('visible')", timeout=20_000)
-    page.get_by_text(f"{UAVS} UAVs").wait_for(timeout=10_000)
+    page.wait_for_function(f"!({BANNER})('visible')", timeout=PATIENCE_MS)
+    page.get_by_text(f"{UAVS} UAVs").wait_for(timeout=PATIENCE_MS)
 
 
 def test_a_killed_server_is_announced_and_comes_back(page, viewer: Viewer) -> None:
     viewer.kill()
-    page.wait_for_function(BANNER, arg="visible", timeout=12_000)
+    page.wait_for_function(BANNER, arg="visible", timeout=PATIENCE_MS)
     viewer.start()
     page.bring_to_front()
-    page.wait_for_function(f"!({BANNER})('visible')", timeout=20_000)
-    page.get_by_text(f"{UAVS} UAVs").wait_for(timeout=10_000)
+    page.wait_for_function(f"!({BANNER})('visible')", timeout=PATIENCE_MS)
+    page.get_by_text(f"{UAVS} UAVs").wait_for(timeout=PATIENCE_MS)
     page.locator('tr[data-uav="9"]').dispatch_event("pointerdown")
     selected(page, "UAV-009")
 
@@ -325,11 +326,11 @@ def test_an_empty_page_says_what_it_waits_for(page) -> None:
     other = Viewer(unused_port(), address)
     try:
         page.goto(f"http://127.0.0.1:{other.port}/?fixedDpr=0.5")
-        page.get_by_text("No vehicles yet").wait_for(timeout=15_000)
+        page.get_by_text("No vehicles yet").wait_for(timeout=PATIENCE_MS)
         assert "parauav/*/sample" in page.inner_text("body")
     finally:
         other.process.send_signal(signal.SIGTERM)
-        rest, _ = other.process.communicate(timeout=15)
+        rest, _ = other.process.communicate(timeout=60)
         session.close()
     assert (other.process.returncode, rest) == (0, b"")
 
@@ -349,6 +350,6 @@ def test_a_taken_port_is_a_sentence(router: str, free_port: int) -> None:
         held.listen()
         command = [sys.executable, "-m", "viewer", "--port", str(free_port), "--router", router]
         env = {**os.environ, "PYTHONPATH": str(ROOT)}
-        ended = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=30, check=False)
+        ended = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=60, check=False)
     assert ended.returncode == 2 and ended.stdout == ""
     assert untimed(ended.stderr)[0].startswith(f"viewer: --port: found {free_port} in use")

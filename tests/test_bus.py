@@ -110,6 +110,18 @@ def test_what_is_put_aside_is_handed_out_in_order_with_whose_it_is(pair: Pair) -
     assert last[3] is None or last[2] == "odd" or last[1] == payload
 
 
+def test_what_is_kept_for_an_aircraft_is_released_and_made_again(router: tuple) -> None:
+    sample, heard = EXAMPLES[Sample], SimpleQueue()
+    with connect(router[0]) as bus:
+        bus.subscribe(Sample, lambda message, _: heard.put(message.uav))
+        for uav in range(1, 4):
+            bus.publish(msgspec.structs.replace(sample, uav=uav))
+        bus.remove_publishers({1, 3})
+        assert {uav for _, uav in bus._publishers} == {2}
+        bus.publish(msgspec.structs.replace(sample, uav=3))
+        assert [heard.get(timeout=PATIENCE_S) for _ in range(4)] == [1, 2, 3, 3]
+
+
 def test_a_subscriber_hears_its_own_class_alone(pair: Pair) -> None:
     heard: SimpleQueue = SimpleQueue()
     pair.there.subscribe(Status, lambda message, _: heard.put(message))

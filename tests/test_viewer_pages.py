@@ -163,6 +163,14 @@ def test_a_page_that_reloads_has_its_aircraft_and_colours_again(site) -> None:
     assert one._client.local_storage.set_item.call_args.args[1] == '{"uav": 1, "light": true}'
 
 
+def test_colours_are_stored_before_the_page_is_drawn_again(site) -> None:
+    view = site.views[0]
+    view.browser.preferences = one = remembered('{"uav": 3, "light": false}')
+    site.run()
+    view.browser.set_theme(light=True)  # a page may be reloaded as soon as it has the colours
+    assert one._client.local_storage.set_item.call_args.args[1] == '{"uav": 3, "light": true}'
+
+
 @pytest.mark.parametrize(
     "text", [None, "", "[", "[7]", '{"uav": "7"}', '{"uav": true, "light": 3}', "[" * 500, "9" * 500]
 )

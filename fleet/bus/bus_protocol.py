@@ -1,6 +1,6 @@
 """Interface of a bus: keys, publish, subscribe, queries, liveliness, and the selection among several replies."""
 
-from collections.abc import Callable, Container, Iterable, Iterator
+from collections.abc import Callable, Collection, Container, Iterable, Iterator
 from contextlib import AbstractContextManager
 from functools import lru_cache
 from typing import Any, Protocol, TypeVar
@@ -45,6 +45,9 @@ class Bus(AbstractContextManager, Protocol):
 
     def put(self, encoded: EncodedMessage, stamp: Stamp | None = None) -> None:
         """Publish one encoded message."""
+
+    def remove_publishers(self, uavs: Collection[int]) -> None:
+        """Release what is kept per key for aircraft that this process no longer publishes."""
 
     @property
     def router(self) -> str:

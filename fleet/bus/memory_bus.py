@@ -1,7 +1,7 @@
 """In-memory bus within one process, for tests and for uses without a router."""
 
 import secrets
-from collections.abc import Container, Iterator
+from collections.abc import Collection, Container, Iterator
 from contextlib import AbstractContextManager, suppress
 from functools import partial
 from typing import Any, TypeVar
@@ -44,6 +44,9 @@ class MemoryBus(AbstractContextManager):
     def put(self, encoded: EncodedMessage, stamp: Stamp | None = None) -> None:
         """Publish one encoded message."""
         self.deliver(encoded.kind, encoded.payload, encoding(encoded.kind), stamp)
+
+    def remove_publishers(self, uavs: Collection[int]) -> None:
+        """Do nothing: this bus keeps nothing per key."""
 
     def deliver(self, kind: type, payload: bytes, encoding_name: str, stamp: Stamp | None = None) -> None:
         """Pass a payload to the subscribers as if received; count payloads that do not decode."""

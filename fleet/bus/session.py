@@ -12,7 +12,7 @@ import logging
 import secrets
 import socket
 import threading
-from collections.abc import Callable, Container, Iterable, Iterator
+from collections.abc import Callable, Collection, Container, Iterable, Iterator
 from contextlib import AbstractContextManager
 from itertools import islice
 from typing import Any, TypeVar
@@ -85,6 +85,13 @@ class ZenohBus(AbstractContextManager):
                     )
                     self._publishers[encoded.kind, encoded.uav] = publisher
         publisher.put(encoded.payload, attachment=pack_stamp(stamp) if stamp else None)
+
+    def remove_publishers(self, uavs: Collection[int]) -> None:
+        """Undeclare the publishers of aircraft that this process no longer publishes."""
+        with self._lock:
+            removed = [self._publishers.pop(key) for key in list(self._publishers) if key[1] in uavs]
+        for publisher in removed:
+            publisher.undeclare()
 
     @property
     def router(self) -> str:

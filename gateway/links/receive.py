@@ -14,7 +14,7 @@ from typing import Protocol
 import numba as nb
 import numpy as np
 
-from fleet.telemetry.mavlink.parsing.received import ReceivedBytes, compact
+from fleet.telemetry.mavlink.parsing.received import ReceivedBytes, compact, read_only
 from gateway.links.link import wall
 
 MAX_DATAGRAMS = 256  # datagrams per batch, at most 16 MB
@@ -94,7 +94,7 @@ class BatchReceiver:
         self._recvmmsg = ctypes.CDLL(None, use_errno=True).recvmmsg  # releases the interpreter during the call
         self._recvmmsg.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
         self._memory = mmap.mmap(-1, MAX_DATAGRAMS * SLOT_BYTES, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-        self._slots = np.frombuffer(self._memory, np.uint8)
+        self._slots = read_only(np.frombuffer(self._memory, np.uint8))
         self._names = np.zeros((MAX_DATAGRAMS, _ADDRESS), np.uint8)
         self._stamps = np.zeros((MAX_DATAGRAMS, _STAMP_NUMBERS), np.int64)
         self._newest = 0.0  # arrival [s since 1970]
@@ -110,7 +110,7 @@ class BatchReceiver:
         self._name_sizes = self._column(_Message.header.offset + _Header.name_size.offset)
         self._stamp_sizes = self._column(_Message.header.offset + _Header.control_size.offset)
         self._addresses: dict[bytes, Hashable] = {}
-        number_addresses(self._names[:0], self._name_sizes[:0])  # compile before the first datagram
+        number_addresses(self._names[:2], self._name_sizes[:2])  # compile before the first datagram
 
     def _column(self, offset: int) -> np.ndarray:
         stride = ctypes.sizeof(_Message)

@@ -94,6 +94,7 @@ class Publisher:
                 }
         self._repeated_wires = {who: wire for who, wire in self._repeated_wires.items() if who[1] not in uavs}
         self.history.remove(uavs)
+        self._bus.remove_publishers(uavs)
 
     def _send(self, wires: Sequence[EncodedMessage], stamp: Stamp | None = None) -> None:
         self._repeated_wires.update({(wire.kind, wire.uav): wire for wire in wires if wire.kind in REPEATED_KINDS})

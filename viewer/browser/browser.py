@@ -23,5 +23,5 @@ class Browser:
 
     def set_theme(self, *, light: bool) -> None:
         """Select the light or the dark theme."""
-        self.preferences.light = light
+        self.preferences.set_theme(light=light)
         self._wake()

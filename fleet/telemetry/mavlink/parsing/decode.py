@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from fleet.telemetry.mavlink.parsing import scan as s
 from fleet.telemetry.mavlink.parsing.objects import message_objects
 from fleet.telemetry.mavlink.parsing.payload_gather import collect_payloads, group_payloads
-from fleet.telemetry.mavlink.parsing.received import ReceivedBytes, compact
+from fleet.telemetry.mavlink.parsing.received import ReceivedBytes, compact, read_only
 
 MAX_SENDERS = 512  # senders of one link whose incomplete frames are stored
 _NAMES = {number: kind.msgname for number, kind in dialect.mavlink_map.items()}
@@ -77,7 +77,7 @@ def joined_frames(parts: Sequence[Frames]) -> Frames:
         senders.append(np.array(new_index, np.int64)[part.sender])
         offset += len(part.buf)
     buf, arrival = np.concatenate([part.buf for part in parts]), np.concatenate([part.arrival for part in parts])
-    return Frames(buf, np.concatenate(headers), arrival, np.concatenate(senders), tuple(sender_index))
+    return Frames(read_only(buf), np.concatenate(headers), arrival, np.concatenate(senders), tuple(sender_index))
 
 
 class Fields:
@@ -161,6 +161,7 @@ class Decoder:
 
     def decode(self, received: ReceivedBytes) -> Frames:
         """Decode pieces in order of arrival; return the frames they complete."""
+        received = received._replace(buf=read_only(received.buf))
         if self._carry and not self._carry.keys().isdisjoint(received.senders):
             return self._decode_joined(received)
         headers = _empty_headers(received.buf, 0)

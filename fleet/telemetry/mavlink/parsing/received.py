@@ -65,6 +65,13 @@ def merge_received(parts: Sequence[ReceivedBytes]) -> ReceivedBytes:
     return ReceivedBytes(merged_buf, merged_start, merged_stop, arrival, who, tuple(sender_index))
 
 
+def read_only(buf: np.ndarray) -> np.ndarray:
+    """Return a read-only view; kernels are compiled separately for arrays that can and that cannot be written."""
+    view = buf.view()
+    view.flags.writeable = False
+    return view
+
+
 @nb.njit(cache=True, nogil=True)
 def compact(buf, start, length):
     """Copy pieces to a contiguous buffer: bytes, (b,) uint8, and end of each piece, (n,)."""
