@@ -5,6 +5,7 @@ from collections.abc import Callable, Hashable
 from functools import partial
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from fleet.bus.codec import EncodedMessage
@@ -16,7 +17,15 @@ from fleet.telemetry.mavlink.batch import process_table_rows
 from fleet.telemetry.mavlink.collision import SenderConflict
 from fleet.telemetry.mavlink.heartbeat import is_aircraft
 from fleet.telemetry.mavlink.microservices.route import MISSION_MESSAGES
-from fleet.telemetry.mavlink.parsing.decode import IDS, MESSAGE_NAMES, Decoder, Frames, joined_frames, message_kinds
+from fleet.telemetry.mavlink.parsing.decode import (
+    IDS,
+    MESSAGE_NAMES,
+    Decoder,
+    Frames,
+    joined_frames,
+    message_kinds,
+    restore_message,
+)
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes, merge_received
 from fleet.telemetry.mavlink.parsing.scan import COMPONENT, EXTRA, ID, SEQ, SYSTEM
 from fleet.telemetry.mavlink.timing import update_timings
@@ -25,7 +34,7 @@ MAX_UAVS = 2_000  # over all links
 SECOND_SENDER = "second sender for a live id"
 NO_HEARTBEAT = "no aircraft heartbeat yet"
 MAX_EARLY = 4096  # messages of one system buffered until its first heartbeat
-MAX_EARLY_TOTAL = 32_768  # the same for all systems of a link, about 25 MB
+MAX_EARLY_TOTAL = 32_768  # the same for all systems of a link, about 5 MB
 EARLY_S = 15.0  # maximum age of buffered messages; heartbeats arrive every second [s]
 SILENCE_LIMIT_S = 30.0  # silence after which an aircraft may be removed [s]
 PROBATION_S = 30.0  # an aircraft received for this long is only removed for a new aircraft [s]
@@ -35,6 +44,7 @@ EARLY_MESSAGES = MISSION_MESSAGES | {"PARAM_VALUE", "HOME_POSITION"}  # sent onc
 IS_SINGLE = np.zeros(len(EXTRA), bool)  # by message id: processed individually, not as table rows
 IS_SINGLE[[IDS[name] for name in (*EARLY_MESSAGES, "HEARTBEAT", "STATUSTEXT", "AUTOPILOT_VERSION")]] = True
 IS_SINGLE[IDS["MISSION_CURRENT"]] = True  # also a table row
+_EARLY_ENCODER = msgspec.msgpack.Encoder(enc_hook=np.ndarray.tolist)
 IdOwners = dict[int, AircraftLink]
 """Aircraft that owns a UAV id, over all links of a gateway."""
 AdmissionFilter = Callable[[Frames, Counter[str]], Frames]
@@ -71,7 +81,7 @@ class MavlinkReceiver:
         self._conflicts: dict[int, SenderConflict] = {}  # by UAV id
         self._first_heartbeat: dict[int, int] = {}  # in this batch: frame number of the first heartbeat, by system
         self._conflicting_systems: set[int] = set()  # systems whose UAV id another link owns
-        self._early: dict[int, list[tuple[float, Any]]] = {}  # messages before the first heartbeat, by system id
+        self._early: dict[int, list[bytes]] = {}  # packed messages before the first heartbeat, by system id
         self._early_count = 0  # number of these messages
         self._aircraft_by_number: list[AircraftLink] = []  # by number in the arrays, including removed aircraft
         self._registered_t: dict[int, float] = {}  # registration time by system id [s since 1970]
@@ -151,7 +161,8 @@ class MavlinkReceiver:
         An aircraft received for less than `PROBATION_S` is removed after `SILENCE_LIMIT_S` of silence, any other when a
         new aircraft replaces it.
         """
-        for system in [system for system, buffered in self._early.items() if now - buffered[0][0] > EARLY_S]:
+        oldest = {system: msgspec.msgpack.decode(buffered[0])[0] for system, buffered in self._early.items()}
+        for system in [system for system, arrival in oldest.items() if now - arrival > EARLY_S]:
             self.rejected[NO_HEARTBEAT] += len(self._pop_early(system))
         removed = []
         for system, link in list(self.aircraft.items()):
@@ -348,7 +359,7 @@ class MavlinkReceiver:
         system = message.get_srcSystem()
         has_room = len(self._early.get(system, ())) < MAX_EARLY and self._early_count < MAX_EARLY_TOTAL
         if has_room and message.get_type() in EARLY_MESSAGES:
-            self._early.setdefault(system, []).append((arrival, message))
+            self._early.setdefault(system, []).append(_EARLY_ENCODER.encode((arrival, message.get_type(), *message)))
             self._early_count += 1
         else:
             self.rejected[NO_HEARTBEAT] += 1
@@ -356,7 +367,8 @@ class MavlinkReceiver:
     def _pop_early(self, system: int) -> list[tuple[float, Any]]:
         buffered = self._early.pop(system, [])
         self._early_count -= len(buffered)
-        return buffered
+        rows = map(msgspec.msgpack.decode, buffered)
+        return [(arrival, restore_message(name, values)) for arrival, name, *values in rows]
 
 
 def unpacked(messages: list[TelemetryMessage | EncodedMessage]) -> list[TelemetryMessage]:

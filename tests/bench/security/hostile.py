@@ -63,6 +63,13 @@ def megabytes(pid: int) -> float:
     return int(found[1]) / 1024
 
 
+def life(talker: Talker) -> list[bytes]:
+    """Return the frames of an aircraft with parameters, a mission and 4 s of flight."""
+    mission = [talker.count(len(ITEMS)), *(talker.item(k) for k in range(len(ITEMS)))]
+    params = [talker.param(f"Q{i:04d}", i, i, NAMES) for i in range(NAMES)]
+    return [talker.heartbeat(), *mission, *params, *(talker.attitude(0.02 * k) for k in range(200))]
+
+
 class Watch:
     """Memory of a process and samples of the rightful aircraft, looked at all the time."""
 
@@ -114,6 +121,8 @@ class Rightful:
     def _fly(self) -> None:
         talker, boot = Talker(LIVE), 0.0
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as air:
+            for frame in life(talker):  # what the first use of parameters and missions loads is no growth
+                air.sendto(frame, ("127.0.0.1", self._port))
             while not self._stop.wait(0.1):
                 boot += 0.1
                 beat = talker.heartbeat() if round(boot * 10) % 10 == 0 else b""
@@ -161,12 +170,6 @@ def announced(to: Sender) -> None:
 
 def ghosts(to: Sender) -> None:
     """Introduce aircraft that are none: each with parameters, a mission, texts and some flight."""
-
-    def life(talker: Talker) -> list[bytes]:
-        mission = [talker.count(len(ITEMS)), *(talker.item(k) for k in range(len(ITEMS)))]
-        params = [talker.param(f"Q{i:04d}", i, i, NAMES) for i in range(NAMES)]
-        return [talker.heartbeat(), *mission, *params, *(talker.attitude(0.02 * k) for k in range(200))]
-
     _every(to, life)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from fleet.telemetry.mavlink.parsing import scan as s
-from fleet.telemetry.mavlink.parsing.objects import message_objects
+from fleet.telemetry.mavlink.parsing.objects import message_class, message_objects
 from fleet.telemetry.mavlink.parsing.payload_gather import collect_payloads, group_payloads
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes, compact, read_only
 
@@ -107,6 +107,11 @@ def layout(name: str) -> np.dtype:
             )
         _DTYPES[name] = np.dtype([(f[0], f[1]) if len(f) == 2 or f[2] == (1,) else f for f in dtype_fields])
     return _DTYPES[name]
+
+
+def restore_message(name: str, values: Sequence[Any]) -> Any:
+    """Return the message object whose values, with system and component, were stored."""
+    return message_class(name, layout(name).names or ())(*values)
 
 
 _KIND_BY_NAME = {_NAMES[number]: kind for kind, number in enumerate(sorted(_NAMES))}

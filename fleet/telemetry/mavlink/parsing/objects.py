@@ -28,7 +28,8 @@ class _MessageBase:
 
 
 @cache
-def _message_class(name: str, fields: tuple[str, ...]) -> type:
+def message_class(name: str, fields: tuple[str, ...]) -> type:
+    """Return the class of the objects of a message."""
     fields_class = namedtuple(name, (*fields, "system", "component"))  # type: ignore[misc]
     return type(name, (_MessageBase, fields_class), {"__slots__": (), "NAME": name})
 
@@ -42,14 +43,14 @@ def message_objects(name: str, rows: np.ndarray, systems: Sequence[int], compone
         systems, components: MAVLink ids of the senders, n numbers
     """
     names = rows.dtype.names or ()
-    message_class, text_columns = (
-        _message_class(name, names),
+    kind, text_columns = (
+        message_class(name, names),
         [column for column, field in enumerate(names) if rows.dtype[field].kind == "S"],
     )
     values = rows.tolist()
     if text_columns:
         values = [_decode_texts(row, text_columns) for row in values]
-    return [message_class(*row, *address) for row, *address in zip(values, systems, components, strict=True)]
+    return [kind(*row, *address) for row, *address in zip(values, systems, components, strict=True)]
 
 
 def _decode_texts(row: tuple[Any, ...], text_columns: list[int]) -> list[Any]:
