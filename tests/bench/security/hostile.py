@@ -119,7 +119,7 @@ class Rightful:
         self._thread = threading.Thread(target=self._fly)
 
     def _fly(self) -> None:
-        talker, boot = Talker(LIVE), 0.0
+        talker, boot = Talker(LIVE), 4.0
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as air:
             for frame in life(talker):  # what the first use of parameters and missions loads is no growth
                 air.sendto(frame, ("127.0.0.1", self._port))
