@@ -12,7 +12,7 @@ from fleet.contract import FleetState
 from twin_worker.ownership.rendezvous import owners
 
 from .site import Site, Worker, until
-from .starve import limited
+from .starve import limited, throttled_s
 
 _PATIENCE_S = 30.0
 _AFTER_S = 2.0  # looked at after it is over [s]
@@ -228,6 +228,8 @@ def _starved(site: Site, pids: list[int], seconds: float) -> dict[str, Any]:
         per_s, gap, late = site.reader.count(uavs, begun) / took, site.reader.gap(uavs, begun), site.reader.late(begun)
         claims, silent = site.reader.announced(begun), _silent(site, uavs, begun)
         used = (sum(worker.cpu_s for worker in site.workers) - used) / took
+        names = {site.gateway.pid: "gateway", site.router_process.pid: "router"}
+        throttled = [(names.get(pid, "worker"), round(throttled_s(pid) / took, 2)) for pid in pids]
     back = time.monotonic()
     wait(_CALM_S)
     return {
@@ -238,6 +240,7 @@ def _starved(site: Site, pids: list[int], seconds: float) -> dict[str, Any]:
         "predictions_per_s": [round(usual, 1), round(per_s, 1)],
         "behind_s": late,
         "workers_cpu": round(used, 2),
+        "throttled": throttled,  # time each process waited for its next period, by all its threads [s/s]
         "back": {"gap_s": site.reader.gap(uavs, back)},
     }
 
