@@ -22,7 +22,7 @@ from fleet.telemetry.recording.ids import IdAllocator
 from gateway.links import receive, tcp_listener
 from gateway.links.link import Batch, wall
 from gateway.links.opening import open_link
-from gateway.links.send_queue import MAX_BYTES, SendQueue
+from gateway.links.stream import MAX_BYTES, SendQueue
 from gateway.onboard import RequestSender
 from gateway.pipeline import Pipeline
 from gateway.settings.link_spec import read_spec
