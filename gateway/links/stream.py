@@ -13,8 +13,7 @@ from typing import Any
 
 import serial
 
-from gateway.links.backoff import BackOff
-from gateway.links.link import POLL_S, Batch, BatchWriter
+from gateway.links.link import POLL_S, BackOff, Batch, BatchWriter
 from gateway.settings.link_spec import LinkSpec
 
 MAX_BYTES = 65_536  # capacity in bytes; eleven seconds at 57,600 baud

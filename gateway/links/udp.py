@@ -8,8 +8,7 @@ import threading
 from collections.abc import Hashable, Sequence
 from typing import Any, cast
 
-from gateway.links.backoff import BackOff
-from gateway.links.link import POLL_S, Batch, BatchWriter
+from gateway.links.link import POLL_S, BackOff, Batch, BatchWriter
 from gateway.links.receive import MAX_DATAGRAMS, make_receiver
 from gateway.settings.link_spec import LinkSpec
 
