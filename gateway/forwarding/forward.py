@@ -13,8 +13,7 @@ import numpy as np
 
 from fleet.telemetry.mavlink.parsing.decode import Frames
 from fleet.telemetry.mavlink.parsing.scan import START, STOP
-from gateway.forwarding.routes import Port, Routes
-from gateway.forwarding.targets import targets
+from gateway.forwarding.routes import Port, Routes, targets
 from gateway.links.link import Endpoint
 
 MAX_DATAGRAM = 1_400  # size limit of combined messages: below the MTU of common networks [bytes]
