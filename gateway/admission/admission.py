@@ -6,8 +6,7 @@ from pathlib import Path
 
 from fleet.telemetry.mavlink.parsing.decode import Frames
 from gateway.admission.signing import Signing, read_keys, select_key
-from gateway.settings.link_spec import LinkSpec
-from gateway.settings.message_filter import MessageFilter
+from gateway.settings.link_spec import LinkSpec, MessageFilter
 
 FILTERED = "excluded by the filter of the link"
 
