@@ -1,7 +1,7 @@
 """Verification of cached parameters, identified by the board number of the aircraft, before they are used."""
 
 import random
-from typing import Any
+from typing import Any, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -9,7 +9,36 @@ from fleet.autopilots.laws import NAMES
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
 from fleet.telemetry.mavlink.microservices.params import HASH_NAME
 from gateway.onboard.cache import Cache, CachedAircraft
-from gateway.onboard.dialects import ANY, DIALECTS
+
+
+class RequestDialect(NamedTuple):
+    """Request protocol of one autopilot."""
+
+    items_at_once: int = 1  # mission items requested at once
+    probe: bool = False  # any item may be requested at any time, not only in order after the count
+    hash: str = ""  # name of the parameter with the hash over all parameters
+    volatile: tuple[str, ...] = ()  # prefixes of parameters that the autopilot changes itself
+    streams: bool = False  # old versions support only groups of messages: REQUEST_DATA_STREAM
+
+
+DIALECTS = {
+    "ardupilot": RequestDialect(
+        5, True, volatile=("STAT_", "SYS_NUM_RESETS", "BARO", "GND_", "ARSPD", "COMPASS_"), streams=True
+    ),
+    "px4": RequestDialect(hash=HASH_NAME),
+}
+ANY = RequestDialect()
+
+STREAMS = {
+    "ATTITUDE": dialect.MAV_DATA_STREAM_EXTRA1,
+    "SERVO_OUTPUT_RAW": dialect.MAV_DATA_STREAM_RC_CHANNELS,
+    "GLOBAL_POSITION_INT": dialect.MAV_DATA_STREAM_POSITION,
+    "VFR_HUD": dialect.MAV_DATA_STREAM_EXTRA2,
+    "NAV_CONTROLLER_OUTPUT": dialect.MAV_DATA_STREAM_EXTENDED_STATUS,
+    "MISSION_CURRENT": dialect.MAV_DATA_STREAM_EXTENDED_STATUS,
+}
+"""Stream group of each message."""
+
 
 RETRY_S = 1.0  # between two equal requests [s]
 TRIES = 4  # unsuccessful attempts after which everything is requested again

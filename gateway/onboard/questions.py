@@ -9,8 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
 from gateway.onboard.cache import Cache
-from gateway.onboard.dialects import ANY, DIALECTS, STREAMS, RequestDialect
-from gateway.onboard.parameter_cache_check import CacheCheck
+from gateway.onboard.parameter_cache_check import ANY, DIALECTS, STREAMS, CacheCheck, RequestDialect
 from gateway.onboard.rates import WANTED_HZ
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 1.0, 60.0  # for a complete list, doubled at every attempt [s]
