@@ -30,8 +30,7 @@ from gateway.onboard.cache import Cache
 from gateway.onboard.rates import DEFAULT_BUDGET
 from gateway.pipeline import Pipeline
 from gateway.record.recorder import LinkRecorder
-from gateway.record.size import read_size
-from gateway.record.tape import DiskBudget
+from gateway.record.tape import DiskBudget, read_size
 from gateway.settings.link_spec import read_forward, read_spec
 from gateway.status.metrics import counters
 from gateway.status.status_table import status_display

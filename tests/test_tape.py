@@ -17,8 +17,7 @@ from fleet.telemetry.recording.recordings import replay_messages
 from gateway.links.link import Batch
 from gateway.record import recorder as module
 from gateway.record.recorder import LinkRecorder, RecordedQueue
-from gateway.record.size import format_size, read_size
-from gateway.record.tape import MAX_FILE_S, RETRY_S, DiskBudget, TlogWriter
+from gateway.record.tape import MAX_FILE_S, RETRY_S, DiskBudget, TlogWriter, format_size, read_size
 
 MORE = 10**9
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
 from fleet.telemetry.mavlink.parsing.decode import layout
-from gateway.record.size import format_size, read_size
+from gateway.record.tape import format_size, read_size
 from gateway.settings.link_spec import LinkSpec
 
 WANTED_HZ: dict[str, float] = {  # [Hz]

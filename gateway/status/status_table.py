@@ -16,7 +16,7 @@ from fleet.contract import GatewayCounters, Link, Status
 from fleet.process.sanitise import printable
 from fleet.report.progress import run_alongside
 from gateway.publication.publish import StatusSnapshot
-from gateway.record.size import format_size
+from gateway.record.tape import format_size
 
 REFRESH_S = 1.0
 PLAIN_S = 30.0  # between lines where the output is not a terminal [s]
