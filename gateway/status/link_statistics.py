@@ -12,7 +12,7 @@ from fleet.telemetry.mavlink.intake import MavlinkReceiver
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
 from gateway.links.link import Endpoint
 from gateway.onboard.rates import RateShare
-from gateway.publication.router_session import RouterSession
+from gateway.publication.publish import RouterSession
 from gateway.record.recorder import LinkRecorder, RecordingCounters
 
 SMOOTHING = 0.3  # weight of the newest second in a rate
