@@ -13,8 +13,18 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import T0, Ears, Talker
 
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
-from gateway.admission.admission import Admission, make_admissions
-from gateway.admission.signing import REPLAYED, STALE, UNSIGNED, WRONG, Signing, read_keys, select_key, stamp_now
+from gateway.admission.admission import (
+    REPLAYED,
+    STALE,
+    UNSIGNED,
+    WRONG,
+    Admission,
+    Signing,
+    make_admissions,
+    read_keys,
+    select_key,
+    stamp_now,
+)
 from gateway.settings.link_spec import read_spec
 
 KEY, OTHER = bytes(range(32)), bytes(32)
