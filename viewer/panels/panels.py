@@ -1,6 +1,7 @@
 """Panels of the page: fleet, alerts and display options on the left, selected UAV on the right."""
 
 from collections.abc import Callable
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,6 @@ import viser
 
 from viewer.browser.browser import Browser
 from viewer.panels.charts import Charts
-from viewer.panels.commands import Commands
 from viewer.panels.detail import figures_html, status_html
 from viewer.panels.event_list import event_list_html
 from viewer.store.states import RouterStatus, notices
@@ -19,6 +19,34 @@ from viewer.text.clicks import parse_click
 from viewer.text.missed_events import missed_events_html
 from viewer.text.words import MAX_ROWS, alerts_html, empty_html, legend_html, severity, summary_html, table
 from viewer.theme.palette import STATE_TEXT, Palette, triple
+
+MAX_OFFERED = 200  # UAVs in the palette; the search field finds the others
+
+
+class Commands:
+    """Commands of the palette."""
+
+    def __init__(self, gui: Any, choose: Callable[[int], None], actions: dict[str, Callable[[], None]]) -> None:
+        self._gui, self._choose = gui, choose
+        self._offered: set[int] = set()
+        for label, act in actions.items():
+            gui.add_command(label).on_trigger(partial(self._act, act))
+
+    def offer(self, fleet: list[Vehicle]) -> None:
+        """Add selection commands for the first `MAX_OFFERED` UAVs."""
+        for vehicle in fleet[:MAX_OFFERED]:
+            if vehicle.uav not in self._offered and len(self._offered) < MAX_OFFERED:
+                command = self._gui.add_command(f"Select {vehicle.name}", icon=viser.Icon.DRONE)
+                command.on_trigger(partial(self._pick, vehicle.uav))
+                self._offered.add(vehicle.uav)
+
+    def _pick(self, uav: int, _: Any) -> None:
+        self._choose(uav)
+
+    @staticmethod
+    def _act(act: Callable[[], None], _: Any) -> None:
+        act()
+
 
 STALE = "No data from the viewer: this page is out of date. Restart the viewer; the page reconnects automatically."
 NO_UAV = "–"  # menu entry without a selection
