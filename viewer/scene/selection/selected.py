@@ -8,17 +8,49 @@ from fleet.contract import TwinState
 from viewer.scene import mismatch_lines
 from viewer.scene.labels import CameraView, Tag
 from viewer.scene.routes import NOTHING, RouteLines
-from viewer.scene.selection.hindcast import hindcast
 from viewer.scene.selection.pins import EventMarkers
 from viewer.scene.selection.plan import MissionDrawing, active_seq
 from viewer.scene.selection.tube import curtain, marked_look_aheads, rings, sample_paths, tube_faces
 from viewer.scene.strokes import SegmentBatch, Strokes, chain, circle_corners, closed_loops, dashed
-from viewer.store.forecast import ScenePrediction
+from viewer.store.forecast import PastPrediction, ScenePrediction
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.text import mismatch_text
 from viewer.text.words import MIN_HORIZON_S, fit
 from viewer.theme.palette import Palette, mix, rgb, triple
+
+AGE_S, SPAN_S = 25.0, 5.0  # age of the compared prediction and its tolerance [s]
+MIN_REACH_S = 5.0  # shortest stretch drawn [s]
+NO_HINDCAST = np.zeros((0, 2, 3)), None
+
+
+def hindcast(past: list[PastPrediction], trail: np.ndarray, clock: float) -> tuple[np.ndarray, Tag | None]:
+    """Return an earlier prediction and error lines to the flown trail every 5 s.
+
+    Args:
+        past: predictions, oldest first
+        trail: data time [s], scene ENU [10 m], (n, 4 or more)
+        clock: current data time [s]
+    Returns:
+        segments (k, 2, 3) and their label
+    """
+    old = [prediction for prediction in past if AGE_S - SPAN_S <= clock - prediction.t <= AGE_S + SPAN_S]
+    if not old or len(trail) < 2:
+        return NO_HINDCAST
+    prediction = min(old, key=lambda candidate: abs(clock - candidate.t - AGE_S))
+    reach = min(clock - prediction.t, prediction.horizon_s, float(trail[-1, 0] - prediction.t))  # at most the horizon
+    if reach < MIN_REACH_S:
+        return NO_HINDCAST
+    at = np.arange(5.0, reach, 5.0)
+    actual = np.stack([np.interp(prediction.t + at, trail[:, 0], trail[:, i]) for i in (1, 2, 3)], axis=-1)
+    lines = np.concatenate(
+        [
+            dashed(prediction.position_at(np.linspace(0, reach, 2 * int(reach) + 2))),
+            np.stack([prediction.position_at(at), actual], axis=1),
+        ]
+    )
+    return lines, Tag("then", f"predicted {clock - prediction.t:.0f} s ago", prediction.position_at(0.4 * reach))
+
 
 BANDS, BAND_STEPS = 5, 12  # fading bands of the tube, slices per band
 BEYOND_S = 20.0  # look-ahead of the grey dashes beyond the horizon [s]
