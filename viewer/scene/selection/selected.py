@@ -9,15 +9,65 @@ from viewer.scene import mismatch_lines
 from viewer.scene.labels import CameraView, Tag
 from viewer.scene.routes import NOTHING, RouteLines
 from viewer.scene.selection.pins import EventMarkers
-from viewer.scene.selection.plan import MissionDrawing, active_seq
 from viewer.scene.selection.tube import curtain, marked_look_aheads, rings, sample_paths, tube_faces
-from viewer.scene.strokes import SegmentBatch, Strokes, chain, circle_corners, closed_loops, dashed
+from viewer.scene.strokes import SegmentBatch, Strokes, chain, circle_corners, closed_loops, dash_lines, dashed
 from viewer.store.forecast import PastPrediction, ScenePrediction
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.text import mismatch_text
 from viewer.text.words import MIN_HORIZON_S, fit
+from viewer.theme.numerals import digit_strokes, face_camera
 from viewer.theme.palette import Palette, mix, rgb, triple
+
+MAX_NUMBERS = 60  # items up to which numbers are drawn
+
+
+class MissionDrawing:
+    """Two nodes: the route and its active leg."""
+
+    def __init__(self, scene: Any, palette: Palette) -> None:
+        self._palette = palette
+        self._route = Strokes(scene, "/selected/route", 1.6)
+        self._leg = Strokes(scene, "/selected/leg", 3.0)
+
+    def draw(self, route: RouteLines, seq: int, camera_view: CameraView, unit: float) -> None:
+        """Draw a route: legs and loiters solid, jumps and returns dashed, a ring and its number at each item.
+
+        Args:
+            route: lines of the mission
+            seq: active item; -1 when unknown
+            camera_view: view that the numbers face
+            unit: drawn span of an aircraft [10 m]
+        """
+        p, lines, leg = self._palette, SegmentBatch(), SegmentBatch()
+        lines.add(np.concatenate([route.legs, route.circles]), mix(p.route, p.ground, 0.7))
+        lines.add(dash_lines(route.returns, 1.2 * unit), mix(p.route, p.ground, 0.5))
+        for point, item in zip(route.points, route.items.tolist(), strict=True):
+            is_active = item == seq
+            (leg if is_active else lines).add(
+                closed_loops(circle_corners(point, 0.22 * unit, 14)), rgb(p.ink if is_active else p.route)
+            )
+            if len(route.items) <= MAX_NUMBERS:
+                lines.add(
+                    self._number(item, point, camera_view, unit), rgb(p.ink) if is_active else mix(p.ink, p.route, 0.35)
+                )
+        leg.add(route.legs[route.ends == seq], rgb(p.route))
+        self._route.draw(*lines.all())
+        self._leg.draw(*leg.all())
+
+    @staticmethod
+    def _number(item: int, point: np.ndarray, camera_view: CameraView, unit: float) -> np.ndarray:
+        """Return the strokes of an item number beside its ring, facing the camera: (n, 2, 3)."""
+        right, up = camera_view.axes()
+        return face_camera(digit_strokes(str(item), 0.42 * unit), right, up) + point + 0.34 * unit * (right + up)
+
+
+def active_seq(vehicle: Vehicle) -> int:
+    """Return the active mission item from telemetry, prediction or mission; -1 when unknown."""
+    predicted_seq = vehicle.prediction.seq if vehicle.prediction is not None else -1
+    mission_seq = vehicle.mission.seq if vehicle.mission is not None else -1
+    return next((seq for seq in (vehicle.detector_state.seq, predicted_seq, mission_seq) if seq >= 0), -1)
+
 
 AGE_S, SPAN_S = 25.0, 5.0  # age of the compared prediction and its tolerance [s]
 MIN_REACH_S = 5.0  # shortest stretch drawn [s]
