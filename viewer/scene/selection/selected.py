@@ -1,11 +1,11 @@
 """Selected UAV in 3-D: tube, rings, horizon, route, flown path, hindcast and labels."""
 
+from math import isfinite
 from typing import Any
 
 import numpy as np
 
-from fleet.contract import TwinState
-from viewer.scene import mismatch_lines
+from fleet.contract import DiagnosisOutcome, Mismatch, TwinState
 from viewer.scene.labels import CameraView, Tag
 from viewer.scene.routes import NOTHING, RouteLines
 from viewer.scene.selection.pins import EventMarkers
@@ -13,8 +13,10 @@ from viewer.scene.selection.tube import curtain, marked_look_aheads, rings, samp
 from viewer.scene.strokes import SegmentBatch, Strokes, chain, circle_corners, closed_loops, dash_lines, dashed
 from viewer.store.forecast import PastPrediction, ScenePrediction
 from viewer.store.store import FleetStore
+from viewer.store.track import positions_at
 from viewer.store.vehicle import Vehicle
 from viewer.text import mismatch_text
+from viewer.text.mismatch_text import located_spans
 from viewer.text.words import MIN_HORIZON_S, fit
 from viewer.theme.numerals import digit_strokes, face_camera
 from viewer.theme.palette import Palette, mix, rgb, triple
@@ -235,8 +237,8 @@ class Selection:
         normal = ~mismatch_text.is_located(rows[:, 0], vehicle.mismatch)[1:] & (rows[:-1, 0] < self._trail_start)
         self._track.draw(chain(rows[:, 1:])[normal] if len(rows) > 1 else NOTHING.legs, self._track_colour)
         mismatch = vehicle.mismatch
-        self._mismatch.draw(mismatch_lines.lines(mismatch, rows), rgb(self._palette.mismatch))
-        onset = mismatch_lines.onset_position(mismatch, rows)
+        self._mismatch.draw(lines(mismatch, rows), rgb(self._palette.mismatch))
+        onset = onset_position(mismatch, rows)
         self.marks = self._event_markers.draw(vehicle.events, rows, vehicle.position(now), unit)
         if mismatch is not None and onset is not None:
             self.marks.insert(0, Tag("mismatch", f"▲ {mismatch_text.short_text(mismatch)} from here", onset))
@@ -266,3 +268,37 @@ def selection_text(vehicle: Vehicle, now: float) -> str:
     lost = f"  link lost {vehicle.sample_age_s(now):.0f} s" if vehicle.state(now) is TwinState.LINK_LOST else ""
     mean = fit(vehicle)
     return vehicle.name + (lost or (f"  fit {mean:.0f} %" if mean is not None else "") + horizon)
+
+
+MAX_POINTS = 200  # points of a segment
+
+
+def lines(mismatch: Mismatch | None, track: np.ndarray) -> np.ndarray:
+    """Return the located stretches of the flown path as segments (n, 2, 3) [10 m].
+
+    Args:
+        mismatch: the latest mismatch
+        track: flown path: data time [s], scene ENU [10 m], (m, 4)
+    """
+    segments = [np.zeros((0, 2, 3))]
+    if mismatch is None or mismatch.outcome is DiagnosisOutcome.NONE or len(track) < 2:
+        return segments[0]
+    newest, oldest = float(track[-1, 0]), float(track[0, 0])
+    for begin, last in located_spans(mismatch, newest):
+        if last > (first := max(begin, oldest)):
+            points = positions_at(track, np.linspace(first, last, min(int(last - first) + 2, MAX_POINTS)))
+            segments.append(chain(points[np.isfinite(points).all(axis=1)]))
+    return np.concatenate(segments)
+
+
+def onset_position(mismatch: Mismatch | None, track: np.ndarray) -> np.ndarray | None:
+    """Return the position of the mismatch onset, (3,) [10 m]; None when it is unknown."""
+    if (
+        mismatch is None
+        or mismatch.outcome is DiagnosisOutcome.NONE
+        or mismatch.onset is None
+        or not isfinite(mismatch.onset)
+    ):
+        return None
+    (point,) = positions_at(track, np.array([mismatch.onset]))
+    return point if np.isfinite(point).all() else None
