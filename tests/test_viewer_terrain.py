@@ -9,8 +9,7 @@ from PIL import Image, TiffImagePlugin
 from pretend_feed import HOME
 
 from viewer.scene.terrain.land import MAX_CONTOURS, HeightGrid, TerrainLayer, contours
-from viewer.scene.terrain.raster import KEYS, NO_DATA, SCALE, TIEPOINT, read_raster
-from viewer.scene.terrain.utm import to_utm
+from viewer.scene.terrain.raster import KEYS, NO_DATA, SCALE, TIEPOINT, read_raster, to_utm
 from viewer.store.place import UNIT_M, SceneFrame
 from viewer.theme.palette import DARK
 
