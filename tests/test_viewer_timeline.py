@@ -17,8 +17,7 @@ from viewer.text.words import summary_html, table
 from viewer.theme.events import EventKind, TimelineEvent
 from viewer.theme.palette import DARK
 from viewer.timeline import compare, strip
-from viewer.timeline.deck import Timeline
-from viewer.timeline.panel import STEPS, TRANSPORT
+from viewer.timeline.deck import STEPS, TRANSPORT, Timeline
 from viewer.timeline.past import PastVehicle
 from viewer.timeline.player import Player, TimelineRange
 from viewer.timeline.recording import MAX_ROWS, PREDICTION_STEP_S, RETENTION_S, UavRecording
