@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fleet.contract import Item, Mission
-from viewer.store.mission_items import (
+from viewer.store.event_detection import (
     DO_JUMP,
     LAND,
     LOITER_TIME,

@@ -24,9 +24,28 @@ from fleet.contract import (
     Status,
     Verdict,
 )
-from viewer.store.mission_items import ITEM_NAMES
 from viewer.store.received.inbox import SampleSubset
 from viewer.theme.events import LATEST, MAX_ALERTS, EventKind, TimelineEvent
+
+# MAV_CMD. Source: MAVLink common.xml.
+WAYPOINT, LOITER_UNLIM, LOITER_TURNS, LOITER_TIME, RTL, LAND, TAKEOFF, LOITER_TO_ALT = 16, 17, 18, 19, 20, 21, 22, 31
+SPLINE, VTOL_TAKEOFF, VTOL_LAND, DO_JUMP = 82, 84, 85, 177
+
+ITEM_NAMES = {
+    WAYPOINT: "waypoint",
+    LOITER_UNLIM: "loiter",
+    LOITER_TURNS: "loiter turns",
+    LOITER_TIME: "loiter for a time",
+    RTL: "return",
+    LAND: "land",
+    TAKEOFF: "take-off",
+    LOITER_TO_ALT: "loiter to altitude",
+    SPLINE: "spline waypoint",
+    VTOL_TAKEOFF: "VTOL take-off",
+    VTOL_LAND: "VTOL landing",
+    DO_JUMP: "jump",
+}
+
 
 MAX_TEXT = 200  # characters kept of a received text
 QUIET_S = 2.5  # without a gateway status for this long, link alerts of the worker count [s]
