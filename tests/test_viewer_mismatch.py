@@ -8,7 +8,7 @@ from pretend_feed import HOSTILE, STAMP, Clock, T, feed_of
 from fleet.contract import Cause, DiagnosisOutcome, Mismatch
 from viewer.panels.detail import status_html
 from viewer.scene.selection import selected as mismatch_lines
-from viewer.text import mismatch_text
+from viewer.text import words as mismatch_text
 from viewer.text.words import alerts_html, severity, table
 from viewer.theme.events import EventKind
 from viewer.theme.palette import DARK

@@ -9,7 +9,7 @@ from viewer.store.errors import LOOK_AHEADS_S, prediction_errors, rms_by_look_ah
 from viewer.store.place import UNIT_M
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
-from viewer.text.mismatch_text import is_located
+from viewer.text.words import is_located
 from viewer.theme.palette import Palette
 
 ERROR_AHEAD_S = 5.0  # look-ahead whose error is shown over time [s]

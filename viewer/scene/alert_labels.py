@@ -6,8 +6,7 @@ from fleet.contract import TwinState
 from viewer.scene.fleet_arrays import FleetArrays
 from viewer.scene.labels import Tag
 from viewer.store.vehicle import Vehicle
-from viewer.text.mismatch_text import in_force, short_text
-from viewer.text.words import age_text, severity
+from viewer.text.words import age_text, in_force, severity, short_text
 from viewer.theme.palette import GLYPH
 
 MAX_LABELS = 6  # most labels at once; overlapping ones are omitted

@@ -7,7 +7,7 @@ from viewer.store.place import UNIT_M, scene_quat
 from viewer.store.received.inbox import LARGE_FLEET
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
-from viewer.text.mismatch_text import in_force
+from viewer.text.words import in_force
 
 CHUNKS, STEPS = 5, 12  # the trail: chunks of 12 s and a head of up to 12 s, one point per second
 TRAIL_AGES_S = np.arange(float(CHUNKS + 1) * STEPS, -1.0, -1.0)  # age of each trail point, (73,) [s]

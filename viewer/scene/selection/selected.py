@@ -15,9 +15,8 @@ from viewer.store.forecast import PastPrediction, ScenePrediction
 from viewer.store.store import FleetStore
 from viewer.store.track import positions_at
 from viewer.store.vehicle import Vehicle
-from viewer.text import mismatch_text
-from viewer.text.mismatch_text import located_spans
-from viewer.text.words import MIN_HORIZON_S, fit
+from viewer.text import words as mismatch_text
+from viewer.text.words import MIN_HORIZON_S, fit, located_spans
 from viewer.theme.numerals import digit_strokes, face_camera
 from viewer.theme.palette import Palette, mix, rgb, triple
 
