@@ -12,7 +12,7 @@ from viewer.scene.fleet_arrays import LARGE_FLEET, LOST, MISMATCH, READ_PARTS, T
 from viewer.scene.labels import MAX_LABELS, CameraView, Tag, visible_labels
 from viewer.scene.selection.selected import active_seq
 from viewer.scene.selection.tube import BAND_SIGMA, sample_paths
-from viewer.store.backfill import Backfill
+from viewer.server.app import Backfill
 from viewer.store.errors import LOOK_AHEADS_S, prediction_errors, rms_by_look_ahead
 from viewer.store.received.inbox import Inbox
 from viewer.store.store import COALESCE_S, FleetStore

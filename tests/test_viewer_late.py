@@ -8,7 +8,7 @@ from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import History, Sample
 from viewer.scene.labels import CameraView, Tag, visible_labels
 from viewer.scene.strokes import smooth_curve
-from viewer.store.backfill import SMALL_FLEET, Backfill
+from viewer.server.app import SMALL_FLEET, Backfill
 from viewer.store.store import FleetStore
 from viewer.store.track import TRAIL_ROWS
 
