@@ -11,9 +11,8 @@ from fleet.contract import Sample
 from fleet.telemetry.recording.recordings import replay_messages
 from twin_worker.diagnosis import __main__ as diagnosis
 from twin_worker.diagnosis.baseline import hidden
-from twin_worker.diagnosis.baseline.own_past import OwnPast
+from twin_worker.diagnosis.baseline.own_past import ENERGY, OwnPast, find_tracking_loss
 from twin_worker.diagnosis.baseline.past import calibrate_past, part_after, part_before
-from twin_worker.diagnosis.baseline.tracking_loss import ENERGY, find_tracking_loss
 from twin_worker.diagnosis.data.card import UNKNOWN
 from twin_worker.diagnosis.data.flight import FlightData, read_flights
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome
