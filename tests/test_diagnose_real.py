@@ -10,7 +10,7 @@ import real_flights
 from fleet.contract import Sample
 from fleet.telemetry.recording.recordings import replay_messages
 from twin_worker.diagnosis import __main__ as diagnosis
-from twin_worker.diagnosis.baseline import hidden
+from twin_worker.diagnosis.baseline import own_past as hidden
 from twin_worker.diagnosis.baseline.own_past import ENERGY, OwnPast, find_tracking_loss
 from twin_worker.diagnosis.baseline.past import calibrate_past, part_after, part_before
 from twin_worker.diagnosis.data.card import UNKNOWN

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fleet.cli import make_parser, run_command
 from fleet.commands.offline.diagnose import EXAMPLES, arguments, check_arguments
-from twin_worker.diagnosis.baseline import hidden
+from twin_worker.diagnosis.baseline import own_past as hidden
 from twin_worker.diagnosis.baseline.own_past import OwnPast
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.learn import calibrate_recordings, card_or_unknown, log_progress

@@ -5,8 +5,7 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from twin_worker.diagnosis.baseline.hidden import conceal_channels, exclude_concealed
-from twin_worker.diagnosis.baseline.own_past import OwnPast
+from twin_worker.diagnosis.baseline.own_past import OwnPast, conceal_channels, exclude_concealed
 from twin_worker.diagnosis.data.flight import FlightData, read_flights
 from twin_worker.diagnosis.inference.diagnose import diagnose
 from twin_worker.diagnosis.inference.report import Report

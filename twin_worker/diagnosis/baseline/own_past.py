@@ -1,13 +1,12 @@
 """Diagnose a flight against its own past: find changes after a trusted first part."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fleet.frames import G
 from fleet.process.sanitise import format_below
-from twin_worker.diagnosis.baseline import hidden
 from twin_worker.diagnosis.baseline.past import CONTEXT_S, calibrate_past, part_after, part_before
 from twin_worker.diagnosis.data.card import AircraftCard
 from twin_worker.diagnosis.data.flight import FlightData
@@ -15,6 +14,7 @@ from twin_worker.diagnosis.data.smooth import DT
 from twin_worker.diagnosis.inference.diagnose import diagnose
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.inference.words import with_sentence
+from twin_worker.diagnosis.model.baseline import Baseline, exclude_equations
 
 ENERGY, TURN, PITCH = "energy held", "turn by bank", "pitch attitude"
 _MEAN_S = 2.0  # running mean
@@ -110,7 +110,7 @@ class OwnPast:
                 f"{self.until:.0f} s, "
                 f"expected {MIN_AFTER_S:.0f} s at least to diagnose; trust a shorter past"
             )
-        visible = hidden.conceal_channels(flight, conceal, part_before(flight, self.until))
+        visible = conceal_channels(flight, conceal, part_before(flight, self.until))
         base = calibrate_past(flight, self.until, self.card, progress, visible if conceal else None)
         limitation = (
             f"calibrated on {flight.seconds - after:.0f} s of its own past: effects present from the start and a mean "
@@ -147,3 +147,46 @@ def only_new_findings(report: Report, tracking_loss: TrackingLoss | None, until:
     if report.outcome is ReportOutcome.UNKNOWN:
         return with_sentence(replace(report, outcome=ReportOutcome.NONE, findings=(), terms={}, where=("", ())))
     return with_sentence(report)
+
+
+_READINGS = {
+    "airspeed": ("Va",),
+    "imu": ("a_x", "a_y", "a_z"),
+    "pressure": ("baro",),
+    "gnss": ("gnss",),
+    "wind": (),  # not read: the diagnosis uses neither the estimated wind nor the battery state
+    "battery": (),
+}
+_COMMANDS = {"aileron": 0, "elevator": 1, "rudder": 2, "throttle": 3}
+NAMES = (*_READINGS, *_COMMANDS)
+"""Channels that can be concealed."""
+
+_EQUATION = {"aileron": "L", "elevator": "M", "rudder": "N", "throttle": "X"}
+
+
+def check(names: Iterable[str]) -> None:
+    """Reject unknown channel names.
+
+    Raises:
+        ValueError: if a name is unknown; the message lists the valid names.
+    """
+    if unknown := [name for name in names if name not in NAMES]:
+        raise ValueError(f"--conceal: found {unknown[0]!r}, expected names of {', '.join(NAMES)}; correct it")
+
+
+def conceal_channels(flight: FlightData, names: Sequence[str], typical: FlightData) -> FlightData:
+    """Return a flight without some channels; a concealed command is replaced by its median in `typical`."""
+    if not names:
+        return flight
+    removed = {reading for name in names for reading in _READINGS.get(name, ())}
+    readings = {name: x for name, x in flight.readings.items() if name not in removed}
+    commands = flight.commands.copy()
+    for column in (_COMMANDS[name] for name in names if name in _COMMANDS):
+        commands[:, column] = np.median(typical.commands[typical.ok, column])
+    limitations = (f"concealed: {', '.join(names)}", *flight.limitations)
+    return replace(flight, readings=readings, commands=commands, limitations=limitations)
+
+
+def exclude_concealed(base: Baseline, names: Iterable[str]) -> Baseline:
+    """Return a baseline that ignores the axes whose commands are concealed."""
+    return exclude_equations(base, [_EQUATION[name] for name in names if name in _EQUATION])
