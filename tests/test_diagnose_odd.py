@@ -7,8 +7,13 @@ import numpy as np
 import pytest
 
 from twin_worker.diagnosis.data.card import UNKNOWN
-from twin_worker.diagnosis.inference.isolation.changed import ChannelEquation
-from twin_worker.diagnosis.inference.isolation.unmodelled import RULES, Anomaly, find_tones, first_unexplained
+from twin_worker.diagnosis.inference.isolation.unmodelled import (
+    RULES,
+    Anomaly,
+    ChannelEquation,
+    find_tones,
+    first_unexplained,
+)
 from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline, unit_noise
 
 STEP_S, ONSET_S = 0.2, 90.0
