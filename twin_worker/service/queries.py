@@ -13,8 +13,7 @@ from fleet.bus.codec import EncodedMessage, Stamp, encode
 from fleet.contract import Prediction, Predictions, WhatIf
 from twin_worker.ownership.twin_store import OwnedTwin
 from twin_worker.whatif import query
-from twin_worker.whatif.answer import answer_query
-from twin_worker.whatif.resample import read_grid, resample
+from twin_worker.whatif.answer import answer_query, read_grid, resample
 
 _log = logging.getLogger(__name__)
 StampedMessages = Iterator[tuple[Any, Stamp]]
