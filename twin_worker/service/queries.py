@@ -12,7 +12,7 @@ from msgspec import Raw
 from fleet.bus.codec import EncodedMessage, Stamp, encode
 from fleet.contract import Prediction, Predictions, WhatIf
 from twin_worker.ownership.twin_store import OwnedTwin
-from twin_worker.whatif import query
+from twin_worker.whatif import answer as query
 from twin_worker.whatif.answer import answer_query, read_grid, resample
 
 _log = logging.getLogger(__name__)
