@@ -25,7 +25,7 @@ from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import open_router
 from fleet.contract import Message
 from twin_worker.confidence.tube_and_horizon import ConfidenceTracker
-from twin_worker.evaluation.offline import run_offline
+from twin_worker.evaluation.replay import run_offline
 from twin_worker.prediction.method_selection import MethodSelector
 from twin_worker.service.worker import OwnedTwin, Worker
 from twin_worker.twin.step import Twin

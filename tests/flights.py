@@ -14,7 +14,7 @@ from fleet.simulator.flight.drive import to_tlog
 from fleet.simulator.flight.uav import SimulatedUav
 from fleet.telemetry.recording.recordings import replay_messages
 from fleet.window import Window
-from twin_worker.evaluation.offline import run_offline
+from twin_worker.evaluation.replay import run_offline
 from twin_worker.identification.linear.linear_model import AXES, AxisModel
 from twin_worker.identification.linear.linear_prior import INPUTS, STATES, prior
 from twin_worker.telemetry.history import TelemetryHistory

@@ -19,7 +19,7 @@ from fleet.telemetry.inspection.survey import ROTOR_AIRBORNE_HEIGHT, VERTICAL_TA
 from twin_worker.diagnosis.baseline import own_past, past
 from twin_worker.diagnosis.data import flight, smooth
 from twin_worker.diagnosis.data.card import UNKNOWN
-from twin_worker.evaluation.offline import run_offline
+from twin_worker.evaluation.replay import run_offline
 from twin_worker.prediction import turn_rate
 from twin_worker.telemetry import resample
 from twin_worker.telemetry.history import TelemetryHistory

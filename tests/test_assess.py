@@ -128,7 +128,7 @@ def test_nothing_later_is_known_at_a_start(one, driven):
 
 
 def test_ours_is_what_a_twin_publishes(one, cases):
-    from twin_worker.evaluation.offline import run_offline
+    from twin_worker.evaluation.replay import run_offline
 
     by_t = {p.t: p.path.numpy() for p in run_offline(one[: len(one) // 3], {}) if isinstance(p, Prediction)}
     for case in cases[:3]:

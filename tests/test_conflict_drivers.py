@@ -17,7 +17,7 @@ from fleet.contract import Alert, AlertKind, FleetRow, FleetState, Message, Pred
 from fleet.frames import to_geodetic
 from twin_worker.__main__ import main
 from twin_worker.alerts.conflict_probability import Separation
-from twin_worker.evaluation import offline
+from twin_worker.evaluation import replay as offline
 from twin_worker.service import worker as live
 from twin_worker.service.worker import Worker
 

@@ -9,7 +9,7 @@ from flights import HERE, T0, drive, item, predictions, status
 
 from fleet.contract import EVENT_TEXTS, Event, Mission, Prediction, Sample, Status
 from fleet.frames import to_geodetic
-from twin_worker.evaluation.offline import run_offline
+from twin_worker.evaluation.replay import run_offline
 from twin_worker.twin.step import Twin, advance
 
 

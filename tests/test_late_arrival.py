@@ -12,7 +12,7 @@ from fleet.contract import Alert, AlertKind, Event, Link, Sample, Status, TwinSt
 from fleet.simulator.flight import drive as simulator
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
 from tests.late_arrival import ARRIVALS, Datagram, flight, lived, relayed
-from twin_worker.evaluation.offline import run_offline
+from twin_worker.evaluation.replay import run_offline
 from twin_worker.service import worker as live
 from twin_worker.service.worker import Worker
 from twin_worker.twin.step import advance

@@ -10,7 +10,7 @@ from fleet.autopilots import copter
 from fleet.contract import Mission, Params, Prediction, Sample, Status, TwinState
 from fleet.frames import to_ned
 from twin_worker.confidence.tube_and_horizon import AHEAD
-from twin_worker.evaluation.offline import run_offline
+from twin_worker.evaluation.replay import run_offline
 from twin_worker.prediction.turn_rate import imm
 from twin_worker.twin.step import Twin
 

@@ -9,7 +9,7 @@ import pytest
 from flights import item, predictions, published, rows
 
 from fleet.contract import Mission, Params, Sample, Status
-from twin_worker.evaluation.offline import run_offline
+from twin_worker.evaluation.replay import run_offline
 from twin_worker.twin.step import Twin, advance
 
 NAN, INF = float("nan"), float("inf")

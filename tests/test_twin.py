@@ -18,7 +18,7 @@ from fleet.contract import (
     TwinState,
 )
 from tests.flights import ROUTE
-from twin_worker.evaluation.offline import run_offline
+from twin_worker.evaluation.replay import run_offline
 from twin_worker.twin.state import state
 from twin_worker.twin.step import Twin, advance, fleet_row
 

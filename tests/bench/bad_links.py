@@ -24,7 +24,7 @@ from fleet.simulator.flight.uav import SimulatedUav
 from fleet.telemetry.recording.recordings import replay_messages
 from tests.bad_radio import RADIOS, Radio, worsen
 from twin_worker.confidence.tube_and_horizon import axes_error, first_passage, path_length
-from twin_worker.evaluation.offline import run_offline
+from twin_worker.evaluation.replay import run_offline
 from twin_worker.twin.step import Twin
 
 FROM_S = 60.0  # predictions count from here on: before, there is little to learn from [s]

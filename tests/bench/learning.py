@@ -22,7 +22,7 @@ import numpy as np
 from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Message
 from fleet.telemetry.recording.recordings import replay_messages
-from twin_worker.evaluation.offline import run_offline
+from twin_worker.evaluation.replay import run_offline
 from twin_worker.service.warm_up import warm_up
 from twin_worker.service.worker import OwnedTwin, Worker
 from twin_worker.twin import step as loop

@@ -8,7 +8,7 @@ import argparse
 import json
 import sys
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,29 @@ from fleet.process.logs import report_progress
 from fleet.telemetry.recording.recordings import replay_messages
 from twin_worker.alerts.traffic import TrafficMonitor
 from twin_worker.confidence.weighted_quantile import survival
-from twin_worker.evaluation.offline import run_offline
-from twin_worker.twin.step import Twin
+from twin_worker.twin.step import Twin, advance
+
+
+def run_offline(
+    messages: Iterable[Message], twins: dict[int, Twin], traffic: TrafficMonitor | None = None
+) -> Iterator[Message]:
+    """Drive twins with recorded messages; every new UAV gets a twin.
+
+    Args:
+        messages: Sample, Status, Mission, Params in the order they were received
+        twins: twins by UAV id, filled and changed in place
+        traffic: conflict assessment of all pairs, changed in place; None: a new one
+    Yields:
+        Model, Prediction and Alert messages
+    """
+    traffic = traffic or TrafficMonitor()
+    for message in messages:
+        twin = twins.get(message.uav)
+        if twin is None:
+            twin = twins[message.uav] = Twin.of(message.uav)
+        results = advance(twin, (message,))
+        yield from traffic.process_results(twin.config.uav, twin.telemetry.last_step_t, results)
+
 
 WITHIN_S = (10, 30, 60, 120)
 _REPORT_EVERY_S = 60.0  # recorded time between two lines of progress [s]

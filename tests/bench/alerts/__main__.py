@@ -22,7 +22,7 @@ import numpy as np
 from fleet.contract import Alert, AlertKind, Prediction
 from fleet.simulator.flight.drive import EPOCH_US, to_tlog
 from fleet.telemetry.recording.recordings import replay_messages
-from twin_worker.evaluation.offline import run_offline
+from twin_worker.evaluation.replay import run_offline
 from twin_worker.service.warm_up import warm_up
 
 from .world import END_S, HIGH_M, SAFE_M, STEP_S, WIDE_M, Flight, apart, chain, is_clear, lost_at, make
