@@ -7,8 +7,8 @@ from flights import DT, T0
 
 from fleet.airframes import GENERIC, load
 from fleet.frames import body_to_ned, ned_to_body
-from fleet.physics.actuators import TAU
 from fleet.physics.dynamics import step
+from fleet.physics.simulate import TAU
 from fleet.physics.wrench import NAMES, OFFSETS, WIND
 from fleet.window import Window
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel

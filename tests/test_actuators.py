@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fleet.physics.actuators import TAU, lagged
+from fleet.physics.simulate import TAU, lagged
 
 
 def stepped(n: int, at: int) -> np.ndarray:

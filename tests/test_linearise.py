@@ -5,8 +5,8 @@ import pytest
 from coupled_flights import AT, aircraft, fly, known
 
 from fleet.contract import LinearModel
-from fleet.physics.actuators import TAU, lagged
 from fleet.physics.dynamics import step
+from fleet.physics.simulate import TAU, lagged
 from fleet.physics.wrench import WIND
 from fleet.window import INPUTS, STATES
 from twin_worker.identification.fixed_wing.linearise import linearise

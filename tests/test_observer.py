@@ -7,8 +7,8 @@ import pytest
 from coupled_flights import NOISE, aircraft, fly, known
 
 from fleet.frames import G
-from fleet.physics.actuators import TAU as LAGS
-from fleet.physics.actuators import lagged
+from fleet.physics.simulate import TAU as LAGS
+from fleet.physics.simulate import lagged
 from fleet.physics.wrench import OFFSETS
 from fleet.window import Window
 from twin_worker.validation.gust_observer import _ALPHA, _BETA, TAU, AlphaBetaFilter

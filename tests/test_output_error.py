@@ -5,7 +5,7 @@ import pytest
 from coupled_flights import AT, NOISE, SMALL, TRIM, aircraft, fly
 from flights import DT
 
-from fleet.physics.actuators import TAU, lagged
+from fleet.physics.simulate import TAU, lagged
 from fleet.physics.wrench import N_PAR, WIND
 from twin_worker.identification.fixed_wing import output_error as oe
 from twin_worker.identification.fixed_wing.derivatives_prior import prior

@@ -9,7 +9,7 @@ from flights import published, truth
 
 from fleet.bus.codec import decode, encode
 from fleet.contract import Model, Outcome, Verdict
-from fleet.physics.actuators import TAU
+from fleet.physics.simulate import TAU
 from fleet.physics.wrench import NAMES
 from twin_worker.identification.fixed_wing.derivatives_model import identify
 from twin_worker.twin.state.state import Twin

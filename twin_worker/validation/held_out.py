@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fleet.physics.actuators import TAU, lagged
+from fleet.physics.simulate import TAU, lagged
 from fleet.window import STATES, Window
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
 from twin_worker.identification.fixed_wing.output_error import LINE_SAMPLES

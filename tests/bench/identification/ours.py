@@ -10,7 +10,7 @@ import numpy as np
 
 from fleet.airframes import Airframe, load
 from fleet.frames import body_to_ned, ned_to_body
-from fleet.physics.actuators import TAU, lagged
+from fleet.physics.simulate import TAU, lagged
 from fleet.window import Window
 from twin_worker.estimation.wind_filter import WindFilter
 from twin_worker.identification.fixed_wing.derivatives_model import identify

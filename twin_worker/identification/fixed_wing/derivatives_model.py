@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.airframes import Airframe
-from fleet.physics.actuators import TAU, lagged
 from fleet.physics.dynamics import free_runs
+from fleet.physics.simulate import TAU, lagged
 from fleet.physics.wrench import N_PAR, OFFSETS, WIND
 from fleet.window import Window
 from twin_worker.identification.fixed_wing.derivatives_prior import prior

@@ -3,9 +3,8 @@
 import numba as nb
 import numpy as np
 
-from fleet.physics.actuators import TAU, lagged
 from fleet.physics.dynamics import rates_of_change
-from fleet.physics.simulate import coupled_plant, linear_plant
+from fleet.physics.simulate import TAU, coupled_plant, lagged, linear_plant
 from fleet.physics.wrench import OFFSETS, WIND
 from fleet.window import INPUTS, Window
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel

@@ -3,7 +3,7 @@
 import numpy as np
 
 from fleet.contract import Array, Derivatives, LinearModel, Model
-from fleet.physics.actuators import TAU
+from fleet.physics.simulate import TAU
 from fleet.physics.wrench import NAMES
 from fleet.window import Window
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
