@@ -16,8 +16,7 @@ landing, the upper bound of the period in wind on circles, throttle compensation
 Source: see `npfg`, `tecs`; PX4 1.13 to 1.16 for the implementation.
 """
 
-from fleet.autopilots.px4_fixedwing.attitude import stabilise
-from fleet.autopilots.px4_fixedwing.guide import align_integrators, fly, init
+from fleet.autopilots.px4_fixedwing.guide import align_integrators, fly, init, stabilise
 from fleet.autopilots.px4_fixedwing.params import DEFAULTS, NAMES, TABLE, parameters
 from fleet.autopilots.px4_fixedwing.path import begin, height_demand
 
