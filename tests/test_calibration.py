@@ -10,9 +10,8 @@ from made_up import GROUP, V
 from scipy.stats import norm
 
 from twin_worker.confidence.calibration.__main__ import main
-from twin_worker.confidence.calibration.conformal import conformal_factors
 from twin_worker.confidence.calibration.evaluate_table import figures, regions_cross_fitted, regions_of_table
-from twin_worker.confidence.calibration.fit_table import fit, fit_sigma
+from twin_worker.confidence.calibration.fit_table import conformal_factors, fit, fit_sigma
 from twin_worker.confidence.calibration.scored_predictions import ScoredPredictions, concatenate
 from twin_worker.confidence.calibration_table import (
     INDEPENDENT,

@@ -15,7 +15,7 @@ from fleet.frames import Origin, to_geodetic, to_ned
 from twin_worker.alerts.conflict_probability import Separation
 from twin_worker.alerts.gaussian_forecast import axis_z, to_gaussian
 from twin_worker.alerts.traffic import TrafficMonitor
-from twin_worker.confidence.calibration.conformal import conformal_factors
+from twin_worker.confidence.calibration.fit_table import conformal_factors
 
 Z = axis_z(0.9)
 

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import minimize
 
-from twin_worker.confidence.calibration.conformal import conformal_factors
 from twin_worker.confidence.calibration.scored_predictions import ScoredPredictions
 from twin_worker.confidence.calibration_table import (
     INDEPENDENT,
@@ -22,6 +21,35 @@ from twin_worker.confidence.calibration_table import (
 from twin_worker.confidence.horizon_risk import critical_factor, running_max_error_ratio
 from twin_worker.confidence.weighted_quantile import censored_quantile, weighted_quantile
 from twin_worker.numerics.prediction_errors import AHEAD, NOMINAL_COVERAGE, first_passage
+
+
+def conformal_factors(ratio: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the factors of joint coverage `NOMINAL_COVERAGE` on new predictions, (3,), and the coverage of one axis.
+
+    The latter is `NOMINAL_COVERAGE` for fully dependent axes and its cube root for independent ones. Without scores
+    both are nan.
+
+    Args:
+        ratio: errors along, cross, vertical over their sigma, nan where unknown, (s, k, 3) [-]
+        weight: of each prediction, (s,)
+    """
+    valid = np.isfinite(ratio).all(axis=2)
+    n = int(valid.any(axis=1).sum())
+    if not n:
+        return np.full(3, np.nan), float("nan")
+    x, w = ratio[valid].T.copy(), np.broadcast_to(weight[:, None], valid.shape)[valid]
+    highest = np.max([_rank(row, w) for row in x], axis=0)
+    level = weighted_quantile(highest[None], w[None], np.array([min(NOMINAL_COVERAGE * (n + 1) / n, 1.0)]))
+    return np.maximum(weighted_quantile(x, np.tile(w, (3, 1)), np.tile(level, 3)), 1e-3), float(level[0])
+
+
+def _rank(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return the share of the weight that lies below each value, (n,)."""
+    order = np.argsort(x)
+    out = np.empty(len(x))
+    out[order] = (np.cumsum(weight[order]) - 0.5 * weight[order]) / weight.sum()
+    return out
+
 
 _KNOT_RATIO = 1.2  # look-aheads within this factor of a knot are used for it [-]
 _COLUMNS_PER_KNOT = 3  # number of them, evenly spaced: neighbours are highly correlated
