@@ -21,9 +21,17 @@ from twin_worker.confidence.calibration_table import (
     error_growth,
     uncertainty_features,
 )
-from twin_worker.confidence.groups import airframe_class, group_chain, group_name
 from twin_worker.confidence.lagged_ensemble import LaggedForecasts
-from twin_worker.confidence.table_files import TableSet, TableSource, load, read_tables, write
+from twin_worker.confidence.table_files import (
+    TableSet,
+    TableSource,
+    airframe_class,
+    group_chain,
+    group_name,
+    load,
+    read_tables,
+    write,
+)
 from twin_worker.confidence.weighted_quantile import (
     censored_quantile,
     kaplan_meier_masses,

@@ -22,8 +22,7 @@ from twin_worker.confidence.calibration.evaluate_table import (
 from twin_worker.confidence.calibration.fit_table import fit
 from twin_worker.confidence.calibration.scored_predictions import ScoredPredictions, read
 from twin_worker.confidence.calibration_table import CalibrationTable
-from twin_worker.confidence.groups import ANY, group_chain
-from twin_worker.confidence.table_files import TableSource, load, read_tables, write
+from twin_worker.confidence.table_files import ANY, TableSource, group_chain, load, read_tables, write
 
 MIN_STARTS, MIN_FLIGHTS = 30, 3  # minimum for a table
 SUFFICIENT_FLIGHTS = 8  # with fewer, differences between methods of one family are not significant

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 
 from fleet.contract import EVENT_TEXTS, Array, Controller, Event, Message, Prediction, TwinState
-from twin_worker.confidence.groups import airframe_class, group_name
+from twin_worker.confidence.table_files import airframe_class, group_name
 from twin_worker.confidence.tube_and_horizon import AHEAD, NOMINAL_COVERAGE, Confidence, PointForecast
 from twin_worker.identification.fixed_wing.plant import DYNAMICS
 from twin_worker.prediction.autopilot_parameters import IDENTIFIED, ControllerTwin
