@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 from fleet.contract import Message
-from fleet.simulator.conceal.cards import card
+from fleet.simulator.conceal.exam import card
 from fleet.simulator.conceal.plan import NOMINAL_EXCITATION, FlightJob, draw_flight
 from fleet.simulator.conceal.record import fly
 from fleet.simulator.faults.kinds import parse_fault
