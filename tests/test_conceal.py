@@ -14,10 +14,9 @@ from fleet.simulator.conceal import exam as examination
 from fleet.simulator.conceal import plan as planning
 from fleet.simulator.conceal import record as recording
 from fleet.simulator.conceal.effects import BOTH, HIDDEN, UNKNOWN
-from fleet.simulator.conceal.exam import draw_jobs, simulate_exam
+from fleet.simulator.conceal.exam import are_separable, counts, draw_jobs, simulate_exam
 from fleet.simulator.conceal.plan import FlightJob, PlannedFlight, draw_flight
 from fleet.simulator.conceal.record import fly, rejection_reason
-from fleet.simulator.conceal.roles import are_separable, counts
 from fleet.telemetry.recording.recordings import replay_messages
 
 KINDS = HIDDEN | UNKNOWN

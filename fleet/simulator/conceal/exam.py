@@ -6,14 +6,14 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from math import degrees
+from math import ceil, degrees
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fleet.simulator.conceal import roles
 from fleet.simulator.conceal.acts import MIN_OVER_NOISE, effect_strength
+from fleet.simulator.conceal.effects import HIDDEN, UNKNOWN
 from fleet.simulator.conceal.paths import EXAM_HOME
 from fleet.simulator.conceal.plan import NOMINAL_EXCITATION, FlightJob, PlannedFlight, draw_flight
 from fleet.simulator.conceal.record import fly, rejection_reason
@@ -89,7 +89,7 @@ def draw_jobs(seed: int, flights: int) -> list[FlightJob]:
     """Draw the effects of all flights; order and names are independent of them."""
     rng = np.random.default_rng((seed, 22))
     requests: list[tuple[str, str, tuple[str, ...]]] = []
-    for k, (role, count) in enumerate(roles.counts(flights).items()):
+    for k, (role, count) in enumerate(counts(flights).items()):
         for i, airframe in enumerate(AIRFRAMES):
             n_flights = (count + (i + k) % 2) // 2
             requests += [(airframe, role, names) for names in _names(rng, role, airframe, n_flights)]
@@ -108,7 +108,7 @@ def draw_jobs(seed: int, flights: int) -> list[FlightJob]:
 
 
 def _names(rng: np.random.Generator, role: str, airframe: str, count: int) -> list[tuple[str, ...]]:
-    draws = {"single": roles.singles, "compound": roles.compounds, "unknown": roles.unknowns}
+    draws = {"single": singles, "compound": compounds, "unknown": unknowns}
     return draws[role](rng, airframe, count) if role in draws else [()] * count
 
 
@@ -172,3 +172,74 @@ def _try_flight(planned: PlannedFlight, path: Path, rejections: list[str]) -> La
         "flown_s": planned.seconds,
         "acts": strengths,
     }
+
+
+_SINGLE, _COMPOUND, _UNKNOWN = 50 / 140, 16 / 140, 14 / 140
+_OVERLAPPING = (  # pairs of channels that are not separable
+    {"air", "airspeed"},
+    {"air", "heading"},
+    {"air", "gps"},
+    {"force", "imu"},
+    {"imu", "heading"},
+    {"force", "pitch"},
+    {"gps", "baro"},
+)
+_GLOBAL_EFFECTS = {"air_density", "turbulence"}  # affect all channels: never combined
+EffectNames = tuple[str, ...]
+"""Names of the hidden effects of one flight."""
+
+
+def counts(flights: int) -> dict[str, int]:
+    """Distribute the flights over the roles.
+
+    Raises:
+        ValueError: when there are fewer than 6 flights.
+    """
+    if flights < 6:
+        raise ValueError(f"flights: found {flights}, expected 6 at least, so that each role has one; ask for more")
+    single, compound = ceil(flights * _SINGLE), ceil(flights * _COMPOUND)
+    unknown = max(round(flights * _UNKNOWN), 1)
+    control = flights - single - compound - unknown
+    return {"control": control, "single": single, "compound": compound, "unknown": unknown}
+
+
+def singles(rng: np.random.Generator, airframe: str, n: int) -> list[EffectNames]:
+    """Draw `n` effects without repetition until all are used."""
+    return [(name,) for name in _draw_cycling(rng, [x for x, h in HIDDEN.items() if airframe in h.airframes], n)]
+
+
+def unknowns(rng: np.random.Generator, airframe: str, n: int) -> list[EffectNames]:
+    """Draw `n` uncatalogued effects."""
+    return [(name,) for name in _draw_cycling(rng, [x for x, h in UNKNOWN.items() if airframe in h.airframes], n)]
+
+
+def compounds(rng: np.random.Generator, airframe: str, n: int) -> list[EffectNames]:
+    """Draw `n` separable pairs, least used effects first."""
+    names = [x for x, h in HIDDEN.items() if airframe in h.airframes]
+    pairs = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :] if are_separable(a, b)]
+    use_count: dict[str, int] = dict.fromkeys(names, 0)
+    out: list[EffectNames] = []
+    for _ in range(n):
+        min_count = min(use_count[a] + use_count[b] for a, b in pairs)
+        rarest = [pair for pair in pairs if use_count[pair[0]] + use_count[pair[1]] == min_count]
+        a, b = rarest[int(rng.integers(len(rarest)))]
+        use_count[a], use_count[b] = use_count[a] + 1, use_count[b] + 1
+        out.append((a, b))
+    return out
+
+
+def are_separable(a: str, b: str) -> bool:
+    """Return whether two effects are separable in one flight."""
+    if {a, b} & _GLOBAL_EFFECTS:
+        return False
+    channels = {HIDDEN[a].channel, HIDDEN[b].channel}
+    if len(channels) == 1 or channels in _OVERLAPPING:
+        return False
+    return not ("servo" in channels and channels & {"roll", "pitch", "yaw"})
+
+
+def _draw_cycling(rng: np.random.Generator, names: list[str], n: int) -> list[str]:
+    out: list[str] = []
+    while len(out) < n:
+        out += [names[i] for i in rng.permutation(len(names))]
+    return out[:n]
