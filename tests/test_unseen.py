@@ -12,8 +12,7 @@ from fleet.contract import Outcome
 from fleet.physics.wrench import NAMES, WIND
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
 from twin_worker.validation.held_out import HeldOut
-from twin_worker.validation.verify import AXES, fit_and_persistence, mean_fit, verify, with_diagnostics
-from twin_worker.validation.whiteness import LAGS, whiteness
+from twin_worker.validation.verify import AXES, LAGS, fit_and_persistence, mean_fit, verify, whiteness, with_diagnostics
 
 START = 500
 
