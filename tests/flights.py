@@ -15,8 +15,7 @@ from fleet.simulator.flight.uav import SimulatedUav
 from fleet.telemetry.recording.recordings import replay_messages
 from fleet.window import Window
 from twin_worker.evaluation.replay import run_offline
-from twin_worker.identification.linear.linear_model import AXES, AxisModel
-from twin_worker.identification.linear.linear_prior import INPUTS, STATES, prior
+from twin_worker.identification.linear.linear_model import AXES, INPUTS, STATES, AxisModel, prior
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.twin.step import Twin, advance
 

@@ -12,8 +12,7 @@ import numpy as np
 from fleet.contract import Outcome
 from fleet.window import STATES as ALL
 from fleet.window import Window
-from twin_worker.identification.linear.linear_model import AXES, AxisModel
-from twin_worker.identification.linear.linear_prior import INPUTS, STATES
+from twin_worker.identification.linear.linear_model import AXES, INPUTS, STATES, AxisModel
 from twin_worker.identification.linear.prediction_error_method import refine
 from twin_worker.identification.linear.state_space import StateSpace
 from twin_worker.identification.linear.subspace import pbsid
