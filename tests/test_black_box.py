@@ -12,8 +12,7 @@ from twin_worker.identification.linear.black_box_prediction_error import (
 )
 from twin_worker.identification.linear.order_selection import select_order
 from twin_worker.identification.linear.state_space import StateSpace
-from twin_worker.identification.linear.subspace import pbsid
-from twin_worker.identification.linear.subspace_open_loop import projection
+from twin_worker.identification.linear.subspace import pbsid, projection
 
 POLES = {2: (0.92 + 0.15j,), 3: (0.92 + 0.15j, 0.8), 4: (0.92 + 0.15j, 0.75 + 0.4j), 5: (0.92 + 0.15j, 0.5j, 0.85)}
 POLES[6] = (*POLES[4], 0.3 + 0.7j)

@@ -15,8 +15,7 @@ from fleet.window import Window
 from twin_worker.identification.linear.linear_model import AXES, INPUTS, STATES, AxisModel
 from twin_worker.identification.linear.prediction_error_method import refine
 from twin_worker.identification.linear.state_space import StateSpace
-from twin_worker.identification.linear.subspace import pbsid
-from twin_worker.identification.linear.subspace_open_loop import projection
+from twin_worker.identification.linear.subspace import pbsid, projection
 from twin_worker.paper_experiments.recorded_flights import RecordedFlight
 from twin_worker.telemetry.flight_phase import phase_of
 from twin_worker.validation.held_out import HeldOut
