@@ -11,8 +11,8 @@ from fleet.contract import Outcome, Verdict
 from fleet.window import STATES
 from twin_worker.twin.state.models import VerifiedModel
 from twin_worker.twin.state.state import Twin
+from twin_worker.twin.steps import identify_step as choosing
 from twin_worker.twin.steps import identify_step as learning
-from twin_worker.twin.steps import model_selection as choosing
 from twin_worker.validation.held_out import HeldOut
 
 VERDICT = Verdict(outcome=Outcome.VERIFIED, sentence="mean fit 30 %")
