@@ -11,8 +11,7 @@ from fleet.physics.dynamics import step
 from fleet.physics.simulate import TAU
 from fleet.physics.wrench import NAMES, OFFSETS, WIND
 from fleet.window import Window
-from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
-from twin_worker.identification.fixed_wing.derivatives_prior import prior
+from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel, prior
 
 V, W0 = 20.0, 1.0  # trim, forward and down the body [m/s]
 AT = np.array([V, W0])

@@ -9,7 +9,7 @@ from fleet.airframes import GENERIC, derivatives, load
 from fleet.frames import ned_to_body
 from fleet.physics.dynamics import rates_of_change
 from fleet.physics.wrench import NAMES, OFFSETS, WIND
-from twin_worker.identification.fixed_wing.derivatives_prior import prior
+from twin_worker.identification.fixed_wing.derivatives_model import prior
 
 CLASS, TYPE = load(GENERIC), load("aerosonde")
 TRIM = np.array([0.0, 0.05, 0.0, 0.6])

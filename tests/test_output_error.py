@@ -8,7 +8,7 @@ from flights import DT
 from fleet.physics.simulate import TAU, lagged
 from fleet.physics.wrench import N_PAR, WIND
 from twin_worker.identification.fixed_wing import output_error as oe
-from twin_worker.identification.fixed_wing.derivatives_prior import prior
+from twin_worker.identification.fixed_wing.derivatives_model import prior
 from twin_worker.identification.fixed_wing.output_error import (
     EstimationProblem,
     estimate,

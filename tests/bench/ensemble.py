@@ -22,7 +22,7 @@ from fleet.frames import Origin
 from fleet.mission import unroll_route
 from fleet.physics import point_mass as H
 from fleet.physics.simulate import N_STATE, coupled_plant, simulate
-from twin_worker.identification.fixed_wing.derivatives_prior import prior
+from twin_worker.identification.fixed_wing.derivatives_model import prior
 
 EXAMPLES = """
   python -m tests.bench.ensemble --json ensemble.json

@@ -5,8 +5,7 @@ import numpy as np
 
 from fleet.contract import Array, Model, Outcome, Prediction, TwinState
 from fleet.physics.wrench import N_PAR, NAMES
-from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
-from twin_worker.identification.fixed_wing.derivatives_prior import prior
+from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel, prior
 from twin_worker.twin.state.models import VerifiedModel
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.extrapolate import MAX_ROLLOUT_AGE_S
