@@ -12,11 +12,10 @@ import pytest
 from conftest import ROOT, unused_port
 
 from fleet import cli
-from fleet.access.entry import ROUTER, BusConfig
+from fleet.access.entry import PASSWORD, ROUTER, BusConfig, access_control
 from fleet.access.knock import probe_router
 from fleet.access.papers import expiry_of, find_certificate, read_password
 from fleet.access.roles import ROLES, ROUTER_ROLE
-from fleet.access.rules import PASSWORD, access_control
 from fleet.bus.session import connect, open_router
 from fleet.config import bus_config_from, router_arguments, router_options
 from gateway import __main__ as gateway
