@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from fleet.frames import to_ned
 from fleet.simulator.flight import drive
-from fleet.simulator.flight.link import RadioLink
+from fleet.simulator.flight.drive import RadioLink
 from fleet.simulator.flight.mavlink import MavlinkEndpoint
 from fleet.simulator.flight.mavlink_messages import AUTO, TELEMETRY
 from fleet.simulator.flight.tuning import tuned_parameters

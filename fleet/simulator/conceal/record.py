@@ -9,8 +9,7 @@ import numpy as np
 
 from fleet.simulator.conceal.plan import SETTLE_S, PlannedFlight
 from fleet.simulator.faults.fault import Fault
-from fleet.simulator.flight.drive import TICK_S, write
-from fleet.simulator.flight.link import RadioLink
+from fleet.simulator.flight.drive import TICK_S, RadioLink, write
 from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.jsbsim import Truth
 from fleet.simulator.vehicle.sensors import Estimate, pressure_height
