@@ -13,8 +13,9 @@ from twin_worker.ownership.protocol_state import (
     FencingToken,
     OwnershipPlan,
     OwnershipState,
+    owner,
+    owners,
 )
-from twin_worker.ownership.rendezvous import owner, owners
 
 IDS = range(100)
 WALL = 1_700_000_000_000

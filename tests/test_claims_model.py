@@ -14,8 +14,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from fleet.bus.codec import Stamp
 from fleet.bus.epoch_fence import WRITER_TIMEOUT_S, EpochFence
-from twin_worker.ownership.protocol_state import CLAIM_DELAY_S, PAUSE_S, SILENT_S, FencingToken, OwnershipState
-from twin_worker.ownership.rendezvous import owners
+from twin_worker.ownership.protocol_state import CLAIM_DELAY_S, PAUSE_S, SILENT_S, FencingToken, OwnershipState, owners
 
 UAVS = range(5)
 RANGES = (range(5), range(3), range(2, 5))

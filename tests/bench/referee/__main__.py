@@ -21,7 +21,7 @@ import numpy as np
 
 from fleet.cli import make_parser, run_command
 from fleet.contract import Claim
-from twin_worker.ownership.rendezvous import owners
+from twin_worker.ownership.protocol_state import owners
 
 from . import faults
 from .site import PACE, Site, Worker, until

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fleet.contract import FleetState
-from twin_worker.ownership.rendezvous import owners
+from twin_worker.ownership.protocol_state import owners
 
 from .site import Site, Worker, until
 from .starve import limited, throttled_s
