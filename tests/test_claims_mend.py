@@ -15,9 +15,8 @@ from fleet.bus.codec import encode
 from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.presence import WorkerToken
 from fleet.contract import Claim, Handover, HandoverRequest, History, Message, Sample, Status
-from twin_worker.ownership.history_query import query_history
 from twin_worker.ownership.protocol import OwnershipProtocol
-from twin_worker.ownership.twin_store import INBOX_SIZE
+from twin_worker.ownership.twin_store import INBOX_SIZE, query_history
 from twin_worker.service.worker import Worker
 
 OTHER = WorkerToken("00000000000000aa", range(5), 1)

@@ -25,9 +25,8 @@ from twin_worker.alerts.traffic import TrafficMonitor
 from twin_worker.mismatch.coordinator import Coordinator
 from twin_worker.mismatch.messages import summary
 from twin_worker.ownership.handover import Snapshot
-from twin_worker.ownership.history_query import LATCHED_TYPES
 from twin_worker.ownership.protocol import OwnershipProtocol
-from twin_worker.ownership.twin_store import LocalTwinStore, OwnedTwin
+from twin_worker.ownership.twin_store import LATCHED_TYPES, LocalTwinStore, OwnedTwin
 from twin_worker.service.busy_fallback import (
     CHECK_PERIOD_S,
     fallback_prediction,
