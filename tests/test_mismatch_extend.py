@@ -20,7 +20,7 @@ from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
 from twin_worker.identification.fixed_wing.point_mass_with_effects import EffectIncrements, with_effects
 from twin_worker.mismatch.adapt_models import adapt_models, adapted_derivatives, wind_with_effects
 from twin_worker.mismatch.effect_increments import EffectOutputs, actual_deflections
-from twin_worker.twin.state.checkpoint import MAX_CHECKPOINTS, latest_before
+from twin_worker.twin.state.models import MAX_CHECKPOINTS, latest_before
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.step import advance
 

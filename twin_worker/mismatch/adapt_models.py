@@ -20,8 +20,7 @@ from twin_worker.mismatch.effect_increments import EffectOutputs
 from twin_worker.numerics.ridge_regression import solve_ridge
 from twin_worker.prediction.closed_loop import Rollout, synchronise_controller
 from twin_worker.telemetry.resample import Resampler
-from twin_worker.twin.state.checkpoint import ActiveEffects, Checkpoint, latest_before
-from twin_worker.twin.state.models import VerifiedModel
+from twin_worker.twin.state.models import ActiveEffects, Checkpoint, VerifiedModel, latest_before
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.rollouts import method_paths
 

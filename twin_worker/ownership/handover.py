@@ -33,11 +33,10 @@ from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.resample import Resampler
 from twin_worker.telemetry.row_buffer import RowBuffer
 from twin_worker.twin.state.budget import ComputeBudget
-from twin_worker.twin.state.checkpoint import ActiveEffects, Checkpoint
 from twin_worker.twin.state.events import FlightEvent
 from twin_worker.twin.state.flight_phase import FlightPhase
 from twin_worker.twin.state.inputs import Environment, OnboardState, Telemetry
-from twin_worker.twin.state.models import Identification, ModelBank, VerifiedModel
+from twin_worker.twin.state.models import ActiveEffects, Checkpoint, Identification, ModelBank, VerifiedModel
 from twin_worker.twin.state.outputs import AlertingState, ConfidenceState, PredictionState
 from twin_worker.twin.state.schedule import Schedule
 from twin_worker.twin.state.state import Twin, TwinConfig

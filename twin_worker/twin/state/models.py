@@ -1,6 +1,10 @@
 """Identified state of one aircraft: the newest identification, and the models that may predict."""
 
 from collections import deque
+from collections.abc import Iterable
+from copy import deepcopy
+from dataclasses import dataclass
+from datetime import UTC, datetime
 
 import msgspec
 import numpy as np
@@ -12,15 +16,53 @@ from twin_worker.identification.fixed_wing.plant import Plant
 from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel
 from twin_worker.prediction.kinematic import KinematicModel
 from twin_worker.prediction.multirotor.rollout import MultirotorModel
-from twin_worker.twin.state.checkpoint import (
-    CHECKPOINT_PERIOD_S,
-    MAX_CHECKPOINTS,
-    ActiveEffects,
-    Checkpoint,
-    create_checkpoint,
-)
 from twin_worker.twin.state.timer import Timer
 from twin_worker.validation.forecast_shrinkage import Shrinkage
+
+CHECKPOINT_PERIOD_S = 10.0  # between checkpoints [s]
+MAX_CHECKPOINTS = 15  # number of checkpoints kept; covers the telemetry history
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """State of one twin at one instant.
+
+    Attributes:
+        t: time [s since 1970]
+        wind_filter: copy of the wind filter
+        derivatives_model: verified stability-and-control model; None before the first
+        point_mass: verified point-mass model; None before the first
+    """
+
+    t: float
+    wind_filter: WindFilter
+    derivatives_model: DerivativesModel | None
+    point_mass: PointMassModel | None
+
+
+@dataclass(frozen=True)
+class ActiveEffects:
+    """Fault effects added to the active model: their names, and the onset [s since 1970]."""
+
+    names: str
+    onset: float
+
+    def __str__(self) -> str:
+        return f"{self.names} since {datetime.fromtimestamp(self.onset, UTC):%H:%M:%S} UTC"
+
+
+def create_checkpoint(
+    t: float, wind_filter: WindFilter, models: tuple[Plant | None, ...], point_mass: PointMassModel | None
+) -> Checkpoint:
+    """Create a checkpoint with the first stability-and-control model among `models`."""
+    derivatives_model = next((model for model in models if isinstance(model, DerivativesModel)), None)
+    return Checkpoint(t, deepcopy(wind_filter), derivatives_model, point_mass)
+
+
+def latest_before(checkpoints: Iterable[Checkpoint], t: float) -> Checkpoint | None:
+    """Return the newest checkpoint before time t [s since 1970]; None if there is none."""
+    return max((checkpoint for checkpoint in checkpoints if checkpoint.t < t), key=lambda one: one.t, default=None)
+
 
 _NEWEST_WEIGHT = 0.3  # of the newest rollout in a model's error [-]
 
