@@ -8,8 +8,7 @@ import numpy as np
 from fleet.effects import Body, Effect, Flow, Parameter, Stage
 from twin_worker.diagnosis.data.card import AircraftCard
 from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
-from twin_worker.diagnosis.data.flight import FlightData
-from twin_worker.diagnosis.data.smooth import DT
+from twin_worker.diagnosis.data.flight import DT, FlightData
 from twin_worker.diagnosis.model.baseline import ActuatorTiming, Baseline
 from twin_worker.diagnosis.model.residual import RHO_0
 from twin_worker.diagnosis.model.simulate import STATE, Runs, Simulation

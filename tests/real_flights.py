@@ -9,8 +9,7 @@ import numpy as np
 import scipy.io
 
 from fleet.frames import Origin, to_ned
-from twin_worker.diagnosis.data.flight import FlightData
-from twin_worker.diagnosis.data.smooth import DT
+from twin_worker.diagnosis.data.flight import DT, FlightData
 
 _THOR_S = 205.0, 590.0  # what is read; and in the air
 _AIRBORNE_S = 222.0, 560.0

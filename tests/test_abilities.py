@@ -17,7 +17,8 @@ from fleet.process.sanitise import format_below
 from fleet.telemetry.inspection import abilities as needs
 from fleet.telemetry.inspection.survey import ROTOR_AIRBORNE_HEIGHT, VERTICAL_TAKEOFF, airborne, survey_recording
 from twin_worker.diagnosis.baseline import own_past, past
-from twin_worker.diagnosis.data import flight, smooth
+from twin_worker.diagnosis.data import flight
+from twin_worker.diagnosis.data import flight as smooth
 from twin_worker.diagnosis.data.card import UNKNOWN
 from twin_worker.evaluation.replay import run_offline
 from twin_worker.prediction import turn_rate

@@ -6,8 +6,7 @@ import numpy as np
 
 from fleet.effects import ALL_SURFACES, MEMORY, SURFACES, Body, Flow, Stage
 from twin_worker.diagnosis.data.fault_hypothesis import ALWAYS, FaultHypothesis
-from twin_worker.diagnosis.data.flight import FlightData
-from twin_worker.diagnosis.data.smooth import DT
+from twin_worker.diagnosis.data.flight import DT, FlightData
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.model.baseline import Baseline
 from twin_worker.diagnosis.model.residual import ModelledFlight

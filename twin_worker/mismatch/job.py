@@ -9,8 +9,7 @@ from fleet.contract import COLUMNS
 from twin_worker.diagnosis.baseline.own_past import only_new_findings
 from twin_worker.diagnosis.baseline.past import CONTEXT_S, calibrate_past, part_after
 from twin_worker.diagnosis.data.card import AircraftCard
-from twin_worker.diagnosis.data.flight import FlightData, resample_flight
-from twin_worker.diagnosis.data.smooth import STEP_S
+from twin_worker.diagnosis.data.flight import STEP_S, FlightData, resample_flight
 from twin_worker.diagnosis.inference.diagnose import diagnose
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 from twin_worker.diagnosis.inference.report import Report

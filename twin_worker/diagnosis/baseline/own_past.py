@@ -9,8 +9,7 @@ from fleet.frames import G
 from fleet.process.sanitise import format_below
 from twin_worker.diagnosis.baseline.past import CONTEXT_S, calibrate_past, part_after, part_before
 from twin_worker.diagnosis.data.card import AircraftCard
-from twin_worker.diagnosis.data.flight import FlightData
-from twin_worker.diagnosis.data.smooth import DT
+from twin_worker.diagnosis.data.flight import DT, FlightData
 from twin_worker.diagnosis.inference.diagnose import diagnose
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.inference.words import with_sentence

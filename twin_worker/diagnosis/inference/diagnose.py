@@ -9,8 +9,7 @@ import numpy as np
 
 from fleet.effects import Onset, Stage, catalogue
 from twin_worker.diagnosis.data.fault_hypothesis import ALWAYS, FaultHypothesis
-from twin_worker.diagnosis.data.flight import FlightData
-from twin_worker.diagnosis.data.smooth import decimated
+from twin_worker.diagnosis.data.flight import FlightData, decimated
 from twin_worker.diagnosis.inference.isolation.isolate import MIN_R2, ScoredHypothesis
 from twin_worker.diagnosis.inference.isolation.refine import refine
 from twin_worker.diagnosis.inference.isolation.select_hypotheses import (

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from fleet.effects import Onset
-from twin_worker.diagnosis.data.smooth import STEP_S
+from twin_worker.diagnosis.data.flight import STEP_S
 from twin_worker.diagnosis.inference.isolation.isolate import (
     MIN_R2,
     PARAMETER_COST,

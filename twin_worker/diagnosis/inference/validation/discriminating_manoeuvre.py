@@ -5,8 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
-from twin_worker.diagnosis.data.flight import FlightData
-from twin_worker.diagnosis.data.smooth import DT, STEP_S, decimated
+from twin_worker.diagnosis.data.flight import DT, STEP_S, FlightData, decimated
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 
 _BANK, _SLOPE = np.radians(20.0), np.radians(3.0)

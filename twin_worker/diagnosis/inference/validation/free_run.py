@@ -4,7 +4,7 @@ import numpy as np
 
 from fleet.effects import Stage
 from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
-from twin_worker.diagnosis.data.smooth import DECIMATION, DT
+from twin_worker.diagnosis.data.flight import DECIMATION, DT
 from twin_worker.diagnosis.inference.validation.force_prediction import blocks
 from twin_worker.diagnosis.model.residual import ModelledFlight
 from twin_worker.diagnosis.model.simulate import STATE, Simulation
