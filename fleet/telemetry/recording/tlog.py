@@ -9,7 +9,7 @@ import numpy as np
 
 from fleet.telemetry.mavlink.parsing import scan as s
 from fleet.telemetry.mavlink.parsing.decode import IDS, Decoder, Frames, find_frames
-from fleet.telemetry.mavlink.parsing.payload_gather import collect_payloads
+from fleet.telemetry.mavlink.parsing.received import collect_payloads
 from fleet.telemetry.recording.opening import RecordingFile
 
 CHUNK = 1 << 20

@@ -10,8 +10,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from fleet.telemetry.mavlink.parsing import scan as s
-from fleet.telemetry.mavlink.parsing.payload_gather import collect_payloads, group_payloads
-from fleet.telemetry.mavlink.parsing.received import ReceivedBytes, compact, read_only
+from fleet.telemetry.mavlink.parsing.received import ReceivedBytes, collect_payloads, compact, group_payloads, read_only
 
 
 class _MessageBase:
