@@ -7,8 +7,7 @@ from fleet.autopilots import laws
 from fleet.contract import Mission
 from fleet.frames import Origin, _radii, to_ned
 from twin_worker.confidence import adaptive_conformal
-from twin_worker.confidence.prediction_log import CAPACITY, PredictionLog
-from twin_worker.confidence.prediction_log_kernel import accumulate_length
+from twin_worker.confidence.prediction_log import CAPACITY, PredictionLog, accumulate_length
 from twin_worker.estimation.airspeed_setpoint import _median
 from twin_worker.numerics.interpolation import interpolate_rows
 from twin_worker.numerics.prediction_errors import AHEAD, track_frame
