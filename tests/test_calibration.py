@@ -21,7 +21,6 @@ from twin_worker.confidence.calibration_table import (
     error_growth,
     uncertainty_features,
 )
-from twin_worker.confidence.lagged_ensemble import LaggedForecasts
 from twin_worker.confidence.table_files import (
     TableSet,
     TableSource,
@@ -32,6 +31,7 @@ from twin_worker.confidence.table_files import (
     read_tables,
     write,
 )
+from twin_worker.confidence.tube_and_horizon import LaggedForecasts
 from twin_worker.confidence.weighted_quantile import (
     censored_quantile,
     kaplan_meier_masses,

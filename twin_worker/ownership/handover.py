@@ -12,11 +12,10 @@ from fleet.contract import Message, Mismatch
 from fleet.frames import Origin
 from twin_worker.alerts.hysteresis import AlertState, PendingAlert
 from twin_worker.confidence.adaptive_conformal import AdaptiveLevels, ScaleFactors
-from twin_worker.confidence.lagged_ensemble import LaggedForecasts
 from twin_worker.confidence.prediction_log import PredictionLog
 from twin_worker.confidence.table_files import TableSet
 from twin_worker.confidence.table_files import load as load_tables
-from twin_worker.confidence.tube_and_horizon import Confidence, ConfidenceTracker, PointForecast
+from twin_worker.confidence.tube_and_horizon import Confidence, ConfidenceTracker, LaggedForecasts, PointForecast
 from twin_worker.estimation.wind_filter import WindFilter
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
 from twin_worker.identification.fixed_wing.energy_balance import RegressionResult

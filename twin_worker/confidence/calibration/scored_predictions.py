@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from twin_worker.confidence.calibration_table import UncertaintyFeatures, uncertainty_features
-from twin_worker.confidence.lagged_ensemble import LaggedForecasts
 from twin_worker.confidence.table_files import ANY, group_chain, group_setting
+from twin_worker.confidence.tube_and_horizon import LaggedForecasts
 from twin_worker.numerics.prediction_errors import AHEAD, axes_error
 
 _MIN_STARTS = 30  # minimum predictions of a setting that forms a fold of its own
