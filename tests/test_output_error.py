@@ -10,12 +10,14 @@ from fleet.physics.wrench import N_PAR, WIND
 from twin_worker.identification.fixed_wing import output_error as oe
 from twin_worker.identification.fixed_wing.derivatives_model import prior
 from twin_worker.identification.fixed_wing.output_error import (
+    GROUP,
+    N_COLUMN,
     EstimationProblem,
     estimate,
     line_fit_start,
+    residuals_and_jacobian,
     unbroken_segments,
 )
-from twin_worker.identification.fixed_wing.output_error_kernel import GROUP, N_COLUMN, residuals_and_jacobian
 
 HELD = prior(SMALL, AT, TRIM, np.array([2.0, -3.0]))
 LAMBDA = np.diag(HELD[1] ** -2.0)
