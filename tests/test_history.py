@@ -12,8 +12,7 @@ from fleet.bus.codec import EncodedMessage, encode
 from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import connect
 from fleet.contract import Array, History, Rows, Sample, Status
-from gateway.publication.history import HistoryStore
-from gateway.publication.publish import Publisher
+from gateway.publication.publish import HistoryStore, Publisher
 
 
 def sample(uav, t, rows=3):
