@@ -22,7 +22,7 @@ from gateway.onboard.cache import Cache
 from gateway.onboard.rates import budget_of
 from gateway.publication.publish import Publisher
 from gateway.record.recorder import LinkRecorder, RecordedQueue
-from gateway.status.link_statistics import StatisticsCollector
+from gateway.status.status_table import StatisticsCollector
 
 TICK_S = 0.1  # between two publications of a live link [s]
 IDLE_WAIT_S = 0.02  # wait at an empty queue [s]

@@ -23,8 +23,7 @@ from gateway.record.recorder import LinkRecorder
 from gateway.record.tape import DiskBudget
 from gateway.settings.link_spec import read_spec
 from gateway.status import status_table
-from gateway.status.link_statistics import counters, overruns
-from gateway.status.status_table import format_line, render, status_display
+from gateway.status.status_table import counters, format_line, overruns, render, status_display
 
 ACCOUNT, STATUS = EXAMPLES[GatewayCounters], EXAMPLES[Status]
 
