@@ -27,7 +27,7 @@ from gateway.links.link import Endpoint
 from gateway.links.opening import open_link
 from gateway.links.recorded import ReplayLink
 from gateway.onboard.cache import Cache
-from gateway.onboard.rates import DEFAULT_BUDGET
+from gateway.onboard.questions import DEFAULT_BUDGET
 from gateway.pipeline import Pipeline
 from gateway.record.recorder import LinkRecorder
 from gateway.record.tape import DiskBudget, read_size

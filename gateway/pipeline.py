@@ -19,7 +19,7 @@ from gateway.forwarding.forward import FrameForwarder
 from gateway.links.link import QUEUE, Batch, Endpoint, wall
 from gateway.onboard import RequestSender
 from gateway.onboard.cache import Cache
-from gateway.onboard.rates import budget_of
+from gateway.onboard.questions import budget_of
 from gateway.publication.publish import Publisher
 from gateway.record.recorder import LinkRecorder, RecordedQueue
 from gateway.status.status_table import StatisticsCollector

@@ -12,7 +12,7 @@ from fleet.simulator.flight.mavlink_messages import DIALECTS
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
 from gateway.onboard import RequestSender
 from gateway.onboard.cache import Cache
-from gateway.onboard.rates import MIN_SHARE, WANTED_BYTES_S, WANTED_HZ, budget_of
+from gateway.onboard.questions import MIN_SHARE, WANTED_BYTES_S, WANTED_HZ, budget_of
 from gateway.settings.link_spec import read_spec
 
 VALUES = {"NAVL1_PERIOD": 17.0, "STAT_RUNTIME": 1.0, **{f"P{k:03d}": k / 7 for k in range(300)}}

@@ -8,8 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from fleet.contract import Link
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
 from gateway.onboard.cache import Cache
-from gateway.onboard.questions import RequestScheduler
-from gateway.onboard.rates import RateShare
+from gateway.onboard.questions import RateShare, RequestScheduler
 
 # Other ground stations use 255: they must not receive our answers, and an aircraft must detect the loss of theirs.
 SYSTEM, COMPONENT = 254, dialect.MAV_COMP_ID_MISSIONPLANNER
