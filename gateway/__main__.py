@@ -26,7 +26,7 @@ from gateway.links.isolated_replay import replay_process, split_replays
 from gateway.links.link import Endpoint
 from gateway.links.opening import open_link
 from gateway.links.recorded import ReplayLink
-from gateway.onboard.cache import Cache
+from gateway.onboard.parameter_cache_check import Cache
 from gateway.onboard.questions import DEFAULT_BUDGET
 from gateway.pipeline import Pipeline
 from gateway.record.recorder import LinkRecorder

@@ -18,7 +18,7 @@ from gateway.admission.admission import Admission, make_admissions
 from gateway.forwarding.forward import FrameForwarder
 from gateway.links.link import QUEUE, Batch, Endpoint, wall
 from gateway.onboard import RequestSender
-from gateway.onboard.cache import Cache
+from gateway.onboard.parameter_cache_check import Cache
 from gateway.onboard.questions import budget_of
 from gateway.publication.publish import Publisher
 from gateway.record.recorder import LinkRecorder, RecordedQueue

@@ -11,7 +11,7 @@ from fleet.simulator.flight.mavlink import MavlinkEndpoint
 from fleet.simulator.flight.mavlink_messages import DIALECTS
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
 from gateway.onboard import RequestSender
-from gateway.onboard.cache import Cache
+from gateway.onboard.parameter_cache_check import Cache
 from gateway.onboard.questions import MIN_SHARE, WANTED_BYTES_S, WANTED_HZ, budget_of
 from gateway.settings.link_spec import read_spec
 

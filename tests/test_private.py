@@ -13,7 +13,7 @@ from fleet.access.papers import check_private as secret
 from fleet.blind_test.seal import consume_key, encrypt
 from fleet.health import machine
 from fleet.process import private_files
-from gateway.onboard.cache import Cache, CachedAircraft
+from gateway.onboard.parameter_cache_check import Cache, CachedAircraft
 from tests.bench.security import planted
 
 CACHES = ("NUMBA_CACHE_DIR", "PARAUAV_CACHE", "XDG_CACHE_HOME", "HOME", "TMPDIR")

@@ -7,7 +7,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from fleet.contract import Link
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
-from gateway.onboard.cache import Cache
+from gateway.onboard.parameter_cache_check import Cache
 from gateway.onboard.questions import RateShare, RequestScheduler
 
 # Other ground stations use 255: they must not receive our answers, and an aircraft must detect the loss of theirs.

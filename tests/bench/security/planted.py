@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from gateway.onboard.cache import Cache, CachedAircraft
+from gateway.onboard.parameter_cache_check import Cache, CachedAircraft
 
 ROOT = Path(__file__).resolve().parents[3]
 _PROGRAM = """
