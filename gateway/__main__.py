@@ -22,10 +22,9 @@ from fleet.telemetry.mavlink.intake import MAX_UAVS
 from fleet.telemetry.mavlink.warm import warm_up
 from fleet.telemetry.recording.ids import IdAllocator
 from gateway.admission.admission import make_admissions
-from gateway.links.isolated_replay import replay_process, split_replays
 from gateway.links.link import Endpoint
 from gateway.links.opening import open_link
-from gateway.links.recorded import ReplayLink
+from gateway.links.recorded import ReplayLink, replay_process, split_replays
 from gateway.onboard.parameter_cache_check import Cache
 from gateway.onboard.questions import DEFAULT_BUDGET
 from gateway.pipeline import Pipeline

@@ -1,14 +1,21 @@
 """Recording as a link: replayed in real time, faster, or as fast as possible, optionally with copies of aircraft."""
 
+import argparse
 import contextlib
 import itertools
 import logging
+import os
 import queue
+import subprocess
+import sys
 import threading
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
+from fleet.config import router_options
 from fleet.contract import FleetState
+from fleet.process.children import PARENT
 from fleet.telemetry.mavlink.steps import STEP_S
 from fleet.telemetry.recording.fleet_news import renumbered
 from fleet.telemetry.recording.ids import IdAllocator
@@ -161,3 +168,58 @@ def _put(out: "queue.Queue[Batch]", batch: Batch, stop: threading.Event, max_que
             continue
         with contextlib.suppress(queue.Full):
             return out.put(batch, timeout=POLL_S)
+
+
+LogCallback = Callable[[str], None]
+Process = subprocess.Popen[bytes]
+
+_STOP_TIMEOUT_S = 8.0  # between the request to terminate and the kill [s]
+
+
+def split_replays(specs: Sequence[LinkSpec]) -> tuple[list[LinkSpec], list[LinkSpec]]:
+    """Return the links to open here, and the recordings to replay separately: all, if there is a live link."""
+    files = [spec for spec in specs if spec.kind == "replay"]
+    live = [spec for spec in specs if spec.kind != "replay"]
+    return (live, files) if live else (files, [])
+
+
+@contextmanager
+def replay_process(
+    files: Sequence[LinkSpec], args: argparse.Namespace, report: LogCallback
+) -> Iterator[Process | None]:
+    """Replay recordings in a separate process until they or the block end.
+
+    Args:
+        files: the recordings; none: no process
+        args: arguments of this gateway; those of the router and the limits are passed on
+        report: called with a message if the process fails
+    """
+    if not files:
+        yield None
+        return
+    options = [f"--link={spec.text.partition('#')[0]}#offset={spec.offset}" for spec in files]
+    options += [*router_options(args), "--listen-only", f"--most-uavs={args.most_uavs}"]
+    options += ["--log-json"] if args.log_json else []
+    command = [sys.executable, "-m", "gateway", *options]
+    child = subprocess.Popen(command, stdin=subprocess.DEVNULL, env=os.environ | {PARENT: str(os.getpid())})
+    ended = threading.Event()
+    watcher = threading.Thread(target=_report_exit, args=(child, ended, report), daemon=True)
+    watcher.start()
+    try:
+        yield child
+    finally:
+        ended.set()
+        if child.poll() is None:
+            child.terminate()
+        try:
+            child.wait(_STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+        watcher.join()
+
+
+def _report_exit(child: Process, ended: threading.Event, report: LogCallback) -> None:
+    code = child.wait()
+    if code and not ended.is_set():
+        report(f"the replay of recordings ended with exit code {code}; the live links continue")
