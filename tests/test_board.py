@@ -17,7 +17,7 @@ from test_gateway import PATIENCE_S, Ear
 from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import GatewayCounters, Status
 from fleet.metrics import serve, with_unit
-from gateway.links.udp import Udp
+from gateway.links.receive import Udp
 from gateway.pipeline import Pipeline
 from gateway.record.recorder import LinkRecorder
 from gateway.record.tape import DiskBudget

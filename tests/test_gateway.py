@@ -20,8 +20,8 @@ from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
 from fleet.telemetry.recording.recordings import replay_messages
 from gateway.__main__ import compile_decoder
 from gateway.links.link import Batch
+from gateway.links.receive import Udp
 from gateway.links.recorded import ReplayLink
-from gateway.links.udp import Udp
 from gateway.pipeline import Pipeline
 from gateway.settings.link_spec import read_spec
 

@@ -2,10 +2,10 @@
 
 from fleet.telemetry.recording.ids import IdAllocator
 from gateway.links.link import Endpoint
+from gateway.links.receive import Udp
 from gateway.links.recorded import ReplayLink
 from gateway.links.stream import StreamClient
 from gateway.links.tcp_listener import TcpListener
-from gateway.links.udp import Udp
 from gateway.settings.link_spec import LinkSpec
 
 
