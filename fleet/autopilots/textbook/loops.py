@@ -12,8 +12,8 @@ from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.common import controller_state as S
 from fleet.autopilots.common.kernels import array_kernel, clip, kernel
 from fleet.autopilots.textbook import params as P
+from fleet.autopilots.textbook import params as X
 from fleet.autopilots.textbook import path
-from fleet.autopilots.textbook import state as X
 from fleet.frames import G, wrap
 from fleet.mission import VA_C
 

@@ -55,3 +55,8 @@ def parameters(values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np
     resolved = [row.default if value is None else value for row, value in zip(TABLE, matches, strict=True)]
     absent = tuple(row.name for row, value in zip(TABLE, matches, strict=True) if value is None)
     return padded(np.array([*resolved, eas2tas(altitude_m)], float), TEXTBOOK), absent
+
+
+C_N, C_E, FILLET_SIDE = 12, 13, 22  # centre of the fillet, NED [m]; 1 right turn, -1 left turn, 0 no fillet
+I_CHI, I_H, I_V = 32, 33, 34  # integrators [rad, rad, 0..1]
+I_A, I_E = 43, 44  # surface deflections at trim, 1 = full throw

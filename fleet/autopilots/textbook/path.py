@@ -11,7 +11,7 @@ from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.common import controller_state as S
 from fleet.autopilots.common.kernels import clip, kernel
 from fleet.autopilots.textbook import params as P
-from fleet.autopilots.textbook import state as X
+from fleet.autopilots.textbook import params as X
 from fleet.frames import G, wrap
 from fleet.mission import KIND, LAND, LOITER_UNLIMITED, P_D, P_E, P_N, RADIUS, TAKEOFF, WAYPOINT
 
