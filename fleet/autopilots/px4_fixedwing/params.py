@@ -113,3 +113,12 @@ def parameters(values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np
             values_si[list(group)] = [TABLE[i].default * TABLE[i].factor for i in group]
             absent += [TABLE[i].name for i in group]
     return padded(np.append(values_si, eas2tas(altitude_m)), PX4), tuple(dict.fromkeys(absent))
+
+
+MIN_DISTANCE = 10  # minimum distance to the waypoint so far, -1 before [m]
+PHI = 12  # roll demand, slew-limited [rad]
+H_REF, H_DOT_REF = 25, 26  # height reference, up positive [m], and its rate [m/s]
+STE_DOT = 31  # filtered total energy rate [m2/s3]
+I_THETA = 33  # pitch integrator [rad]
+I_R = 45  # yaw rate integrator, 1 = full throw
+S_R, S_A, S_E = 46, 49, 50  # last surfaces before the limit, 1 = full throw

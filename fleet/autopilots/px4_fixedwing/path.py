@@ -13,7 +13,7 @@ from fleet.autopilots.common import controller_state as S
 from fleet.autopilots.common.kernels import angle_to, clip, kernel
 from fleet.autopilots.px4_fixedwing import npfg
 from fleet.autopilots.px4_fixedwing import params as P
-from fleet.autopilots.px4_fixedwing import state as X
+from fleet.autopilots.px4_fixedwing import params as X
 from fleet.frames import wrap
 from fleet.mission import ACCEPT_RADIUS, KIND, LAND, LOITER_UNLIMITED, P_D, P_E, P_N, RADIUS, TAKEOFF, WAYPOINT
 

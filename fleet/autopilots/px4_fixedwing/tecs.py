@@ -15,7 +15,7 @@ from fleet.autopilots.arduplane.demand import MIN_FILTERED_SPEED
 from fleet.autopilots.common import controller_state as S
 from fleet.autopilots.common.kernels import clip, kernel
 from fleet.autopilots.px4_fixedwing import params as P
-from fleet.autopilots.px4_fixedwing import state as X
+from fleet.autopilots.px4_fixedwing import params as X
 from fleet.frames import G
 
 _MARGIN = 0.15  # fraction of cruise: underspeed starts one margin below minimum speed, and is full at two [-]
