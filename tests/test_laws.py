@@ -11,7 +11,7 @@ from point_mass import HERE, PLANE, TRIM_ALPHA, Plane, begin, fly, leg, route
 from fleet import mission as m
 from fleet.autopilots import arduplane, laws
 from fleet.autopilots.common import controller_state as S
-from fleet.autopilots.common import parameter_vector
+from fleet.autopilots.common import controller_state as parameter_vector
 from fleet.autopilots.px4_fixedwing import npfg
 from fleet.autopilots.px4_fixedwing import params as P
 from fleet.autopilots.shadow import replay_controller

@@ -3,6 +3,8 @@
 The elements below N_LEG belong to the current leg; the replay resets them separately.
 """
 
+import numpy as np
+
 # the leg
 LEG = 0  # index of the current leg
 PREV_N, PREV_E, PREV_D = 1, 2, 3  # start of its line, NED [m]
@@ -37,3 +39,19 @@ I_A, I_E = 43, 44  # integrators [rad of surface]
 E_A, E_E, D_A, D_E = 45, 46, 47, 48  # last errors [rad/s], filtered derivatives [rad/s2]
 S_A, S_E = 49, 50  # last surfaces before the limit, 1 = full throw
 N_CTL = 51
+
+
+N_PAR = 72  # length of every parameter vector
+W_N, W_E = -3, -2  # wind estimate of the autopilot, NED, direction it blows to [m/s]
+LAW = -1  # code of the law, one of the three below
+ARDUPLANE, PX4, TEXTBOOK = 0.0, -1.0, -2.0
+
+__all__ = ["ARDUPLANE", "LAW", "N_CTL", "N_PAR", "PX4", "TEXTBOOK", "W_E", "W_N", "padded"]
+
+
+def padded(law_parameters: np.ndarray, law: float) -> np.ndarray:
+    """Pad the parameters of a law (k,) to a parameter vector without wind, (N_PAR,)."""
+    par = np.zeros(N_PAR)
+    par[: len(law_parameters)] = law_parameters
+    par[LAW] = law
+    return par

@@ -12,8 +12,8 @@ from math import atan, cos, hypot, pi, sin, sqrt
 
 import numpy as np
 
+from fleet.autopilots.common.controller_state import W_E, W_N
 from fleet.autopilots.common.kernels import angle_to, clip, kernel
-from fleet.autopilots.common.parameter_vector import W_E, W_N
 from fleet.autopilots.px4_fixedwing import params as P
 from fleet.frames import G
 

@@ -8,7 +8,7 @@ from math import radians
 
 import numpy as np
 
-from fleet.autopilots.common.parameter_vector import PX4, padded
+from fleet.autopilots.common.controller_state import PX4, padded
 from fleet.autopilots.common.parameters import ParameterSpec, eas2tas, lookup
 
 _DEG = radians(1.0)

@@ -8,7 +8,7 @@ from math import pi
 
 import numpy as np
 
-from fleet.autopilots.common.parameter_vector import TEXTBOOK, padded
+from fleet.autopilots.common.controller_state import TEXTBOOK, padded
 from fleet.autopilots.common.parameters import ParameterSpec, eas2tas, lookup
 
 TABLE = (
