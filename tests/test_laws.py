@@ -12,8 +12,8 @@ from fleet import mission as m
 from fleet.autopilots import arduplane, laws
 from fleet.autopilots.common import controller_state as S
 from fleet.autopilots.common import controller_state as parameter_vector
-from fleet.autopilots.px4_fixedwing import npfg
 from fleet.autopilots.px4_fixedwing import params as P
+from fleet.autopilots.px4_fixedwing import path as npfg
 from fleet.autopilots.shadow import replay_controller
 from fleet.autopilots.textbook import params as T
 from fleet.frames import G

@@ -8,9 +8,10 @@ from fleet.autopilots.arduplane import demand
 from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.common import controller_state as S
 from fleet.autopilots.common.kernels import array_kernel, clip, kernel
-from fleet.autopilots.px4_fixedwing import npfg, path, tecs
 from fleet.autopilots.px4_fixedwing import params as P
 from fleet.autopilots.px4_fixedwing import params as X
+from fleet.autopilots.px4_fixedwing import path, tecs
+from fleet.autopilots.px4_fixedwing import path as npfg
 from fleet.frames import G
 from fleet.mission import VA_C
 
