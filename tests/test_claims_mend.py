@@ -11,9 +11,9 @@ import msgspec
 import pytest
 
 import fleet
+from fleet.bus.bus_protocol import WorkerToken
 from fleet.bus.codec import encode
 from fleet.bus.memory_bus import MemoryBus
-from fleet.bus.presence import WorkerToken
 from fleet.contract import Claim, Handover, HandoverRequest, History, Message, Sample, Status
 from twin_worker.ownership.protocol import OwnershipProtocol
 from twin_worker.ownership.twin_store import INBOX_SIZE, query_history

@@ -1,9 +1,10 @@
 """Interface of a bus: keys, publish, subscribe, queries, liveliness, and the selection among several replies."""
 
+import re
 from collections.abc import Callable, Collection, Container, Iterable, Iterator
 from contextlib import AbstractContextManager
 from functools import lru_cache
-from typing import Any, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 from fleet.access.roles import ROOT
 from fleet.bus.codec import EncodedMessage, Stamp, is_plausible_epoch
@@ -152,3 +153,34 @@ def _rank(message: Any, stamp: Stamp | None) -> tuple[Stamp, float]:
 def replies_about(uav: int | None, replies: Replies) -> Replies:
     """Filter replies lazily by UAV id; None keeps all."""
     return ((m, stamp) for m, stamp in replies if uav is None or getattr(m, "uav", uav) == uav)
+
+
+_TOKEN_PATTERN = re.compile(r"worker/([0-9a-f]{16})/(\d{1,9})-(\d{1,9})/(\d{1,18})", re.ASCII)
+
+
+class WorkerToken(NamedTuple):
+    """Parsed liveliness token of a worker.
+
+    Attributes:
+        worker: its id on the bus, 16 hex digits
+        ids: UAV ids it may own
+        started_ms: start time, distinguishes it from an earlier incarnation [ms since 1970]
+    """
+
+    worker: str
+    ids: range
+    started_ms: int
+
+    @property
+    def token(self) -> str:
+        """Return the text of the token."""
+        return f"worker/{self.worker}/{self.ids.start}-{self.ids.stop - 1}/{self.started_ms}"
+
+
+def parse_token(token: str) -> WorkerToken | None:
+    """Parse a token; None where it is not a worker's."""
+    match = _TOKEN_PATTERN.fullmatch(token)
+    if match is None:
+        return None
+    worker, low, high, started = match.groups()
+    return WorkerToken(worker, range(int(low), int(high) + 1), int(started))

@@ -6,8 +6,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 
 from fleet import SOURCES
-from fleet.bus.bus_protocol import Bus
-from fleet.bus.presence import parse_token
+from fleet.bus.bus_protocol import Bus, parse_token
 from fleet.contract import Claim, GatewayCounters, Status
 from fleet.health.finding import BAD, NOTE, OK, CheckResult
 from fleet.report.report_text import id_ranges
