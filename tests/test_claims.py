@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from fleet.bus.bus_protocol import WRITER_TIMEOUT_S, EpochFence
 from fleet.bus.codec import Stamp
-from fleet.bus.epoch_fence import WRITER_TIMEOUT_S, EpochFence
 from tests.bench.security import forged
 from twin_worker.ownership.protocol_state import (
     CLAIM_DELAY_S,

@@ -12,8 +12,8 @@ from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
+from fleet.bus.bus_protocol import WRITER_TIMEOUT_S, EpochFence
 from fleet.bus.codec import Stamp
-from fleet.bus.epoch_fence import WRITER_TIMEOUT_S, EpochFence
 from twin_worker.ownership.protocol_state import CLAIM_DELAY_S, PAUSE_S, SILENT_S, FencingToken, OwnershipState, owners
 
 UAVS = range(5)

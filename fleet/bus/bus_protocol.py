@@ -1,6 +1,7 @@
 """Interface of a bus: keys, publish, subscribe, queries, liveliness, and the selection among several replies."""
 
 import re
+import time
 from collections.abc import Callable, Collection, Container, Iterable, Iterator
 from contextlib import AbstractContextManager
 from functools import lru_cache
@@ -184,3 +185,36 @@ def parse_token(token: str) -> WorkerToken | None:
         return None
     worker, low, high, started = match.groups()
     return WorkerToken(worker, range(int(low), int(high) + 1), int(started))
+
+
+WRITER_TIMEOUT_S = (
+    10.0  # a writer silent for this long loses its claim: a lower one (a restarted fleet) is accepted [s]
+)
+
+
+class _AcceptedWriter(NamedTuple):
+    rank: Stamp
+    received_t: float
+
+
+class EpochFence:
+    """Accepted writer by UAV id; hides the brief double writing during a handover.
+
+    Args:
+        clock: any monotonic clock [s]
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._by_uav: dict[int, _AcceptedWriter] = {}
+
+    def accepts(self, uav: int, stamp: Stamp | None) -> bool:
+        """Return whether a result is accepted: no writer with a higher plausible claim wrote recently."""
+        rank, now = stamp or Stamp(0, 0), self._clock()
+        if not is_plausible_epoch(rank.epoch):
+            return False
+        current = self._by_uav.get(uav)
+        if current is not None and rank < current.rank and now - current.received_t < WRITER_TIMEOUT_S:
+            return False
+        self._by_uav[uav] = _AcceptedWriter(rank, now)
+        return True

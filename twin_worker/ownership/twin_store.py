@@ -13,9 +13,8 @@ from typing import Protocol
 import msgspec
 
 import fleet
-from fleet.bus.bus_protocol import Bus
+from fleet.bus.bus_protocol import Bus, EpochFence
 from fleet.bus.codec import EncodedMessage, Stamp
-from fleet.bus.epoch_fence import EpochFence
 from fleet.contract import (
     Handover,
     History,

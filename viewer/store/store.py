@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from fleet.bus.bus_protocol import Bus, RawMessage, key_of
+from fleet.bus.bus_protocol import WRITER_TIMEOUT_S, Bus, EpochFence, RawMessage, key_of
 from fleet.bus.codec import Stamp, decode_for_key, encoding
-from fleet.bus.epoch_fence import WRITER_TIMEOUT_S, EpochFence
 from fleet.contract import (
     Alert,
     AlertKind,

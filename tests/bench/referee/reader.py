@@ -7,9 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.bus.bus_protocol import Bus
+from fleet.bus.bus_protocol import Bus, EpochFence
 from fleet.bus.codec import Stamp
-from fleet.bus.epoch_fence import EpochFence
 from fleet.contract import Claim, FleetState, Model, Prediction
 
 

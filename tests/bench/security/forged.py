@@ -2,9 +2,8 @@
 
 import time
 
-from fleet.bus.bus_protocol import select_latest
+from fleet.bus.bus_protocol import EpochFence, select_latest
 from fleet.bus.codec import Stamp, is_plausible_epoch
-from fleet.bus.epoch_fence import EpochFence
 from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Claim, Handover, Status
 from twin_worker.ownership.protocol import OwnershipProtocol
