@@ -16,7 +16,7 @@ from fleet.simulator.vehicle.missions import (
     StartState,
     mission_item,
 )
-from fleet.simulator.vehicle.situation import Pilot
+from fleet.simulator.vehicle.types import Pilot
 
 EXAM_HOME = Origin(536_500_000, 80_500_000, 5_000)  # marshland by the sea [1e-7 deg, 1e-7 deg, mm]
 """Near sea level: the turbulence of JSBSim scales with the wind at 20 ft only below 1000 ft above sea level."""

@@ -10,8 +10,7 @@ from fleet.simulator.conceal.paths import EXAM_HOME, draw_exam_mission, multisin
 from fleet.simulator.faults.fault import Fault
 from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.altered import instrumented_type
-from fleet.simulator.vehicle.situation import FlightSetup, Weather
-from fleet.simulator.vehicle.types import AircraftType
+from fleet.simulator.vehicle.types import AircraftType, FlightSetup, Weather
 
 SETTLE_S = 20.0  # simulated before the recording starts
 NOMINAL_S, EXAMINED_S = 210.0, 200.0

@@ -21,8 +21,7 @@ from fleet.simulator.vehicle.altered import instrumented_type
 from fleet.simulator.vehicle.jsbsim import Aircraft, Gusts
 from fleet.simulator.vehicle.missions import HOME, StartState, draw_mission
 from fleet.simulator.vehicle.sensors import AltitudeSensors, Estimate, Sensors, Servos, WindEstimator
-from fleet.simulator.vehicle.situation import FlightSetup, Weather
-from fleet.simulator.vehicle.types import TYPES
+from fleet.simulator.vehicle.types import TYPES, FlightSetup, Weather
 
 DT = 1 / TICK_HZ
 _INNER, _OUTER = 2, 10  # attitude loop at 50 Hz, guidance at 10 Hz [ticks]
