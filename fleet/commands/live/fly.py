@@ -10,7 +10,7 @@ from fleet.cli import id_range, stop_on_signal
 from fleet.process.logs import report_status
 
 if TYPE_CHECKING:
-    from fleet.simulator.faults.fault import Fault
+    from fleet.simulator.faults.physics import Fault
     from fleet.simulator.flight.uav import SimulatedUav
 
 EXAMPLES = """

@@ -9,9 +9,8 @@ import numpy as np
 from fleet.simulator.conceal.plan import PlannedFlight
 from fleet.simulator.conceal.record import ExamFlightLog, fly
 from fleet.simulator.faults.carried import FaultSet
-from fleet.simulator.faults.fault import Fault
 from fleet.simulator.faults.oddities import UNCATALOGUED
-from fleet.simulator.faults.physics import PHYSICS_FAULTS, WIND_FAULTS
+from fleet.simulator.faults.physics import PHYSICS_FAULTS, WIND_FAULTS, Fault
 from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.jsbsim import DT
 

@@ -17,8 +17,7 @@ from fleet.simulator.conceal.effects import HIDDEN, UNKNOWN, reported_values
 from fleet.simulator.conceal.paths import EXAM_HOME
 from fleet.simulator.conceal.plan import NOMINAL_EXCITATION, FlightJob, PlannedFlight, baseline_type, draw_flight
 from fleet.simulator.conceal.record import ExamFlightLog, fly, rejection_reason
-from fleet.simulator.faults.fault import Fault
-from fleet.simulator.faults.physics import FaultyPhysics
+from fleet.simulator.faults.physics import Fault, FaultyPhysics
 from fleet.simulator.vehicle.altered import instrumented_type
 from fleet.simulator.vehicle.jsbsim import DT, KG_TO_LB, Aircraft
 from fleet.simulator.vehicle.sensors import pressure_at

@@ -7,7 +7,7 @@ import numpy as np
 
 from fleet.simulator.conceal.effects import HIDDEN, UNKNOWN, HiddenEffect
 from fleet.simulator.conceal.paths import EXAM_HOME, draw_exam_mission, multisine
-from fleet.simulator.faults.fault import Fault
+from fleet.simulator.faults.physics import Fault
 from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.altered import instrumented_type
 from fleet.simulator.vehicle.types import AircraftType, FlightSetup, Weather

@@ -6,9 +6,8 @@ from math import radians
 
 import numpy as np
 
-from fleet.simulator.faults.fault import Fault
 from fleet.simulator.faults.oddities import UNCATALOGUED
-from fleet.simulator.faults.physics import PHYSICS_FAULTS, WIND_FAULTS, FaultyPhysics
+from fleet.simulator.faults.physics import PHYSICS_FAULTS, WIND_FAULTS, Fault, FaultyPhysics
 from fleet.simulator.faults.servos import SERVO_FAULTS, SURFACES, Commands, ServoFault
 from fleet.simulator.vehicle.jsbsim import Aircraft
 from fleet.simulator.vehicle.sensors import Estimate, pressure_at, pressure_height

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from math import inf, isfinite
 from typing import NamedTuple
 
-from fleet.simulator.faults.fault import Fault
+from fleet.simulator.faults.physics import Fault
 from fleet.simulator.faults.servos import SURFACES
 
 

@@ -13,7 +13,7 @@ from fleet.autopilots.common.controller_state import W_E, W_N
 from fleet.contract import Item
 from fleet.frames import G, Origin, to_geodetic
 from fleet.simulator.faults.carried import FaultSet
-from fleet.simulator.faults.fault import Fault
+from fleet.simulator.faults.physics import Fault
 from fleet.simulator.flight.mavlink import MAX_AIRCRAFT, TICK_HZ, MavlinkEndpoint, MavlinkGroundStation
 from fleet.simulator.flight.mavlink_messages import DIALECTS, ONBOARD_DIALECT, TelemetryState
 from fleet.simulator.flight.tuning import tuned_parameters
