@@ -11,7 +11,7 @@ from fleet.simulator.conceal.effects import SERVO_LAG_S, reported_values
 from fleet.simulator.conceal.paths import EXAM_HOME
 from fleet.simulator.conceal.plan import baseline_type
 from fleet.simulator.faults.carried import SENSOR_FAULTS
-from fleet.simulator.faults.kinds import KINDS, parse_fault
+from fleet.simulator.faults.oddities import KINDS, parse_fault
 from fleet.simulator.faults.physics import Fault, FaultyPhysics
 from fleet.simulator.faults.servos import SERVO_FAULTS
 from fleet.simulator.vehicle.altered import instrumented_type

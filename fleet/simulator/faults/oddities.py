@@ -4,11 +4,13 @@ They are not available on the command line; only a blind test uses them.
 """
 
 from collections.abc import Mapping
-from math import exp, pi, sin
+from math import exp, inf, isfinite, pi, sin
+from typing import NamedTuple
 
 import numpy as np
 
-from fleet.simulator.faults.servos import Commands
+from fleet.simulator.faults.physics import Fault
+from fleet.simulator.faults.servos import SURFACES, Commands
 from fleet.simulator.vehicle.jsbsim import DT, Aircraft
 from fleet.simulator.vehicle.sensors import Estimate
 from fleet.simulator.vehicle.weather import FT
@@ -126,3 +128,101 @@ UNCATALOGUED: dict[str, type[UncataloguedFault]] = {
     "_gyro_scale": _GyroScale,
     "_pitot_lag": _PitotLag,
 }
+
+
+class ParameterRange(NamedTuple):
+    """Range of a parameter."""
+
+    low: float
+    high: float
+    required: bool = True
+
+
+class FaultKind(NamedTuple):
+    """One kind of fault."""
+
+    values: Mapping[str, ParameterRange]
+    parts: tuple[str, ...] = ()  # surfaces or axes; one is required
+    transient: bool = False  # has an end
+    aircraft: tuple[str, ...] = ("small", "c172p")
+
+
+_ANGLE = ParameterRange(-15.0, 15.0, required=False)
+_SPEED, _FROM = ParameterRange(0.0, 20.0), ParameterRange(-360.0, 360.0)
+_CESSNA = ("c172p",)
+
+KINDS: dict[str, FaultKind] = {
+    "actuator_lag": FaultKind({"tau_s": ParameterRange(0.0, 2.0)}, SURFACES),
+    "actuator_delay": FaultKind({"delay_s": ParameterRange(0.0, 1.0)}, SURFACES),
+    "actuator_rate_limit": FaultKind({"rate_per_s": ParameterRange(0.01, 50.0)}, SURFACES),
+    "actuator_deadband": FaultKind({"half_width": ParameterRange(0.0, 0.5)}, SURFACES),
+    "actuator_saturation": FaultKind({"limit": ParameterRange(0.0, 1.0)}, SURFACES),
+    "actuator_offset": FaultKind({"offset": ParameterRange(-0.6, 0.6)}, SURFACES),
+    "actuator_stuck": FaultKind({"position": ParameterRange(-1.0, 1.0, required=False)}, SURFACES),
+    "control_effectiveness_loss": FaultKind({"loss": ParameterRange(0.0, 1.0)}, SURFACES),
+    "airspeed_scale": FaultKind({"scale": ParameterRange(0.3, 2.0)}),
+    "airspeed_bias": FaultKind({"bias_mps": ParameterRange(-15.0, 15.0)}),
+    "gps_latency": FaultKind({"latency_s": ParameterRange(0.0, 2.0)}),
+    "imu_misalignment": FaultKind({"roll_deg": _ANGLE, "pitch_deg": _ANGLE, "yaw_deg": _ANGLE}),
+    "gyro_bias": FaultKind({"bias_dps": ParameterRange(-15.0, 15.0)}, ("p", "q", "r")),
+    "accel_bias": FaultKind({"bias_mps2": ParameterRange(-5.0, 5.0)}, ("x", "y", "z")),
+    "heading_bias": FaultKind({"bias_deg": ParameterRange(-60.0, 60.0)}),
+    "baro_bias": FaultKind({"bias_m": ParameterRange(-100.0, 100.0)}),
+    "wind_steady": FaultKind({"speed_mps": _SPEED, "from_deg": _FROM}),
+    "wind_shear": FaultKind({"mps_per_100m": _SPEED, "from_deg": _FROM}),
+    "gust_discrete": FaultKind({"speed_mps": _SPEED, "from_deg": _FROM}, transient=True),
+    "updraft": FaultKind({"speed_mps": ParameterRange(-15.0, 15.0)}, transient=True),
+    "turbulence": FaultKind({"w20_mps": ParameterRange(0.0, 25.0)}),
+    "air_density": FaultKind({"density_ratio": ParameterRange(0.6, 1.3)}),
+    "thrust_loss": FaultKind({"fraction": ParameterRange(0.0, 1.0)}),
+    "drag_increase": FaultKind({"dCD": ParameterRange(-0.02, 0.2)}),
+    "icing": FaultKind({"lift_loss": ParameterRange(0.0, 0.5), "dCD": ParameterRange(0.0, 0.2)}),
+    "flap_deployed": FaultKind({"flap_deg": ParameterRange(0.0, 30.0)}, aircraft=_CESSNA),
+    "mass_change": FaultKind({"dmass_kg": ParameterRange(-200.0, 200.0)}),
+    "cg_shift": FaultKind({"dx_m": ParameterRange(-0.3, 0.3)}),
+    "prop_torque": FaultKind({"sense": ParameterRange(-1.0, 1.0)}, aircraft=_CESSNA),
+    "p_factor": FaultKind({"inches_per_rad": ParameterRange(-300.0, 300.0)}, aircraft=_CESSNA),
+    "slipstream_tail": FaultKind({"share": ParameterRange(0.0, 3.0)}, aircraft=_CESSNA),
+}
+_TIMES = {"at": ParameterRange(0.0, 1e6), "ramp": ParameterRange(0.0, 1e4), "for": ParameterRange(0.5, 1e4)}  # [s]
+
+
+def parse_fault(text: str, aircraft: str) -> Fault:
+    """Parse NAME[:part],key=value,… with at=, ramp= and, for transients, for= in seconds.
+
+    Raises:
+        ValueError: when the text is no fault of this aircraft.
+    """
+    head, *pairs = text.split(",")
+    name, _, part = head.partition(":")
+    kind = KINDS.get(name)
+    if kind is None:
+        raise ValueError(f"fault: found {name!r}, expected one of {', '.join(KINDS)}; choose one")
+    if aircraft not in kind.aircraft:
+        raise ValueError(f"fault {name}: found aircraft {aircraft!r}, expected {' or '.join(kind.aircraft)}; use it")
+    if part not in (kind.parts or ("",)):
+        expected = f"one of {', '.join(kind.parts)} after a colon" if kind.parts else "nothing after its name"
+        raise ValueError(f"fault {name}: found {part or 'no part'!r}, expected {expected}; correct it")
+    values = dict(_parse_pair(name, pair, kind) for pair in pairs)
+    missing = [key for key, wanted in kind.values.items() if wanted.required and key not in values]
+    missing += ["for"] if kind.transient and "for" not in values else []
+    if missing:
+        raise ValueError(f"fault {name}: found no {missing[0]}, expected {missing[0]}=NUMBER; add it")
+    times = {key: values.pop(key, 0.0) for key in _TIMES}
+    t1 = times["at"] + times["for"] if kind.transient else inf
+    return Fault(name, part, values, times["at"], times["ramp"], t1)
+
+
+def _parse_pair(name: str, text: str, kind: FaultKind) -> tuple[str, float]:
+    key, _, value = text.partition("=")
+    ranges = {**kind.values, **{k: v for k, v in _TIMES.items() if k != "for" or kind.transient}}
+    if key not in ranges:
+        raise ValueError(f"fault {name}: found {key!r}, expected {', '.join(ranges)}; correct it")
+    try:
+        number = float(value)
+    except ValueError:
+        number = inf
+    low, high, _ = ranges[key]
+    if not isfinite(number) or not low <= number <= high:
+        raise ValueError(f"fault {name}: found {key}={value}, expected a number {low:g}..{high:g}; correct it")
+    return key, number
