@@ -18,7 +18,7 @@ from talker import ARDU, PLANE, T0, Talker, of
 
 from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Alert, AlertKind, GatewayCounters, Status
-from fleet.telemetry.mavlink.collision import CLEAR_AFTER_S
+from fleet.telemetry.mavlink.heartbeat import CLEAR_AFTER_S
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
 from fleet.telemetry.recording.ids import IdAllocator
 from gateway.links.opening import open_link

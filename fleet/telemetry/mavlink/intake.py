@@ -14,8 +14,7 @@ from fleet.telemetry.mavlink.aircraft_link import LINK_LOST_S, AircraftLink
 from fleet.telemetry.mavlink.arrays.counts import LAST_ARRIVAL
 from fleet.telemetry.mavlink.arrays.fleet_arrays import AircraftArrays
 from fleet.telemetry.mavlink.batch import process_table_rows
-from fleet.telemetry.mavlink.collision import SenderConflict
-from fleet.telemetry.mavlink.heartbeat import is_aircraft
+from fleet.telemetry.mavlink.heartbeat import SenderConflict, is_aircraft
 from fleet.telemetry.mavlink.microservices.route import MISSION_MESSAGES
 from fleet.telemetry.mavlink.parsing.decode import (
     IDS,
