@@ -13,7 +13,7 @@ from fleet.frames import Origin
 from fleet.mission import GLOBAL_FRAMES
 from fleet.telemetry.mavlink.steps import STEP_S
 from fleet.telemetry.recording.fleet_news import with_uav
-from fleet.telemetry.replay.offset import GridOffset
+from fleet.telemetry.replay.rewrite_frames import GridOffset
 
 GROUP_COUNT = 10  # groups of copies delayed by 0, 1, 2 … steps, to spread the load
 _PLACES = ("position", "target")
