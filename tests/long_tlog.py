@@ -13,7 +13,7 @@ from talker import T0, Talker
 
 from fleet.telemetry.mavlink.parsing import scan as s
 from fleet.telemetry.mavlink.parsing.decode import IDS, find_frames, layout
-from fleet.telemetry.replay.rewrite_frames import write_checksums
+from fleet.telemetry.replay.offset_copies import write_checksums
 
 BLOCK_S = 60.0  # flown anew in bytes, then repeated with other times
 TICKS = {"ATTITUDE": ("time_boot_ms", 1), "GLOBAL_POSITION_INT": ("time_boot_ms", 1)}

@@ -25,8 +25,14 @@ from fleet.telemetry.mavlink.intake import MavlinkReceiver
 from fleet.telemetry.mavlink.steps import STEP_S
 from fleet.telemetry.recording.ids import IdAllocator
 from fleet.telemetry.replay.broadcaster import Broadcaster, loopback_address
-from fleet.telemetry.replay.offset_copies import GROUP_COUNT, CopyGroup, MessageTemplate, OffsetCopies
-from fleet.telemetry.replay.rewrite_frames import SPACING_M, GridOffset
+from fleet.telemetry.replay.offset_copies import (
+    GROUP_COUNT,
+    SPACING_M,
+    CopyGroup,
+    GridOffset,
+    MessageTemplate,
+    OffsetCopies,
+)
 from gateway.links.recorded import ReplayLink
 from gateway.pipeline import Pipeline
 from gateway.settings.link_spec import read_spec

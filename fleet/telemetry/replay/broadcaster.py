@@ -20,8 +20,7 @@ from fleet.telemetry.recording.opening import RecordingFile
 from fleet.telemetry.recording.pace import ReplayPace
 from fleet.telemetry.recording.recordings import Recording
 from fleet.telemetry.recording.tlog import Tlog
-from fleet.telemetry.replay.offset_copies import GROUP_COUNT
-from fleet.telemetry.replay.rewrite_frames import FrameBlock, GridOffset, extract_frames, rewrite_frames
+from fleet.telemetry.replay.offset_copies import GROUP_COUNT, FrameBlock, GridOffset, extract_frames, rewrite_frames
 
 MAX_BATCH = 1024  # datagrams per call, the system's limit
 _VECTOR = np.dtype([("base", "u8"), ("size", "u8")])
