@@ -9,8 +9,8 @@ from rich.console import Console
 
 from fleet.report import progress
 from fleet.report.progress import show_progress
-from fleet.telemetry.recording import pace
-from fleet.telemetry.recording.pace import ReplayPace, read_speed
+from fleet.telemetry.recording import opening as pace
+from fleet.telemetry.recording.opening import ReplayPace, read_speed
 
 
 class Half:

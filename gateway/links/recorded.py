@@ -19,7 +19,7 @@ from fleet.process.children import PARENT
 from fleet.telemetry.mavlink.steps import STEP_S
 from fleet.telemetry.recording.fleet_news import renumbered
 from fleet.telemetry.recording.ids import IdAllocator
-from fleet.telemetry.recording.pace import ReplayPace
+from fleet.telemetry.recording.opening import ReplayPace
 from fleet.telemetry.recording.recordings import Recording
 from fleet.telemetry.replay.offset_copies import OffsetCopies
 from gateway.links.link import POLL_S, QUEUE, Batch

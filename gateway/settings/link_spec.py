@@ -8,7 +8,7 @@ import numpy as np
 
 from fleet.telemetry.mavlink.parsing.decode import IDS
 from fleet.telemetry.mavlink.parsing.scan import COMPONENT, ID, SYSTEM
-from fleet.telemetry.recording.pace import read_speed
+from fleet.telemetry.recording.opening import read_speed
 
 COLUMNS = {"messages": ID, "systems": SYSTEM, "components": COMPONENT}
 """Setting of a link -> column of a frame that it tests; the prefix `no-` inverts it."""

@@ -12,7 +12,7 @@ from fleet.process.children import run_until
 from fleet.process.logs import report_progress
 from fleet.report.progress import show_progress
 from fleet.telemetry.recording.ids import IdAllocator
-from fleet.telemetry.recording.pace import read_speed
+from fleet.telemetry.recording.opening import read_speed
 from fleet.telemetry.replay.broadcaster import MAX_PER_LINK, Broadcaster, loopback_address, share_out
 
 EXAMPLES = """

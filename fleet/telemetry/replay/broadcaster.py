@@ -16,8 +16,7 @@ from fleet.telemetry.mavlink.heartbeat import is_aircraft
 from fleet.telemetry.mavlink.parsing.decode import IDS, Frames
 from fleet.telemetry.mavlink.parsing.scan import ID, SYSTEM
 from fleet.telemetry.recording.ids import IdAllocator
-from fleet.telemetry.recording.opening import RecordingFile
-from fleet.telemetry.recording.pace import ReplayPace
+from fleet.telemetry.recording.opening import RecordingFile, ReplayPace
 from fleet.telemetry.recording.recordings import Recording
 from fleet.telemetry.recording.tlog import Tlog
 from fleet.telemetry.replay.offset_copies import GROUP_COUNT, FrameBlock, GridOffset, extract_frames, rewrite_frames
