@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from fleet.blind_test.mark import GradedFlight, ScoredParameter, grade
-from fleet.blind_test.score import REQUIREMENTS, meets_requirement, score
+from fleet.blind_test.mark import REQUIREMENTS, GradedFlight, ScoredParameter, grade, meets_requirement, score
 from fleet.blind_test.seal import consume_key, decrypt, digest, encrypt
 from fleet.blind_test.shown import confusion, misses_first
 from fleet.cli import main as fleet

@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from fleet.blind_test.course import BlindTestConfig, BlindTestResult
-from fleet.blind_test.mark import GradedFlight
-from fleet.blind_test.score import score_rows
+from fleet.blind_test.mark import GradedFlight, score_rows
 from fleet.blind_test.shown import confusion, fit_text, misses_first, parameter_texts
 from fleet.report.html import document, escape_text
 

@@ -10,8 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fleet.blind_test.course import BlindTestConfig, BlindTestResult
-from fleet.blind_test.mark import GradedFlight
-from fleet.blind_test.score import REQUIREMENTS, meets_requirement, score_rows
+from fleet.blind_test.mark import REQUIREMENTS, GradedFlight, meets_requirement, score_rows
 
 
 def as_json_values(config: BlindTestConfig, outcome: BlindTestResult, scores: Mapping[str, Any]) -> dict[str, Any]:

@@ -43,7 +43,7 @@ def _run_test(args: argparse.Namespace, folder: Path) -> int:
 
     from fleet.blind_test import page, shown
     from fleet.blind_test.course import BlindTestConfig, RunAborted, run_blind_test
-    from fleet.blind_test.score import score
+    from fleet.blind_test.mark import score
 
     setup = BlindTestConfig(args.seed, args.flights, folder, args.jobs, write_pages=args.report is not None)
     try:
