@@ -22,7 +22,7 @@ from fleet.bus.session import open_router
 from fleet.commands.live.status import machines, processes
 from fleet.contract import Claim, FleetRow, FleetState, GatewayCounters, LinkCounters, Status, TwinState
 from fleet.health import claims, door, machine
-from fleet.health.finding import BAD, NOTE, OK
+from fleet.health.machine import BAD, NOTE, OK
 from fleet.report.report_text import id_ranges
 from tests.bench.security.bombs import ESCAPES
 from tests.bench.security.site import expired, make_papers, make_passwords

@@ -8,7 +8,7 @@ import pytest
 from fleet import cli
 from fleet.contract import COLUMNS, TOPICS, Prediction, WhatIf
 from fleet.health import machine
-from fleet.health.finding import CheckResult
+from fleet.health.machine import CheckResult
 
 
 def shown(capsys: pytest.CaptureFixture[str], *argv: str) -> str:

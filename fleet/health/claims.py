@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from fleet import SOURCES
 from fleet.bus.bus_protocol import Bus, parse_token
 from fleet.contract import Claim, GatewayCounters, Status
-from fleet.health.finding import BAD, NOTE, OK, CheckResult
+from fleet.health.machine import BAD, NOTE, OK, CheckResult
 from fleet.report.report_text import id_ranges
 
 OFFSET_NOTE_S = 0.2  # a larger clock offset is a note [s]

@@ -12,8 +12,7 @@ from fleet.access.entry import BusConfig, parse_endpoint
 from fleet.access.knock import probe_router
 from fleet.access.papers import check_private, expiry_of, find_certificate
 from fleet.access.roles import ROLES, ROUTER_ROLE
-from fleet.health.finding import BAD, NOTE, OK, CheckResult
-from fleet.health.machine import is_port_free
+from fleet.health.machine import BAD, NOTE, OK, CheckResult, is_port_free
 
 RENEWAL_PERIOD = timedelta(days=14)
 LOOPBACK = ("127.0.0.1", "::1", "localhost")

@@ -7,10 +7,21 @@ import socket
 import sys
 from collections.abc import Collection, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import fleet
-from fleet.health.finding import CheckResult
 from fleet.process import private_files
+
+OK, NOTE, BAD = "ok", "note", "BAD"
+
+
+class CheckResult(NamedTuple):
+    """Grade `ok`, `note` (optional part missing, or future problem) or `BAD` (the fleet cannot run correctly)."""
+
+    grade: str
+    what: str
+    sentence: str
+
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 MAVLINK_PORT = 14550

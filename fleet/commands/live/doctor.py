@@ -15,7 +15,7 @@ from fleet.bus.session import connect
 from fleet.config import bus_config_from, router_arguments
 from fleet.contract import GatewayCounters
 from fleet.health import claims, door, machine
-from fleet.health.finding import BAD, CheckResult
+from fleet.health.machine import BAD, CheckResult
 from fleet.process.sanitise import printable
 
 EXAMPLES = """
