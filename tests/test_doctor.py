@@ -21,7 +21,8 @@ from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import open_router
 from fleet.commands.live.status import machines, processes
 from fleet.contract import Claim, FleetRow, FleetState, GatewayCounters, LinkCounters, Status, TwinState
-from fleet.health import claims, door, machine
+from fleet.health import claims, machine
+from fleet.health import claims as door
 from fleet.health.machine import BAD, NOTE, OK
 from fleet.report.report_text import id_ranges
 from tests.bench.security.bombs import ESCAPES

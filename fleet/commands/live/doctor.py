@@ -14,7 +14,8 @@ from fleet.access.entry import BusConfig
 from fleet.bus.session import connect
 from fleet.config import bus_config_from, router_arguments
 from fleet.contract import GatewayCounters
-from fleet.health import claims, door, machine
+from fleet.health import claims, machine
+from fleet.health import claims as door
 from fleet.health.machine import BAD, CheckResult
 from fleet.process.sanitise import printable
 
