@@ -7,7 +7,7 @@ from typing import Any
 from fleet.blind_test.course import BlindTestConfig, BlindTestResult
 from fleet.blind_test.mark import GradedFlight, score_rows
 from fleet.blind_test.shown import confusion, fit_text, misses_first, parameter_texts
-from fleet.report.html import document, escape_text
+from fleet.report.ink import document, escape_text
 
 _METHOD = (
     "JSBSim simulates every flight. The effects come from its own physics or from faults of servos and sensors that "

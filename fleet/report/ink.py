@@ -1,8 +1,12 @@
 """Colours and lines of the report, matching the light theme of the viewer."""
 
 from collections.abc import Iterable
+from html import escape
+from pathlib import Path
 
 import numpy as np
+
+from fleet.process.sanitise import printable
 
 INK, MUTED, GRID = "#17212E", "#64748B", "#E2E8EF"
 ROUTE, BAD, GOOD = "#7A6BB8", "#B93A00", "#00795A"
@@ -55,3 +59,27 @@ def axis_limits(values: np.ndarray, margin: float = 0.08, min_range: float = 1.0
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     padding = max(margin * (high - low), 0.5 * min_range)
     return low - padding, high + padding
+
+
+_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # no external resources, no scripts
+_COLOURS = {"ink": INK, "muted": MUTED, "line": GRID, "good": GOOD, "bad": BAD, "doubt": LINES[3], "odd": ROUTE}
+
+
+def document(title: str, body: str) -> str:
+    """Return a page in the project style; `title` is text, `body` is HTML."""
+    colours = "".join(f"--{name}:{colour};" for name, colour in _COLOURS.items())
+    style = f":root{{{colours}}}\n" + Path(__file__).with_name("page.css").read_text(encoding="utf-8")
+    head = (
+        f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+    )
+    return (
+        "<!DOCTYPE html>\n<html "
+        f'lang="en"><head>{head}<title>{escape_text(title)}</title>\n<style>{style}</style></head>\n'
+        f"<body><main>\n{body}\n</main></body></html>\n"
+    )
+
+
+def escape_text(text: str) -> str:
+    """Escape untrusted text, such as a file name."""
+    return escape(printable(text))

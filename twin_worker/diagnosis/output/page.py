@@ -6,7 +6,7 @@ from math import floor, isfinite, log10
 from pathlib import Path
 
 from fleet.effects import Effect
-from fleet.report.html import document, escape_text
+from fleet.report.ink import document, escape_text
 from twin_worker.diagnosis.inference.report import DiagnosisFinding, Report, ReportOutcome
 from twin_worker.diagnosis.output.figures import draw, stems
 from twin_worker.diagnosis.output.marks import CHANNEL_TEXT, OUTCOME_TEXT, format_segments
