@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 
 from fleet.process.sanitise import printable
 from fleet.report import panels
-from fleet.report.ground import ground_track
 from fleet.report.ink import BAD, GOOD, GRID, INK, MUTED, mode_colours
+from fleet.report.panels import ground_track
 from fleet.report.report_text import summary_lines
 from fleet.telemetry.inspection.findings import AircraftFindings, LinkTexts
 from fleet.telemetry.inspection.survey import Survey, mode_spans
