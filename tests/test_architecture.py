@@ -355,7 +355,7 @@ PLANTED = (
     (direction, "viewer/store/a.py", "def f():\n    from viewer.panels import charts"),
     (direction, "fleet/bus/session.py", "import twin_worker.twin.step"),
     (direction, "fleet/simulator/conceal/exam.py", "def f():\n    from fleet.effects import icing"),
-    (direction, "fleet/simulator/conceal/plan.py", "import importlib"),
+    (direction, "fleet/simulator/conceal/paths.py", "import importlib"),
     (direction, "fleet/simulator/faults/physics.py", "from twin_worker.diagnosis.data.card import read"),
     (direction, "twin_worker/diagnosis/name.py", "from fleet.simulator.conceal import hide"),
     (alone, "gateway/a.py", "import zenoh"),

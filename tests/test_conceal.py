@@ -11,11 +11,11 @@ import pytest
 from fleet.contract import Mission, Params, Sample
 from fleet.simulator.conceal import acts as acting
 from fleet.simulator.conceal import exam as examination
-from fleet.simulator.conceal import plan as planning
+from fleet.simulator.conceal import paths as planning
 from fleet.simulator.conceal import record as recording
 from fleet.simulator.conceal.effects import BOTH, HIDDEN, UNKNOWN
 from fleet.simulator.conceal.exam import are_separable, counts, draw_jobs, simulate_exam
-from fleet.simulator.conceal.plan import FlightJob, PlannedFlight, draw_flight
+from fleet.simulator.conceal.paths import FlightJob, PlannedFlight, draw_flight
 from fleet.simulator.conceal.record import fly, rejection_reason
 from fleet.telemetry.recording.recordings import replay_messages
 

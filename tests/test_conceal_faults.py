@@ -8,8 +8,7 @@ import pytest
 
 from fleet.cli import main
 from fleet.simulator.conceal.effects import SERVO_LAG_S, reported_values
-from fleet.simulator.conceal.paths import EXAM_HOME
-from fleet.simulator.conceal.plan import baseline_type
+from fleet.simulator.conceal.paths import EXAM_HOME, baseline_type
 from fleet.simulator.faults.carried import SENSOR_FAULTS
 from fleet.simulator.faults.oddities import KINDS, parse_fault
 from fleet.simulator.faults.physics import Fault, FaultyPhysics

@@ -6,7 +6,7 @@ state with and without the effect. The second compares two flights of the same s
 
 import numpy as np
 
-from fleet.simulator.conceal.plan import PlannedFlight
+from fleet.simulator.conceal.paths import PlannedFlight
 from fleet.simulator.conceal.record import ExamFlightLog, fly
 from fleet.simulator.faults.carried import FaultSet
 from fleet.simulator.faults.oddities import UNCATALOGUED

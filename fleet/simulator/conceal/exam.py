@@ -14,8 +14,14 @@ import numpy as np
 
 from fleet.simulator.conceal.acts import MIN_OVER_NOISE, effect_strength
 from fleet.simulator.conceal.effects import HIDDEN, UNKNOWN, reported_values
-from fleet.simulator.conceal.paths import EXAM_HOME
-from fleet.simulator.conceal.plan import NOMINAL_EXCITATION, FlightJob, PlannedFlight, baseline_type, draw_flight
+from fleet.simulator.conceal.paths import (
+    EXAM_HOME,
+    NOMINAL_EXCITATION,
+    FlightJob,
+    PlannedFlight,
+    baseline_type,
+    draw_flight,
+)
 from fleet.simulator.conceal.record import ExamFlightLog, fly, rejection_reason
 from fleet.simulator.faults.physics import Fault, FaultyPhysics
 from fleet.simulator.vehicle.altered import instrumented_type

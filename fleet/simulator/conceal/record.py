@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.simulator.conceal.plan import SETTLE_S, PlannedFlight
+from fleet.simulator.conceal.paths import SETTLE_S, PlannedFlight
 from fleet.simulator.faults.physics import Fault
 from fleet.simulator.flight.drive import TICK_S, RadioLink, write
 from fleet.simulator.flight.uav import SimulatedUav

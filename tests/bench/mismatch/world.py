@@ -5,7 +5,7 @@ from pathlib import Path
 
 from fleet.contract import Message
 from fleet.simulator.conceal.exam import card
-from fleet.simulator.conceal.plan import NOMINAL_EXCITATION, FlightJob, draw_flight
+from fleet.simulator.conceal.paths import NOMINAL_EXCITATION, FlightJob, draw_flight
 from fleet.simulator.conceal.record import fly
 from fleet.simulator.faults.oddities import parse_fault
 from fleet.simulator.flight.drive import to_tlog
