@@ -17,9 +17,8 @@ import numba as nb
 import numpy as np
 
 from twin_worker.confidence.calibration_table import ATOMS, COLUMN, KNOTS, CalibrationTable
-from twin_worker.confidence.horizon_risk import critical_factor
 from twin_worker.confidence.prediction_log import EVERY_S, PredictionLog
-from twin_worker.confidence.weighted_quantile import censored_quantile, weighted_quantile
+from twin_worker.confidence.weighted_quantile import censored_quantile, critical_factor, weighted_quantile
 from twin_worker.numerics.prediction_errors import AHEAD, NOMINAL_COVERAGE
 
 _TABLE_WEIGHT = 10.0  # independent predictions that the table counts as [-]

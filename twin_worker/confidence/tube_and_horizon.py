@@ -15,10 +15,9 @@ from scipy.interpolate import CubicSpline
 
 from twin_worker.confidence.adaptive_conformal import AdaptiveLevels, ScaleFactors, scale_factors
 from twin_worker.confidence.calibration_table import INDEPENDENT, CalibrationTable, uncertainty_features
-from twin_worker.confidence.horizon_risk import running_max_error_ratio
 from twin_worker.confidence.prediction_log import EVERY_S, PredictionLog
 from twin_worker.confidence.table_files import TableSet, load
-from twin_worker.confidence.weighted_quantile import median_passage
+from twin_worker.confidence.weighted_quantile import median_passage, running_max_error_ratio
 from twin_worker.numerics.prediction_errors import (
     AHEAD,
     ERROR_LIMIT,

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from twin_worker.numerics.prediction_errors import AHEAD, ERROR_LIMIT
+
 
 def weighted_quantile(x: np.ndarray, weight: np.ndarray, level: np.ndarray) -> np.ndarray:
     """Return a quantile of each row, interpolated between the midpoints of the cumulative weights.
@@ -88,3 +90,36 @@ def median_passage(passages: Passages) -> float:
     times, share = survival_curve(passages)
     half = np.flatnonzero(share <= 0.5)
     return float(times[half[0]] if len(half) else times[-1])
+
+
+_POWER = 8.0  # a higher power approximates the maximum more closely
+_STEP = np.gradient(np.log1p(AHEAD))
+
+
+def running_max_error_ratio(half_axes: np.ndarray, predicted_length: np.ndarray) -> np.ndarray:
+    """Return the running maximum of half-axes (..., n, 3) over path length (..., n), strictly rising, (..., n) [-].
+
+    A power mean over log time approximates the running maximum without its constant stretches, on which the horizon
+    would jump by minutes.
+    """
+    ratio = np.linalg.norm(half_axes, axis=-1) / predicted_length
+    largest = np.maximum(ratio.max(axis=-1, keepdims=True), 1e-30)
+    power_sum = np.cumsum((ratio / largest) ** _POWER * _STEP[: ratio.shape[-1]], axis=-1)
+    return largest * power_sum ** (1.0 / _POWER)
+
+
+def critical_factor(ratio: np.ndarray, followed: np.ndarray) -> np.ndarray:
+    """Return the critical factor of each prediction, (m,): exact after a first passage, else an upper bound.
+
+    A prediction that stayed within 10 % needs at most the factor that ends its horizon at the end of its follow-up. As
+    a bound it carries no information on smaller factors, which are determined by difficult flights alone.
+
+    Args:
+        ratio: `running_max_error_ratio` of each prediction over `AHEAD`, (m, n) [-]
+        followed: time of first passage, or follow-up time within 10 %, (m,) [s]
+    """
+    column = np.clip(np.searchsorted(AHEAD, followed, side="right") - 1, 0, len(AHEAD) - 2)
+    fraction = np.clip((followed - AHEAD[column]) / (AHEAD[column + 1] - AHEAD[column]), 0.0, 1.0)
+    row = np.arange(len(ratio))
+    ratio_at_passage = ratio[row, column] + fraction * (ratio[row, column + 1] - ratio[row, column])
+    return ERROR_LIMIT / np.maximum(ratio_at_passage, 1e-9)

@@ -8,9 +8,9 @@ from scipy.stats import spearmanr
 from twin_worker.confidence.calibration.fit_table import fit
 from twin_worker.confidence.calibration.scored_predictions import ScoredPredictions
 from twin_worker.confidence.calibration_table import LEVELS, NOMINAL_COVERAGE, CalibrationTable
-from twin_worker.confidence.horizon_risk import running_max_error_ratio
 from twin_worker.confidence.table_files import TableSet
 from twin_worker.confidence.tube_and_horizon import ConfidenceTracker, PointForecast
+from twin_worker.confidence.weighted_quantile import running_max_error_ratio
 from twin_worker.numerics.prediction_errors import AHEAD, first_passage
 
 REPORTED_S = (5, 16, 30, 60, 120, 180)

@@ -18,8 +18,12 @@ from twin_worker.confidence.calibration_table import (
     at_look_aheads,
     default_table,
 )
-from twin_worker.confidence.horizon_risk import critical_factor, running_max_error_ratio
-from twin_worker.confidence.weighted_quantile import censored_quantile, weighted_quantile
+from twin_worker.confidence.weighted_quantile import (
+    censored_quantile,
+    critical_factor,
+    running_max_error_ratio,
+    weighted_quantile,
+)
 from twin_worker.numerics.prediction_errors import AHEAD, NOMINAL_COVERAGE, first_passage
 
 
