@@ -27,10 +27,14 @@ from twin_worker.diagnosis.inference.report import (
     ReportOutcome,
 )
 from twin_worker.diagnosis.inference.validation import cross_validate, force_prediction
-from twin_worker.diagnosis.inference.validation.cross_validate import MIN_RMS_DROP, CrossValidation
+from twin_worker.diagnosis.inference.validation.cross_validate import (
+    MIN_RMS_DROP,
+    CrossValidation,
+    free_form,
+    high_segments,
+)
 from twin_worker.diagnosis.inference.validation.force_prediction import free_run_error
 from twin_worker.diagnosis.inference.validation.spread import covariances, recommend_manoeuvre, reported_sigma
-from twin_worker.diagnosis.inference.validation.unexplained import free_form, high_segments
 from twin_worker.diagnosis.inference.words import describe_onset, with_sentence
 from twin_worker.diagnosis.model.baseline import CHANNEL_OF, CHANNELS, Baseline
 from twin_worker.diagnosis.model.residual import ModelledFlight
