@@ -6,8 +6,7 @@ from math import inf, isfinite
 import msgspec
 
 from fleet.contract import Cause, DiagnosisOutcome, Mismatch
-from twin_worker.diagnosis.inference.report import DiagnosisFinding, Report, ReportOutcome
-from twin_worker.diagnosis.inference.words import with_sentence
+from twin_worker.diagnosis.inference.report import DiagnosisFinding, Report, ReportOutcome, with_sentence
 
 _MAX_FORCE_ERROR = 100.0  # larger errors come from a diverged simulation and are not published [m/s2]
 

@@ -11,8 +11,7 @@ from twin_worker.diagnosis.baseline.past import CONTEXT_S, calibrate_past, part_
 from twin_worker.diagnosis.data.card import AircraftCard
 from twin_worker.diagnosis.data.flight import DT, FlightData
 from twin_worker.diagnosis.inference.diagnose import diagnose
-from twin_worker.diagnosis.inference.report import Report, ReportOutcome
-from twin_worker.diagnosis.inference.words import with_sentence
+from twin_worker.diagnosis.inference.report import Report, ReportOutcome, with_sentence
 from twin_worker.diagnosis.model.baseline import Baseline, exclude_equations
 
 ENERGY, TURN, PITCH = "energy held", "turn by bank", "pitch attitude"

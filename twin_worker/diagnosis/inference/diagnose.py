@@ -25,6 +25,8 @@ from twin_worker.diagnosis.inference.report import (
     RankedCandidate,
     Report,
     ReportOutcome,
+    describe_onset,
+    with_sentence,
 )
 from twin_worker.diagnosis.inference.validation import cross_validate, force_prediction
 from twin_worker.diagnosis.inference.validation.cross_validate import (
@@ -35,7 +37,6 @@ from twin_worker.diagnosis.inference.validation.cross_validate import (
 )
 from twin_worker.diagnosis.inference.validation.force_prediction import free_run_error
 from twin_worker.diagnosis.inference.validation.spread import covariances, recommend_manoeuvre, reported_sigma
-from twin_worker.diagnosis.inference.words import describe_onset, with_sentence
 from twin_worker.diagnosis.model.baseline import CHANNEL_OF, CHANNELS, Baseline
 from twin_worker.diagnosis.model.residual import ModelledFlight
 from twin_worker.diagnosis.model.weather import own_weather
