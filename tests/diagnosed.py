@@ -3,7 +3,7 @@
 import numpy as np
 
 from fleet.effects import Onset, catalogue
-from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis, OnsetProfile
+from twin_worker.diagnosis.data.card import FaultHypothesis, OnsetProfile
 from twin_worker.diagnosis.inference.report import (
     DiagnosisFinding,
     FigureSeries,

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.effects import Body, Effect, Flow, Parameter, Stage
-from twin_worker.diagnosis.data.card import AircraftCard
-from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
+from twin_worker.diagnosis.data.card import AircraftCard, FaultHypothesis
 from twin_worker.diagnosis.data.flight import DT, FlightData
 from twin_worker.diagnosis.model.baseline import ActuatorTiming, Baseline
 from twin_worker.diagnosis.model.residual import RHO_0

@@ -7,7 +7,7 @@ import pytest
 from effect_flights import CRAFT, Plan, flown
 
 from fleet.effects import Onset, catalogue
-from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis, OnsetProfile
+from twin_worker.diagnosis.data.card import FaultHypothesis, OnsetProfile
 from twin_worker.diagnosis.data.flight import FlightData
 from twin_worker.diagnosis.inference.isolation.isolate import scan
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals

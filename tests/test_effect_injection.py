@@ -10,7 +10,7 @@ from effect_flights import CARD, Plan, flown
 
 from fleet.effects import Effect, Onset, catalogue
 from twin_worker.diagnosis.baseline.calibrate import calibrate
-from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis, OnsetProfile
+from twin_worker.diagnosis.data.card import FaultHypothesis, OnsetProfile
 from twin_worker.diagnosis.inference.report import DiagnosisFinding, Report, ReportOutcome
 from twin_worker.diagnosis.model.baseline import Baseline
 from twin_worker.diagnosis.share import diagnose_all

@@ -11,7 +11,7 @@ from effect_flights import CARD, Plan, flown
 from fleet import cli
 from fleet.effects import FOLDERS_ENV, Onset, catalogue
 from twin_worker.diagnosis.baseline.calibrate import calibrate
-from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis, OnsetProfile
+from twin_worker.diagnosis.data.card import FaultHypothesis, OnsetProfile
 from twin_worker.diagnosis.inference.diagnose import MIN_RMS_DROP, diagnose
 from twin_worker.diagnosis.inference.report import ReportOutcome
 

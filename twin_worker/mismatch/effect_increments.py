@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.effects import ALL_SURFACES, MEMORY, SURFACES, Body, Flow, Stage
-from twin_worker.diagnosis.data.fault_hypothesis import ALWAYS, FaultHypothesis
+from twin_worker.diagnosis.data.card import ALWAYS, FaultHypothesis
 from twin_worker.diagnosis.data.flight import DT, FlightData
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.model.baseline import Baseline

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from twin_worker.diagnosis.baseline.fit import drag_uncertainty, fit, fit_timing
-from twin_worker.diagnosis.data.card import AircraftCard
-from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
+from twin_worker.diagnosis.data.card import AircraftCard, FaultHypothesis
 from twin_worker.diagnosis.data.flight import FlightData
 from twin_worker.diagnosis.inference.isolation.nuisance import (
     MAX_SPREAD_RATIO,

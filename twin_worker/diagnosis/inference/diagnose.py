@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from fleet.effects import Onset, Stage, catalogue
-from twin_worker.diagnosis.data.fault_hypothesis import ALWAYS, FaultHypothesis
+from twin_worker.diagnosis.data.card import ALWAYS, FaultHypothesis
 from twin_worker.diagnosis.data.flight import FlightData, decimated
 from twin_worker.diagnosis.inference.isolation.isolate import MIN_R2, ScoredHypothesis
 from twin_worker.diagnosis.inference.isolation.refine import refine

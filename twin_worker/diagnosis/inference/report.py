@@ -6,7 +6,7 @@ from enum import StrEnum
 import numpy as np
 
 from fleet.effects import Onset
-from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis, OnsetProfile
+from twin_worker.diagnosis.data.card import FaultHypothesis, OnsetProfile
 from twin_worker.diagnosis.inference.validation.cross_validate import MIN_RMS_DROP
 
 

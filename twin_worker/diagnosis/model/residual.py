@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 
 from fleet.effects import ALL_SURFACES, MEMORY, SURFACES, Flow, Stage
 from fleet.frames import G, rotation
-from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
+from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.data.flight import DT, STEP_S, FlightData, decimated, slope, slow, smooth, valid_decimated
 from twin_worker.diagnosis.model import equations as eq
 from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline

@@ -12,7 +12,7 @@ import numpy as np
 
 from fleet.effects import ALL_SURFACES, MEMORY, SURFACES, Flow, Onset, Stage
 from fleet.frames import G, rotation
-from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
+from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.data.flight import DT
 from twin_worker.diagnosis.model import equations as eq
 from twin_worker.diagnosis.model.baseline import Baseline

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from fleet.effects import catalogue
-from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
+from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.data.flight import decimated
 from twin_worker.diagnosis.model.baseline import wind_is_nominal
 from twin_worker.diagnosis.model.residual import RHO_0, ModelledFlight

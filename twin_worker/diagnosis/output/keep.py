@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from fleet.effects import Body, Onset, catalogue
-from twin_worker.diagnosis.data.card import AircraftCard
-from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis, OnsetProfile
+from twin_worker.diagnosis.data.card import AircraftCard, FaultHypothesis, OnsetProfile
 from twin_worker.diagnosis.inference.report import DiagnosisFinding
 from twin_worker.diagnosis.model.baseline import CHANNELS, ActuatorTiming, Baseline, Noise
 from twin_worker.diagnosis.model.equations import TERMS

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.effects import Effect, Onset, catalogue
-from twin_worker.diagnosis.data.fault_hypothesis import ALWAYS, FaultHypothesis, OnsetProfile
+from twin_worker.diagnosis.data.card import ALWAYS, FaultHypothesis, OnsetProfile
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 from twin_worker.diagnosis.model.baseline import Baseline
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleet.effects import Effect, Parameter, Stage, catalogue
-from twin_worker.diagnosis.data.fault_hypothesis import ALWAYS, FaultHypothesis
+from twin_worker.diagnosis.data.card import ALWAYS, FaultHypothesis
 
 _SHARE_FLOOR = 0.03  # least spread of a derivative without a fast accelerometer [-]
 MAX_SPREAD_RATIO = 4.0  # largest estimated spread over its floor

@@ -3,7 +3,7 @@
 import numpy as np
 
 from fleet.effects import Onset, Stage
-from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
+from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.inference.isolation.isolate import ScoredHypothesis
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.effects import Stage
-from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
+from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.inference.isolation.isolate import PARAMETER_COST, ScoredHypothesis, scan
 from twin_worker.diagnosis.inference.isolation.refine import refine
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals

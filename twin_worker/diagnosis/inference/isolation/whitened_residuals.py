@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
+from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.inference.isolation.nuisance import (
     RELEASE_SIGMAS,
     Nuisance,

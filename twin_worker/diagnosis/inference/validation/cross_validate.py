@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.effects import Onset, Stage
-from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
+from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.inference.isolation.refine import refine
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 from twin_worker.diagnosis.inference.validation.force_prediction import blocks

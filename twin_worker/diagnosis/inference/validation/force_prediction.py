@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 
 from fleet.effects import Stage
-from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
+from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.data.flight import DECIMATION, DT
 from twin_worker.diagnosis.model import equations as eq
 from twin_worker.diagnosis.model.residual import RHO_0, EquationTerms, ModelledFlight, evaluate_equation

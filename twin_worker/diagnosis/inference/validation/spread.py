@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 
 from fleet.effects import Onset
-from twin_worker.diagnosis.data.fault_hypothesis import FaultHypothesis
+from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.data.flight import DT, STEP_S, FlightData, decimated
 from twin_worker.diagnosis.inference.isolation.refine import refine, slope_steps
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
