@@ -14,9 +14,8 @@ from fleet.effects import catalogue
 from twin_worker.diagnosis.inference.report import FigureSeries, ReportOutcome
 from twin_worker.diagnosis.model.baseline import CHANNELS
 from twin_worker.diagnosis.output.figures import KINDS, draw, stems
-from twin_worker.diagnosis.output.marks import CHANNEL_TEXT, format_segments, marks, true_segments
 from twin_worker.diagnosis.output.page import amount, unit, write
-from twin_worker.diagnosis.output.traces import choose_channels
+from twin_worker.diagnosis.output.traces import CHANNEL_TEXT, choose_channels, format_segments, marks, true_segments
 
 
 class Reader(HTMLParser):

@@ -16,8 +16,16 @@ from PIL import Image
 from fleet.report.ink import INK, MUTED
 from fleet.report.report_text import printable
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome
-from twin_worker.diagnosis.output.marks import LEGEND, OUTCOME_TEXT, format_segments, marks, show_empty, time_limits
-from twin_worker.diagnosis.output.traces import residuals, simulated
+from twin_worker.diagnosis.output.traces import (
+    LEGEND,
+    OUTCOME_TEXT,
+    format_segments,
+    marks,
+    residuals,
+    show_empty,
+    simulated,
+    time_limits,
+)
 from twin_worker.diagnosis.output.written import safe
 from twin_worker.numerics.plot_style import style_axes
 

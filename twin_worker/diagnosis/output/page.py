@@ -9,7 +9,7 @@ from fleet.effects import Effect
 from fleet.report.ink import document, escape_text
 from twin_worker.diagnosis.inference.report import DiagnosisFinding, Report, ReportOutcome
 from twin_worker.diagnosis.output.figures import draw, stems
-from twin_worker.diagnosis.output.marks import CHANNEL_TEXT, OUTCOME_TEXT, format_segments
+from twin_worker.diagnosis.output.traces import CHANNEL_TEXT, OUTCOME_TEXT, format_segments
 
 _UNITS = {  # suffix of a parameter name -> unit; the first match counts
     "mps_per_100m": "m/s per 100 m",
