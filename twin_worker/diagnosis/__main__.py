@@ -11,7 +11,8 @@ from twin_worker.diagnosis.baseline.own_past import OwnPast
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.learn import calibrate_recordings, card_or_unknown, log_progress
 from twin_worker.diagnosis.model.baseline import Baseline
-from twin_worker.diagnosis.output import keep, written
+from twin_worker.diagnosis.output import keep
+from twin_worker.diagnosis.output import keep as written
 from twin_worker.diagnosis.share import Reference, diagnose_all
 
 

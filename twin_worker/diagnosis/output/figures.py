@@ -16,6 +16,7 @@ from PIL import Image
 from fleet.report.ink import INK, MUTED
 from fleet.report.report_text import printable
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome
+from twin_worker.diagnosis.output.keep import safe
 from twin_worker.diagnosis.output.traces import (
     LEGEND,
     OUTCOME_TEXT,
@@ -26,7 +27,6 @@ from twin_worker.diagnosis.output.traces import (
     simulated,
     time_limits,
 )
-from twin_worker.diagnosis.output.written import safe
 from twin_worker.numerics.plot_style import style_axes
 
 KINDS = ("path", "residuals", "simulated", "candidates")
