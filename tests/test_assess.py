@@ -20,12 +20,11 @@ from fleet.telemetry.recording.recordings import replay_messages
 from twin_worker.evaluation.__main__ import main
 from twin_worker.evaluation.baselines.methods import BASELINES
 from twin_worker.evaluation.drive import EvaluationPlan, RecordingDriver
-from twin_worker.evaluation.keep import KEYS, covariance
 from twin_worker.evaluation.scoring.case import OURS
 from twin_worker.evaluation.scoring.log import ReferenceFlight
 from twin_worker.evaluation.scoring.truth import MIN_EVENT_FREE_S, MIN_FIRST_S
 from twin_worker.evaluation.share import assess_recordings
-from twin_worker.evaluation.table import notes
+from twin_worker.evaluation.table import KEYS, covariance, notes
 
 KEYS_OF_A_METHOD = {
     "m1_t10_lq_s",

@@ -60,7 +60,7 @@ def _run_summary(args: argparse.Namespace, plan: EvaluationPlan, evaluation: Eva
 
 def _write_outputs(folder: Path, cases: list[EvaluationCase]) -> None:
     from twin_worker.evaluation.figures import draw
-    from twin_worker.evaluation.keep import write_predictions
+    from twin_worker.evaluation.table import write_predictions
 
     folder.mkdir(parents=True, exist_ok=True)
     counted = [case for case in cases if not case.exclusion]
