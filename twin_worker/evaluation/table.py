@@ -13,8 +13,7 @@ from scipy.special import ndtri
 from fleet.frames import to_geodetic
 from fleet.report.report_text import printable
 from twin_worker.evaluation.scoring.case import OURS, EvaluationCase
-from twin_worker.evaluation.scoring.compare import BEATEN, WORSE
-from twin_worker.evaluation.scoring.truth import MIN_FIRST_S
+from twin_worker.evaluation.scoring.compare import BEATEN, MIN_FIRST_S, WORSE
 from twin_worker.numerics.prediction_errors import NOMINAL_COVERAGE, path_length, track_frame
 
 _LABELS = {

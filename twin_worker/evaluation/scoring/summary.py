@@ -8,9 +8,8 @@ import numpy as np
 import scipy.stats
 
 from twin_worker.evaluation.scoring.case import EvaluationCase
-from twin_worker.evaluation.scoring.compare import compare
+from twin_worker.evaluation.scoring.compare import MIN_EVENT_FREE_S, compare
 from twin_worker.evaluation.scoring.score import LIMITS, MethodScores, passage_quantile, score_method, survival_at
-from twin_worker.evaluation.scoring.truth import MIN_EVENT_FREE_S
 from twin_worker.telemetry.flight_phase import PHASES
 
 REPORTED_S = (5, 10, 16, 30, 60, 120, 180)  # reported look-aheads, as far as predictions reach [s]
