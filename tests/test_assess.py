@@ -20,9 +20,8 @@ from fleet.telemetry.recording.recordings import replay_messages
 from twin_worker.evaluation.__main__ import main
 from twin_worker.evaluation.baselines.methods import BASELINES
 from twin_worker.evaluation.drive import EvaluationPlan, RecordingDriver
-from twin_worker.evaluation.scoring.case import OURS
 from twin_worker.evaluation.scoring.compare import MIN_EVENT_FREE_S, MIN_FIRST_S
-from twin_worker.evaluation.scoring.log import ReferenceFlight
+from twin_worker.evaluation.scoring.log import OURS, ReferenceFlight
 from twin_worker.evaluation.share import assess_recordings
 from twin_worker.evaluation.table import KEYS, covariance, notes
 

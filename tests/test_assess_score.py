@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from flights import HERE
 
-from twin_worker.evaluation.scoring.case import OURS, EvaluationCase, EvaluationStart, MethodForecast
 from twin_worker.evaluation.scoring.compare import BEATEN, MATCHED, ONE_FLIGHT, WORSE, compare
+from twin_worker.evaluation.scoring.log import OURS, EvaluationCase, EvaluationStart, MethodForecast
 from twin_worker.evaluation.scoring.score import LIMITS, passage_quantile, score_method, survival_at
 from twin_worker.evaluation.scoring.summary import method_figures, summarise
 

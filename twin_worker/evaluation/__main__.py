@@ -12,7 +12,7 @@ from fleet.cli import make_parser, run_command
 from fleet.commands.offline.assess import EXAMPLES, arguments, baseline_methods, check_arguments
 from fleet.process.logs import report_progress
 from twin_worker.evaluation.drive import EvaluationPlan
-from twin_worker.evaluation.scoring.case import EvaluationCase
+from twin_worker.evaluation.scoring.log import EvaluationCase
 from twin_worker.evaluation.scoring.summary import summarise
 from twin_worker.evaluation.share import Evaluation, assess_recordings
 from twin_worker.evaluation.table import table

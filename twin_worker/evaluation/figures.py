@@ -10,7 +10,7 @@ from scipy.special import ndtr, ndtri
 
 from fleet.report.ink import INK, LINES, MUTED, ROUTE
 from twin_worker.confidence.tube_and_horizon import ERROR_LIMIT, NOMINAL_COVERAGE
-from twin_worker.evaluation.scoring.case import OURS, EvaluationCase
+from twin_worker.evaluation.scoring.log import OURS, EvaluationCase
 from twin_worker.evaluation.scoring.score import LIMITS, MethodScores, score_method
 from twin_worker.numerics.plot_style import style_axes
 from twin_worker.telemetry.flight_phase import PHASES

@@ -14,7 +14,7 @@ from rich.console import Console
 from fleet.report.progress import show_progress
 from fleet.telemetry.recording.recordings import Recording
 from twin_worker.evaluation.drive import EvaluationPlan, RecordingDriver
-from twin_worker.evaluation.scoring.case import EvaluationCase
+from twin_worker.evaluation.scoring.log import EvaluationCase
 
 Task = tuple[
     Sequence[Path], EvaluationPlan, int, tuple[int, int]

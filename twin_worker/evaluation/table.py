@@ -12,8 +12,8 @@ from scipy.special import ndtri
 
 from fleet.frames import to_geodetic
 from fleet.report.report_text import printable
-from twin_worker.evaluation.scoring.case import OURS, EvaluationCase
 from twin_worker.evaluation.scoring.compare import BEATEN, MIN_FIRST_S, WORSE
+from twin_worker.evaluation.scoring.log import OURS, EvaluationCase
 from twin_worker.numerics.prediction_errors import NOMINAL_COVERAGE, path_length, track_frame
 
 _LABELS = {

@@ -11,8 +11,7 @@ import numpy as np
 
 from fleet.frames import G
 from fleet.mission import P_D, P_N, unroll_route
-from twin_worker.evaluation.scoring.case import OURS, EvaluationCase, EvaluationStart
-from twin_worker.evaluation.scoring.log import ReferenceFlight
+from twin_worker.evaluation.scoring.log import OURS, EvaluationCase, EvaluationStart, ReferenceFlight
 from twin_worker.evaluation.scoring.score import LIMITS, MethodScores
 from twin_worker.numerics.prediction_errors import path_length
 from twin_worker.telemetry.flight_phase import classify_phase

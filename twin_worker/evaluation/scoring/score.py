@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin_worker.evaluation.scoring.case import EvaluationCase
+from twin_worker.evaluation.scoring.log import EvaluationCase
 from twin_worker.numerics.prediction_errors import (
     ERROR_LIMIT,
     along_cross_down,

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import scipy.stats
 
-from twin_worker.evaluation.scoring.case import EvaluationCase
 from twin_worker.evaluation.scoring.compare import MIN_EVENT_FREE_S, compare
+from twin_worker.evaluation.scoring.log import EvaluationCase
 from twin_worker.evaluation.scoring.score import LIMITS, MethodScores, passage_quantile, score_method, survival_at
 from twin_worker.telemetry.flight_phase import PHASES
 
