@@ -19,11 +19,10 @@ from fleet.contract import DiagnosisOutcome, Mismatch, Prediction
 from twin_worker.diagnosis.data.card import UNKNOWN
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.model.baseline import Baseline
-from twin_worker.mismatch.coordinator import ALL_UAVS, Coordinator
+from twin_worker.mismatch.coordinator import ALL_UAVS, CHECK_PERIOD_S, Coordinator, DiagnosisState
 from twin_worker.mismatch.job import DiagnosisJob, DiagnosisResult, run_job, telemetry_rows
 from twin_worker.mismatch.messages import mismatch_message, shift_times, summary
 from twin_worker.mismatch.process import DiagnosisProcess
-from twin_worker.mismatch.scheduler import CHECK_PERIOD_S, DiagnosisState
 
 BASE = Baseline(UNKNOWN, {}, 20.0)
 
@@ -267,7 +266,7 @@ def test_a_defect_in_taking_an_answer_is_that_aircrafts_alone_and_passes(looking
     live, hand, twin = looking
     turned(live, twin)
     hand.say(made())
-    monkeypatch.setattr("twin_worker.mismatch.scheduler.mismatch_message", None)
+    monkeypatch.setattr("twin_worker.mismatch.coordinator.mismatch_message", None)
     assert turned(live, twin) == [] and "TypeError" in live.defects([1])[0]
     monkeypatch.undo()
     watch = live.state(1)

@@ -4,18 +4,190 @@ import logging
 from _thread import LockType
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
 from typing import Protocol, TypeVar
 
-from fleet.contract import DiagnosisOutcome, Mismatch
-from twin_worker.diagnosis.data.card import UNKNOWN
+import numpy as np
+
+from fleet.contract import DiagnosisOutcome, Mismatch, Outcome
+from twin_worker.diagnosis.data.card import UNKNOWN, AircraftCard
+from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.model.baseline import Baseline
 from twin_worker.mismatch.adapt_models import adapt_models
-from twin_worker.mismatch.job import DiagnosisJob, DiagnosisResult
-from twin_worker.mismatch.messages import with_adaptation
-from twin_worker.mismatch.scheduler import DiagnosisState
-from twin_worker.twin.state.state import Twin
+from twin_worker.mismatch.job import DiagnosisJob, DiagnosisResult, TelemetryRows, telemetry_rows
+from twin_worker.mismatch.messages import mark_unconfirmed, mismatch_message, shift_times, with_adaptation
+from twin_worker.twin.state.state import ROUTE_MODES, Twin
+from twin_worker.twin.state.vehicle_class import WINGED
+
+BASELINE_S = 105.0  # own past used as the comparison model [s]
+FLIGHT_S = 120.0  # flight used for a diagnosis [s]
+CHECK_PERIOD_S, DIAGNOSIS_PERIOD_S = 8.0, 25.0  # between residual checks, and between full diagnoses [s]
+MIN_FLIGHT_S = 45.0  # flight before the first comparison with a model [s]
+_CONFIRM_AFTER_S = 5.0  # before a finding is checked again for confirmation [s]
+_RETRY_S = 30.0  # after a refusal [s]
+_SUSPEND_S, _MAX_SUSPEND_S = 60.0, 3600.0  # after an internal error, doubled each time; upper limit [s]
+_SAME_ONSET_S = 20.0  # findings of one effect with onsets further apart count as different [s]
+_CLEAR_COUNT = 2  # consecutive diagnoses without a finding that clear a mismatch
+_VALID_OUTCOMES = (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST, Outcome.INSUFFICIENT_DATA)
+
+
+@dataclass
+class DiagnosisState:
+    """Diagnosis state of one aircraft.
+
+    Attributes:
+        card: the aircraft, or `card.UNKNOWN`
+        baseline: comparison model; None: the aircraft's own past
+        past: telemetry of that past; None until it is long enough
+        published: newest published mismatch
+        reason: why there is no baseline or no diagnosis
+        defect: internal error of the newest diagnosis, or empty
+        failures: consecutive diagnoses that ended with an internal error
+    """
+
+    card: AircraftCard = UNKNOWN
+    baseline: Baseline | None = None
+    past: TelemetryRows | None = None
+    published: Mismatch | None = None
+    reason: str = ""
+    defect: str = ""
+    failures: int = 0
+    first_t: float = float("nan")  # first telemetry [s since 1970]
+    past_t: float = float("-inf")  # end of the own past [s since 1970]
+    next_t: float = float("-inf")  # earliest next check [s since 1970]
+    suspended_until: float = float("-inf")  # end of the suspension after an internal error [s since 1970]
+    diagnosed_t: float = float("-inf")  # end of the newest flight diagnosed
+    last_report: Report | None = None  # newest diagnosis; start of its flight below
+    last_begin: float = 0.0
+    clear_count: int = 0
+
+    def urgency(self, twin: Twin) -> float | None:
+        """Return the urgency of a diagnosis; None if it is not due."""
+        newest = twin.telemetry.history.newest
+        if newest < self.next_t - _RETRY_S - DIAGNOSIS_PERIOD_S:  # the clock jumped back
+            self.__init__(self.card, self.baseline)  # type: ignore[misc]
+        if self.first_t != self.first_t and np.isfinite(newest):
+            self.first_t = float(min(twin.telemetry.history.rows("attitude")[0], default=newest))
+        if (
+            newest < max(self.next_t, self.suspended_until)
+            or twin.telemetry.link_lost
+            or twin.environment.flight_phase.landed
+            or twin.vehicle not in WINGED
+            or twin.telemetry.origin is None
+        ):
+            return None
+        if self.baseline is None and self.past is None:
+            if self._mission_flight_s(twin) < BASELINE_S:
+                self.next_t = newest + CHECK_PERIOD_S
+                return None
+            self.past = telemetry_rows(twin.telemetry.history, newest - BASELINE_S)
+            self.past_t = newest
+        if newest < (self.first_t + MIN_FLIGHT_S if self.baseline is not None else self.past_t + CHECK_PERIOD_S):
+            return None
+        return (
+            2.0 * (not self._model_valid(twin))
+            + 4.0 * self._needs_confirmation
+            + (newest - self.diagnosed_t) / DIAGNOSIS_PERIOD_S
+        )
+
+    def create_job(self, twin: Twin) -> DiagnosisJob:
+        """Return the job that is due."""
+        newest = twin.telemetry.history.newest
+        self.next_t = newest + CHECK_PERIOD_S
+        full = (
+            newest - self.diagnosed_t >= DIAGNOSIS_PERIOD_S or not self._model_valid(twin) or self._needs_confirmation
+        )
+        rows = telemetry_rows(twin.telemetry.history, newest - FLIGHT_S, self.past)
+        return DiagnosisJob(
+            twin.config.uav, rows, dict(twin.received_params), self.card, self.baseline, self.past_t, full
+        )
+
+    @property
+    def _needs_confirmation(self) -> bool:
+        return self.published is not None and self.published.outcome in (
+            DiagnosisOutcome.SUSPECTED,
+            DiagnosisOutcome.UNKNOWN,
+        )
+
+    def handle_result(self, result: DiagnosisResult) -> Mismatch | None:
+        """Handle a result; return the mismatch to publish, None if nothing changed."""
+        if result.defect:
+            self.suspend(result.uav, result.end, result.defect)
+            return None
+        self.reason, self.defect, self.failures = result.refusal, "", 0
+        if result.refusal:
+            self.next_t = result.end + _RETRY_S
+            return None
+        if result.report is None:
+            return None
+        self.diagnosed_t = result.end
+        report = result.report
+        mismatch = mismatch_message(
+            result.uav, shift_times(report, result.begin - self.first_t), result.begin, result.end
+        )
+        if mismatch.outcome in (DiagnosisOutcome.NAMED, DiagnosisOutcome.UNKNOWN) and not self._is_confirmed(
+            report, result.begin
+        ):
+            self.next_t = result.end + _CONFIRM_AFTER_S
+            mismatch = mark_unconfirmed(mismatch)
+        self.last_report, self.last_begin = report, result.begin
+        confirmed_before = self.published is not None and self.published.outcome in (
+            DiagnosisOutcome.NAMED,
+            DiagnosisOutcome.UNKNOWN,
+        )
+        self.clear_count = (
+            self.clear_count + 1 if mismatch.outcome in (DiagnosisOutcome.NONE, DiagnosisOutcome.SUSPECTED) else 0
+        )
+        if confirmed_before and 0 < self.clear_count < _CLEAR_COUNT:
+            return None  # a single diagnosis without the finding does not clear it
+        self.published = mismatch
+        return mismatch
+
+    def suspend(self, uav: int, t: float, reason: str) -> None:
+        """Suspend the diagnosis after an internal error at data time `t`, longer each time."""
+        pause_s = min(_SUSPEND_S * 2.0**self.failures, _MAX_SUSPEND_S)
+        self.failures, self.suspended_until = self.failures + 1, t + pause_s
+        self.defect = (
+            f"uav-{uav}: diagnosis failed with an internal error ({reason}); retried in {pause_s:.0f} s, report it"
+        )
+
+    def _is_confirmed(self, report: Report, begin: float) -> bool:
+        """Return whether the previous diagnosis agrees with this report."""
+        if self.last_report is None:
+            return False
+        if report.outcome is ReportOutcome.UNKNOWN:
+            return self.last_report.outcome is not ReportOutcome.NONE
+        names = {
+            name for finding in self.last_report.findings for name in (finding.hypothesis.effect.name, *finding.rivals)
+        }
+        onsets = [self.last_begin + one.segments[0][0] for one in self.last_report.findings]
+        return any(
+            one.hypothesis.effect.name in names
+            and any(abs(begin + one.segments[0][0] - onset) < _SAME_ONSET_S for onset in onsets)
+            for one in report.findings
+        )
+
+    @staticmethod
+    def _model_valid(twin: Twin) -> bool:
+        return twin.models.active_model is None or twin.identification.verdict.outcome in _VALID_OUTCOMES
+
+    @staticmethod
+    def _mission_flight_s(twin: Twin) -> float:
+        """Return the uninterrupted flight time on the mission [s]."""
+        if twin.onboard.status is None or twin.onboard.status.mode not in ROUTE_MODES:
+            return 0.0
+        t = twin.telemetry.history.rows(
+            "attitude",
+            max(
+                twin.onboard.plan_changed_t,
+                twin.telemetry.link_restored_t,
+                twin.telemetry.history.newest - BASELINE_S - 5.0,
+            ),
+        )[0]
+        return float(t[-1] - t[0]) if len(t) else 0.0
+
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
