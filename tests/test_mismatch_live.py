@@ -20,8 +20,15 @@ from twin_worker.diagnosis.data.card import UNKNOWN
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.model.baseline import Baseline
 from twin_worker.mismatch.coordinator import ALL_UAVS, CHECK_PERIOD_S, Coordinator, DiagnosisState
-from twin_worker.mismatch.job import DiagnosisJob, DiagnosisResult, run_job, telemetry_rows
-from twin_worker.mismatch.messages import mismatch_message, shift_times, summary
+from twin_worker.mismatch.job import (
+    DiagnosisJob,
+    DiagnosisResult,
+    mismatch_message,
+    run_job,
+    shift_times,
+    summary,
+    telemetry_rows,
+)
 from twin_worker.mismatch.process import DiagnosisProcess
 
 BASE = Baseline(UNKNOWN, {}, 20.0)

@@ -16,8 +16,16 @@ from twin_worker.diagnosis.data.card import UNKNOWN, AircraftCard
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.model.baseline import Baseline
 from twin_worker.mismatch.adapt_models import adapt_models
-from twin_worker.mismatch.job import DiagnosisJob, DiagnosisResult, TelemetryRows, telemetry_rows
-from twin_worker.mismatch.messages import mark_unconfirmed, mismatch_message, shift_times, with_adaptation
+from twin_worker.mismatch.job import (
+    DiagnosisJob,
+    DiagnosisResult,
+    TelemetryRows,
+    mark_unconfirmed,
+    mismatch_message,
+    shift_times,
+    telemetry_rows,
+    with_adaptation,
+)
 from twin_worker.twin.state.state import ROUTE_MODES, Twin
 from twin_worker.twin.state.vehicle_class import WINGED
 

@@ -2,17 +2,19 @@
 
 import time
 from dataclasses import dataclass, replace
+from math import inf, isfinite
 
+import msgspec
 import numpy as np
 
-from fleet.contract import COLUMNS
+from fleet.contract import COLUMNS, Cause, DiagnosisOutcome, Mismatch
 from twin_worker.diagnosis.baseline.own_past import only_new_findings
 from twin_worker.diagnosis.baseline.past import CONTEXT_S, calibrate_past, part_after
 from twin_worker.diagnosis.data.card import AircraftCard
 from twin_worker.diagnosis.data.flight import STEP_S, FlightData, resample_flight
 from twin_worker.diagnosis.inference.diagnose import diagnose
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
-from twin_worker.diagnosis.inference.report import Report
+from twin_worker.diagnosis.inference.report import DiagnosisFinding, Report, ReportOutcome, with_sentence
 from twin_worker.diagnosis.model.baseline import Baseline
 from twin_worker.diagnosis.model.residual import ModelledFlight
 from twin_worker.diagnosis.model.weather import own_weather
@@ -139,3 +141,94 @@ def residual_growth(flight: FlightData, baseline: Baseline) -> float:
         return float("nan")
     mean_square = [((part.e + part.Jn @ whitened.xn)[part.ok] ** 2).mean(axis=0) for part in (recent, earlier)]
     return float((mean_square[0] / np.maximum(mean_square[1], baseline.usual * 0.5)).max())
+
+
+_MAX_FORCE_ERROR = 100.0  # larger errors come from a diverged simulation and are not published [m/s2]
+
+
+def mismatch_message(uav: int, report: Report, begin: float, end: float) -> Mismatch:
+    """Return the message of a report.
+
+    Args:
+        uav: UAV id
+        report: its times count from `begin`
+        begin, end: flight of the diagnosis [s since 1970]
+    """
+    causes = tuple(_cause(finding, begin) for finding in report.findings)
+    if report.outcome is ReportOutcome.UNKNOWN:
+        channel, segments = report.where
+        causes = (Cause(name="unknown", channel=channel, segments=_absolute_times(begin, segments)), *causes)
+    proven = report.outcome is not ReportOutcome.NONE
+    return Mismatch(
+        uav=uav,
+        t=end,
+        outcome=DiagnosisOutcome(report.outcome.value),
+        causes=causes if proven else (),
+        fit_before=_finite_or_none(report.fit_before),
+        fit_after=_finite_or_none(report.fit_after),
+        force_before=_finite_or_none(report.force_before, _MAX_FORCE_ERROR),
+        force_after=_finite_or_none(report.force_after, _MAX_FORCE_ERROR),
+        attitude_error_before=_finite_or_none(report.free_run_error_before),
+        attitude_error_after=_finite_or_none(report.free_run_error_after),
+        flight_t0=begin,
+        sentence=report.sentence,
+    )
+
+
+def shift_times(report: Report, shift: float) -> Report:
+    """Return the report with the times in its sentence shifted by `shift` [s]."""
+    shifted = [
+        replace(finding, hypothesis=replace(finding.hypothesis, onset=finding.hypothesis.onset.shifted(shift)))
+        for finding in report.findings
+    ]
+    channel, segments = report.where
+    shifted_where = channel, tuple((a + shift, b + shift) for a, b in segments)
+    text = with_sentence(replace(report, findings=tuple(shifted), where=shifted_where)).sentence
+    return replace(report, sentence=text)
+
+
+def mark_unconfirmed(mismatch: Mismatch) -> Mismatch:
+    """Mark a mismatch as suspected until a second diagnosis confirms it."""
+    return msgspec.structs.replace(
+        mismatch, outcome=DiagnosisOutcome.SUSPECTED, sentence=f"detected once, not confirmed: {mismatch.sentence}"
+    )
+
+
+def summary(mismatch: Mismatch | None) -> str:
+    """Return a short summary for the fleet table; empty if there is no mismatch."""
+    if mismatch is None or mismatch.outcome is DiagnosisOutcome.NONE:
+        return ""
+    names = " and ".join(_cause_name(cause) for cause in mismatch.causes if cause.name != "unknown")
+    if mismatch.outcome is DiagnosisOutcome.UNKNOWN:
+        return f"unknown, in {mismatch.causes[0].channel}" if mismatch.causes else "unknown"
+    return f"{mismatch.outcome.value} {names}".rstrip()
+
+
+def with_adaptation(mismatch: Mismatch, text: str, *, used: bool) -> Mismatch:
+    """Add to a mismatch whether predictions use the adapted model."""
+    return msgspec.structs.replace(mismatch, adapted=used, sentence=f"{mismatch.sentence}; {text}")
+
+
+def _cause_name(cause: Cause) -> str:
+    return f"{cause.name} of the {cause.surface}" if cause.surface else cause.name
+
+
+def _cause(finding: DiagnosisFinding, begin: float) -> Cause:
+    parameters = {name: float(x) for name, x in finding.reported.items() if isfinite(x)}
+    return Cause(
+        name=finding.hypothesis.effect.name,
+        channel=finding.channel,
+        surface=finding.surface,
+        confusable_with=finding.rivals,
+        segments=_absolute_times(begin, finding.segments),
+        parameters=parameters,
+        sigma={name: float(x) for name, x in finding.sigma.items() if name in parameters and isfinite(x)},
+    )
+
+
+def _absolute_times(begin: float, segments: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    return tuple((float(begin + a), float(begin + b)) for a, b in segments)
+
+
+def _finite_or_none(x: float, limit: float = inf) -> float | None:
+    return float(x) if isfinite(x) and x < limit else None

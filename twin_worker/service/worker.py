@@ -23,7 +23,7 @@ from twin_worker.alerts.conflict_probability import Separation
 from twin_worker.alerts.hysteresis import AlertState
 from twin_worker.alerts.traffic import TrafficMonitor
 from twin_worker.mismatch.coordinator import Coordinator
-from twin_worker.mismatch.messages import summary
+from twin_worker.mismatch.job import summary
 from twin_worker.ownership.handover import Snapshot
 from twin_worker.ownership.protocol import OwnershipProtocol
 from twin_worker.ownership.twin_store import LATCHED_TYPES, LocalTwinStore, OwnedTwin
