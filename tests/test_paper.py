@@ -16,8 +16,14 @@ from fleet.simulator.flight.drive import to_tlog
 from fleet.simulator.flight.uav import SimulatedUav
 from twin_worker.identification.linear.linear_model import AXES
 from twin_worker.paper_experiments import __main__, experiment
-from twin_worker.paper_experiments.experiment import STATE_NAMES, Experiment, ExperimentPlan, both_steps
-from twin_worker.paper_experiments.recorded_flights import RecordedFlight, read_flights
+from twin_worker.paper_experiments.experiment import (
+    STATE_NAMES,
+    Experiment,
+    ExperimentPlan,
+    RecordedFlight,
+    both_steps,
+    read_flights,
+)
 from twin_worker.telemetry.flight_phase import PHASES, phase_of
 
 

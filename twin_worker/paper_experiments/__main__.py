@@ -26,10 +26,11 @@ from twin_worker.paper_experiments.experiment import (
     STATE_NAMES,
     Experiment,
     ExperimentPlan,
+    RecordedFlight,
+    read_flights,
     run_experiments,
 )
 from twin_worker.paper_experiments.figures import draw
-from twin_worker.paper_experiments.recorded_flights import RecordedFlight, read_flights
 from twin_worker.telemetry.flight_phase import PHASES
 
 _PROGRESS_EVERY = 20  # experiments between two progress messages
