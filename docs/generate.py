@@ -26,7 +26,7 @@ from fleet.effects import catalogue
 from gateway import __main__ as gateway
 from gateway.status import status_table as gateway_metrics
 from twin_worker import __main__ as twin_worker
-from twin_worker.service import metrics as worker_metrics
+from twin_worker.service import work_rates as worker_metrics
 from viewer import __main__ as viewer
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -30,7 +30,7 @@ from fleet.contract import FleetState, GatewayCounters, Prediction, Status
 from gateway.status import status_table as gateway
 from tests.bench.security.site import REAL, Site, make_papers, routed, zenohd
 from tests.bench.security.trying import until
-from twin_worker.service import metrics as twin_worker
+from twin_worker.service import work_rates as twin_worker
 
 DEPLOY = ROOT / "deploy"
 README = (DEPLOY / "README.md").read_text()

@@ -27,7 +27,7 @@ from fleet.process.logs import (
     strip_time,
 )
 from tests.bench.security.bombs import ESCAPES
-from twin_worker.service.metrics import counters
+from twin_worker.service.work_rates import counters
 
 PATIENCE_S = 10.0
 

@@ -107,7 +107,7 @@ def _run(args: argparse.Namespace) -> int:
         from twin_worker.alerts.conflict_probability import Separation
         from twin_worker.mismatch.coordinator import Coordinator
         from twin_worker.mismatch.process import DiagnosisProcess
-        from twin_worker.service.metrics import counters
+        from twin_worker.service.work_rates import counters
         from twin_worker.service.worker import Worker
 
         executor = DiagnosisProcess()
