@@ -16,7 +16,7 @@ from fleet.contract import Prediction, Sample
 from twin_worker.__main__ import NICE_INCREMENT, _prepare
 from twin_worker.confidence.tube_and_horizon import AHEAD
 from twin_worker.service.busy_fallback import is_superseded, publish_fallbacks
-from twin_worker.service.cpu_share import MIN_SHARE, CpuShareLimiter
+from twin_worker.service.identification_thread import MIN_SHARE, CpuShareLimiter
 from twin_worker.service.work_rates import RATE_WINDOW_S, WorkRates
 from twin_worker.service.worker import OwnedTwin, Worker, _advance_all
 from twin_worker.twin import step as loop

@@ -34,8 +34,7 @@ from twin_worker.service.busy_fallback import (
     lacks_prediction,
     publish_fallbacks,
 )
-from twin_worker.service.cpu_share import CpuShareLimiter
-from twin_worker.service.identification_thread import IdentificationThread
+from twin_worker.service.identification_thread import CpuShareLimiter, IdentificationThread
 from twin_worker.service.queries import QueryHandlers
 from twin_worker.service.work_rates import WorkRates
 from twin_worker.twin.state.budget import ComputeBudget
