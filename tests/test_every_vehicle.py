@@ -14,8 +14,7 @@ from fleet.frames import to_ned
 from fleet.telemetry.recording.recordings import replay_messages
 from twin_worker.evaluation.replay import run_offline
 from twin_worker.prediction.kinematic import wind_and_airspeed
-from twin_worker.telemetry.hover_detection import hovering_mask, lift_channels
-from twin_worker.telemetry.track import resample_track
+from twin_worker.telemetry.track import hovering_mask, lift_channels, resample_track
 from twin_worker.twin.step import Twin
 
 # --- positions alone -------------------------------------------------------------------------------------------------

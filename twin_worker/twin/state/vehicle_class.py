@@ -11,8 +11,7 @@ from twin_worker.prediction import kinematic
 from twin_worker.prediction.autopilot_parameters import ControllerTwin, multirotor_controller
 from twin_worker.prediction.multirotor import fit, rollout
 from twin_worker.prediction.route_override import RouteOverride
-from twin_worker.telemetry.hover_detection import SETTLING_S, hovering_mask
-from twin_worker.telemetry.track import Track, resample_track
+from twin_worker.telemetry.track import SETTLING_S, Track, hovering_mask, resample_track
 from twin_worker.twin.state.state import ROUTE_MODES, Twin
 
 WINGLESS = ("multirotor", "helicopter")

@@ -12,8 +12,8 @@ from twin_worker.identification.fixed_wing.plant import PAPER, Plant
 from twin_worker.identification.linear.linear_model import AXES, identify_axis
 from twin_worker.prediction.closed_loop import InitialCondition, Rollout, fly_from, synchronise_controller
 from twin_worker.telemetry.history import TelemetryHistory
-from twin_worker.telemetry.hover_detection import SETTLING_S, hovering_mask
 from twin_worker.telemetry.resample import DT
+from twin_worker.telemetry.track import SETTLING_S, hovering_mask
 from twin_worker.twin.state.models import VerifiedModel
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.state.vehicle_class import QUADPLANE, WINGED, WINGLESS, fit_kinematic_models
