@@ -27,9 +27,8 @@ from twin_worker.prediction.autopilot_parameters import ControllerTwin
 from twin_worker.prediction.kinematic import KinematicModel
 from twin_worker.prediction.method_selection import MethodSelector
 from twin_worker.prediction.multirotor.rollout import MultirotorModel
-from twin_worker.telemetry.history import TelemetryHistory
+from twin_worker.telemetry.history import ArrivalDelay, RowBuffer, TelemetryHistory
 from twin_worker.telemetry.resample import Resampler
-from twin_worker.telemetry.row_buffer import ArrivalDelay, RowBuffer
 from twin_worker.twin.state.budget import ComputeBudget
 from twin_worker.twin.state.events import FlightEvent
 from twin_worker.twin.state.flight_phase import FlightPhase

@@ -1,11 +1,150 @@
 """Telemetry of one aircraft over the last minutes, as received."""
 
+from dataclasses import dataclass
 from struct import Struct
 
+import numba as nb
 import numpy as np
 
 from fleet.contract import COLUMNS, DTYPES, FIRST_OPTIONAL_COLUMN, Array, Rows, Sample
-from twin_worker.telemetry.row_buffer import RowBuffer
+
+_MIN_SPARE_ROWS = 40  # minimum spare capacity [rows]
+_MAX_PENDING_ROWS = 256  # largest number of undecoded rows
+
+
+class RowBuffer:
+    """Buffer rows of one kind: times (n,) and values (n, k) float, with spare capacity; the newest rows are unsorted.
+
+    Received rows stay bytes until reading, because decoding a few rows takes as long as decoding many.
+    """
+
+    def __init__(self, t: np.ndarray, x: np.ndarray) -> None:
+        self.t, self.x = t, x
+        self.n, self.n_sorted = len(t), 0  # number of rows, and of sorted rows
+        self._pending_t: list[bytes] = []
+        self._pending_x: list[bytes] = []
+        self._pending_dtype, self._n_pending = "", 0  # type of pending values; number of pending rows
+
+    def add_bytes(self, t: bytes, x: bytes, dtype: str, since: float) -> None:
+        """Append undecoded rows of checked length: times <f8, values of `dtype`; `since` as for `add`."""
+        if dtype != self._pending_dtype or self._n_pending >= _MAX_PENDING_ROWS:
+            self.flush(since)
+            self._pending_dtype = dtype
+        self._pending_t.append(t)
+        self._pending_x.append(x)
+        self._n_pending += len(t) >> 3
+
+    def flush(self, since: float = -np.inf) -> None:
+        """Decode pending rows."""
+        if self._n_pending:
+            t = np.frombuffer(b"".join(self._pending_t), "<f8")
+            x = np.frombuffer(b"".join(self._pending_x), self._pending_dtype).reshape(len(t), -1)
+            self._pending_t, self._pending_x, self._n_pending = [], [], 0
+            self.add(t, x, since)
+
+    def add(self, t: np.ndarray, x: np.ndarray, since: float) -> None:
+        """Append rows; if capacity is exhausted, drop rows before `since`."""
+        self.flush(since)
+        end = self.n + len(t)
+        if end > len(self.t):
+            self._grow(len(t), since)
+            end = self.n + len(t)
+        self.t[self.n : end], self.x[self.n : end] = t, x
+        self.n = end
+
+    def _grow(self, n_new: int, since: float) -> None:
+        recent = self.t[: self.n] >= since
+        t, x = self.t[: self.n][recent], self.x[: self.n][recent]
+        self.n_sorted = int(recent[: self.n_sorted].sum())
+        self.n = len(t)
+        size = self.n + n_new + max(self.n // 4, _MIN_SPARE_ROWS)
+        self.t, self.x = np.empty(size), np.empty((size, self.x.shape[1]))
+        self.t[: self.n], self.x[: self.n] = t, x
+
+    def sort_new_rows(self, max_value: float, n_checked: int | None) -> None:
+        """Sort new rows by time, drop duplicates (the first is kept) and invalid values."""
+        n_checked = self.x.shape[1] if n_checked is None else n_checked
+        if not _is_sorted(self.t[: self.n], self.x, (self.n_sorted, n_checked), max_value):
+            valid = (np.abs(self.x[self.n_sorted : self.n, :n_checked]) < max_value).all(axis=1)  # false for nan
+            keep = np.concatenate([np.ones(self.n_sorted, bool), valid])
+            t, first = np.unique(self.t[: self.n][keep], return_index=True)
+            self.x[: len(t)] = self.x[: self.n][keep][first]
+            self.t[: len(t)] = t
+            self.n = len(t)
+        self.n_sorted = self.n
+
+    def shift_times(self, before_t: float, shift_s: float) -> None:
+        """Shift rows before `before_t` by `shift_s` [s]."""
+        self.flush()
+        t = self.t[: self.n]
+        t[t < before_t] += shift_s
+        self.n_sorted = 0  # later rows may overlap the shifted ones
+
+    def rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return all rows in order of arrival, (n,) and (n, k)."""
+        self.flush()
+        return self.t[: self.n], self.x[: self.n]
+
+
+@nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]
+def _is_sorted(t: np.ndarray, x: np.ndarray, bounds: tuple[int, int], max_value: float) -> bool:
+    """Return whether rows from bounds[0] on rise in time and their first bounds[1] columns are valid, not nan."""
+    for k in range(bounds[0], len(t)):
+        if k > 0 and not t[k] > t[k - 1]:
+            return False
+        for i in range(bounds[1]):
+            if not abs(x[k, i]) < max_value:
+                return False
+    return True
+
+
+_TOLERATED_S = 0.5  # usual delay of a radio link; treated as zero [s]
+
+
+@dataclass
+class ArrivalDelay:
+    """Estimate how far telemetry times are behind the gateway clock, from the order of arrival.
+
+    Samples have aircraft time, status messages have gateway time. A sample of time t that arrives after a status of
+    time G is delayed by at least G - t. The largest such bound between two status messages is the delay. The delay of
+    a simulator that is paused or slower than real time is unbounded.
+
+    Attributes:
+        gateway_t: newest time of a status [s since 1970]
+        bound: largest lower bound since that status [s]
+        established: delay established at that status [s]
+    """
+
+    gateway_t: float = float("-inf")
+    bound: float = float("-inf")
+    established: float = 0.0
+
+    @property
+    def newest_sample_delay(self) -> float:
+        """Return the delay of the newest sample [s]; 0 within the tolerance."""
+        return _zero_if_tolerated(max(self.established, self.bound))
+
+    def on_sample(self, newest: float, clock_jumped: bool) -> None:
+        """Update with telemetry up to `newest` [s since 1970]; a clock jump discards earlier bounds."""
+        bound = self.gateway_t - newest
+        self.bound = bound if clock_jumped else max(self.bound, bound)
+        self.established = 0.0 if clock_jumped else self.established
+
+    def delay_at_status(self, t: float, newest: float) -> float:
+        """Return the delay at a status of time `t` before `on_status`; the first status follows a sample."""
+        if self.gateway_t == float("-inf"):
+            return _zero_if_tolerated(t - newest)
+        return self.established if self.bound == float("-inf") else _zero_if_tolerated(self.bound)
+
+    def on_status(self, t: float, newest: float) -> None:
+        """Update with a status of time `t` that follows telemetry up to `newest` [s since 1970]."""
+        self.established = self.delay_at_status(t, newest)
+        self.gateway_t, self.bound = max(t, self.gateway_t), float("-inf")
+
+
+def _zero_if_tolerated(delay: float) -> float:
+    return delay if _TOLERATED_S < delay < float("inf") else 0.0
+
 
 _MAX_FUTURE_S = 1.0  # rows further in the future of their message are rejected [s]
 _MAX_VALUE = 1e5  # larger values are invalid [m/s, rad, us, ...]

@@ -34,7 +34,7 @@ def advance(twin: Twin, messages: Iterable[Message], now: float = -np.inf) -> li
     Data time is the newest time in any message, on the time axis of telemetry. Due work runs after every message,
     so the result does not depend on how a driver groups them. Without data, the twin steps once a second. Silence is
     measured by arrival: arriving telemetry is not silent, whatever its time stamps
-    (see `twin_worker.telemetry.row_buffer`).
+    (see `twin_worker.telemetry.history`).
 
     Args:
         twin: the aircraft's twin, changed in place

@@ -10,9 +10,8 @@ from fleet.contract import Mission, Params, Sample, Status
 from fleet.frames import Origin
 from twin_worker.estimation.wind_filter import WindFilter, update_from_history
 from twin_worker.prediction.autopilot_identification import AutopilotEstimate
-from twin_worker.telemetry.history import TelemetryHistory
+from twin_worker.telemetry.history import ArrivalDelay, TelemetryHistory
 from twin_worker.telemetry.resample import Resampler
-from twin_worker.telemetry.row_buffer import ArrivalDelay
 from twin_worker.twin.state.flight_phase import FlightPhase
 
 _MODE_CHANGES = 64  # kept
