@@ -35,9 +35,8 @@ from twin_worker.twin.state.flight_phase import FlightPhase
 from twin_worker.twin.state.inputs import Environment, OnboardState, Telemetry
 from twin_worker.twin.state.models import ActiveEffects, Checkpoint, Identification, ModelBank, VerifiedModel
 from twin_worker.twin.state.outputs import AlertingState, ConfidenceState, PredictionState
-from twin_worker.twin.state.schedule import Schedule
+from twin_worker.twin.state.schedule import Schedule, Timer
 from twin_worker.twin.state.state import Twin, TwinConfig
-from twin_worker.twin.state.timer import Timer
 from twin_worker.validation.forecast_shrinkage import Shrinkage
 
 

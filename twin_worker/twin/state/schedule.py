@@ -4,6 +4,9 @@ import argparse
 from dataclasses import dataclass, fields
 from enum import StrEnum
 
+import msgspec
+import numpy as np
+
 EARLY_FRACTION = 0.9  # share of a period after which dependent work is due, so that jitter does not skip a cycle [-]
 
 
@@ -63,3 +66,25 @@ def parse_schedule(text: str) -> Schedule:
             raise argparse.ArgumentTypeError(error_text)
     members = int(values.pop("members", Schedule.members))
     return Schedule(**values, members=members)  # type: ignore[arg-type]
+
+
+class Timer(msgspec.Struct):
+    """When a task was last done. It is due after its period, and also when the clock was set back.
+
+    Attributes:
+        last: time of the last run [s since 1970]; -inf before any
+    """
+
+    last: float = -np.inf
+
+    def due(self, now: float, period: float) -> bool:
+        """Return whether the task is due at `now`, `period` after its last run [s]."""
+        return not self.last <= now < self.last + period
+
+    def restart(self, now: float) -> None:
+        """Start a period at `now`."""
+        self.last = now
+
+    def expire(self) -> None:
+        """Make the task due at once."""
+        self.last = -np.inf
