@@ -21,8 +21,15 @@ from twin_worker.service.work_rates import RATE_WINDOW_S, WorkRates
 from twin_worker.service.worker import OwnedTwin, Worker, _advance_all
 from twin_worker.twin import step as loop
 from twin_worker.twin.state import budget as clocked
-from twin_worker.twin.state.budget import LATE_CPU_FRACTION, MIN_WORK_S, WORK_PER_SWEEP_S, ComputeBudget
-from twin_worker.twin.state.schedule import Schedule, Work, parse_schedule
+from twin_worker.twin.state.budget import (
+    LATE_CPU_FRACTION,
+    MIN_WORK_S,
+    WORK_PER_SWEEP_S,
+    ComputeBudget,
+    Schedule,
+    Work,
+    parse_schedule,
+)
 from twin_worker.twin.step import Twin, advance
 
 

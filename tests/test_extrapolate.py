@@ -11,7 +11,7 @@ from fleet.contract import Array, Prediction, Sample
 from fleet.frames import Origin, to_geodetic
 from twin_worker.confidence.tube_and_horizon import AHEAD
 from twin_worker.prediction.closed_loop import MIN_ROLLOUT_S
-from twin_worker.twin.state.schedule import Schedule
+from twin_worker.twin.state.budget import Schedule
 from twin_worker.twin.step import Twin, advance
 from twin_worker.twin.steps.extrapolate import MAX_OVERDUE_AGE_S, MAX_ROLLOUT_AGE_S, extrapolate, widen_tube
 

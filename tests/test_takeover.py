@@ -39,7 +39,7 @@ from twin_worker.ownership.history_decoder import decode_history
 from twin_worker.ownership.protocol import OwnershipProtocol
 from twin_worker.ownership.typed_serialization import serialise
 from twin_worker.service.worker import Worker
-from twin_worker.twin.state.schedule import Schedule
+from twin_worker.twin.state.budget import Schedule
 
 PATIENCE_S = 120.0  # an upper bound on a busy machine
 OTHER = "00000000000000aa"

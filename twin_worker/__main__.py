@@ -21,7 +21,7 @@ from fleet.metrics import parse_address, serve
 from fleet.process.children import Children
 from fleet.process.logs import log_arguments, report_progress, report_status
 from fleet.process.malloc_trim import enable_malloc_trim
-from twin_worker.twin.state.schedule import parse_schedule
+from twin_worker.twin.state.budget import parse_schedule
 
 _POLL_S = 0.5
 _RESTART_DELAY_S = 5.0  # before a restart, so that an immediate failure does not loop at full load [s]

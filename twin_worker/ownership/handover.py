@@ -29,13 +29,12 @@ from twin_worker.prediction.method_selection import MethodSelector
 from twin_worker.prediction.multirotor.rollout import MultirotorModel
 from twin_worker.telemetry.history import ArrivalDelay, RowBuffer, TelemetryHistory
 from twin_worker.telemetry.resample import Resampler
-from twin_worker.twin.state.budget import ComputeBudget
+from twin_worker.twin.state.budget import ComputeBudget, Schedule, Timer
 from twin_worker.twin.state.events import FlightEvent
 from twin_worker.twin.state.flight_phase import FlightPhase
 from twin_worker.twin.state.inputs import Environment, OnboardState, Telemetry
 from twin_worker.twin.state.models import ActiveEffects, Checkpoint, Identification, ModelBank, VerifiedModel
 from twin_worker.twin.state.outputs import AlertingState, ConfidenceState, PredictionState
-from twin_worker.twin.state.schedule import Schedule, Timer
 from twin_worker.twin.state.state import Twin, TwinConfig
 from twin_worker.validation.forecast_shrinkage import Shrinkage
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from fleet.contract import Message, Prediction
 from twin_worker.ownership.twin_store import OwnedTwin
-from twin_worker.twin.state.schedule import EARLY_FRACTION
+from twin_worker.twin.state.budget import EARLY_FRACTION
 from twin_worker.twin.steps.extrapolate import MAX_OVERDUE_AGE_S, MAX_ROLLOUT_AGE_S, propagate
 
 CHECK_PERIOD_S = 0.4  # between checks for aircraft without a prediction [s]

@@ -9,7 +9,7 @@ from functools import partial
 from fleet.contract import Message
 from twin_worker.ownership.twin_store import OwnedTwin
 from twin_worker.service.work_rates import WorkRates
-from twin_worker.twin.state.schedule import Work
+from twin_worker.twin.state.budget import Work
 from twin_worker.twin.step import identify, identify_due
 
 MIN_SHARE = 0.2  # lower limit [-]

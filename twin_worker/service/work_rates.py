@@ -8,7 +8,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 
 from fleet.contract import FleetRow, FleetState, TwinState
 from fleet.metrics import Families, MetricNaming, families
-from twin_worker.twin.state.schedule import Schedule, Work
+from twin_worker.twin.state.budget import Schedule, Work
 
 RATE_WINDOW_S = 30.0  # averaging time of the rates [s]
 _OVERLOAD_FACTOR = 1.3  # ratio of actual to scheduled period that is reported [-]

@@ -37,8 +37,7 @@ from twin_worker.service.busy_fallback import (
 from twin_worker.service.identification_thread import CpuShareLimiter, IdentificationThread
 from twin_worker.service.queries import QueryHandlers
 from twin_worker.service.work_rates import WorkRates
-from twin_worker.twin.state.budget import ComputeBudget
-from twin_worker.twin.state.schedule import Schedule, Work
+from twin_worker.twin.state.budget import ComputeBudget, Schedule, Work
 from twin_worker.twin.state.state import AUTO, Twin, TwinConfig
 from twin_worker.twin.step import advance, catch_up, fleet_row
 

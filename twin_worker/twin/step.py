@@ -9,9 +9,9 @@ from msgspec.structs import replace
 from fleet.contract import Alert, Event, FleetRow, Link, Message, Sample, Status, TwinState
 from fleet.frames import to_ned
 from twin_worker.prediction import method_selection
+from twin_worker.twin.state.budget import EARLY_FRACTION, Work
 from twin_worker.twin.state.events import record_event
 from twin_worker.twin.state.flight_phase import update_flight_phase
-from twin_worker.twin.state.schedule import EARLY_FRACTION, Work
 from twin_worker.twin.state.state import Twin, ingest
 from twin_worker.twin.state.vehicle_class import active_command
 from twin_worker.twin.steps.alerts import link_alerts, prediction_alerts

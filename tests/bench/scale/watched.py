@@ -12,7 +12,7 @@ import numpy as np
 
 from fleet.contract import FleetState, Prediction, Sample
 from tests.bench.referee.site import Site, cpu_s, until
-from twin_worker.twin.state.schedule import parse_schedule
+from twin_worker.twin.state.budget import parse_schedule
 
 _MODELS = 0.95  # share of the aircraft that must have a model before anything is counted [-]
 _PATIENCE_S = 240.0  # with models [s]

@@ -16,7 +16,7 @@ from twin_worker.identification.fixed_wing.plant import Plant
 from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel
 from twin_worker.prediction.kinematic import KinematicModel
 from twin_worker.prediction.multirotor.rollout import MultirotorModel
-from twin_worker.twin.state.schedule import Timer
+from twin_worker.twin.state.budget import Timer
 from twin_worker.validation.forecast_shrinkage import Shrinkage
 
 CHECKPOINT_PERIOD_S = 10.0  # between checkpoints [s]

@@ -10,8 +10,8 @@ from twin_worker.confidence.tube_and_horizon import ConfidenceTracker
 from twin_worker.prediction.autopilot_parameters import ControllerTwin
 from twin_worker.prediction.method_selection import MethodSelector
 from twin_worker.prediction.route_override import RouteOverride
+from twin_worker.twin.state.budget import Timer
 from twin_worker.twin.state.events import FlightEvent
-from twin_worker.twin.state.schedule import Timer
 
 
 class PredictionState(msgspec.Struct):

@@ -23,12 +23,11 @@ from fleet.mission import FIRST_ITEM
 from fleet.window import Window
 from twin_worker.prediction.autopilot_identification import LAW_OF_AUTOPILOT
 from twin_worker.prediction.closed_loop import AutopilotConfig, PredictionContext
-from twin_worker.twin.state.budget import ComputeBudget
+from twin_worker.twin.state.budget import ComputeBudget, Schedule, Work
 from twin_worker.twin.state.events import invalidate_prediction
 from twin_worker.twin.state.inputs import Environment, OnboardState, Telemetry
 from twin_worker.twin.state.models import Identification, ModelBank
 from twin_worker.twin.state.outputs import AlertingState, ConfidenceState, PredictionState
-from twin_worker.twin.state.schedule import Schedule, Work
 from twin_worker.validation.verify import FIT_THRESHOLD
 
 _CONTROLLER_PREFIXES = ("FW_", "MPC_", "NAV_", "NPFG_", "Q_WP_", "RTL_", "WPNAV_", "WP_")  # not ArduPlane

@@ -16,7 +16,7 @@ from twin_worker.prediction.closed_loop import (
 )
 from twin_worker.prediction.fixed_wing import ensemble
 from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_point_mass
-from twin_worker.twin.state.schedule import EARLY_FRACTION, Work
+from twin_worker.twin.state.budget import EARLY_FRACTION, Work
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.state.vehicle_class import PathForecast, no_prediction
 
