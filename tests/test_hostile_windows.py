@@ -14,8 +14,7 @@ from twin_worker.identification.fixed_wing.derivatives_model import DerivativesM
 from twin_worker.identification.fixed_wing.plant import is_finite
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps import identify_step
-from twin_worker.twin.steps.identify_step import select_model
-from twin_worker.twin.steps.model_message import model_message
+from twin_worker.twin.steps.identify_step import model_message, select_model
 from twin_worker.validation.verify import verify
 
 ROWS, SPLIT = 236, 130  # a short flight: 5.2 s to learn from, 4.2 s held out

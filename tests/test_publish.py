@@ -13,7 +13,7 @@ from fleet.physics.simulate import TAU
 from fleet.physics.wrench import NAMES
 from twin_worker.identification.fixed_wing.derivatives_model import identify
 from twin_worker.twin.state.state import Twin
-from twin_worker.twin.steps.model_message import derivatives_message, model_message
+from twin_worker.twin.steps.identify_step import derivatives_message, model_message
 
 WINDOW = fly(aircraft(0), 40.0)
 GOOD, BAD = (
