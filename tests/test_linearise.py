@@ -9,7 +9,7 @@ from fleet.physics.dynamics import step
 from fleet.physics.simulate import TAU, lagged
 from fleet.physics.wrench import WIND
 from fleet.window import INPUTS, STATES
-from twin_worker.identification.fixed_wing.linearise import linearise
+from twin_worker.identification.fixed_wing.derivatives_model import linearise
 
 FINE = 20  # steps of integration in one sample
 

@@ -10,8 +10,7 @@ from fleet.physics.wrench import NAMES
 from fleet.process.sanitise import format_below
 from fleet.window import Window
 from twin_worker.identification.fixed_wing import derivatives_model
-from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
-from twin_worker.identification.fixed_wing.linearise import linearise
+from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel, linearise
 from twin_worker.identification.fixed_wing.plant import PAPER, Plant
 from twin_worker.identification.linear.linear_model import AXES, identify_axis
 from twin_worker.prediction.closed_loop import InitialCondition, Rollout, fly_from, synchronise_controller
