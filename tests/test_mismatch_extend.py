@@ -17,7 +17,7 @@ from fleet.simulator.flight.drive import to_tlog
 from fleet.simulator.flight.uav import SimulatedUav
 from fleet.telemetry.recording.recordings import replay_messages
 from twin_worker.diagnosis.data.card import FaultHypothesis
-from twin_worker.identification.fixed_wing.point_mass_with_effects import EffectIncrements, with_effects
+from twin_worker.identification.fixed_wing.point_mass_model import EffectIncrements, with_effects
 from twin_worker.mismatch.adapt_models import adapt_models, adapted_derivatives, wind_with_effects
 from twin_worker.mismatch.effect_increments import EffectOutputs, actual_deflections
 from twin_worker.twin.state.models import MAX_CHECKPOINTS, latest_before

@@ -15,7 +15,7 @@ from fleet.physics.wrench import NAMES, WIND, L, M, N, X, Y, Z, terms
 from fleet.window import Window
 from twin_worker.estimation.wind_filter import WindFilter, update_from_history
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
-from twin_worker.identification.fixed_wing.point_mass_with_effects import EffectIncrements, with_effects
+from twin_worker.identification.fixed_wing.point_mass_model import EffectIncrements, with_effects
 from twin_worker.mismatch.effect_increments import EffectOutputs
 from twin_worker.numerics.ridge_regression import solve_ridge
 from twin_worker.prediction.closed_loop import Rollout, synchronise_controller
