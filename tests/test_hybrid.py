@@ -11,7 +11,8 @@ from fleet.contract import Item
 from fleet.frames import G, Origin
 from fleet.mission import unroll_route
 from fleet.physics import point_mass as H
-from twin_worker.identification.fixed_wing import attitude_lag, energy_balance
+from twin_worker.identification.fixed_wing import energy_balance
+from twin_worker.identification.fixed_wing import energy_balance as attitude_lag
 from twin_worker.identification.fixed_wing.energy_balance import PointMassData, RegressionResult
 from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel, identify
 from twin_worker.prediction.closed_loop import InitialCondition, synchronise_controller

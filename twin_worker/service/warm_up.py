@@ -17,7 +17,7 @@ from twin_worker.alerts.traffic import TrafficMonitor
 from twin_worker.confidence.adaptive_conformal import AdaptiveLevels
 from twin_worker.confidence.prediction_log import PredictionLog
 from twin_worker.estimation.wind_filter import WindFilter
-from twin_worker.identification.fixed_wing import attitude_lag
+from twin_worker.identification.fixed_wing import energy_balance as attitude_lag
 from twin_worker.identification.fixed_wing.derivatives_model import identify, linearise
 from twin_worker.identification.fixed_wing.plant import bias_corrected
 from twin_worker.identification.linear.linear_model import AXES, identify_axis

@@ -6,7 +6,8 @@ import numpy as np
 
 from fleet.physics import point_mass as H
 from fleet.window import Window
-from twin_worker.identification.fixed_wing import attitude_lag, energy_balance
+from twin_worker.identification.fixed_wing import energy_balance
+from twin_worker.identification.fixed_wing import energy_balance as attitude_lag
 from twin_worker.identification.fixed_wing.energy_balance import (
     PointMassData,
     RegressionResult,
