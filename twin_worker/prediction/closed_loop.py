@@ -21,8 +21,13 @@ from twin_worker.estimation.airspeed_setpoint import apply_setpoint, inferred_se
 from twin_worker.estimation.wind_filter import WindFilter
 from twin_worker.identification.fixed_wing.plant import Plant, actuator_state, bias_corrected
 from twin_worker.numerics.interpolation import interpolate_rows, zero_order_hold
-from twin_worker.prediction.autopilot_parameters import CRUISE_OF, ControllerTwin, fixed_wing_controller
-from twin_worker.prediction.route_override import RouteOverride, transfer_controller
+from twin_worker.prediction.autopilot_parameters import (
+    CRUISE_OF,
+    ControllerTwin,
+    RouteOverride,
+    fixed_wing_controller,
+    transfer_controller,
+)
 from twin_worker.telemetry.history import TelemetryHistory
 
 MIN_ROLLOUT_S = 60.0  # shortest valid rollout [s]

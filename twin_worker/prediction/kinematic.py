@@ -18,9 +18,14 @@ from fleet.frames import G, Origin
 from fleet.mission import KIND, TAKEOFF, VA_C, Route
 from fleet.process.sanitise import format_below
 from twin_worker.numerics.interpolation import interpolate_rows
-from twin_worker.prediction.autopilot_parameters import CRUISE_OF, ControllerTwin, fixed_wing_controller
+from twin_worker.prediction.autopilot_parameters import (
+    CRUISE_OF,
+    ControllerTwin,
+    RouteOverride,
+    fixed_wing_controller,
+    transfer_controller,
+)
 from twin_worker.prediction.closed_loop import cached_route
-from twin_worker.prediction.route_override import RouteOverride, transfer_controller
 from twin_worker.telemetry.track import STEP, Track
 
 MIN_TRACK_S = 5.0  # minimum track on this route [s]

@@ -12,9 +12,8 @@ from fleet.contract import MAX_ITEMS, Array, Item, Mission, Prediction, Status, 
 from fleet.frames import Origin, to_geodetic, to_ned, wrap
 from fleet.mission import FIRST_ITEM
 from twin_worker.confidence.tube_and_horizon import AHEAD
-from twin_worker.prediction.autopilot_parameters import SPEED_PARAMETERS, range_error
+from twin_worker.prediction.autopilot_parameters import SPEED_PARAMETERS, RouteOverride, range_error
 from twin_worker.prediction.kinematic import wind_and_airspeed
-from twin_worker.prediction.route_override import RouteOverride
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.twin.state.state import ROUTE_MODES, Twin
 from twin_worker.twin.state.vehicle_class import WINGLESS, recent_track

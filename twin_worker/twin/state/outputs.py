@@ -7,9 +7,8 @@ from fleet.contract import Event, Prediction, TwinState
 from fleet.frames import Origin
 from twin_worker.alerts.hysteresis import AlertState
 from twin_worker.confidence.tube_and_horizon import ConfidenceTracker
-from twin_worker.prediction.autopilot_parameters import ControllerTwin
+from twin_worker.prediction.autopilot_parameters import ControllerTwin, RouteOverride
 from twin_worker.prediction.method_selection import MethodSelector
-from twin_worker.prediction.route_override import RouteOverride
 from twin_worker.twin.state.budget import Timer
 from twin_worker.twin.state.events import FlightEvent
 

@@ -8,9 +8,8 @@ import numpy as np
 from fleet.autopilots import copter, greybox
 from fleet.contract import Mission
 from twin_worker.prediction import kinematic
-from twin_worker.prediction.autopilot_parameters import ControllerTwin, multirotor_controller
+from twin_worker.prediction.autopilot_parameters import ControllerTwin, RouteOverride, multirotor_controller
 from twin_worker.prediction.multirotor import fit, rollout
-from twin_worker.prediction.route_override import RouteOverride
 from twin_worker.telemetry.track import SETTLING_S, Track, hovering_mask, resample_track
 from twin_worker.twin.state.state import ROUTE_MODES, Twin
 
