@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twin_worker.prediction.turn_rate import STEP, constant_turn_prediction, imm
+from twin_worker.prediction.method_selection import STEP, constant_turn_prediction, imm
 from twin_worker.telemetry.track import STEP as TRACK_STEP
 from twin_worker.telemetry.track import Track
 

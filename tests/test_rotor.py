@@ -11,7 +11,7 @@ from fleet.contract import Mission, Params, Prediction, Sample, Status, TwinStat
 from fleet.frames import to_ned
 from twin_worker.confidence.tube_and_horizon import AHEAD
 from twin_worker.evaluation.replay import run_offline
-from twin_worker.prediction.turn_rate import imm
+from twin_worker.prediction.method_selection import imm
 from twin_worker.twin.step import Twin
 
 SEED = 106

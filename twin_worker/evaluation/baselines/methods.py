@@ -21,8 +21,8 @@ from twin_worker.evaluation.baselines.route_line import LineInputs, route_line
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
 from twin_worker.prediction.closed_loop import fly_ahead
 from twin_worker.prediction.kinematic import wind_and_airspeed
+from twin_worker.prediction.method_selection import constant_turn_prediction
 from twin_worker.prediction.multirotor.rollout import items_in_force
-from twin_worker.prediction.turn_rate import constant_turn_prediction
 from twin_worker.telemetry.track import STEP, Track
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.state.vehicle_class import WINGLESS
