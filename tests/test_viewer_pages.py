@@ -15,8 +15,7 @@ from pretend_feed import PretendFleet
 
 from fleet.bus.memory_bus import MemoryBus
 from tests.bench.viewing.watcher import Watcher
-from viewer.browser.browser import PagePreferences
-from viewer.browser.http_server import serve, without_stdout
+from viewer.browser.http_server import PagePreferences, serve, without_stdout
 from viewer.panels.panels import NO_UAV
 from viewer.server.app import App
 from viewer.server.view import View

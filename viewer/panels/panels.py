@@ -8,7 +8,7 @@ from typing import Any
 
 import viser
 
-from viewer.browser.browser import Browser
+from viewer.browser.http_server import Browser
 from viewer.panels.charts import Charts
 from viewer.panels.detail import figures_html, status_html
 from viewer.panels.event_list import event_list_html

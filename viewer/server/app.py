@@ -12,7 +12,7 @@ import viser
 
 from fleet.bus.bus_protocol import Bus
 from fleet.contract import History
-from viewer.browser.browser import Browser
+from viewer.browser.http_server import Browser
 from viewer.scene.camera import IN_VIEW_M, set_initial_view, within_reach
 from viewer.scene.fleet_arrays import TRAIL_AGES_S, FleetArrays
 from viewer.scene.routes import home_alt_m

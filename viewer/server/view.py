@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import viser
 
-from viewer.browser.browser import Browser
+from viewer.browser.http_server import Browser
 from viewer.export.panel import Export
 from viewer.panels.detail import clip
 from viewer.panels.panels import Panels
