@@ -29,7 +29,7 @@ from viewer.panels.event_list import event_list_html
 from viewer.scene.camera import FOV, frame, within_reach
 from viewer.scene.routes import mission_lines
 from viewer.scene.scene import DASHES, cut_at_horizon
-from viewer.scene.selection.tube import curtain, marked_look_aheads, rings, tube_faces
+from viewer.scene.selection.pins import curtain, marked_look_aheads, rings, tube_faces
 from viewer.server.view import FRAME_MARGIN, outgrown
 from viewer.store.place import UNIT_M, SceneFrame, scene_quat
 from viewer.store.store import FleetStore

@@ -10,8 +10,8 @@ from fleet.contract import Array, Mission, Rows, Sample, Status
 from fleet.frames import Origin
 from viewer.scene.fleet_arrays import LARGE_FLEET, LOST, MISMATCH, READ_PARTS, TRAIL_AGES_S, FleetArrays, display_status
 from viewer.scene.labels import MAX_LABELS, CameraView, Tag, visible_labels
+from viewer.scene.selection.pins import BAND_SIGMA, sample_paths
 from viewer.scene.selection.selected import active_seq
-from viewer.scene.selection.tube import BAND_SIGMA, sample_paths
 from viewer.server.app import Backfill
 from viewer.store.errors import LOOK_AHEADS_S, prediction_errors, rms_by_look_ahead
 from viewer.store.received.inbox import Inbox

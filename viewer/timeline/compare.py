@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viewer.scene.selection.tube import path_frame
+from viewer.scene.selection.pins import path_frame
 from viewer.store.forecast import ScenePrediction
 from viewer.store.place import UNIT_M
 

@@ -106,3 +106,83 @@ def event_text(event: TimelineEvent) -> str:
     text = event.text.split(":")[0] if event.kind in MODEL_KINDS else event.text
     text = text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 1] + "…"
     return f"{MARK[event.kind]} {text} {time_of_day(event.t)}"
+
+
+SIDES = 20  # corners of one ring
+BAND_SIGMA = 2.1  # half-axes of the simultaneous 90 % region in standard deviations
+
+
+def path_frame(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the cross and vertical unit vectors along a path (n, 3): two (n, 3); hovering keeps the last direction."""
+    run = np.gradient(path, axis=0) if len(path) > 1 else np.zeros_like(path)
+    flat = run * [1.0, 1.0, 0.0]
+    length = np.linalg.norm(flat, axis=1)
+    moving = length > 1e-6
+    index = np.maximum.accumulate(np.where(moving, np.arange(len(path)), 0))
+    if not moving.any():
+        flat, length = np.tile([1.0, 0.0, 0.0], (len(path), 1)), np.ones(len(path))
+    elif not moving[0]:
+        index[: int(np.argmax(moving))] = int(np.argmax(moving))
+    ahead = flat[index] / length[index][:, None]
+    cross = np.stack([-ahead[:, 1], ahead[:, 0], np.zeros(len(path))], axis=-1)
+    along = np.where(np.linalg.norm(run, axis=1)[index, None] > 1e-6, run[index], ahead)
+    along = along / np.linalg.norm(along, axis=1)[:, None]
+    return cross, np.cross(along, cross)
+
+
+def rings(path: np.ndarray, axes: np.ndarray, sides: int = SIDES) -> np.ndarray:
+    """Return the cross-section of the tube at each point.
+
+    Args:
+        path: mean position, (n, 3) [10 m]
+        axes: half-axes along, cross, vertical, (n, 3) [10 m]
+    Returns:
+        corners, (n, sides, 3) [10 m]
+    """
+    cross, up = path_frame(path)
+    turn = np.linspace(0, 2 * np.pi, sides, endpoint=False)[None, :, None]
+    return (
+        path[:, None]
+        + np.cos(turn) * (axes[:, 1, None, None] * cross[:, None])
+        + np.sin(turn) * (axes[:, 2, None, None] * up[:, None])
+    )
+
+
+def tube_faces(n: int, sides: int = SIDES) -> np.ndarray:
+    """Return the triangles between n rings: (2 (n - 1) sides, 3) indices into the flattened corners."""
+    near = np.arange(n - 1)[:, None] * sides + np.arange(sides)
+    next_ = np.arange(n - 1)[:, None] * sides + (np.arange(sides) + 1) % sides
+    halves = [np.stack([near, next_, near + sides], -1), np.stack([next_, next_ + sides, near + sides], -1)]
+    return np.concatenate([half.reshape(-1, 3) for half in halves]).astype(np.uint32)
+
+
+def curtain(path: np.ndarray, ground: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return a vertical surface from a path to the ground: corners (2 n, 3), triangles (2 (n - 1), 3)."""
+    foot = path * [1.0, 1.0, 0.0] + [0.0, 0.0, ground]
+    k = np.arange(len(path) - 1) * 2
+    faces = np.concatenate([np.stack([k, k + 1, k + 2], -1), np.stack([k + 1, k + 3, k + 2], -1)])
+    return np.stack([path, foot], axis=1).reshape(-1, 3), faces.astype(np.uint32)
+
+
+def marked_look_aheads(horizon_s: float, steps: tuple[float, ...] = (5, 10, 20, 30, 60, 120)) -> list[float]:
+    """Return the look-aheads to mark [s]: those with enough distance to the horizon."""
+    return [step for step in steps if step < horizon_s - max(2.0, 0.12 * horizon_s)]
+
+
+def sample_paths(path: np.ndarray, axes: np.ndarray, n: int, seed: int) -> np.ndarray:
+    """Sample paths that the tube contains with its nominal coverage: (n, k, 3).
+
+    Cross and vertical offsets are standard normal in units of the half-axes over `BAND_SIGMA` and rotate slowly into
+    a second pair, so that errors are correlated along the path.
+
+    Args:
+        path: mean position, (k, 3) [10 m]
+        axes: half-axes along, cross, vertical, (k, 3) [10 m]
+        n: number of paths
+        seed: constant per UAV, so that paths do not flicker
+    """
+    cross, up = path_frame(path)
+    begin, end = np.random.default_rng(seed).standard_normal((2, n, 2, 1))
+    turn = np.linspace(0.0, 0.9, len(path))
+    offset = (np.cos(turn) * begin + np.sin(turn) * end) / BAND_SIGMA
+    return path + offset[:, 0, :, None] * (axes[:, 1, None] * cross) + offset[:, 1, :, None] * (axes[:, 2, None] * up)

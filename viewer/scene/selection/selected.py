@@ -8,8 +8,7 @@ import numpy as np
 from fleet.contract import DiagnosisOutcome, Mismatch, TwinState
 from viewer.scene.labels import CameraView, Tag
 from viewer.scene.routes import NOTHING, RouteLines
-from viewer.scene.selection.pins import EventMarkers
-from viewer.scene.selection.tube import curtain, marked_look_aheads, rings, sample_paths, tube_faces
+from viewer.scene.selection.pins import EventMarkers, curtain, marked_look_aheads, rings, sample_paths, tube_faces
 from viewer.scene.strokes import SegmentBatch, Strokes, chain, circle_corners, closed_loops, dash_lines, dashed
 from viewer.store.forecast import PastPrediction, ScenePrediction
 from viewer.store.store import FleetStore
