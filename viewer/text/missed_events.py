@@ -6,7 +6,7 @@ import time
 from html import escape
 from typing import Any, NamedTuple
 
-from viewer.store.received.datatime import time_of_day
+from viewer.store.received.inbox import time_of_day
 from viewer.store.vehicle import Vehicle
 from viewer.text.clicks import encode_click
 from viewer.theme.events import EventKind, TimelineEvent

@@ -9,7 +9,7 @@ from fleet.contract import FleetRow, TwinState
 from viewer.scene.fleet_arrays import TRAIL_AGES_S, FleetArrays
 from viewer.store.forecast import ScenePrediction
 from viewer.store.place import UNIT_M, scene_quat
-from viewer.store.received.datatime import DataTime
+from viewer.store.received.inbox import DataTime
 from viewer.store.track import positions_at
 from viewer.store.vehicle import Vehicle
 from viewer.theme.events import TimelineEvent
