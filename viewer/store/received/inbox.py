@@ -4,17 +4,19 @@ Samples that change the mission item are always decoded. Decoding costs ten time
 fleet only what is drawn is decoded.
 """
 
+import struct
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
+from functools import cache
 from math import inf, isfinite
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 
 from fleet.access.roles import TOPIC_RULES
 from fleet.bus.bus_protocol import RawMessage
 from fleet.bus.codec import Stamp
-from fleet.contract import Rows, Sample
+from fleet.contract import Array, Rows, Sample
 
 LARGE_FLEET = 300  # UAVs above which only the newest sample of each is decoded
 MAX_QUEUED = 40  # queued samples of one UAV; then the newest replaces the last
@@ -230,3 +232,46 @@ def timestamp(t: float) -> str:
 def rate_text(rate: float) -> str:
     """Format a rate: 4×."""
     return f"{rate:.0f}×" if rate >= 1.5 else f"{rate:.2g}×"
+
+
+_STRUCT_CODES = {"<f4": "f", "<f8": "d", "<i4": "i", "<i8": "q", "|u1": "B"}
+
+
+@cache
+def _packed(dtype: str, width: int) -> struct.Struct:
+    return struct.Struct(f"<{width}{_STRUCT_CODES[dtype]}")
+
+
+def last_row(x: Array) -> tuple[float, ...]:
+    """Return the last row of a table; empty when there is none.
+
+    Raises:
+        ValueError: when dtype, shape and byte count disagree; correct the sender.
+    """
+    shape = x.shape
+    if len(shape) != 2 or not shape[0]:
+        return ()
+    if (
+        x.dtype not in _STRUCT_CODES
+        or not 0 < shape[1] < 100
+        or len(x.data) != shape[0] * _packed(x.dtype, shape[1]).size
+    ):
+        return tuple(map(float, x.numpy()[-1]))  # raises with the reason
+    pack = _packed(x.dtype, shape[1])
+    return pack.unpack_from(x.data, (shape[0] - 1) * pack.size)
+
+
+def position_rows(uav: int, rows: Rows) -> tuple[Any, Any]:
+    """Return the times (n,) and rows (n, 3 or more) of positions; decode a single row without numpy.
+
+    Raises:
+        ValueError: when the shapes do not match; the gateway must resend.
+    """
+    t, x = rows.t, rows.x
+    if x.shape == (1, 3) and t.shape == (1,):
+        row_times, row = last_row(Array(t.dtype, (1, 1), t.data)), last_row(x)
+        return row_times, (row,)
+    times, positions = t.numpy(), x.numpy()
+    if positions.ndim != 2 or positions.shape[1] < 3 or times.shape != (len(positions),):
+        raise ValueError(f"uav-{uav}: position rows have shape {positions.shape}, expected (n, 3) and n times; resend")
+    return times.tolist(), positions.tolist()
