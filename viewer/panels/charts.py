@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from viser import uplot
 
-from viewer.store.errors import LOOK_AHEADS_S, prediction_errors, rms_by_look_ahead
+from viewer.store.forecast import LOOK_AHEADS_S, prediction_errors, rms_by_look_ahead
 from viewer.store.place import UNIT_M
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
