@@ -19,7 +19,7 @@ from viewer.browser.http_server import PagePreferences, serve, without_stdout
 from viewer.panels.panels import NO_UAV
 from viewer.server.app import App
 from viewer.server.view import View
-from viewer.text.clicks import encode_click, parse_click
+from viewer.text.missed_events import encode_click, parse_click
 from viewer.text.words import table
 from viewer.theme.palette import DARK, LIGHT
 

@@ -15,8 +15,7 @@ from viewer.panels.event_list import event_list_html
 from viewer.store.states import RouterStatus, notices
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
-from viewer.text.clicks import parse_click
-from viewer.text.missed_events import missed_events_html
+from viewer.text.missed_events import missed_events_html, parse_click
 from viewer.text.words import MAX_ROWS, alerts_html, empty_html, legend_html, severity, summary_html, table
 from viewer.theme.palette import STATE_TEXT, Palette, triple
 

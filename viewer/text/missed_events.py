@@ -8,9 +8,25 @@ from typing import Any, NamedTuple
 
 from viewer.store.received.inbox import time_of_day
 from viewer.store.vehicle import Vehicle
-from viewer.text.clicks import encode_click
-from viewer.theme.events import EventKind, TimelineEvent
+from viewer.theme.events import LATEST, EventKind, TimelineEvent
 from viewer.theme.palette import MARK, Palette
+
+
+def encode_click(uav: int, t: float) -> str:
+    """Encode a UAV id and a data time [s since 1970]: `7@1700000000.500`; omit an invalid time."""
+    return f"{uav}@{t:.3f}" if 0 <= t < LATEST else f"{uav}"
+
+
+def parse_click(text: str) -> tuple[int, float | None] | None:
+    """Parse `7` or `7@1700000000.500`; return None for any other text."""
+    uav, _, t = text[:40].partition("@")
+    if not (uav.isascii() and uav.isdecimal() and len(uav) <= 6):
+        return None
+    if not t:
+        return int(uav), None
+    valid = t.isascii() and t.replace(".", "", 1).isdecimal() and float(t) < LATEST
+    return (int(uav), float(t)) if valid else None
+
 
 KEY = "parauav-seen"  # in the local storage of the browser
 MIN_ABSENCE_S = 5.0  # a shorter interruption is ignored [s]

@@ -11,7 +11,7 @@ from fleet.contract import DiagnosisOutcome, Mismatch, TwinState
 from viewer.store.received.inbox import rate_text, time_of_day, timestamp
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
-from viewer.text.clicks import encode_click
+from viewer.text.missed_events import encode_click
 from viewer.theme.events import EventKind
 from viewer.theme.palette import GLYPH, MARK, STATE_TEXT, Palette
 
