@@ -18,8 +18,8 @@ from viewer.store.received.inbox import Inbox
 from viewer.store.store import COALESCE_S, FleetStore
 from viewer.text.missed_events import Absence, missed_events, missed_events_html
 from viewer.theme.events import EventKind
-from viewer.theme.numerals import digit_strokes
 from viewer.theme.palette import DARK
+from viewer.theme.shapes import digit_strokes
 
 SIGHT = CameraView(np.array([0.0, -100.0, 50.0]), np.zeros(3), np.radians(50), 1.6)
 

@@ -7,8 +7,8 @@ import numpy as np
 from viewer.scene.routes import circle
 from viewer.scene.strokes import Strokes, chain
 from viewer.store.place import UNIT_M
-from viewer.theme.numerals import digit_strokes
 from viewer.theme.palette import Palette, rgb
+from viewer.theme.shapes import digit_strokes
 
 RINGS_M = (500, 1000, 2000, 5000, 10_000)
 GRIDS = ((100, 1_200, 0.5), (500, 6_000, 1.0), (5_000, 30_000, 1.0))  # spacing [m], extent [m], strength [-]

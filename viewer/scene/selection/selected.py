@@ -16,8 +16,8 @@ from viewer.store.track import positions_at
 from viewer.store.vehicle import Vehicle
 from viewer.text import words as mismatch_text
 from viewer.text.words import MIN_HORIZON_S, fit, located_spans
-from viewer.theme.numerals import digit_strokes, face_camera
 from viewer.theme.palette import Palette, mix, rgb, triple
+from viewer.theme.shapes import digit_strokes, face_camera
 
 MAX_NUMBERS = 60  # items up to which numbers are drawn
 
