@@ -16,7 +16,8 @@ from viewer.store.vehicle import Vehicle
 from viewer.text.words import summary_html, table
 from viewer.theme.events import EventKind, TimelineEvent
 from viewer.theme.palette import DARK
-from viewer.timeline import compare, strip
+from viewer.timeline import past as compare
+from viewer.timeline import strip
 from viewer.timeline.deck import STEPS, TRANSPORT, Timeline
 from viewer.timeline.past import PastVehicle
 from viewer.timeline.player import Player, TimelineRange

@@ -15,7 +15,8 @@ from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.theme.events import TimelineEvent
 from viewer.theme.palette import Palette, mix, rgb
-from viewer.timeline import compare, strip
+from viewer.timeline import past as compare
+from viewer.timeline import strip
 from viewer.timeline.past import PastVehicle, update_past_arrays, vehicle_at
 from viewer.timeline.player import Player, TimelineRange, last_before, next_after
 from viewer.timeline.recordings import RecordingStore
