@@ -14,8 +14,7 @@ from viewer.store.received.inbox import DataTime
 from viewer.store.track import positions_at
 from viewer.store.vehicle import Vehicle
 from viewer.theme.events import TimelineEvent
-from viewer.timeline.recording import UavRecording
-from viewer.timeline.state_at import StateRecord
+from viewer.timeline.recording import StateRecord, UavRecording
 
 TRAIL_S = 90.0  # length of the fine trail [s]
 PAST_S = 60.0  # age of the past predictions [s]

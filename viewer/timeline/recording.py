@@ -1,15 +1,50 @@
 """Recording of one UAV for replay on the page: rows, predictions every 5 s, and states."""
 
+from typing import NamedTuple
+
 import msgspec
 import numpy as np
 
-from fleet.contract import Array
+from fleet.contract import Alert, AlertKey, Array, Link, Mismatch, TwinState
 from fleet.frames import wrap
 from viewer.store.forecast import ScenePrediction
 from viewer.store.track import TRAIL_ROWS
 from viewer.store.vehicle import JUMP_S, Vehicle
+from viewer.text.words import fit
 from viewer.theme.events import TimelineEvent
-from viewer.timeline.state_at import StateRecord, state_record
+
+
+class StateRecord(NamedTuple):
+    """State of a UAV from a time until the next record."""
+
+    t: float  # data time [s since 1970]
+    state: TwinState
+    link: Link
+    mode: str
+    armed: bool
+    sentence: str  # of its status
+    verdict: str  # of its newest identification
+    fit: float | None  # mean over the states [%]
+    alerts: dict[AlertKey, Alert]
+    mismatch: Mismatch | None
+
+
+def state_record(vehicle: Vehicle, at: float, now: float) -> StateRecord:
+    """Return the state of a UAV at data time `at` [s since 1970]; `now` is monotonic [s]."""
+    status, mean = vehicle.status, fit(vehicle)
+    return StateRecord(
+        at,
+        vehicle.state(now),
+        status.link if status is not None else Link.LIVE,
+        status.mode if status is not None else "",
+        status.armed if status is not None else False,
+        status.sentence if status is not None else "",
+        vehicle.model.verdict.sentence if vehicle.model is not None else "",
+        None if mean is None else float(round(mean)),
+        vehicle.alerts,
+        vehicle.mismatch,
+    )
+
 
 RETENTION_S = 600.0  # retention of a live flight; a recording is kept completely [s]
 PREDICTION_STEP_S = 5.0  # between two recorded predictions [s]
