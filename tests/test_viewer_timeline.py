@@ -20,9 +20,8 @@ from viewer.timeline import past as compare
 from viewer.timeline import strip
 from viewer.timeline.deck import STEPS, TRANSPORT, Timeline
 from viewer.timeline.past import PastVehicle
-from viewer.timeline.player import Player, TimelineRange
 from viewer.timeline.recording import MAX_ROWS, PREDICTION_STEP_S, RETENTION_S, UavRecording
-from viewer.timeline.recordings import RecordingStore
+from viewer.timeline.recordings import Player, RecordingStore, TimelineRange
 
 
 @pytest.fixture

@@ -18,8 +18,7 @@ from viewer.theme.palette import Palette, mix, rgb
 from viewer.timeline import past as compare
 from viewer.timeline import strip
 from viewer.timeline.past import PastVehicle, update_past_arrays, vehicle_at
-from viewer.timeline.player import Player, TimelineRange, last_before, next_after
-from viewer.timeline.recordings import RecordingStore
+from viewer.timeline.recordings import Player, RecordingStore, TimelineRange, last_before, next_after
 from viewer.timeline.strip import drag_attributes
 
 TRANSPORT = ("Pause", "1×", "4×", "● Live")

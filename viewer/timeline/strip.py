@@ -8,7 +8,7 @@ from viewer.store.received.inbox import time_of_day
 from viewer.theme.events import EventKind, TimelineEvent
 from viewer.theme.palette import MARK, Palette
 from viewer.timeline.past import STEPS_S, LeadTimeError
-from viewer.timeline.player import TimelineRange
+from viewer.timeline.recordings import TimelineRange
 
 WIDTH = 1000  # width of the drawing; the page scales it
 SEVERE = {
