@@ -20,7 +20,7 @@ from gateway.links.link import QUEUE, Batch, Endpoint, wall
 from gateway.onboard import RequestSender
 from gateway.onboard.parameter_cache_check import Cache
 from gateway.onboard.questions import budget_of
-from gateway.publication.publish import Publisher
+from gateway.publication import Publisher
 from gateway.record.recorder import LinkRecorder, RecordedQueue
 from gateway.status.status_table import StatisticsCollector
 

@@ -12,7 +12,7 @@ from fleet.bus.codec import EncodedMessage, encode
 from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import connect
 from fleet.contract import Array, History, Rows, Sample, Status
-from gateway.publication.publish import HistoryStore, Publisher
+from gateway.publication import HistoryStore, Publisher
 
 
 def sample(uav, t, rows=3):

@@ -27,7 +27,7 @@ from gateway import pipeline as pump_module
 from gateway.links.link import Batch, wall
 from gateway.links.receive import MAX_DATAGRAMS, BatchReceiver
 from gateway.pipeline import FLUSH_BYTES, Pipeline
-from gateway.publication.publish import Publisher
+from gateway.publication import Publisher
 
 
 def fly(intake: MavlinkReceiver, talker: Talker, begin: float, seconds: float, source: str = "air") -> list:

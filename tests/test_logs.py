@@ -39,7 +39,7 @@ def record(message: str, *, defect: bool = False) -> logging.LogRecord:
             raise ZeroDivisionError("by a stranger")
         except ZeroDivisionError:
             info = sys.exc_info()
-    return logging.LogRecord("gateway.publication.publish", logging.WARNING, __file__, 1, "%s", (message,), info)
+    return logging.LogRecord("gateway.publication", logging.WARNING, __file__, 1, "%s", (message,), info)
 
 
 def test_people_read_a_sentence_that_steers_no_terminal() -> None:
@@ -91,7 +91,7 @@ def test_machines_read_one_line_of_json() -> None:
     assert (told["level"], told["process"], told["from"]) == (
         "warning",
         "gateway",
-        "gateway.publication.publish",
+        "gateway.publication",
     )
     assert told["t"].endswith("+00:00")
 

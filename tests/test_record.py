@@ -26,7 +26,7 @@ from fleet.telemetry.recording.fleet_news import RESULT_TYPES, TELEMETRY_TYPES
 from fleet.telemetry.recording.recordings import Recording, replay_messages
 from gateway.links.recorded import ReplayLink
 from gateway.pipeline import Pipeline
-from gateway.publication.publish import Publisher
+from gateway.publication import Publisher
 from gateway.settings.link_spec import read_spec
 from viewer.store.store import FleetStore
 

@@ -18,7 +18,7 @@ from fleet.bus.codec import EncodedMessage, encode
 from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import connect, open_router
 from fleet.contract import GatewayCounters, Mission, Status
-from gateway.publication.publish import LEASE_S, Publisher, RouterSession
+from gateway.publication import LEASE_S, Publisher, RouterSession
 
 STATUS = EncodedMessage(Status, 7, encode(Status(uav=7, t=T0)))
 

@@ -33,7 +33,7 @@ from fleet.contract import (
     Sample,
     Status,
 )
-from gateway.publication.publish import Publisher
+from gateway.publication import Publisher
 from tests.bench.asking.answerer import prediction
 from twin_worker.ownership.history_decoder import decode_history
 from twin_worker.ownership.protocol import OwnershipProtocol

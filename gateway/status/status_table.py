@@ -25,7 +25,7 @@ from fleet.telemetry.mavlink.intake import MavlinkReceiver
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
 from gateway.links.link import Endpoint
 from gateway.onboard.questions import RateShare
-from gateway.publication.publish import RouterSession, StatusSnapshot
+from gateway.publication import RouterSession, StatusSnapshot
 from gateway.record.recorder import LinkRecorder, RecordingCounters
 from gateway.record.tape import format_size
 

@@ -15,7 +15,7 @@ from fleet.commands.live.record import BusRecorder
 from fleet.commands.live.status import as_objects, fleet_rows, fleet_table
 from fleet.commands.live.whatif import as_object, format_text, send_request
 from fleet.contract import FleetState, GatewayCounters, Mission, Prediction, Sample, Status, WhatIf
-from gateway.publication.publish import Publisher
+from gateway.publication import Publisher
 from tests.bench.peak_memory import peak_mb, reset_peak
 from tests.examples import EXAMPLES
 from twin_worker.service.worker import Worker
