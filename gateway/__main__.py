@@ -22,6 +22,7 @@ from fleet.telemetry.mavlink.intake import MAX_UAVS
 from fleet.telemetry.mavlink.warm import warm_up
 from fleet.telemetry.recording.ids import IdAllocator
 from gateway.admission.admission import make_admissions
+from gateway.link_spec import read_forward, read_spec
 from gateway.links.link import Endpoint
 from gateway.links.opening import open_link
 from gateway.links.recorded import ReplayLink, replay_process, split_replays
@@ -30,7 +31,6 @@ from gateway.onboard.questions import DEFAULT_BUDGET
 from gateway.pipeline import Pipeline
 from gateway.record.recorder import LinkRecorder
 from gateway.record.tape import DiskBudget, read_size
-from gateway.settings.link_spec import read_forward, read_spec
 from gateway.status.status_table import counters, status_display
 
 SWITCH_S = 5e-4  # longest wait of a receiving thread for the interpreter [s]

@@ -7,8 +7,8 @@ from talker import Ears
 
 from fleet.process import logs
 from gateway.__main__ import COMPILING
+from gateway.link_spec import read_spec
 from gateway.links.link import Batch
-from gateway.settings.link_spec import read_spec
 
 PATIENCE_S = 60.0  # an upper bound; every wait ends with its condition
 

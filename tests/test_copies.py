@@ -33,9 +33,9 @@ from fleet.telemetry.replay.offset_copies import (
     MessageTemplate,
     OffsetCopies,
 )
+from gateway.link_spec import read_spec
 from gateway.links.recorded import ReplayLink
 from gateway.pipeline import Pipeline
-from gateway.settings.link_spec import read_spec
 
 HOME = Origin(470_000_000, 80_000_000, 500_000)
 PATIENCE_S = 60.0

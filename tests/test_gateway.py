@@ -19,11 +19,11 @@ from fleet.contract import GatewayCounters, Mission, Params, Sample, Status
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
 from fleet.telemetry.recording.recordings import replay_messages
 from gateway.__main__ import compile_decoder
+from gateway.link_spec import read_spec
 from gateway.links.link import Batch
 from gateway.links.receive import Udp
 from gateway.links.recorded import ReplayLink
 from gateway.pipeline import Pipeline
-from gateway.settings.link_spec import read_spec
 
 PATIENCE_S = 30.0  # an upper bound; every wait ends with its condition
 

@@ -13,8 +13,8 @@ from fleet.bus.session import connect
 from fleet.contract import GatewayCounters, Status
 from fleet.telemetry.onboard_logs.ulog.formats import Formats
 from fleet.telemetry.recording.opening import MAX_RATIO, MIN_UNPACKED_LIMIT, RecordingFile
+from gateway.link_spec import read_spec
 from gateway.links.recorded import split_replays
-from gateway.settings.link_spec import read_spec
 from tests.bench.security.hostile_files import CPU_S, FILES, MEMORY_MB, a_flight, read_apart, rightful_files, written
 
 SHORT = ("regex", "nested formats", "records in records", "DataFlash, formats over and over", "tlog with gaps")

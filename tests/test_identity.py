@@ -21,9 +21,9 @@ from fleet.contract import Alert, AlertKind, GatewayCounters, Status
 from fleet.telemetry.mavlink.heartbeat import CLEAR_AFTER_S
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
 from fleet.telemetry.recording.ids import IdAllocator
+from gateway.link_spec import read_spec
 from gateway.links.opening import open_link
 from gateway.pipeline import Pipeline
-from gateway.settings.link_spec import read_spec
 
 
 def test_a_second_sender_raises_one_alarm_which_ends_when_it_is_silent():

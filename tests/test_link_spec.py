@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gateway.settings.link_spec import read_filter, read_forward, read_spec
+from gateway.link_spec import read_filter, read_forward, read_spec
 
 
 def test_links_are_read():

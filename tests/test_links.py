@@ -19,13 +19,13 @@ from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import GatewayCounters
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
 from fleet.telemetry.recording.ids import IdAllocator
+from gateway.link_spec import read_spec
 from gateway.links import receive, tcp_listener
 from gateway.links.link import Batch, wall
 from gateway.links.opening import open_link
 from gateway.links.stream import MAX_BYTES, SendQueue
 from gateway.onboard import RequestSender
 from gateway.pipeline import Pipeline
-from gateway.settings.link_spec import read_spec
 
 DROPPED = "dropped: decoding fell behind"
 HELLO, ANSWER = Talker().heartbeat(), Talker(255, 190).heartbeat(6, 8)

@@ -10,10 +10,10 @@ from fleet.contract import Item, Mission, Params
 from fleet.simulator.flight.mavlink import MavlinkEndpoint
 from fleet.simulator.flight.mavlink_messages import DIALECTS
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
+from gateway.link_spec import read_spec
 from gateway.onboard import RequestSender
 from gateway.onboard.parameter_cache_check import Cache
 from gateway.onboard.questions import MIN_SHARE, WANTED_BYTES_S, WANTED_HZ, budget_of
-from gateway.settings.link_spec import read_spec
 
 VALUES = {"NAVL1_PERIOD": 17.0, "STAT_RUNTIME": 1.0, **{f"P{k:03d}": k / 7 for k in range(300)}}
 LONG = tuple(ITEMS) + tuple(Item(seq=k, command=16, lat_e7=470_100_000 + k) for k in range(len(ITEMS), 60))

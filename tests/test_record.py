@@ -24,10 +24,10 @@ from fleet.contract import TOPICS, Alert, FleetState, Message, Mission, Model, P
 from fleet.telemetry.recording.fleet_log import MAX_UNRECOGNISED, BusRecord
 from fleet.telemetry.recording.fleet_news import RESULT_TYPES, TELEMETRY_TYPES
 from fleet.telemetry.recording.recordings import Recording, replay_messages
+from gateway.link_spec import read_spec
 from gateway.links.recorded import ReplayLink
 from gateway.pipeline import Pipeline
 from gateway.publication import Publisher
-from gateway.settings.link_spec import read_spec
 from viewer.store.store import FleetStore
 
 PATIENCE_S = 60.0

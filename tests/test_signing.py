@@ -25,7 +25,7 @@ from gateway.admission.admission import (
     select_key,
     stamp_now,
 )
-from gateway.settings.link_spec import read_spec
+from gateway.link_spec import read_spec
 
 KEY, OTHER = bytes(range(32)), bytes(32)
 NOW = 37_000_000_000_000  # [10 us since 2015]

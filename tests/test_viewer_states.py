@@ -11,9 +11,9 @@ from test_gateway import flight
 
 from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import GatewayCounters, LinkCounters, Status
+from gateway.link_spec import read_spec
 from gateway.links.recorded import ReplayLink
 from gateway.pipeline import Pipeline
-from gateway.settings.link_spec import read_spec
 from viewer.panels.detail import status_html
 from viewer.scene.camera import set_initial_view
 from viewer.scene.ground import RINGS_M

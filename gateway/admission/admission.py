@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from fleet.telemetry.mavlink.parsing.decode import Frames
 from fleet.telemetry.mavlink.parsing.scan import COMPONENT, EXTRA, START, STOP, SYSTEM, V2
 from fleet.telemetry.mavlink.parsing.scan import SIGNED as FLAG
-from gateway.settings.link_spec import LinkSpec, MessageFilter
+from gateway.link_spec import LinkSpec, MessageFilter
 
 WRONG, REPLAYED, STALE, UNSIGNED = (
     "signature: wrong",

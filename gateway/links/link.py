@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 
 from fleet.bus.codec import EncodedMessage
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
-from gateway.settings.link_spec import LinkSpec
+from gateway.link_spec import LinkSpec
 
 QUEUE = 20_000  # batches between receiving and decoding
 QUEUE_BYTES = 8 << 20  # limit of one link in the queue: a flood on one link must not delay the others for long

@@ -1,12 +1,12 @@
 """Open a link from its specification."""
 
 from fleet.telemetry.recording.ids import IdAllocator
+from gateway.link_spec import LinkSpec
 from gateway.links.link import Endpoint
 from gateway.links.receive import Udp
 from gateway.links.recorded import ReplayLink
 from gateway.links.stream import StreamClient
 from gateway.links.tcp_listener import TcpListener
-from gateway.settings.link_spec import LinkSpec
 
 
 def open_link(spec: LinkSpec, ids: IdAllocator) -> Endpoint:

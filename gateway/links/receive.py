@@ -19,8 +19,8 @@ import numba as nb
 import numpy as np
 
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes, compact, read_only
+from gateway.link_spec import LinkSpec
 from gateway.links.link import POLL_S, BackOff, Batch, BatchWriter, wall
-from gateway.settings.link_spec import LinkSpec
 
 MAX_DATAGRAMS = 256  # datagrams per batch, at most 16 MB
 SLOT_BYTES = 65_536  # maximum size of a datagram [bytes]

@@ -22,8 +22,8 @@ from fleet.telemetry.recording.ids import IdAllocator
 from fleet.telemetry.recording.opening import ReplayPace
 from fleet.telemetry.recording.recordings import Recording
 from fleet.telemetry.replay.offset_copies import OffsetCopies
+from gateway.link_spec import LinkSpec
 from gateway.links.link import POLL_S, QUEUE, Batch
-from gateway.settings.link_spec import LinkSpec
 
 READ_AHEAD_S = 3.0  # recorded time read ahead to find the aircraft [s]
 _MAX_READ_AHEAD = 100  # steps read ahead before the first message

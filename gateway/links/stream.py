@@ -13,8 +13,8 @@ from typing import Any
 
 import serial
 
+from gateway.link_spec import LinkSpec
 from gateway.links.link import POLL_S, BackOff, Batch, BatchWriter
-from gateway.settings.link_spec import LinkSpec
 
 MAX_BYTES = 65_536  # capacity in bytes; eleven seconds at 57,600 baud
 

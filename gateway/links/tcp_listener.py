@@ -8,9 +8,9 @@ import threading
 import time
 from collections.abc import Hashable, Sequence
 
+from gateway.link_spec import LinkSpec
 from gateway.links.link import POLL_S, Batch, BatchWriter
 from gateway.links.stream import Tcp, enqueue
-from gateway.settings.link_spec import LinkSpec
 
 MOST = 64  # clients at a time
 SPEAKING_S = 3.0  # a client that sent data within this time is not disconnected [s]

@@ -11,9 +11,9 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
 from fleet.telemetry.mavlink.parsing.decode import layout
+from gateway.link_spec import LinkSpec
 from gateway.onboard.parameter_cache_check import ANY, DIALECTS, STREAMS, Cache, CacheCheck, RequestDialect
 from gateway.record.tape import format_size, read_size
-from gateway.settings.link_spec import LinkSpec
 
 WANTED_HZ: dict[str, float] = {  # [Hz]
     "ATTITUDE": 25,

@@ -17,10 +17,10 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
 from fleet.telemetry.mavlink.intake import SILENCE_LIMIT_S, MavlinkReceiver
+from gateway.link_spec import read_spec
 from gateway.links.link import Batch
 from gateway.links.tcp_listener import MOST, TcpListener
 from gateway.record.tape import RETRY_S, DiskBudget, TlogWriter
-from gateway.settings.link_spec import read_spec
 from tests.talker import T0, Talker
 from viewer.browser.http_server import VIOLATION, serve, without_stdout
 

@@ -1,1 +1,0 @@
-"""Link specifications from the command line, and which messages a link carries."""
