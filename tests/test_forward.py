@@ -13,7 +13,7 @@ from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Alert, Mission, Params
 from fleet.telemetry.mavlink.parsing.decode import IDS
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
-from gateway.forwarding.forward import DUPLICATE_SENDER, MAX_DATAGRAM, NO_TARGET, targets
+from gateway.forwarding import DUPLICATE_SENDER, MAX_DATAGRAM, NO_TARGET, targets
 from gateway.links.link import Batch
 from gateway.pipeline import Pipeline
 

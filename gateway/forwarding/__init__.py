@@ -1,1 +1,0 @@
-"""Forwarding of raw MAVLink between links."""
