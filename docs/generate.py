@@ -24,7 +24,7 @@ from fleet.commands.offline import schema
 from fleet.contract import COLUMNS, QUERIES, TOPICS, FleetState, GatewayCounters, Link, Sample, Status, meaning
 from fleet.effects import catalogue
 from gateway import __main__ as gateway
-from gateway.status import status_table as gateway_metrics
+from gateway import status as gateway_metrics
 from twin_worker import __main__ as twin_worker
 from twin_worker.service import work_rates as worker_metrics
 from viewer import __main__ as viewer

@@ -31,7 +31,7 @@ from gateway.onboard.questions import DEFAULT_BUDGET
 from gateway.pipeline import Pipeline
 from gateway.record.recorder import LinkRecorder
 from gateway.record.tape import DiskBudget, read_size
-from gateway.status.status_table import counters, status_display
+from gateway.status import counters, status_display
 
 SWITCH_S = 5e-4  # longest wait of a receiving thread for the interpreter [s]
 COLD_S = 2.0  # compilation that takes longer is logged [s]

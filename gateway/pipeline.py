@@ -22,7 +22,7 @@ from gateway.onboard.parameter_cache_check import Cache
 from gateway.onboard.questions import budget_of
 from gateway.publication import Publisher
 from gateway.record.recorder import LinkRecorder, RecordedQueue
-from gateway.status.status_table import StatisticsCollector
+from gateway.status import StatisticsCollector
 
 TICK_S = 0.1  # between two publications of a live link [s]
 IDLE_WAIT_S = 0.02  # wait at an empty queue [s]

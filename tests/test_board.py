@@ -17,13 +17,13 @@ from test_gateway import PATIENCE_S, Ear
 from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import GatewayCounters, Status
 from fleet.metrics import serve, with_unit
+from gateway import status as status_table
 from gateway.link_spec import read_spec
 from gateway.links.receive import Udp
 from gateway.pipeline import Pipeline
 from gateway.record.recorder import LinkRecorder
 from gateway.record.tape import DiskBudget
-from gateway.status import status_table
-from gateway.status.status_table import counters, format_line, overruns, render, status_display
+from gateway.status import counters, format_line, overruns, render, status_display
 
 ACCOUNT, STATUS = EXAMPLES[GatewayCounters], EXAMPLES[Status]
 

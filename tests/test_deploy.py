@@ -27,7 +27,7 @@ from fleet.bus.codec import decode, encode
 from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import connect
 from fleet.contract import FleetState, GatewayCounters, Prediction, Status
-from gateway.status import status_table as gateway
+from gateway import status as gateway
 from tests.bench.security.site import REAL, Site, make_papers, routed, zenohd
 from tests.bench.security.trying import until
 from twin_worker.service import work_rates as twin_worker

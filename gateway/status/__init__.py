@@ -1,1 +1,0 @@
-"""Statistics of links and aircraft, as printed, published and exported."""
