@@ -21,7 +21,7 @@ from fleet.report.progress import show_progress
 from fleet.telemetry.mavlink.intake import MAX_UAVS
 from fleet.telemetry.mavlink.warm import warm_up
 from fleet.telemetry.recording.ids import IdAllocator
-from gateway.admission.admission import make_admissions
+from gateway.admission import make_admissions
 from gateway.link_spec import read_forward, read_spec
 from gateway.links.link import Endpoint
 from gateway.links.opening import open_link

@@ -14,7 +14,7 @@ from fleet.contract import Message
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
 from fleet.telemetry.mavlink.intake import MAX_UAVS, MavlinkReceiver
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
-from gateway.admission.admission import Admission, make_admissions
+from gateway.admission import Admission, make_admissions
 from gateway.forwarding import FrameForwarder
 from gateway.links.link import QUEUE, Batch, Endpoint, wall
 from gateway.onboard import RequestSender

@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import T0, Ears, Talker
 
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
-from gateway.admission.admission import (
+from gateway.admission import (
     REPLAYED,
     STALE,
     UNSIGNED,

@@ -1,1 +1,0 @@
-"""Which frames are accepted: message filter, signature check, limits."""
