@@ -14,7 +14,7 @@ from test_viewer_timeline import fly, tape_of, timeline
 
 from fleet.contract import Alert, AlertKind, Status
 from fleet.frames import to_geodetic
-from viewer.export.panel import COLUMNS, Export, FlightAnimation, escape_formula, picture, png, table
+from viewer.export import COLUMNS, Export, FlightAnimation, escape_formula, picture, png, table
 from viewer.theme.palette import DARK, rgb
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import viser
 
 from viewer.browser.http_server import Browser
-from viewer.export.panel import Export
+from viewer.export import Export
 from viewer.panels.detail import clip
 from viewer.panels.panels import Panels
 from viewer.scene.alert_labels import alert_labels

@@ -1,1 +1,0 @@
-"""Exports of the page: view as PNG, flight as HTML, data of a UAV as CSV."""
