@@ -14,7 +14,7 @@ from viewer.scene.selection.pins import BAND_SIGMA, sample_paths
 from viewer.scene.selection.selected import active_seq
 from viewer.server.app import Backfill
 from viewer.store.forecast import LOOK_AHEADS_S, prediction_errors, rms_by_look_ahead
-from viewer.store.received.inbox import Inbox
+from viewer.store.inbox import Inbox
 from viewer.store.store import COALESCE_S, FleetStore
 from viewer.text.missed_events import Absence, missed_events, missed_events_html
 from viewer.theme.events import EventKind

@@ -12,8 +12,8 @@ from fleet.telemetry.onboard_logs.onboard_news import DEFAULT_EPOCH_S
 from fleet.telemetry.recording.recordings import Recording
 from viewer.panels.detail import figures_html, status_html
 from viewer.scene.selection.pins import MAX_LABELS, MINOR_KINDS, event_text, labelled_events
-from viewer.store.received import inbox as datatime
-from viewer.store.received.inbox import DataTime, date_text, is_dated, rate_text, time_of_day, timestamp
+from viewer.store import inbox as datatime
+from viewer.store.inbox import DataTime, date_text, is_dated, rate_text, time_of_day, timestamp
 from viewer.store.store import FleetStore
 from viewer.store.track import POINTS, FlightTrack, positions_at
 from viewer.store.vehicle import ENDED_S, SILENT_S

@@ -6,7 +6,7 @@ from pretend_feed import Clock, T, feed_of
 
 from fleet.contract import Array, Prediction, Status, TwinState
 from viewer.store.forecast import ScenePrediction
-from viewer.store.received.inbox import DataTime
+from viewer.store.inbox import DataTime
 from viewer.timeline.recording import (
     INITIAL_ROWS,
     MAX_PREDICTIONS,

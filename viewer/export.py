@@ -19,8 +19,8 @@ from viewer.scene.labels import CameraView, Labels
 from viewer.scene.routes import mission_lines
 from viewer.scene.scene import Scene
 from viewer.scene.selection.selected import Selection
+from viewer.store.inbox import is_dated, timestamp
 from viewer.store.place import UNIT_M, SceneFrame
-from viewer.store.received.inbox import is_dated, timestamp
 from viewer.store.store import FleetStore
 from viewer.theme.palette import Palette, rgb
 from viewer.timeline.past import PastVehicle, update_past_arrays, vehicle_at

@@ -4,7 +4,7 @@ from html import escape
 from math import isfinite
 
 from fleet.contract import Controller, Outcome, TwinState
-from viewer.store.received.inbox import rate_text, timestamp
+from viewer.store.inbox import rate_text, timestamp
 from viewer.store.vehicle import Vehicle
 from viewer.text import words as mismatch_text
 from viewer.text.words import MIN_HORIZON_S, age_text, fit, horizon_s, status_label

@@ -2,7 +2,7 @@
 
 from html import escape
 
-from viewer.store.received.inbox import date_text, time_of_day, timestamp
+from viewer.store.inbox import date_text, time_of_day, timestamp
 from viewer.theme.events import TimelineEvent
 from viewer.theme.palette import MARK, Palette
 

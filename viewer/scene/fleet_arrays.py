@@ -3,8 +3,8 @@
 import numpy as np
 
 from fleet.contract import TwinState
+from viewer.store.inbox import LARGE_FLEET
 from viewer.store.place import UNIT_M, scene_quat
-from viewer.store.received.inbox import LARGE_FLEET
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.text.words import in_force

@@ -19,8 +19,8 @@ from viewer.scene.routes import home_alt_m
 from viewer.scene.selection.selected import BEYOND_S
 from viewer.scene.terrain.land import TerrainLayer
 from viewer.server.view import View
+from viewer.store.inbox import SampleSubset
 from viewer.store.place import UNIT_M
-from viewer.store.received.inbox import SampleSubset
 from viewer.store.store import FleetStore
 from viewer.store.track import positions_at
 from viewer.store.vehicle import Vehicle

@@ -24,7 +24,7 @@ from fleet.contract import (
     Status,
     Verdict,
 )
-from viewer.store.received.inbox import SampleSubset
+from viewer.store.inbox import SampleSubset
 from viewer.theme.events import LATEST, MAX_ALERTS, EventKind, TimelineEvent
 
 # MAV_CMD. Source: MAVLink common.xml.

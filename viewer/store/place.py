@@ -3,7 +3,7 @@
 import numpy as np
 
 from fleet.frames import Origin, to_geodetic, to_ned
-from viewer.store.received.inbox import SampleSubset
+from viewer.store.inbox import SampleSubset
 
 UNIT_M = 10.0  # metres per scene unit: keeps the fleet between the near and far planes of the renderer
 REACH_M = 100_000.0  # beyond this distance the tangent plane is inaccurate and nothing is drawn

@@ -24,8 +24,8 @@ from fleet.contract import (
     TwinState,
 )
 from viewer.store.forecast import PastPrediction, check_prediction
+from viewer.store.inbox import LARGE_FLEET, CoalescingQueue, Inbox, QueuedMessage, SampleSubset, decode_sample
 from viewer.store.place import OutOfRangeError, SceneFrame, checked_origin, first_fix
-from viewer.store.received.inbox import LARGE_FLEET, CoalescingQueue, Inbox, QueuedMessage, SampleSubset, decode_sample
 from viewer.store.vehicle import ENDED_S, JUMP_S, Vehicle, stamp_of
 from viewer.theme.events import MAX_ALERTS
 

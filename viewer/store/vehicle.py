@@ -25,8 +25,8 @@ from fleet.contract import (
 )
 from viewer.store.event_detection import DetectorState, detect_events
 from viewer.store.forecast import PastPrediction, ScenePrediction
+from viewer.store.inbox import DataTime, SampleSubset, last_row, position_rows
 from viewer.store.place import UNIT_M, SceneFrame
-from viewer.store.received.inbox import DataTime, SampleSubset, last_row, position_rows
 from viewer.store.track import FlightTrack, Trail
 from viewer.theme.events import TimelineEvent, closed_at, merged
 

@@ -6,7 +6,7 @@ import time
 from html import escape
 from typing import Any, NamedTuple
 
-from viewer.store.received.inbox import time_of_day
+from viewer.store.inbox import time_of_day
 from viewer.store.vehicle import Vehicle
 from viewer.theme.events import LATEST, EventKind, TimelineEvent
 from viewer.theme.palette import MARK, Palette

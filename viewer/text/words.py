@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fleet.contract import DiagnosisOutcome, Mismatch, TwinState
-from viewer.store.received.inbox import rate_text, time_of_day, timestamp
+from viewer.store.inbox import rate_text, time_of_day, timestamp
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.text.missed_events import encode_click

@@ -10,7 +10,7 @@ import viser
 
 from viewer.scene.fleet_arrays import FleetArrays
 from viewer.scene.strokes import Strokes, chain
-from viewer.store.received.inbox import timestamp
+from viewer.store.inbox import timestamp
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.theme.events import TimelineEvent

@@ -9,8 +9,8 @@ from fleet.contract import FleetRow, TwinState
 from viewer.scene.fleet_arrays import TRAIL_AGES_S, FleetArrays
 from viewer.scene.selection.pins import path_frame
 from viewer.store.forecast import ScenePrediction
+from viewer.store.inbox import DataTime
 from viewer.store.place import UNIT_M, scene_quat
-from viewer.store.received.inbox import DataTime
 from viewer.store.track import positions_at
 from viewer.store.vehicle import Vehicle
 from viewer.theme.events import TimelineEvent

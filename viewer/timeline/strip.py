@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from html import escape
 from math import inf
 
-from viewer.store.received.inbox import time_of_day
+from viewer.store.inbox import time_of_day
 from viewer.theme.events import EventKind, TimelineEvent
 from viewer.theme.palette import MARK, Palette
 from viewer.timeline.past import STEPS_S, LeadTimeError

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from viewer.scene.labels import Tag
-from viewer.store.received.inbox import time_of_day
+from viewer.store.inbox import time_of_day
 from viewer.store.track import positions_at
 from viewer.theme.events import EventKind, TimelineEvent
 from viewer.theme.palette import MARK, Palette, mesh_colour, rgb

@@ -1,1 +1,0 @@
-"""Messages as received from the bus, their times and rows."""
