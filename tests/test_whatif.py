@@ -14,7 +14,7 @@ from fleet.contract import MAX_ITEMS, Prediction, WhatIf, WhatIfStart
 from fleet.frames import to_geodetic
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.predict_step import predict
-from twin_worker.whatif.answer import answer_query
+from twin_worker.whatif import answer_query
 
 NAN, INF = float("nan"), float("inf")
 FAST_S = 0.05  # the best of three answers takes no longer [s]

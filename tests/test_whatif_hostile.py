@@ -9,7 +9,7 @@ from odd_missions import ODD
 
 from fleet.contract import MAX_ITEMS, Prediction, WhatIf
 from twin_worker.twin.state.state import Twin
-from twin_worker.whatif.answer import MAX_BYTES, answer_query
+from twin_worker.whatif import MAX_BYTES, answer_query
 
 NAN, INF = float("nan"), float("inf")
 PLACE = {"lat_e7": 470_000_000, "lon_e7": 80_000_000, "alt_mm": 500_000}

@@ -25,7 +25,7 @@ from twin_worker.ownership.twin_store import INBOX_SIZE
 from twin_worker.service import worker as live
 from twin_worker.service.queries import latest_prediction as told_of
 from twin_worker.service.worker import Worker
-from twin_worker.whatif.answer import read_grid, resample
+from twin_worker.whatif import read_grid, resample
 
 NAN = float("nan")
 

@@ -11,9 +11,9 @@ from msgspec import Raw
 
 from fleet.bus.codec import EncodedMessage, Stamp, encode
 from fleet.contract import Prediction, Predictions, WhatIf
+from twin_worker import whatif as query
 from twin_worker.ownership.twin_store import OwnedTwin
-from twin_worker.whatif import answer as query
-from twin_worker.whatif.answer import answer_query, read_grid, resample
+from twin_worker.whatif import answer_query, read_grid, resample
 
 _log = logging.getLogger(__name__)
 StampedMessages = Iterator[tuple[Any, Stamp]]

@@ -1,1 +1,0 @@
-"""What-if queries: a prediction under another route, speed, start, wind or parameters."""
