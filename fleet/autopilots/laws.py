@@ -22,9 +22,19 @@ from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane.guide import align_integrators as shift_arduplane
 from fleet.autopilots.arduplane.guide import assume_commanded_speed
 from fleet.autopilots.arduplane.guide import fly as fly_arduplane
-from fleet.autopilots.common.controller_state import ARDUPLANE, LAW, LEG, PX4, TEXTBOOK, W_E, W_N, padded
+from fleet.autopilots.common.controller_state import (
+    ARDUPLANE,
+    LAW,
+    LEG,
+    PX4,
+    TEXTBOOK,
+    W_E,
+    W_N,
+    ParameterSpec,
+    lookup,
+    padded,
+)
 from fleet.autopilots.common.kernels import array_kernel, kernel
-from fleet.autopilots.common.parameters import ParameterSpec, lookup
 
 inlined = nb.njit(cache=True, error_model="numpy", inline="always")
 

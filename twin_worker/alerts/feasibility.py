@@ -18,7 +18,7 @@ from scipy.special import ndtr
 from fleet import mission as m
 from fleet.autopilots import arduplane
 from fleet.autopilots.arduplane import params as P
-from fleet.autopilots.common import parameters
+from fleet.autopilots.common import controller_state as parameters
 from fleet.contract import AlertKind
 from fleet.frames import G, Origin, to_geodetic
 from twin_worker.alerts.hysteresis import HazardEstimate

@@ -8,8 +8,7 @@ from math import pi
 
 import numpy as np
 
-from fleet.autopilots.common.controller_state import TEXTBOOK, padded
-from fleet.autopilots.common.parameters import ParameterSpec, eas2tas, lookup
+from fleet.autopilots.common.controller_state import TEXTBOOK, ParameterSpec, eas2tas, lookup, padded
 
 TABLE = (
     ParameterSpec("chi_inf", pi / 3, 1, 0.1, pi / 2),
