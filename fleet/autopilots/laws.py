@@ -31,10 +31,11 @@ from fleet.autopilots.common.controller_state import (
     W_E,
     W_N,
     ParameterSpec,
+    array_kernel,
+    kernel,
     lookup,
     padded,
 )
-from fleet.autopilots.common.kernels import array_kernel, kernel
 
 inlined = nb.njit(cache=True, error_model="numpy", inline="always")
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.common import controller_state as S
-from fleet.autopilots.common.kernels import array_kernel, kernel
+from fleet.autopilots.common.controller_state import array_kernel, kernel
 from fleet.autopilots.laws import align_integrators, begin, engage, fly, stabilise
 from fleet.frames import wrap
 from fleet.mission import SEQ

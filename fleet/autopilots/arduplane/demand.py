@@ -10,7 +10,7 @@ import numpy as np
 
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.common import controller_state as S
-from fleet.autopilots.common.kernels import clip, kernel
+from fleet.autopilots.common.controller_state import clip, kernel
 from fleet.frames import G
 
 _FILTER_BANDWIDTH = 2.0  # bandwidth of the airspeed filter [rad/s]

@@ -12,7 +12,7 @@ import numpy as np
 
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.common import controller_state as S
-from fleet.autopilots.common.kernels import angle_to, clip, hypot, kernel
+from fleet.autopilots.common.controller_state import angle_to, clip, hypot, kernel
 from fleet.frames import G, wrap
 from fleet.mission import P_E, P_N
 

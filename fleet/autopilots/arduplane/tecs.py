@@ -13,7 +13,7 @@ import numpy as np
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.arduplane.demand import MIN_FILTERED_SPEED, demand_height, demand_speed, min_airspeed
 from fleet.autopilots.common import controller_state as S
-from fleet.autopilots.common.kernels import clip, kernel
+from fleet.autopilots.common.controller_state import clip, kernel
 from fleet.frames import G
 
 

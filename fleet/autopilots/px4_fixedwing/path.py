@@ -10,8 +10,7 @@ import numpy as np
 
 from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.common import controller_state as S
-from fleet.autopilots.common.controller_state import W_E, W_N
-from fleet.autopilots.common.kernels import angle_to, clip, kernel
+from fleet.autopilots.common.controller_state import W_E, W_N, angle_to, clip, kernel
 from fleet.autopilots.px4_fixedwing import params as P
 from fleet.autopilots.px4_fixedwing import params as X
 from fleet.frames import G, wrap

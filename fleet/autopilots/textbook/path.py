@@ -9,7 +9,7 @@ import numpy as np
 
 from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.common import controller_state as S
-from fleet.autopilots.common.kernels import clip, kernel
+from fleet.autopilots.common.controller_state import clip, kernel
 from fleet.autopilots.textbook import params as P
 from fleet.autopilots.textbook import params as X
 from fleet.frames import G, wrap
