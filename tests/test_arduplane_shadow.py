@@ -8,8 +8,8 @@ from point_mass import HERE, PAR, Plane, begin, fly, leg, route
 
 from fleet import mission as m
 from fleet.autopilots import arduplane as ap
+from fleet.autopilots import common as S
 from fleet.autopilots.arduplane import params as P
-from fleet.autopilots.common import controller_state as S
 from fleet.autopilots.shadow import replay_controller
 
 LAP = [(800.0, 0.0, 100.0), (800.0, 700.0, 130.0), (0.0, 700.0, 130.0), (0.0, 0.0, 90.0), (800.0, 0.0, 100.0)]

@@ -17,8 +17,8 @@ from scipy.special import ndtr
 
 from fleet import mission as m
 from fleet.autopilots import arduplane
+from fleet.autopilots import common as parameters
 from fleet.autopilots.arduplane import params as P
-from fleet.autopilots.common import controller_state as parameters
 from fleet.contract import AlertKind
 from fleet.frames import G, Origin, to_geodetic
 from twin_worker.alerts.hysteresis import HazardEstimate

@@ -7,9 +7,9 @@ from types import MappingProxyType
 import numpy as np
 
 from fleet import mission as legs_of
+from fleet.autopilots import common as memory
 from fleet.autopilots import laws
-from fleet.autopilots.common import controller_state as memory
-from fleet.autopilots.common.controller_state import W_E, W_N
+from fleet.autopilots.common import W_E, W_N
 from fleet.contract import Item
 from fleet.frames import G, Origin, to_geodetic
 from fleet.simulator.faults.carried import FaultSet
