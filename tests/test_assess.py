@@ -18,7 +18,7 @@ from fleet.simulator.flight.drive import to_tlog
 from fleet.simulator.flight.uav import SimulatedUav
 from fleet.telemetry.recording.recordings import replay_messages
 from twin_worker.evaluation.__main__ import main
-from twin_worker.evaluation.baselines.methods import BASELINES
+from twin_worker.evaluation.baselines import BASELINES
 from twin_worker.evaluation.drive import EvaluationPlan, RecordingDriver
 from twin_worker.evaluation.scoring.compare import MIN_EVENT_FREE_S, MIN_FIRST_S
 from twin_worker.evaluation.scoring.log import OURS, ReferenceFlight

@@ -6,7 +6,7 @@ from flights import HERE, T0, item, messages, turn
 
 from fleet.contract import Message, Mission, Params, Status
 from fleet.mission import unroll_route
-from twin_worker.evaluation.baselines.methods import BASELINES, BaselineInput, LineInputs, route_line
+from twin_worker.evaluation.baselines import BASELINES, BaselineInput, LineInputs, route_line
 from twin_worker.twin.state.state import Twin, ingest
 from twin_worker.twin.state.vehicle_class import recent_track
 from twin_worker.twin.step import advance

@@ -7,7 +7,7 @@ import numpy as np
 
 from fleet.contract import Message, Params, Prediction, Status
 from twin_worker.confidence.tube_and_horizon import AHEAD
-from twin_worker.evaluation.baselines.methods import BASELINES, BaselineInput
+from twin_worker.evaluation.baselines import BASELINES, BaselineInput
 from twin_worker.evaluation.scoring.compare import MIN_EVENT_FREE_S, MIN_FIRST_S, resolve_start
 from twin_worker.evaluation.scoring.log import OURS, EvaluationCase, EvaluationStart, MethodForecast, ReferenceFlight
 from twin_worker.identification.fixed_wing.plant import DYNAMICS, PAPER

@@ -1,1 +1,0 @@
-"""Simpler prediction methods to compare with."""
