@@ -8,7 +8,7 @@ import pytest
 from PIL import Image, TiffImagePlugin
 from pretend_feed import HOME
 
-from viewer.scene.terrain.land import (
+from viewer.scene.terrain import (
     KEYS,
     MAX_CONTOURS,
     NO_DATA,

@@ -11,7 +11,7 @@ from fleet.config import bus_config_from, router_arguments
 from fleet.process.logs import log_arguments, report_status
 from fleet.process.malloc_trim import enable_malloc_trim
 from viewer.browser.http_server import serve, without_stdout
-from viewer.scene.terrain.land import TerrainLayer, read_raster
+from viewer.scene.terrain import TerrainLayer, read_raster
 from viewer.server.app import App
 
 GC_THRESHOLDS = 50_000, 10, 10  # a large fleet allocates 10,000 objects per second, almost none in cycles

@@ -17,7 +17,7 @@ from viewer.scene.camera import IN_VIEW_M, set_initial_view, within_reach
 from viewer.scene.fleet_arrays import TRAIL_AGES_S, FleetArrays
 from viewer.scene.routes import home_alt_m
 from viewer.scene.selection.selected import BEYOND_S
-from viewer.scene.terrain.land import TerrainLayer
+from viewer.scene.terrain import TerrainLayer
 from viewer.server.view import View
 from viewer.store.inbox import SampleSubset
 from viewer.store.place import UNIT_M

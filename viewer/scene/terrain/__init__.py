@@ -1,1 +1,0 @@
-"""Ground elevation and imagery from local files."""
