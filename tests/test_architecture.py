@@ -18,7 +18,7 @@ ORDER = (  # a folder, or a module in the root of a package, imports only from i
     ("fleet.metrics", "fleet.mission", "fleet.window", "fleet.access"),
     ("fleet.config", "fleet.bus", "fleet.cli"),
     ("fleet.airframes",),
-    ("fleet.autopilots.common",),
+    ("fleet.autopilots.control_law",),
     ("fleet.autopilots.arduplane",),
     ("fleet.autopilots.px4_fixedwing", "fleet.autopilots.textbook"),
     ("fleet.autopilots",),

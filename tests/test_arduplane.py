@@ -10,7 +10,7 @@ from point_mass import HERE, PAR, PLANE, TRIM_ALPHA, TRIM_THR, Plane, begin, fly
 
 from fleet import mission as m
 from fleet.autopilots import arduplane as ap
-from fleet.autopilots import common as S
+from fleet.autopilots import control_law as S
 from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane import params as P
 from fleet.frames import G

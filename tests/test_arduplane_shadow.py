@@ -8,7 +8,7 @@ from point_mass import HERE, PAR, Plane, begin, fly, leg, route
 
 from fleet import mission as m
 from fleet.autopilots import arduplane as ap
-from fleet.autopilots import common as S
+from fleet.autopilots import control_law as S
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.shadow import replay_controller
 

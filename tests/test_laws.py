@@ -10,8 +10,8 @@ from point_mass import HERE, PLANE, TRIM_ALPHA, Plane, begin, fly, leg, route
 
 from fleet import mission as m
 from fleet.autopilots import arduplane, laws
-from fleet.autopilots import common as S
-from fleet.autopilots import common as parameter_vector
+from fleet.autopilots import control_law as S
+from fleet.autopilots import control_law as parameter_vector
 from fleet.autopilots.px4_fixedwing import params as P
 from fleet.autopilots.px4_fixedwing import path as npfg
 from fleet.autopilots.shadow import replay_controller

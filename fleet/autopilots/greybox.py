@@ -13,7 +13,7 @@ import numpy as np
 
 from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane.l1 import to_roll
-from fleet.autopilots.common import array_kernel, clip
+from fleet.autopilots.control_law import array_kernel, clip
 from fleet.frames import G
 from fleet.mission import KIND, LAND, VA_C
 

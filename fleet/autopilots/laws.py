@@ -22,7 +22,7 @@ from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane.guide import align_integrators as shift_arduplane
 from fleet.autopilots.arduplane.guide import assume_commanded_speed
 from fleet.autopilots.arduplane.guide import fly as fly_arduplane
-from fleet.autopilots.common import (
+from fleet.autopilots.control_law import (
     ARDUPLANE,
     LAW,
     LEG,

@@ -8,9 +8,9 @@ from math import isfinite, nan, sqrt
 
 import numpy as np
 
-from fleet.autopilots import common as S
+from fleet.autopilots import control_law as S
 from fleet.autopilots.arduplane import legs as leg_rules
-from fleet.autopilots.common import array_kernel, kernel
+from fleet.autopilots.control_law import array_kernel, kernel
 from fleet.autopilots.laws import align_integrators, begin, engage, fly, stabilise
 from fleet.frames import wrap
 from fleet.mission import SEQ

@@ -17,7 +17,7 @@ from scipy.special import ndtr
 
 from fleet import mission as m
 from fleet.autopilots import arduplane
-from fleet.autopilots import common as parameters
+from fleet.autopilots import control_law as parameters
 from fleet.autopilots.arduplane import params as P
 from fleet.contract import AlertKind
 from fleet.frames import G, Origin, to_geodetic

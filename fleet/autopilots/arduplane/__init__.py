@@ -20,7 +20,7 @@ Source: Park, Deyst & How (2004) for L1; Lambregts (1983) for TECS; ArduPlane 4.
 from fleet.autopilots.arduplane.guide import guide, init, stabilise
 from fleet.autopilots.arduplane.legs import set_leg
 from fleet.autopilots.arduplane.params import DEFAULTS, N_PAR, NAMES, TABLE, parameters, read, vector
-from fleet.autopilots.common import FROM, LEG, N_CTL, N_LEG, TURN, eas2tas
+from fleet.autopilots.control_law import FROM, LEG, N_CTL, N_LEG, TURN, eas2tas
 
 LAW = "arduplane: L1 + TECS"
 

@@ -8,9 +8,9 @@ from math import cos, sin, sqrt
 
 import numpy as np
 
-from fleet.autopilots import common as S
+from fleet.autopilots import control_law as S
 from fleet.autopilots.arduplane import params as P
-from fleet.autopilots.common import clip, kernel
+from fleet.autopilots.control_law import clip, kernel
 from fleet.frames import G
 
 _FILTER_BANDWIDTH = 2.0  # bandwidth of the airspeed filter [rad/s]

@@ -4,11 +4,11 @@ from math import cos, pi, radians, sin, tan
 
 import numpy as np
 
-from fleet.autopilots import common as S
+from fleet.autopilots import control_law as S
 from fleet.autopilots.arduplane import demand, l1, tecs
 from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane import params as P
-from fleet.autopilots.common import array_kernel, clip, kernel
+from fleet.autopilots.control_law import array_kernel, clip, kernel
 from fleet.frames import G
 from fleet.mission import VA_C
 

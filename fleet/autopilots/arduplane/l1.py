@@ -10,9 +10,9 @@ from math import asin, atan, atan2, cos, pi, sin
 
 import numpy as np
 
-from fleet.autopilots import common as S
+from fleet.autopilots import control_law as S
 from fleet.autopilots.arduplane import params as P
-from fleet.autopilots.common import angle_to, clip, hypot, kernel
+from fleet.autopilots.control_law import angle_to, clip, hypot, kernel
 from fleet.frames import G, wrap
 from fleet.mission import P_E, P_N
 

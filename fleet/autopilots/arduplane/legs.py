@@ -8,11 +8,11 @@ from math import atan2, pi
 
 import numpy as np
 
-from fleet.autopilots import common as S
-from fleet.autopilots import common as kernels
+from fleet.autopilots import control_law as S
+from fleet.autopilots import control_law as kernels
 from fleet.autopilots.arduplane import l1
 from fleet.autopilots.arduplane import params as P
-from fleet.autopilots.common import hypot, kernel
+from fleet.autopilots.control_law import hypot, kernel
 from fleet.frames import wrap
 from fleet.mission import (
     ACCEPT_RADIUS,

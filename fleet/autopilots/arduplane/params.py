@@ -8,7 +8,7 @@ from math import radians
 
 import numpy as np
 
-from fleet.autopilots.common import ParameterSpec, eas2tas, lookup
+from fleet.autopilots.control_law import ParameterSpec, eas2tas, lookup
 
 _DEG = radians(1.0)
 _PERCENT = 0.01

@@ -10,10 +10,10 @@ from math import cos
 
 import numpy as np
 
-from fleet.autopilots import common as S
+from fleet.autopilots import control_law as S
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.arduplane.demand import MIN_FILTERED_SPEED, demand_height, demand_speed, min_airspeed
-from fleet.autopilots.common import clip, kernel
+from fleet.autopilots.control_law import clip, kernel
 from fleet.frames import G
 
 

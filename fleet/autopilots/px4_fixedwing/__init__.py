@@ -10,7 +10,7 @@
     delta_a, delta_e, delta_r = stabilise(ctl, par, phi_c, theta_c, euler, rates, Va, dt)
 
 `fleet.autopilots.laws` provides `guide`, `fleet.autopilots.shadow` the replay. NPFG uses the wind estimate of the
-autopilot: par[W_N], par[W_E] of `fleet.autopilots.common`. Not modelled: terrain following, flaps,
+autopilot: par[W_N], par[W_E] of `fleet.autopilots.control_law`. Not modelled: terrain following, flaps,
 landing, the upper bound of the period in wind on circles, throttle compensation for airspeed and air density.
 
 Source: see `npfg`, `tecs`; PX4 1.13 to 1.16 for the implementation.

@@ -4,10 +4,10 @@ from math import cos, hypot, sin, tan
 
 import numpy as np
 
-from fleet.autopilots import common as S
+from fleet.autopilots import control_law as S
 from fleet.autopilots.arduplane import demand
 from fleet.autopilots.arduplane import legs as leg_rules
-from fleet.autopilots.common import array_kernel, clip, kernel
+from fleet.autopilots.control_law import array_kernel, clip, kernel
 from fleet.autopilots.px4_fixedwing import params as P
 from fleet.autopilots.px4_fixedwing import params as X
 from fleet.autopilots.px4_fixedwing import path, tecs

@@ -8,7 +8,7 @@ from math import radians
 
 import numpy as np
 
-from fleet.autopilots.common import PX4, ParameterSpec, eas2tas, lookup, padded
+from fleet.autopilots.control_law import PX4, ParameterSpec, eas2tas, lookup, padded
 
 _DEG = radians(1.0)
 

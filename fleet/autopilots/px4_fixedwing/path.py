@@ -8,9 +8,9 @@ from math import atan, atan2, cos, hypot, pi, sin, sqrt
 
 import numpy as np
 
-from fleet.autopilots import common as S
+from fleet.autopilots import control_law as S
 from fleet.autopilots.arduplane import legs as leg_rules
-from fleet.autopilots.common import W_E, W_N, angle_to, clip, kernel
+from fleet.autopilots.control_law import W_E, W_N, angle_to, clip, kernel
 from fleet.autopilots.px4_fixedwing import params as P
 from fleet.autopilots.px4_fixedwing import params as X
 from fleet.frames import G, wrap

@@ -11,9 +11,9 @@ from math import cos, sqrt
 
 import numpy as np
 
-from fleet.autopilots import common as S
+from fleet.autopilots import control_law as S
 from fleet.autopilots.arduplane.demand import MIN_FILTERED_SPEED
-from fleet.autopilots.common import clip, kernel
+from fleet.autopilots.control_law import clip, kernel
 from fleet.autopilots.px4_fixedwing import params as P
 from fleet.autopilots.px4_fixedwing import params as X
 from fleet.frames import G

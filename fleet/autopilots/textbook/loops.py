@@ -7,10 +7,10 @@ from math import asin, atan2, cos, hypot
 
 import numpy as np
 
-from fleet.autopilots import common as S
+from fleet.autopilots import control_law as S
 from fleet.autopilots.arduplane import demand
 from fleet.autopilots.arduplane import legs as leg_rules
-from fleet.autopilots.common import array_kernel, clip, kernel
+from fleet.autopilots.control_law import array_kernel, clip, kernel
 from fleet.autopilots.textbook import params as P
 from fleet.autopilots.textbook import params as X
 from fleet.autopilots.textbook import path

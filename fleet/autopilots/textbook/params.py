@@ -8,7 +8,7 @@ from math import pi
 
 import numpy as np
 
-from fleet.autopilots.common import TEXTBOOK, ParameterSpec, eas2tas, lookup, padded
+from fleet.autopilots.control_law import TEXTBOOK, ParameterSpec, eas2tas, lookup, padded
 
 TABLE = (
     ParameterSpec("chi_inf", pi / 3, 1, 0.1, pi / 2),

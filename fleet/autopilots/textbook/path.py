@@ -7,9 +7,9 @@ from math import atan, atan2, cos, hypot, pi, sin, tan
 
 import numpy as np
 
-from fleet.autopilots import common as S
+from fleet.autopilots import control_law as S
 from fleet.autopilots.arduplane import legs as leg_rules
-from fleet.autopilots.common import clip, kernel
+from fleet.autopilots.control_law import clip, kernel
 from fleet.autopilots.textbook import params as P
 from fleet.autopilots.textbook import params as X
 from fleet.frames import G, wrap

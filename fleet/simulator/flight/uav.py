@@ -7,9 +7,9 @@ from types import MappingProxyType
 import numpy as np
 
 from fleet import mission as legs_of
-from fleet.autopilots import common as memory
+from fleet.autopilots import control_law as memory
 from fleet.autopilots import laws
-from fleet.autopilots.common import W_E, W_N
+from fleet.autopilots.control_law import W_E, W_N
 from fleet.contract import Item
 from fleet.frames import G, Origin, to_geodetic
 from fleet.simulator.faults.carried import FaultSet
