@@ -20,7 +20,7 @@ from fleet.contract import (
     Verdict,
 )
 from fleet.contract import Event as Happened
-from viewer.panels.event_list import MAX_ROWS, event_list_html
+from viewer.panels.event_list import MAX_EVENT_ROWS, event_list_html
 from viewer.store.event_detection import MAX_STEPS, MAX_TEXT, DetectorState, detect_events
 from viewer.store.inbox import SampleSubset
 from viewer.theme.events import MAX_ALERTS, MAX_EVENTS, EventKind, TimelineEvent, closed_at, merged
@@ -271,7 +271,7 @@ def test_the_end_takes_away_only_losses_after_it() -> None:
 
 
 def test_the_list_is_newest_first_bounded_and_escaped() -> None:
-    events = tuple(TimelineEvent(T + k, EventKind.WARNING, f"{k} {HOSTILE}") for k in range(MAX_ROWS + 12))
+    events = tuple(TimelineEvent(T + k, EventKind.WARNING, f"{k} {HOSTILE}") for k in range(MAX_EVENT_ROWS + 12))
     page = event_list_html(events, DARK)
-    assert page.count('class="event"') == MAX_ROWS and "and 12 earlier" in page and "<img" not in page
-    assert page.index(f"{MAX_ROWS + 11} &lt;img") < page.index(f"{MAX_ROWS + 10} &lt;img")
+    assert page.count('class="event"') == MAX_EVENT_ROWS and "and 12 earlier" in page and "<img" not in page
+    assert page.index(f"{MAX_EVENT_ROWS + 11} &lt;img") < page.index(f"{MAX_EVENT_ROWS + 10} &lt;img")

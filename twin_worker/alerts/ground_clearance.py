@@ -13,7 +13,7 @@ MIN_HEIGHT_WINGS_M, MIN_HEIGHT_ROTORS_M = (
     5.0,
 )  # minimum height above home outside landings, fixed wings and multirotors [m]
 _MIN_PROBABILITY = 0.02  # below this probability no alert text is composed [-]
-_CLEAR_TEXT = "no descent below the minimum height predicted"
+_GROUND_CLEAR_TEXT = "no descent below the minimum height predicted"
 
 
 def height_above_home(flight: GaussianForecast, home: Origin) -> np.ndarray:
@@ -33,7 +33,7 @@ def ground_hazard(flight: GaussianForecast, home: Origin, margin: float, until: 
     z = (margin - height) / sigma
     probability = float(ndtr(z.max()))
     if probability < _MIN_PROBABILITY:
-        return HazardEstimate(AlertKind.GROUND, probability, "", _CLEAR_TEXT)
+        return HazardEstimate(AlertKind.GROUND, probability, "", _GROUND_CLEAR_TEXT)
     first = int(
         np.flatnonzero(z >= min(z.max(), 0.0))[0]
     )  # where the mean goes below the margin, else the lowest point
@@ -42,4 +42,4 @@ def ground_hazard(flight: GaussianForecast, home: Origin, margin: float, until: 
         f"{probability:.0%} chance that it sinks below {margin:.0f} m above home (terrain unknown) in "
         f"{max(t - flight.prediction.t, 0.0):.0f} s; lowest {height.min():.0f} m"
     )
-    return HazardEstimate(AlertKind.GROUND, probability, message, _CLEAR_TEXT, -1, t, flight.position(first))
+    return HazardEstimate(AlertKind.GROUND, probability, message, _GROUND_CLEAR_TEXT, -1, t, flight.position(first))

@@ -6,7 +6,7 @@ from viewer.store.inbox import date_text, time_of_day, timestamp
 from viewer.theme.events import TimelineEvent
 from viewer.theme.palette import MARK, Palette
 
-MAX_ROWS = 40  # events shown; earlier ones are counted
+MAX_EVENT_ROWS = 40  # events shown; earlier ones are counted
 
 
 def event_list_html(events: tuple[TimelineEvent, ...], palette: Palette, seek: str = "") -> str:
@@ -19,8 +19,8 @@ def event_list_html(events: tuple[TimelineEvent, ...], palette: Palette, seek: s
     """
     if not events:
         return '<div class="uav"><b>Events</b> <span class="soft">none yet</span></div>'
-    rows = "".join(_row(event, palette, seek) for event in reversed(events[-MAX_ROWS:]))
-    earlier = len(events) - MAX_ROWS
+    rows = "".join(_row(event, palette, seek) for event in reversed(events[-MAX_EVENT_ROWS:]))
+    earlier = len(events) - MAX_EVENT_ROWS
     more = f'<div class="soft">and {earlier} earlier</div>' if earlier > 0 else ""
     return (
         f'<div class="uav"><b>Events</b> <span class="soft">{len(events)} · {date_text(events[-1].t)}</span>'

@@ -9,13 +9,13 @@ from viewer.store.vehicle import Vehicle
 from viewer.text.words import age_text, in_force, severity, short_text
 from viewer.theme.palette import GLYPH
 
-MAX_LABELS = 6  # most labels at once; overlapping ones are omitted
+MAX_ALERT_LABELS = 6  # most labels at once; overlapping ones are omitted
 
 
 def alert_labels(fleet_arrays: FleetArrays, selected: int | None, unit: float) -> list[Tag]:
     """Return labels at the most severe UAVs; `unit` is the drawn span of an aircraft [10 m]."""
     exceptional = [(v, i) for v, i in fleet_arrays.exceptional if v.uav != selected and not v.ended]
-    rows = sorted(exceptional, key=lambda entry: severity(entry[0], fleet_arrays.now))[:MAX_LABELS]
+    rows = sorted(exceptional, key=lambda entry: severity(entry[0], fleet_arrays.now))[:MAX_ALERT_LABELS]
     above = np.array([0.0, 0.0, 0.9 * unit])
     return [
         Tag(

@@ -11,7 +11,7 @@ from viewer.theme.palette import Palette, mesh_colour, rgb
 from viewer.theme.shapes import aircraft, dart, rotorcraft
 
 SPAN_SHARE, MIN_SPAN_SHARE = 0.042, 0.016  # share of the image height that an aircraft spans at its centre [-]
-SMALL_FLEET = 60  # visible aircraft up to which they have that size; more are drawn smaller
+LARGE_GLYPH_COUNT = 60  # visible aircraft up to which they have that size; more are drawn smaller
 DISTANCE_EXPONENT = 0.5  # 1: same apparent size at any distance; 0: perspective [-]
 EXCEPTION_SCALE, SELECTED_SCALE = 1.7, 1.25  # scale of exceptional UAVs in a large fleet, and of the selected UAV
 MUTED_SHARE = 0.62  # large fleet: colour share of nominal UAVs, the rest is ground colour [-]
@@ -57,7 +57,7 @@ class Glyphs:
         self.unit = (
             size
             * focus_distance
-            * max(SPAN_SHARE * min(1.0, SMALL_FLEET / max(visible_count, 1)) ** 0.5, MIN_SPAN_SHARE)
+            * max(SPAN_SHARE * min(1.0, LARGE_GLYPH_COUNT / max(visible_count, 1)) ** 0.5, MIN_SPAN_SHARE)
         )
         relative_distance = np.linalg.norm(fleet_arrays.at - camera_view.position, axis=1) / focus_distance
         scale = self.unit * np.clip(relative_distance, 0.05, 20.0) ** DISTANCE_EXPONENT
