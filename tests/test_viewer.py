@@ -25,7 +25,7 @@ from fleet.contract import (
 from fleet.frames import Origin, body_to_ned, to_geodetic
 from viewer.panels.charts import axis_range, band
 from viewer.panels.detail import figures_html, law_html, limitations, status_html
-from viewer.panels.event_list import event_list_html
+from viewer.panels.panels import event_list_html
 from viewer.scene.camera import FOV, frame, within_reach
 from viewer.scene.routes import mission_lines
 from viewer.scene.scene import DASHES, cut_at_horizon

@@ -20,7 +20,7 @@ from fleet.contract import (
     Verdict,
 )
 from fleet.contract import Event as Happened
-from viewer.panels.event_list import MAX_EVENT_ROWS, event_list_html
+from viewer.panels.panels import MAX_EVENT_ROWS, event_list_html
 from viewer.store.event_detection import MAX_STEPS, MAX_TEXT, DetectorState, detect_events
 from viewer.store.inbox import SampleSubset
 from viewer.theme.events import MAX_ALERTS, MAX_EVENTS, EventKind, TimelineEvent, closed_at, merged
