@@ -15,8 +15,7 @@ from fleet.frames import Origin
 from fleet.mission import unroll_route
 from twin_worker.alerts.feasibility import FlightLimits, MissionState, feasibility_hazard, read_limits
 from twin_worker.alerts.gaussian_forecast import axis_z, to_gaussian
-from twin_worker.alerts.geofence import GeofenceLimits, geofence_hazard, read_geofence
-from twin_worker.alerts.ground_clearance import ground_hazard
+from twin_worker.alerts.geofence import GeofenceLimits, geofence_hazard, ground_hazard, read_geofence
 from twin_worker.alerts.hysteresis import RULES, AlertState, HazardEstimate
 from twin_worker.twin.step import Twin, advance
 from twin_worker.twin.steps.alerts import home, prediction_alerts

@@ -6,12 +6,13 @@ from fleet.contract import Alert, AlertKind, Prediction
 from fleet.frames import Origin, to_ned
 from twin_worker.alerts.feasibility import MissionState, feasibility_hazard, read_limits
 from twin_worker.alerts.gaussian_forecast import GaussianForecast, to_gaussian
-from twin_worker.alerts.geofence import geofence_hazard, read_geofence
-from twin_worker.alerts.ground_clearance import (
+from twin_worker.alerts.geofence import (
     MIN_HEIGHT_ROTORS_M,
     MIN_HEIGHT_WINGS_M,
+    geofence_hazard,
     ground_hazard,
     height_above_home,
+    read_geofence,
 )
 from twin_worker.alerts.hysteresis import HazardEstimate
 from twin_worker.confidence.table_files import UNCALIBRATED
