@@ -11,10 +11,9 @@ from viewer.browser.http_server import Browser
 from viewer.export import Export
 from viewer.panels.detail import clip
 from viewer.panels.panels import Panels
-from viewer.scene.alert_labels import alert_labels
 from viewer.scene.camera import IN_VIEW_M, Camera, within_reach
 from viewer.scene.fleet_arrays import LOST, MISMATCH, FleetArrays, display_status
-from viewer.scene.labels import Labels
+from viewer.scene.labels import Labels, alert_labels
 from viewer.scene.routes import NOTHING, mission_lines
 from viewer.scene.scene import Scene
 from viewer.scene.selection.selected import BEYOND_S, Selection
