@@ -1,4 +1,4 @@
-"""Parser of the `--link` and `--forward` arguments."""
+"""Parser of the `--link` and `--forward` arguments, and of their message filters."""
 
 import contextlib
 from typing import NamedTuple

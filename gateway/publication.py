@@ -1,4 +1,4 @@
-"""Publish contract messages on the bus, and answer queries with the latest of each aircraft."""
+"""Publish contract messages on the bus; answer queries with the latest, and with the past, of each aircraft."""
 
 import contextlib
 import logging

@@ -1,4 +1,4 @@
-"""Status display: a live table on a terminal; otherwise a line periodically and at every change of warnings."""
+"""Statistics of links and aircraft: live table on a terminal, otherwise lines; published counters and metrics."""
 
 import platform
 import threading

@@ -1,4 +1,4 @@
-"""Answer a what-if query with a prediction of a modified copy of the twin; twin and aircraft are not affected."""
+"""What-if queries: parse a query, modify a copy of the twin, predict; twin and aircraft are not affected."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Export buttons of the page."""
+"""Export buttons of the page: view as PNG, flight as HTML film, data of a UAV as CSV."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""Address of the router and credentials (certificates, or role and password) as Zenoh configuration."""
+"""Address of the router and credentials as Zenoh configuration; access rules by role."""
 
 from dataclasses import dataclass
 from itertools import groupby

@@ -1,4 +1,4 @@
-"""Controller state: one float64 vector `ctl`, indices by name.
+"""Shared by all control laws: controller state `ctl` (indices by name), parameter vector and table, compiled functions.
 
 The elements below N_LEG belong to the current leg; the replay resets them separately.
 """

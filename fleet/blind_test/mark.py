@@ -1,4 +1,4 @@
-"""Grade one report against its label: names, location, onset, parameters and standard deviations."""
+"""Grade reports against their labels: names, location, onset, parameters and standard deviations; score of all."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""Interface of a bus: keys, publish, subscribe, queries, liveliness, and the selection among several replies."""
+"""Interface of a bus: keys, publish, subscribe, queries, presence, epoch fence, selection among replies."""
 
 import re
 import time

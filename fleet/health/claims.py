@@ -1,4 +1,4 @@
-"""Fleet checks: clocks, versions, owners of aircraft, unclaimed and doubly claimed aircraft."""
+"""Fleet checks: router and credentials, clocks, versions, owners of aircraft, unclaimed and doubly claimed aircraft."""
 
 import socket
 import ssl

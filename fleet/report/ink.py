@@ -1,4 +1,4 @@
-"""Colours and lines of the report, matching the light theme of the viewer."""
+"""Colours and lines of the report, matching the light theme of the viewer; and its HTML page."""
 
 from collections.abc import Iterable
 from html import escape

@@ -1,4 +1,4 @@
-"""Time panels: altitude, speeds, angles, servos, strip of modes and events, strip of rates."""
+"""Panels of a report: ground track; altitude, speeds, angles, servos, modes and events, rates over time."""
 
 from typing import Any
 

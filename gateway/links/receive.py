@@ -1,4 +1,4 @@
-"""Receive datagrams from a socket: in batches with `recvmmsg` on Linux, one by one elsewhere.
+"""UDP links. Datagrams are received in batches with `recvmmsg` on Linux, one by one elsewhere.
 
 Source: recvmmsg(2), udp(7), socket(7), cmsg(3); structures as in <sys/socket.h> of 64-bit Linux.
 """

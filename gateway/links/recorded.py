@@ -1,4 +1,4 @@
-"""Recording as a link: replayed in real time, faster, or as fast as possible, optionally with copies of aircraft."""
+"""Recording as a link: replayed at any speed, optionally with copies of aircraft, in its own process."""
 
 import argparse
 import contextlib

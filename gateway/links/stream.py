@@ -1,4 +1,4 @@
-"""Open byte stream over TCP or a serial line, with a common interface."""
+"""Open byte stream over TCP or a serial line: reconnecting client and send queue."""
 
 import logging
 import os

@@ -1,4 +1,4 @@
-"""Verification of cached parameters, identified by the board number of the aircraft, before they are used."""
+"""Cache of parameters by board number, MAVLink dialects, and the verification of cached parameters before use."""
 
 import logging
 import random

@@ -1,4 +1,4 @@
-"""Recording thread: queues received bytes without blocking and writes them to disk."""
+"""Recording thread: queues received bytes without blocking, writes them to disk and cuts files."""
 
 import logging
 import queue

@@ -1,4 +1,4 @@
-"""Probability that a predicted flight breaches the geofence in the autopilot parameters.
+"""Probability that a predicted flight breaches the geofence in the autopilot parameters, or the minimum height.
 
 Supported are a circle around home and height limits above home. Polygon fences (ArduPilot polygons, PX4 fence items)
 are not parameters and are not received; the alert text names them as not monitored.

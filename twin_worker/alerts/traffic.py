@@ -1,4 +1,4 @@
-"""Conflict alerts: each pair is assessed once, by the worker that owns the aircraft with the lower id."""
+"""Conflict alerts: traffic picture from all predictions; each pair is assessed once, by the owner of the lower id."""
 
 from dataclasses import dataclass, field
 from math import inf, isfinite

@@ -1,4 +1,4 @@
-"""Calibration tables on disk: JSON with source flights, date and command."""
+"""Calibration tables on disk, by group of flights: JSON with source flights, date and command."""
 
 import re
 from collections.abc import Sequence

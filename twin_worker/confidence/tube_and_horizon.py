@@ -1,4 +1,4 @@
-"""Prediction region (tube) and confidence horizon from calibration tables and the aircraft's own past predictions.
+"""Prediction region (tube) and confidence horizon from calibration tables and past predictions.
 
 A position is covered if it lies within all three half-axes (along, cross, vertical) of the predicted track at its
 look-ahead. This box is never wider than the ellipsoid of the same coverage. A look-ahead is scored as soon as it has

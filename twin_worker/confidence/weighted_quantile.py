@@ -1,4 +1,4 @@
-"""Quantiles of weighted scores, some of them left-censored (known only by an upper bound).
+"""Quantiles of weighted scores, some left-censored (known only by an upper bound); and the risk-controlled horizon.
 
 Source: Tibshirani et al. 2019, "Conformal prediction under covariate shift" (weights); Kaplan & Meier 1958.
 """

@@ -1,4 +1,4 @@
-"""Tables of the evaluation results, with the same content as the JSON."""
+"""Tables and files of the evaluation results, with the same content as the JSON."""
 
 from collections.abc import Sequence
 from pathlib import Path

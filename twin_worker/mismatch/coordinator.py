@@ -1,4 +1,4 @@
-"""Coordinate the diagnoses of a worker's aircraft, most urgent first, without delaying any prediction."""
+"""Coordinate and schedule the diagnoses of a worker's aircraft, most urgent first, without delaying any prediction."""
 
 import logging
 from _thread import LockType

@@ -1,4 +1,4 @@
-"""Input and result of one diagnosis job, and the job itself: a pure function that runs in any process."""
+"""Input and result of one diagnosis job, the job itself (a pure function that runs in any process) and its messages."""
 
 import time
 from dataclasses import dataclass, replace

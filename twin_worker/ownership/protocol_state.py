@@ -1,4 +1,4 @@
-"""Ownership state of one worker, and its next actions; without bus, thread or clock.
+"""Ownership state of one worker and its next actions, with rendezvous hashing; without bus, thread or clock.
 
 A worker knows the others by their liveliness tokens and their aircraft by their announcements. Rendezvous hashing
 assigns each aircraft to one live worker. That worker requests a snapshot from a live owner, and acquires aircraft

@@ -1,4 +1,4 @@
-"""Store the twins of one worker: queue messages, acquire and release twins."""
+"""Store the twins of one worker: queue messages, acquire and release twins, query their history."""
 
 import logging
 import threading

@@ -1,4 +1,4 @@
-"""Controller twin: control law, parameters and the provenance of each parameter.
+"""Controller twin: control law, parameters with their provenance, and the route override of a what-if.
 
 One module creates it, so that published and simulated parameters are equal. A parameter that is not received is
 identified from flight, or else the default of the autopilot; the provenance is published.

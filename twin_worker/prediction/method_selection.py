@@ -1,4 +1,4 @@
-"""Selection of the prediction method with the smallest past error, all methods scored at the same times.
+"""Selection of the prediction method with the smallest past error, all scored at the same times; turn-rate estimation.
 
 Source: Bates & Granger 1969, "The combination of forecasts" (the mean of two forecasts is one of the methods).
 """

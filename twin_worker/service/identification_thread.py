@@ -1,4 +1,4 @@
-"""Identify one aircraft after another in a thread, so that telemetry of the others is not delayed."""
+"""Identify one aircraft after another in a thread of limited CPU share; telemetry is not delayed."""
 
 import logging
 import threading

@@ -1,4 +1,4 @@
-"""Measure the actual rates of heavy work, and describe those that are too low."""
+"""Measure the actual rates of heavy work, describe those that are too low, and export metrics."""
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterator

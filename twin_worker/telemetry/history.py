@@ -1,4 +1,4 @@
-"""Telemetry of one aircraft over the last minutes, as received."""
+"""Telemetry of one aircraft over the last minutes, as received: row buffers and arrival delays."""
 
 from dataclasses import dataclass
 from struct import Struct

@@ -1,4 +1,4 @@
-"""Track of an aircraft from positions and velocities alone, which every vehicle sends."""
+"""Track of an aircraft from positions and velocities alone, which every vehicle sends; hover detection."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""HTTP server of the page: access checks, security headers, loading page. All patches of viser are here."""
+"""HTTP server of the page (access checks, headers, loading page, patches of viser), and the state of each browser."""
 
 import asyncio
 import contextlib

@@ -1,4 +1,4 @@
-"""Up to eight labels in 3-D by priority, without overlap."""
+"""Labels in 3-D by priority, without overlap; labels of UAVs with an alert."""
 
 from typing import Any, NamedTuple
 

@@ -1,4 +1,4 @@
-"""Fleet in 3-D on one page: about fifteen nodes, independent of its size."""
+"""Fleet in 3-D on one page: about fifteen nodes, independent of its size; aircraft glyphs."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,4 @@
-"""Viewer process: one store, one render thread and one view per client."""
+"""Viewer process: one store, one render thread, one view per client, backfill of tracks."""
 
 import contextlib
 import logging

@@ -1,4 +1,4 @@
-"""Prediction in scene coordinates: checked on arrival, transformed on first use."""
+"""Prediction in scene coordinates (checked on arrival, transformed on first use), and its error against the flight."""
 
 from functools import cached_property
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Meshes of about one unit: vertices and triangles."""
+"""Meshes of about one unit, and numerals as line segments."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Timeline of one page: player, panel, and the fleet at the time shown."""
+"""Timeline of one page: its controls, the panel, the fleet at the time shown, and what happened after."""
 
 import threading
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""A UAV at a past time, with the interface of `Vehicle` for drawing and texts."""
+"""A UAV at a past time, with the interface of `Vehicle` for drawing and texts; comparison with what was flown."""
 
 from typing import Any, NamedTuple
 

@@ -1,4 +1,4 @@
-"""Recording of one UAV for replay on the page: rows, predictions every 5 s, and states."""
+"""Recording of one UAV for replay on the page: rows, predictions every 5 s, and states at a time."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""Recordings of all UAVs, shared by all pages."""
+"""Recordings of all UAVs, shared by all pages; and the player that moves the time shown."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Complete guidance step at 10 Hz: route, L1 and TECS."""
+"""Complete guidance step at 10 Hz: route, L1 and TECS; and the attitude loops below it."""
 
 from math import cos, pi, radians, sin, tan
 

@@ -1,4 +1,4 @@
-"""Complete guidance step of PX4: route, NPFG and TECS; and the integrator alignment after a replay."""
+"""Complete guidance step of PX4: route, NPFG and TECS; attitude loops; and the integrator alignment after a replay."""
 
 from math import cos, hypot, sin, tan
 

@@ -1,4 +1,4 @@
-"""Path, leg sequencing and height demand of PX4.
+"""Path, leg sequencing and height demand of PX4; lateral guidance by NPFG.
 
 A waypoint is reached within the switch distance and the height tolerance; a missed waypoint is approached again.
 Source: PX4 navigator (mission items) and its fixed-wing mode manager (lines, circles, first-order altitude hold).

@@ -1,4 +1,4 @@
-"""All flights of a blind test: draw the hidden effects, simulate in several processes, check, return the labels."""
+"""All flights of a blind test: draw airframes, roles and hidden effects, simulate in processes, return the labels."""
 
 import json
 import multiprocessing

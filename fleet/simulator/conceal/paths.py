@@ -1,4 +1,4 @@
-"""Missions of a blind test, with more manoeuvres than usual, and test pilot inputs for excitation."""
+"""Plan of a blind test: missions with more manoeuvres than usual, start and wind, test pilot inputs for excitation."""
 
 from math import atan2, cos, hypot, inf, pi, radians, sin
 from typing import NamedTuple

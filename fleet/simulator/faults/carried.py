@@ -1,4 +1,4 @@
-"""All faults of one aircraft: physics, wind, estimate and commands."""
+"""All faults of one aircraft: physics, wind, sensors, estimate and commands."""
 
 from collections import deque
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""Uncatalogued faults, which a diagnosis must report as unknown.
+"""Faults by name; and uncatalogued faults, which a diagnosis must report as unknown.
 
 They are not available on the command line; only a blind test uses them.
 """

@@ -1,4 +1,4 @@
-"""Faults of the physics: increments of JSBSim properties and of the wind.
+"""A fault in time, and faults of the physics: increments of JSBSim properties and of the wind.
 
 `vehicle.altered` defines the properties conceal/*.
 """

@@ -1,4 +1,4 @@
-"""Drivers of simulated aircraft: in real time over UDP, or as fast as possible into a recording."""
+"""Drivers of simulated aircraft and their links: in real time over UDP, or as fast as possible into a recording."""
 
 import socket
 import struct

@@ -1,4 +1,4 @@
-"""Types of simulated aircraft: JSBSim model, cruise speed, mission geometry and parameter variations."""
+"""Types of simulated aircraft (JSBSim model, cruise speed, geometry, variations); initial situation of a flight."""
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType

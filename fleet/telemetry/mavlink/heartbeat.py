@@ -1,4 +1,4 @@
-"""Evaluate HEARTBEAT: aircraft or not, autopilot, vehicle type, mode."""
+"""Evaluate HEARTBEAT: aircraft or not, autopilot, vehicle type, mode; and two senders with one id."""
 
 from collections.abc import Hashable
 from typing import Any

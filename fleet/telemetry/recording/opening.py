@@ -1,4 +1,4 @@
-"""Read recordings in pieces, compressed or not, with progress and a size limit."""
+"""Read recordings in pieces, compressed or not, with progress and a size limit; and the pace of a replay."""
 
 import bz2
 import gzip

@@ -1,4 +1,4 @@
-"""Copies of recorded aircraft with own ids, positions and times, written into encoded messages."""
+"""Copies of recorded aircraft with own ids, positions and times, written into encoded messages and frames."""
 
 from collections import deque
 from collections.abc import Iterator, Sequence

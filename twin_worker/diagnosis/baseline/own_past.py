@@ -1,4 +1,4 @@
-"""Diagnose a flight against its own past: find changes after a trusted first part."""
+"""Diagnose a flight against its own past: find changes after a trusted first part, and loss of tracking."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Read the aircraft card (mass, inertia, geometry, servo mapping) from an airframe TOML or a JSON file."""
+"""Read the aircraft card (mass, inertia, geometry, servo mapping) from an airframe TOML or JSON; fault hypotheses."""
 
 import json
 from collections.abc import Callable, Mapping

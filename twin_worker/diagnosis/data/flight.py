@@ -1,4 +1,4 @@
-"""Read a recording and resample each flight to one grid, with a mask of valid rows."""
+"""Read a recording, smooth it and resample each flight to one grid, with a mask of valid rows."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Result of a diagnosis: one frozen report per flight, for files, figures and pages."""
+"""Result of a diagnosis: one frozen report per flight, for files, figures and pages, and its sentences."""
 
 from dataclasses import dataclass, field, replace
 from enum import StrEnum

@@ -1,4 +1,4 @@
-"""Save and load the calibrated simulation with its effects as a JSON model file."""
+"""Save and load the calibrated simulation as a JSON model file; write the report as text."""
 
 import json
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Figures over time: residuals before and after, and measured against simulated specific force."""
+"""Figures over time: residuals before and after, measured against simulated specific force, and marks of effects."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""Comparison of ours with every other method on the same starts: paired differences with confidence intervals.
+"""True path of each start; comparison with every other method on the same starts: paired differences with intervals.
 
 Starts of one flight are dependent, so the bootstrap resamples flights, not starts.
 Source: Davison & Hinkley 1997, "Bootstrap methods and their application", section 3.8 (cluster bootstrap, percentile).

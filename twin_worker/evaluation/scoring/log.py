@@ -1,4 +1,4 @@
-"""Actual flight of one aircraft: positions, and the events that end the scoring of a prediction."""
+"""Actual flight of one aircraft and cases to score: positions, and the events that end the scoring of a prediction."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Turn rate, angle of attack and excess power: three regressions with priors on smoothed flight data.
+"""Turn rate, angle of attack and excess power, and attitude lags: regressions with priors on smoothed flight data.
 
 psi_dot = k g tan phi / V + b               theta - gamma = a_0 + a_n (n (V_0 / V)^2 - 1)
 V_dot + g h_dot / V = c_0 + c_t (delta_t - t_0) + c_v (V - V_0) + c_n (n^2 - 1)

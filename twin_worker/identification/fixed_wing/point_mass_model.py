@@ -1,4 +1,4 @@
-"""Identify the point-mass model: two lags, turn, lift and power, from the last two minutes of flight."""
+"""Identify the point-mass model, with or without effects: two lags, turn, lift and power, from the last two minutes."""
 
 from dataclasses import dataclass, replace
 

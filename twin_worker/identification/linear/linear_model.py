@@ -1,4 +1,4 @@
-"""Two-step identification of the paper on one window: subspace estimate, then prediction-error refinement."""
+"""Two-step identification of the paper on one window: subspace estimate, then refinement with a prior."""
 
 from dataclasses import dataclass
 

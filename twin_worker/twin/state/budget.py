@@ -1,4 +1,4 @@
-"""CPU time budget for heavy work in each sweep over all twins; telemetry of every aircraft has priority.
+"""Schedule of a twin, timers, CPU budget for heavy work in each sweep; telemetry of every aircraft has priority.
 
 A token bucket. While sweeps are on time, each sweep adds a fixed amount. A late sweep adds a fraction of the CPU time
 that this thread received since the previous sweep. On a shared or limited processor, heavy work therefore falls in

@@ -1,4 +1,4 @@
-"""Identified state of one aircraft: the newest identification, and the models that may predict."""
+"""Identified state of one aircraft: newest identification, models that may predict, checkpoints of them."""
 
 from collections import deque
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""Identification step: window, identification, verification on held-out data, model selection, publication."""
+"""Identification step: requirements, window, identification, verification on held-out data, selection, publication."""
 
 import msgspec
 import numpy as np

@@ -1,4 +1,4 @@
-"""Event markers of the selected UAV on its flown path, with labels for the newest few."""
+"""Event markers of the selected UAV on its flown path, and the tube around its predicted path."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Selected UAV in 3-D: tube, rings, horizon, route, flown path, hindcast and labels."""
+"""Selected UAV in 3-D: tube, rings, horizon, route, flown path, hindcast, mismatch lines and labels."""
 
 from math import isfinite
 from typing import Any

@@ -1,4 +1,4 @@
-"""Decode bytes of many senders to MAVLink frames, and frames to field arrays or messages."""
+"""Decode bytes of many senders to MAVLink frames, and frames to field arrays or message objects."""
 
 import re
 from collections import Counter, OrderedDict, namedtuple

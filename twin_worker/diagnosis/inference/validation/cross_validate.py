@@ -1,4 +1,4 @@
-"""Cross-validation: fit effects on even blocks of 10 s, evaluate them on odd blocks."""
+"""Cross-validation: fit effects on even blocks of 10 s, evaluate them on odd blocks; and the part left unexplained."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Predict the accelerometer from the other sensors and compare on held-out blocks.
+"""Predict the accelerometer from the other sensors, and free runs of the model, compared on held-out blocks.
 
 Lift follows from velocity and attitude, or from the pitching moment; side force from sideslip over the ground, or from
 the rolling or yawing moment; dynamic pressure from velocity, or from the airspeed sensor. An effect is visible where it

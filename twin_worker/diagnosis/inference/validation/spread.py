@@ -1,4 +1,4 @@
-"""Standard deviations of fitted effects, from the residuals and from the variation between parts of the flight."""
+"""Standard deviations of fitted effects, and the manoeuvre that would distinguish two effects."""
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
