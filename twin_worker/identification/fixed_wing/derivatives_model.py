@@ -1,4 +1,4 @@
-"""Derivatives model of a fixed wing: prior, stability and control derivatives and mean wind from a window; linearised form.
+"""Derivatives model of a fixed wing: prior, stability and control derivatives and mean wind from a window.
 
 Exact kinematics and the mean wind in body axes couple both axes; the linearised model has a much lower fit.
 The information of the last verified model, partly discounted, is the prior of the next window.
