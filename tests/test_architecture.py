@@ -195,10 +195,18 @@ def size(path: str, tree: ast.AST, text: str) -> Iterator[str]:
 
 def crowded(paths: Iterable[str]) -> Iterator[str]:
     """Complain of folders with too many files of their own."""
-    count = Counter(path.rpartition("/")[0] for path in paths if path.startswith(PACKAGES))
+    paths = [path for path in paths if path.startswith(PACKAGES) or Path(path).name.startswith("test_")]
+    count = Counter(path.rpartition("/")[0] for path in paths)
     for folder, files in sorted(count.items()):
         if files > MOST_FILES and folder not in TABLE_FOLDERS:
             yield f"{folder}: {files} files, the limit is {MOST_FILES}; group some of them in a subfolder"
+
+
+def mirrored(path: str, tree: ast.AST, text: str) -> Iterator[str]:
+    """Test files lie in a folder named like the product folder they test, or in the root where they test the whole."""
+    folder = path.removeprefix("tests/").rpartition("/")[0]
+    if path.startswith("tests/") and Path(path).name.startswith("test_") and folder and not (ROOT / folder).is_dir():
+        yield f"{path}: there is no folder {folder}; put it where what it tests is"
 
 
 def name(path: str, tree: ast.AST, text: str) -> Iterator[str]:
@@ -268,6 +276,7 @@ RULES: tuple[Callable[..., Iterator[str]], ...] = (
     alone,
     has_a_place,
     size,
+    mirrored,
     name,
     arguments,
     docstrings,
@@ -362,6 +371,8 @@ PLANTED = (
     (alone, "fleet/simulator/flight/uav.py", "from jsbsim import FGFDMExec"),
     (has_a_place, "fleet/attic.py", ""),
     (size, "viewer/a.py", "x = 1\n" * 401),
+    (mirrored, "tests/attic/test_a.py", ""),
+    (mirrored, "tests/bench/test_a.py", ""),
     (name, "fleet/telemetry/utils.py", ""),
     (arguments, "viewer/a.py", "def f(a, b, c, d, e, g): ..."),
     (docstrings, "viewer/a.py", "x = 1"),

@@ -19,7 +19,6 @@ import pytest
 import yaml
 import zenoh
 from conftest import ROOT, unused_port
-from examples import EXAMPLES
 from test_readme import MAINS, commands, understood
 
 from fleet.access.roles import ROLES, ROUTER_ROLE
@@ -30,6 +29,7 @@ from fleet.contract import FleetState, GatewayCounters, Prediction, Status
 from gateway import status as gateway
 from tests.bench.security.site import REAL, Site, make_papers, routed, zenohd
 from tests.bench.security.trying import until
+from tests.support.examples import EXAMPLES
 from twin_worker.service import work_rates as twin_worker
 
 DEPLOY = ROOT / "deploy"

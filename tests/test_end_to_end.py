@@ -15,9 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import ROOT, unused_port
-from fake_link import beside_compiling
 from pymavlink.dialects.v20 import ardupilotmega as mav
-from talker import Talker
 
 from fleet import cli
 from fleet.bus.bus_protocol import Bus
@@ -36,6 +34,8 @@ from fleet.contract import (
     TwinState,
 )
 from fleet.process import logs
+from tests.support.fake_link import beside_compiling
+from tests.support.talker import Talker
 
 PATIENCE_S = 300.0  # an upper bound on a cold machine; every wait ends with its condition
 ROW = {"uav", "state", "verdict", "fit", "horizon_s", "worker", "sample_age_s", "prediction_age_s"}

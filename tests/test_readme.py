@@ -116,7 +116,7 @@ def test_a_foreign_tool_asks_what_if(tmp_path: Path, holder: Worker) -> None:
 
 
 def test_every_python_block_is_run_by_a_test_or_marked() -> None:
-    from test_newcomer_effect import DOOR
+    from tests.twin_worker.diagnosis.test_newcomer_effect import DOOR
 
     assert sorted(block for text in TEXTS.values() for block in blocks(text)) == sorted([*tools(), DOOR])
 

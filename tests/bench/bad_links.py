@@ -22,7 +22,7 @@ from fleet.frames import to_ned
 from fleet.simulator.flight.drive import to_tlog
 from fleet.simulator.flight.uav import SimulatedUav
 from fleet.telemetry.recording.recordings import replay_messages
-from tests.bad_radio import RADIOS, Radio, worsen
+from tests.support.bad_radio import RADIOS, Radio, worsen
 from twin_worker.confidence.tube_and_horizon import axes_error, first_passage, path_length
 from twin_worker.evaluation.replay import run_offline
 from twin_worker.twin.step import Twin

@@ -9,7 +9,7 @@ lost by mistake where telemetry arrived within the second before.
 import argparse
 import time
 
-from tests.late_arrival import ARRIVALS, flight, lived, relayed
+from tests.support.late_arrival import ARRIVALS, flight, lived, relayed
 
 
 def main() -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from fleet.telemetry.recording.opening import RecordingFile
 from fleet.telemetry.recording.tlog import Tlog
-from tests import oracle
+from tests.support import oracle
 
 AT_ONCE = 10_000  # frames
 

@@ -20,9 +20,9 @@ import numpy as np
 from fleet.bus.codec import EncodedMessage
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
-from tests import oracle
 from tests.bench.peak_memory import peak_mb
-from tests.talker import Talker
+from tests.support import oracle
+from tests.support.talker import Talker
 
 BLOCK = 100_000  # bytes at a time
 GOOD = 251  # system id of the good aircraft

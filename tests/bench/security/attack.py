@@ -16,7 +16,7 @@ from fleet.access.roles import LIVE, MAX_BYTES, ROOT, topic_keys
 from fleet.bus.codec import Stamp, encode, encoding, pack_stamp
 from fleet.bus.session import _config
 from fleet.contract import TOPICS
-from tests.examples import EXAMPLES
+from tests.support.examples import EXAMPLES
 
 from .bombs import ESCAPES, bombs, questions
 

@@ -24,7 +24,7 @@ from fleet.bus.session import connect, open_router
 from fleet.contract import GatewayCounters, Sample
 from gateway.links.tcp_listener import MOST
 from tests.bench.gateway.fuzz import blocks
-from tests.talker import ITEMS, Talker
+from tests.support.talker import ITEMS, Talker
 
 from .site import PATIENCE_S, free_port
 from .trying import until

@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from tests.ulog_writer import flight, ulog
+from tests.support.ulog_writer import flight, ulog
 
 CPU_S, MEMORY_MB = 30.0, 300.0
 _ROW = "vehicle_attitude"

@@ -21,7 +21,7 @@ from gateway.link_spec import read_spec
 from gateway.links.link import Batch
 from gateway.links.tcp_listener import MOST, TcpListener
 from gateway.record.tape import RETRY_S, DiskBudget, TlogWriter
-from tests.talker import T0, Talker
+from tests.support.talker import T0, Talker
 from viewer.browser.http_server import VIOLATION, serve, without_stdout
 
 from . import hostile

@@ -17,7 +17,7 @@ from fleet.commands.live.whatif import as_object, format_text, send_request
 from fleet.contract import FleetState, GatewayCounters, Mission, Prediction, Sample, Status, WhatIf
 from gateway.publication import Publisher
 from tests.bench.peak_memory import peak_mb, reset_peak
-from tests.examples import EXAMPLES
+from tests.support.examples import EXAMPLES
 from twin_worker.service.worker import Worker
 from viewer.store.store import FleetStore
 

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.bench.growth import Row, grown, own_mb
-from tests.cable import Cable
+from tests.support.cable import Cable
 
 from .page import Page
 from .process import cpu_s, free_port, start, tell

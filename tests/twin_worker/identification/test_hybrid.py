@@ -1,0 +1,216 @@
+"""The hybrid: what it identifies on flights whose numbers are known, how it flies, and what its bundle says."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleet.autopilots import arduplane, laws
+from fleet.contract import Item
+from fleet.frames import G, Origin
+from fleet.mission import unroll_route
+from fleet.physics import point_mass as H
+from tests.twin_worker.prediction.test_predict import AHEAD, NORTH, situation
+from twin_worker.identification.fixed_wing import energy_balance
+from twin_worker.identification.fixed_wing import energy_balance as attitude_lag
+from twin_worker.identification.fixed_wing.energy_balance import PointMassData, RegressionResult
+from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel, identify
+from twin_worker.prediction.closed_loop import InitialCondition, synchronise_controller
+from twin_worker.prediction.fixed_wing import ensemble
+from twin_worker.prediction.fixed_wing.point_mass_rollout import (
+    fly_point_mass,
+    ground_velocity,
+    start_and_air,
+    unexplained_velocity,
+)
+
+SPEED = 22.0
+HOME = Origin(470_000_000, 80_000_000, 500_000)
+
+
+def body(**other: float) -> np.ndarray:
+    """An aircraft in trim at 22 m/s and half throttle."""
+    out = np.zeros(H.N_PARAMETERS)
+    out[[H.WN_PHI, H.ZETA_PHI, H.WN_THETA, H.ZETA_THETA]] = 3.0, 0.9, 3.0, 0.9
+    out[[H.K_PSI, H.A_N, H.C_T, H.C_V, H.C_N, H.T_0, H.V_0]] = 1.0, 0.06, 4.0, -0.1, -0.2, 0.5, SPEED
+    for name, value in other.items():
+        out[getattr(H, name)] = value
+    return out
+
+
+def known(**other: float) -> PointMassModel:
+    return PointMassModel(body(**other), RegressionResult(np.zeros(4), np.diag([0.01, 0.1, 1e-4, 0.01]), 0.3), 0.0)
+
+
+# --- what is identified ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lag", [(2.0, 0.7, 0.02), (4.0, 1.0, -0.03)])
+def test_a_lag_is_found_again_from_its_own_flight(lag):
+    rng = np.random.default_rng(3)
+    command = np.repeat(rng.uniform(-0.6, 0.6, 40), 30)
+    out = np.empty(len(command))
+    attitude_lag.second_order_response(command, np.zeros(len(command)), np.array(lag), out)
+    found = attitude_lag.identify(command, out + 0.01 * rng.standard_normal(len(out)))
+    assert np.allclose(found, lag, rtol=0.08, atol=0.006)
+
+
+def test_a_lag_survives_lost_commands_and_holds_to_what_is_usual_without_any():
+    command = np.repeat([0.0, 0.5, np.nan, -0.5, 0.2], 60)
+    out = np.empty(len(command))
+    attitude_lag.second_order_response(command, np.zeros(len(command)), np.array([2.5, 0.8, 0.0]), out)
+    assert np.isfinite(attitude_lag.identify(command, out)).all()
+    assert np.allclose(attitude_lag.identify(np.full(100, np.nan), np.zeros(100)), [3.0, 0.9, 0.0], atol=1e-6)
+
+
+def gusty(seconds: float, gust: float, seed: int) -> PointMassData:
+    """Energy alone, c_t = 3.4, c_v = -0.1: a throttle that answers every gust, climbs asked for now and then."""
+    rng, dt = np.random.default_rng(seed), attitude_lag.STEP
+    n = round(seconds / dt)
+    V, h, thr, blown = np.full(n, SPEED), np.full(n, 100.0), np.full(n, 0.4), 0.0
+    climb = np.repeat(rng.choice([0.0, 0.0, 1.5, -1.5], n // 200 + 1), 200)[:n]
+    I = 0.0
+    for k in range(1, n):
+        blown += dt / 4.0 * -blown + gust * np.sqrt(2 * dt / 4.0) * rng.standard_normal()
+        I = np.clip(I + dt * 0.02 * (SPEED - V[k - 1]), -0.3, 0.3)
+        thr[k] = np.clip(0.4 + G * climb[k] / SPEED / 3.4 + 0.15 * (SPEED - V[k - 1]) + I, 0.0, 1.0)
+        V[k] = V[k - 1] + dt * (3.4 * (thr[k] - 0.4) - 0.1 * (V[k - 1] - SPEED) + blown - G * climb[k] / SPEED)
+        h[k] = h[k - 1] + dt * climb[k]
+    level = np.zeros(n)
+    return PointMassData(V, h, climb, level, level, level, thr, climb, np.full(n, SPEED), level, level)
+
+
+def test_power_is_told_by_what_the_route_asks_not_by_what_gusts_do():
+    flights = [gusty(240.0, 0.8, seed) for seed in range(12)]
+    plain, instrumented = [], []
+    for flight in flights:
+        X = np.column_stack(
+            [
+                np.ones(len(flight) - 20),
+                energy_balance.moving_mean(flight.delta_t) - 0.4,
+                energy_balance.moving_mean(flight.V) - SPEED,
+            ]
+        )
+        y = energy_balance.moving_slope(0.5 * flight.V**2 + G * flight.h) / energy_balance.moving_mean(flight.V)
+        plain.append(np.linalg.lstsq(X, y, rcond=None)[0][1])
+        instrumented.append(energy_balance.fit_excess_power(flight, 0.4, SPEED).value[1])
+    assert np.median(plain) < 0.75 * 3.4  # what feedback makes of it
+    assert np.median(instrumented) == pytest.approx(3.4, rel=0.15)
+
+
+def test_a_flight_too_short_says_so():
+    now = situation()
+    with pytest.raises(ValueError, match=r"hybrid: found .* s of flight, expected 20 s; wait"):
+        identify(now.window.part(0, 100), now.history, 1.0)
+
+
+# --- how it flies ----------------------------------------------------------------------------------------------------
+
+
+def test_it_begins_where_and_as_fast_as_the_aircraft_is():
+    now = situation()
+    start = synchronise_controller(now)
+    assert isinstance(start, InitialCondition)
+    state, air = start_and_air(now, start.window)
+    got = fly_point_mass(now, start, known(), AHEAD)
+    assert got.path is not None and np.allclose(got.path[0], start.window.p[-1])
+    v = (got.path[1] - got.path[0])[:2]
+    assert np.allclose(v, ground_velocity(start.window), atol=0.4)
+    assert np.allclose(unexplained_velocity(state, air, ground_velocity(start.window)), air[[H.REST_N, H.REST_E]])
+
+
+def test_it_flies_the_route_and_turns_where_that_turns():
+    now = situation(items=(NORTH[0], NORTH[1], replace_item(NORTH[2], east=3000.0)))
+    start = synchronise_controller(now)
+    assert isinstance(start, InitialCondition)
+    got = fly_point_mass(now, start, known(), np.arange(0.0, 181.0))
+    assert got.path is not None and np.abs(got.path[:, 1]).max() < 5.0  # its first leg is 5 km long
+    assert got.path[-1, 0] - got.path[0, 0] == pytest.approx(180 * SPEED, rel=0.06)
+
+
+def replace_item(item: Item, east: float) -> Item:
+    import msgspec
+
+    return msgspec.structs.replace(item, lon_e7=item.lon_e7 + int(east * 130))
+
+
+def control() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A controller on a leg of 9 km to the north, at 100 m."""
+    place = [(HOME.lat_e7 + 400_000 * k, HOME.lon_e7, 100.0 if k else 500.0) for k in range(3)]
+    items = tuple(Item(seq=k, command=16, lat_e7=lat, lon_e7=lon, alt_m=alt) for k, (lat, lon, alt) in enumerate(place))
+    way = unroll_route(items, seq=1, origin=HOME, params={})
+    par, _ = laws.parameters("arduplane", arduplane.DEFAULTS | {"AIRSPEED_CRUISE": SPEED, "AIRSPEED_MAX": 30.0}, 600.0)
+    p, v = np.array([0.0, 0.0, -100.0]), np.array([SPEED, 0.0, 0.0])
+    return laws.init(par, way.legs, 0, p, p, v, np.zeros(3), SPEED, 0.0, 0.5), par, way.legs  # type: ignore
+
+
+def flown(air: np.ndarray, chance: np.ndarray, seconds: float = 60.0, dt: float = H.STEP) -> np.ndarray:
+    ctl, par, legs = control()
+    start = np.zeros(H.N_START)
+    start[2], start[H.V], start[H.THROTTLE] = -100.0, SPEED, 0.5
+    out = np.empty((round(seconds / dt) + 1, 3))
+    assert H.simulate_route(ctl, par, legs, body(), air, start, chance, dt, out) == len(out)
+    return out
+
+
+def calm(**other: float) -> np.ndarray:
+    air = np.zeros(H.N_AIR)
+    air[[H.SCALE, H.DRIFT_S, H.REST_S]] = 1.0, 60.0, 7.0
+    for name, value in other.items():
+        air[getattr(H, name)] = value
+    return air
+
+
+def test_wind_carries_it_and_a_gust_passes():
+    none = np.empty((0, 4))
+    still, blown = flown(calm(), none), flown(calm(W_N=4.0), none)
+    assert (blown - still)[-1, 0] == pytest.approx(240.0, abs=10.0)
+    gust = (flown(calm(REST_N=3.0), none) - still)[:, 0]
+    assert 0.0 < gust[10] < 3.3 and abs(gust[-1] - gust[-100]) < 6.0  # carried for seconds, not for a minute
+    assert np.abs(still[:, 1]).max() < 1.0 and np.abs(still[:, 2] + 100.0).max() < 6.0
+
+
+def test_coarse_steps_fly_the_same_flight():
+    none = np.empty((0, 4))
+    fine, coarse = flown(calm(W_E=3.0), none), flown(calm(W_E=3.0), none, dt=H.COARSE_STEP)
+    assert np.linalg.norm(fine[::10] - coarse[::4], axis=1).max() < 6.0  # of 1,300 m
+
+
+# --- the bundle ------------------------------------------------------------------------------------------------------
+
+
+def test_the_first_of_a_bundle_is_the_flight_itself_and_the_others_differ():
+    ctl, par, legs = control()
+    start = np.zeros(H.N_START)
+    start[2], start[H.V], start[H.THROTTLE] = -100.0, SPEED, 0.5
+    chance = np.random.default_rng(1).standard_normal((5, 61, 4))
+    chance[0] = 0.0
+    air = calm(DRIFT=0.6, REST=0.8)
+    rows = [np.tile(row, (5, 1)) for row in (body(), air, start)]
+    out = np.empty((5, 61, 3))
+    H.simulate_ensemble((ctl, par, legs), *rows, chance, np.arange(0, 241, 4), out)  # type: ignore
+    assert np.allclose(out[0], flown(calm(), np.empty((0, 4)), dt=H.COARSE_STEP)[::4])
+    assert np.isfinite(out).all() and (np.ptp(out[:, -1, 0]) > 5.0)
+
+
+def test_the_spread_grows_and_rougher_air_widens_it():
+    now = situation()
+    start = synchronise_controller(now)
+    assert isinstance(start, InitialCondition)
+    ahead = np.arange(0.0, 61.0)
+    now.wind_filter.P *= 1e-3  # as after minutes of flight
+    now.wind_filter._mean_nis = 0.2
+    one = ensemble.ensemble_std(now, start, known(), ahead, np.random.default_rng(0))
+    now.wind_filter._mean_nis = 9.0
+    rough = ensemble.ensemble_std(now, start, known(), ahead, np.random.default_rng(0))
+    assert one is not None and rough is not None and one.shape == (61, 3)
+    assert one[60, 0] > 3 * one[5, 0] > 0.0 and one[60, 0] > one[60, 1] and rough[60, 0] > 1.3 * one[60, 0]
+
+
+def test_a_bundle_that_falls_apart_gives_no_spread():
+    now = situation()
+    start = synchronise_controller(now)
+    assert isinstance(start, InitialCondition)
+    wild = known(C_0=-30.0)
+    assert ensemble.ensemble_std(now, start, replace(wild), np.arange(0.0, 61.0), np.random.default_rng(0)) is None
+    assert fly_point_mass(now, start, wild, AHEAD).diverged

@@ -1,0 +1,143 @@
+"""Predictions between two rollouts: extrapolated from the newest position, widened by age, scored, never stale."""
+
+import copy
+
+import msgspec
+import numpy as np
+import pytest
+
+from fleet.contract import Array, Prediction, Sample
+from fleet.frames import Origin, to_geodetic
+from tests.support import flights as f
+from twin_worker.confidence.tube_and_horizon import AHEAD
+from twin_worker.prediction.closed_loop import MIN_ROLLOUT_S
+from twin_worker.twin.state.budget import Schedule
+from twin_worker.twin.step import Twin, advance
+from twin_worker.twin.steps.extrapolate import MAX_OVERDUE_AGE_S, MAX_ROLLOUT_AGE_S, extrapolate, widen_tube
+
+
+def on(twin: Twin, seconds: float, off: np.ndarray) -> None:
+    """Let the aircraft be so far off the path that was foreseen."""
+    base = twin.prediction.last_rollout
+    path = [np.interp(seconds, base.ahead.numpy(), column) for column in base.path.numpy().T]
+    lat_lon_alt = to_geodetic(twin.telemetry.origin, np.array([np.array(path) + off]))
+    t = base.t + seconds
+    twin.telemetry.history.add(Sample(uav=1, t=t, position=f.rows([t], lat_lon_alt)))
+
+
+def test_a_renewed_prediction_begins_where_the_aircraft_is_and_comes_back_to_the_path(twin: Twin) -> None:
+    twin.prediction.last_rollout = twin.prediction.latest
+    off = np.array([3.0, -4.0, 1.0])
+    on(twin, 2.5, off)
+    (made,) = extrapolate(twin)
+    base = twin.prediction.last_rollout
+    assert made is twin.prediction.latest and made.t == pytest.approx(base.t + 2.5)
+    far = made.ahead.numpy()[-1]
+    foreseen = np.column_stack(
+        [np.interp(2.5 + made.ahead.numpy(), base.ahead.numpy(), c) for c in base.path.numpy().T]
+    )
+    apart = made.path.numpy() - foreseen
+    assert apart[0] == pytest.approx(off, abs=0.05) and np.abs(apart[-1]).max() < 0.1
+    assert base.ahead.numpy()[-1] - 2.5 - 5.0 < far <= base.ahead.numpy()[-1] - 2.5
+    assert made.prediction_region_half_axes.shape == made.path.shape == (len(made.ahead.numpy()), 3)
+
+
+def test_a_renewed_prediction_is_as_wide_as_the_age_of_its_rollout_demands(twin: Twin) -> None:
+    """Half-axes of a rollout whose error is a random walk: c sqrt(look-ahead), and so much more for what fades."""
+    base = twin.prediction.latest
+    ahead = base.ahead.numpy().astype(float)
+    grown = Array.of(np.outer(np.sqrt(ahead) + 0.1, [3.0, 2.0, 1.0]))
+    twin.prediction.last_rollout = msgspec.structs.replace(base, prediction_region_half_axes=grown, horizon_s=30.0)
+    for age in (2.0, 5.0, 9.0):
+        on(twin, age, np.zeros(3))
+        (made,) = extrapolate(twin)
+        at, half = made.ahead.numpy().astype(float), made.prediction_region_half_axes.numpy() / [3.0, 2.0, 1.0]
+        fade = np.exp(-at / 10.0)
+        wanted = np.sqrt((np.sqrt(at + age) + 0.1) ** 2 - (np.sqrt(age) + 0.1) ** 2 * fade * (2.0 - fade))
+        wanted = np.maximum(wanted, np.sqrt(at) + 0.1)
+        assert half == pytest.approx(np.tile(wanted[:, None], 3), rel=0.02, abs=0.02)  # straight between look-aheads
+        assert (half[at >= 5.0, 0] > np.sqrt(at[at >= 5.0]) + 0.1).all()
+        assert made.rollout_age_s == pytest.approx(age) and made.horizon_s == pytest.approx(30.0 - age)
+
+
+def test_errors_of_a_random_walk_are_held_as_often_by_renewed_tubes_as_by_new_ones() -> None:
+    rng, n, age = np.random.default_rng(7), 4000, 6
+    walk = np.cumsum(rng.standard_normal((n, len(AHEAD[:61]), 3)), axis=1)
+    half = np.outer(np.sqrt(np.arange(61.0) + 1.0), np.full(3, 2.114))  # of 0.9 in all three at once
+    tube = np.empty((50, 3), np.float32)
+    widen_tube(AHEAD[:61], half, float(age), tube)
+    fade = np.exp(-AHEAD[:50] / 10.0)[:, None]
+    error = walk[:, age : age + 50] - fade * walk[:, [age]]
+    held = (np.abs(error) <= tube).all(axis=2).mean(axis=0)
+    as_new = (np.abs(error) <= half[:50]).all(axis=2).mean(axis=0)
+    assert held[1:] == pytest.approx(np.full(49, 0.9), abs=0.1) and (held[1:] > 0.88).all()
+    assert as_new[20:].min() < 0.88 < held[20:].min()
+
+
+def test_renewed_predictions_are_scored_and_their_coverage_is_published(heard: tuple, twin: Twin) -> None:
+    twin.config = msgspec.structs.replace(twin.config, schedule=Schedule(predict=5.0, identify=1000.0, renew=0.5))
+    twin.identification.timer.restart(twin.telemetry.data_t)
+    rest = f.shifted([m for m in heard if isinstance(m, Sample) and m.t > heard[-1].t - 40.0], 40.0, 1e9)
+    made = [m for message in rest for m in advance(twin, (message,)) if isinstance(m, Prediction)]
+    coverage, n = twin.confidence.tracker.extrapolated_coverage
+    assert 4 <= n <= 9 and 0.0 <= coverage <= 1.0
+    assert (made[-1].coverage_propagated, made[-1].coverage_propagated_n) == pytest.approx((coverage, n))
+    ages = [m.rollout_age_s for m in made]
+    assert 6 <= ages.count(0.0) <= 10 and max(ages) > 4.0
+
+
+def test_a_renewal_after_the_origin_has_moved_is_in_the_frame_of_its_path(twin: Twin) -> None:
+    twin.prediction.last_rollout = twin.prediction.latest
+    on(twin, 2.0, np.array([3.0, -4.0, 1.0]))
+    (before,) = extrapolate(copy.deepcopy(twin))
+    far = to_geodetic(twin.telemetry.origin, np.array([51e3, 0.0, 0.0]))
+    twin.telemetry.origin = Origin(*map(int, far))
+    (made,) = extrapolate(twin)
+    assert made.origin == before.origin == twin.prediction.last_rollout.origin
+    assert made.path.numpy() == pytest.approx(before.path.numpy(), abs=0.1)
+    assert (
+        twin.confidence.tracker.extrapolated_coverage[1] == 0 and not twin.confidence.tracker._extrapolated
+    )  # scored in the twin's own frame alone
+
+
+def test_nothing_is_renewed_that_is_old_void_or_lost(twin: Twin) -> None:
+    twin.prediction.last_rollout = twin.prediction.latest
+    fresh = copy.deepcopy(twin)
+    on(fresh, 1.0, np.zeros(3))
+    assert extrapolate(fresh)
+    for part, name, value in (
+        ("prediction", "last_rollout", None),
+        ("telemetry", "link_lost", True),
+        ("prediction", "position_lost", True),
+        ("telemetry", "origin", None),
+    ):
+        odd = copy.deepcopy(fresh)
+        setattr(getattr(odd, part), name, value)
+        assert extrapolate(odd) == []
+    on(twin, MAX_ROLLOUT_AGE_S + 0.5, np.zeros(3))
+    assert extrapolate(twin), "the next is due and waits"
+    twin.prediction.predict_timer.restart(twin.prediction.last_rollout.t + MAX_ROLLOUT_AGE_S)
+    assert extrapolate(twin) == []
+    twin.prediction.predict_timer.restart(twin.prediction.last_rollout.t)
+    on(twin, MAX_OVERDUE_AGE_S + 0.5, np.zeros(3))
+    assert extrapolate(twin) == []
+    short = copy.deepcopy(fresh)
+    few = {
+        name: Array.of(getattr(short.prediction.last_rollout, name).numpy()[:2])
+        for name in ("ahead", "path", "prediction_region_half_axes")
+    }
+    short.prediction.last_rollout = msgspec.structs.replace(short.prediction.last_rollout, **few)
+    assert extrapolate(short) == []
+
+
+def test_the_shortest_flight_ahead_is_renewed_as_long_as_any(twin: Twin) -> None:
+    n = int(np.searchsorted(twin.prediction.latest.ahead.numpy(), MIN_ROLLOUT_S)) + 1
+    few = {
+        name: Array.of(getattr(twin.prediction.latest, name).numpy()[:n])
+        for name in ("ahead", "path", "prediction_region_half_axes")
+    }
+    twin.prediction.last_rollout = msgspec.structs.replace(twin.prediction.latest, **few)
+    for seconds in (0.5, 5.0, MAX_ROLLOUT_AGE_S - 0.5):
+        on(twin, seconds, np.zeros(3))
+        (made,) = extrapolate(twin)
+        assert made.ahead.numpy()[-1] > MIN_ROLLOUT_S - seconds - 5.0

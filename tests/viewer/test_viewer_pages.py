@@ -1,0 +1,200 @@
+"""Pages beside each other: a defect of one ends no other, each has its colours, a click shows whose and when."""
+
+import contextlib
+import re
+import threading
+import time
+from collections.abc import Iterator
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
+from conftest import unused_port
+
+from fleet.bus.memory_bus import MemoryBus
+from tests.bench.viewing.watcher import Watcher
+from tests.support.pretend_feed import PretendFleet
+from viewer.browser.http_server import PagePreferences, serve, without_stdout
+from viewer.panels.panels import NO_UAV
+from viewer.server.app import App
+from viewer.server.view import View
+from viewer.text.missed_events import encode_click, parse_click
+from viewer.text.words import table
+from viewer.theme.palette import DARK, LIGHT
+
+
+@pytest.fixture
+def site() -> Iterator[SimpleNamespace]:
+    """A viewer with five aircraft that fly, and two pages on it."""
+    port = unused_port()
+    server, bus = serve("127.0.0.1", port), MemoryBus()
+    app, fleet = App(bus, server), PretendFleet(bus, 5)
+    pages = [Watcher(port), Watcher(port)]
+
+    def run(ticks: int = 10) -> None:
+        for tick in range(ticks):
+            fleet.advance(time.time())
+            app.tick(tick)
+
+    while len(app.views) < 2:  # each is there once it has told its camera
+        run()
+    yield SimpleNamespace(app=app, run=run, views=[app.views[n] for n in sorted(app.views)])
+    for page in pages:
+        page.close()
+    with without_stdout():
+        server.stop()
+
+
+def broken(view: View) -> str:
+    return view.panels._error.content
+
+
+def test_a_defect_of_one_page_is_said_there_and_in_the_log_and_the_others_go_on(site, caplog) -> None:
+    first, second = site.views
+    first.scene.draw_heads = MagicMock(side_effect=KeyError("<b>seven"))
+    drawn = second.scene.draw_heads = MagicMock(wraps=second.scene.draw_heads)
+    site.run()
+    site.run()
+    assert "KeyError: &#x27;&lt;b&gt;seven" in broken(first) and "Reload" in broken(first)
+    assert broken(second) == "" and drawn.call_count > 5
+    said = [record for record in caplog.records if record.name == "viewer.server.app"]
+    assert len(said) == 1 and said[0].exc_info and f"page {first.client.client_id}" in said[0].message
+    del first.scene.draw_heads
+    site.run()
+    assert broken(first)  # it may stumble again at once
+    first._error_time -= 10.0
+    site.run()
+    assert broken(first) == ""
+
+
+def test_a_page_that_cannot_be_opened_is_left_alone(site, caplog, monkeypatch) -> None:
+    number, other = sorted(site.app.views)
+    del site.app.views[number]
+    tried = MagicMock(side_effect=RuntimeError("no room"))
+    monkeypatch.setattr("viewer.server.app.View", tried)
+    site.run()
+    assert tried.call_count == 1 and list(site.app.views) == [other]
+    assert f"page {number} could not be opened" in caplog.text
+
+
+def test_every_page_has_its_own_colours_and_goes_on_where_it_was(site) -> None:
+    first, second = site.views
+    first.select(3)
+    first.browser.set_theme(light=True)
+    site.run()
+    again = site.app.views[first.client.client_id]
+    assert again is not first and again.palette is LIGHT and again.selected == 3 and again.camera is first.camera
+    assert site.app.views[second.client.client_id] is second and second.palette is DARK
+    assert again.client.scene._handle_from_node_name and "/fleet/vehicles" in again.client.scene._handle_from_node_name
+
+
+def test_a_click_on_an_alert_selects_and_shows_its_time(site) -> None:
+    view = site.views[0]
+    tape = site.app.recordings.by_uav[4]
+    while not tape.states or tape.t[-1] - tape.states[0].t < 0.2:
+        site.run()
+    then = float(tape.states[0].t) + 0.1
+    view.panels._pick(encode_click(4, then))
+    assert view.selected == 4 and view.timeline.player.t == pytest.approx(then, abs=2e-3) and view.dirty
+    site.app.draw_selections()
+    assert view.selected_vehicle().shown_t == pytest.approx(then, abs=2e-3) and site.views[1].timeline.player.live
+    view.panels._pick(encode_click(2, float("nan")))  # a time that is none: selected, as a row is
+    assert view.selected == 2
+    for mischief in ("", "x", "7@", "9999999", "1@1e400", "1@nan", "1@-3", "²", "3@" + "9" * 100):
+        view.panels._pick(mischief)
+    assert view.timeline.player.t == pytest.approx(then, abs=2e-3)
+
+
+def test_who_is_selected_is_drawn_ahead_of_lists_and_charts(site, monkeypatch) -> None:
+    view = site.views[0]
+    view.select(3)
+    monkeypatch.setattr(view.panels, "draw", told := MagicMock(wraps=view.panels.draw))
+    site.app.draw_selections()
+    assert view.selection.tags[0].text.startswith("UAV-003") and not told.called
+    site.run(1)
+    assert told.called
+
+
+def test_nothing_is_held_back_while_lists_are_made(site, monkeypatch) -> None:
+    view, held = site.views[0], []
+    buffer = view.client._websock_connection.get_message_buffer()
+
+    def made(*given, **named) -> str:
+        held.append(buffer.atomic_counter)
+        return table(*given, **named)
+
+    monkeypatch.setattr("viewer.panels.panels.table", made)
+    site.run()
+    assert held and not any(held)
+
+
+def test_a_click_is_written_as_it_is_read() -> None:
+    for uav, t in ((0, 0.0), (7, 1_700_000_000.125), (999_999, 3.9e9)):
+        assert parse_click(encode_click(uav, t)) == (uav, pytest.approx(t, abs=1e-3))
+    assert (
+        parse_click(encode_click(5, np.inf)) == (5, None)
+        and parse_click("5") == (5, None)
+        and parse_click("5@x") is None
+    )
+
+
+def remembered(text: str | None, *, error: type[Exception] | None = None) -> PagePreferences:
+    client = MagicMock()
+    client.local_storage.get_item.side_effect = error
+    client.local_storage.get_item.return_value = text
+    told = threading.Event()
+    one = PagePreferences(client, told.set)
+    assert told.wait(10)
+    return one
+
+
+def test_a_page_that_reloads_has_its_aircraft_and_colours_again(site) -> None:
+    one = remembered('{"uav": 3, "light": true}')
+    assert one.uav == 3 and one.light is True
+    view = site.views[0]
+    view.browser.preferences = one
+    site.run()
+    again = site.app.views[view.client.client_id]
+    assert again.selected == 3 and again.palette is LIGHT and one.uav is None
+    again.select(1)
+    site.run()
+    assert one._client.local_storage.set_item.call_args.args[1] == '{"uav": 1, "light": true}'
+
+
+def test_colours_are_stored_before_the_page_is_drawn_again(site) -> None:
+    view = site.views[0]
+    view.browser.preferences = one = remembered('{"uav": 3, "light": false}')
+    site.run()
+    view.browser.set_theme(light=True)  # a page may be reloaded as soon as it has the colours
+    assert one._client.local_storage.set_item.call_args.args[1] == '{"uav": 3, "light": true}'
+
+
+@pytest.mark.parametrize(
+    "text", [None, "", "[", "[7]", '{"uav": "7"}', '{"uav": true, "light": 3}', "[" * 500, "9" * 500]
+)
+def test_what_else_a_browser_says_is_nothing(text: str | None) -> None:
+    one = remembered(text)
+    assert one.uav is None and one.light is None
+
+
+def test_who_was_selected_is_not_forgotten_before_it_is_there_again() -> None:
+    one = remembered('{"uav": 40}')
+    one.save(1)  # another is shown meanwhile
+    with contextlib.suppress(IndexError):
+        assert one._client.local_storage.set_item.call_args.args[1] == '{"uav": 40, "light": null}'
+    assert one.uav == 40 and remembered(None, error=TimeoutError).uav is None
+
+
+def test_the_menu_offers_the_rows_of_the_table_and_both_those_that_pass_the_search(site) -> None:
+    panels = site.views[0].panels
+
+    def rows() -> tuple[str, ...]:
+        return tuple(f"UAV-{int(uav):03d}" for uav in re.findall(r'data-uav="(\d+)"', panels._table.content))
+
+    site.run()
+    assert sorted(rows()) == [f"UAV-{uav:03d}" for uav in range(5)] and panels._menu.options == (NO_UAV, *rows())
+    assert list(rows()) != sorted(rows())  # the worst first
+    panels._search.value = "uav-003"
+    site.run()
+    assert rows() == ("UAV-003",) and panels._menu.options == (NO_UAV, "UAV-003")

@@ -1,0 +1,137 @@
+"""What is wrong with the picture as a whole, said in words: no router, too many UAVs, damaged recordings, no fleet."""
+
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fleet.bus.memory_bus import MemoryBus
+from fleet.contract import GatewayCounters, LinkCounters, Status
+from gateway.link_spec import read_spec
+from gateway.links.recorded import ReplayLink
+from gateway.pipeline import Pipeline
+from tests.gateway.test_gateway import flight
+from tests.support.pretend_feed import HOSTILE, STAMP, Clock, PretendUav, T, feed_of
+from viewer.panels.detail import status_html
+from viewer.scene.camera import set_initial_view
+from viewer.scene.ground import RINGS_M
+from viewer.scene.labels import CameraView
+from viewer.store import store as feeds
+from viewer.store.place import UNIT_M
+from viewer.store.states import MAX_TEXT, RouterStatus, notices
+from viewer.store.store import FleetStore
+from viewer.text.words import empty_html, summary_html
+from viewer.theme.palette import DARK
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+class Adrift(MemoryBus):
+    router = ""
+
+
+def damaged(sentence: str, link: str = "replay:flight.tlog?speed=4") -> GatewayCounters:
+    return GatewayCounters(t=T, links=(link,), per_link=(LinkCounters(link=link, sentence=sentence),))
+
+
+def test_a_router_that_is_away_is_said_with_its_seconds_and_forgotten_when_it_is_back(clock: Clock) -> None:
+    feed, router = FleetStore(Adrift(), clock), RouterStatus()
+    assert not feed.router_available and "No router</b> for 0 s" in router.describe(feed.router_available, 50.0)
+    assert "for 12 s" in notices(feed, router.describe(feed.router_available, 62.0), "", DARK)
+    assert router.describe(True, 63.0) == "" == notices(FleetStore(MemoryBus(), clock), "", "", DARK)
+    assert "for 0 s" in router.describe(False, 70.0)
+
+
+def test_more_uavs_than_fit_are_counted_once_each(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(feeds, "MAX_VEHICLES", 3)
+    monkeypatch.setattr(feeds, "MAX_AWAY", 4)
+    feed, _, bus = feed_of(clock, 3)
+    for _ in range(3):
+        for uav in (7, 8, 5_000_000, -1, 9, 10):
+            bus.publish(Status(uav=uav, t=T))
+    assert len(feed.vehicles) == 3 and len(feed.rejected_uavs) == 4
+    assert "Too many UAVs" in notices(feed, "", "", DARK) and ", 4 more are received" in notices(feed, "", "", DARK)
+    assert "3 UAVs" in summary_html(feed.all(), feed, DARK, clock.now)
+
+
+def test_what_could_not_be_read_of_a_recording_is_said_and_escaped(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 1)
+    bus.publish(damaged(f"flight.tlog: 73750 damaged bytes skipped {HOSTILE} {'x' * 10_000}"))
+    said = notices(feed, "", "", DARK)
+    assert "Recording damaged" in said and "73750 damaged bytes" in said
+    assert "<img" not in said and len(said) < 3 * MAX_TEXT
+    bus.publish(damaged(""))
+    assert notices(feed, "", "", DARK) == ""
+
+
+def test_a_damaged_recording_reaches_the_page(clock: Clock, tmp_path: Path) -> None:
+    path = tmp_path / "flight.tlog"
+    good = bytearray(flight(10.0))
+    good[len(good) // 3 : len(good) // 3 + 900] = b"\x07" * 900
+    path.write_bytes(good)
+    feed = FleetStore(bus := MemoryBus(), clock)
+    Pipeline([ReplayLink(read_spec(f"replay:{path}?speed=max"))], bus).run(threading.Event())
+    said = notices(feed, "", "", DARK)
+    assert (
+        "Recording damaged</b>: flight.tlog: " in said and "damaged bytes skipped" in said and len(feed.vehicles) == 1
+    )
+
+
+def test_links_without_end_are_bounded(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 1)
+    for k in range(500):
+        bus.publish(damaged("late", f"udpin:0.0.0.0:{k}"))
+    assert len(feed.links) == feeds.MAX_LINKS and "<b>Link</b>: late" in notices(feed, "", "", DARK)
+
+
+def test_no_fleet_is_said_with_what_is_listened_to_and_what_to_check(clock: Clock) -> None:
+    feed = FleetStore(MemoryBus(), clock)
+    clock.now += 42
+    said = empty_html(feed, clock.now)
+    assert "No vehicles yet" in said and "parauav/*/sample" in said and "42 s" in said and "0 messages" in said
+    assert "fleet status" in said
+
+
+def test_ten_thousand_letters_of_status_are_cut_and_words_stay_words(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 1)
+    bus.publish(Status(uav=0, t=T + 1, mode=HOSTILE * 50, sentence=HOSTILE + "y" * 10_000))
+    page = status_html(feed.get(0), DARK, clock.now)
+    assert "<img" not in page and "yyy" in page and len(page) < 4_000
+
+
+def test_identifying_says_why_there_is_no_horizon_and_for_how_long(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 2)
+    uav = PretendUav(1)
+    for k in range(1, 46):
+        clock.now += 1
+        bus.publish(uav.sample(T + k - 1, T + k))
+        bus.publish(uav.model(T + k), STAMP)
+    page = status_html(feed.get(1), DARK, clock.now)
+    assert "No horizon yet" in page and "window has 41 samples" in page and "after 45 s of telemetry" in page
+
+
+def test_who_is_lost_is_not_said_to_have_a_slow_worker(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 1)
+    bus.publish(PretendUav(0).prediction(T, 0.0), STAMP)
+    for k in range(1, 8):
+        clock.now += 1.0
+        bus.publish(PretendUav(0).sample(T + k - 1, T + k))
+    behind = status_html(feed.get(0), DARK, clock.now)
+    assert "is overloaded; assign fewer" in behind and "recording" not in behind
+    clock.now += 5.0
+    lost = status_html(feed.get(0), DARK, clock.now)
+    assert "12 s old." in lost and "No sample for 5 s" in lost and "overloaded" not in lost
+
+
+def test_an_empty_page_looks_at_the_ground_and_its_first_ring() -> None:
+    server = SimpleNamespace(initial_camera=SimpleNamespace())
+    set_initial_view(server)
+    start, turn = server.initial_camera, np.linspace(0.0, 2 * np.pi, 40)
+    ring = RINGS_M[0] / UNIT_M * np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=-1)
+    spots, depth = CameraView(start.position, start.look_at, start.fov, 1.0).project(ring)
+    assert (depth > 0).all() and (np.abs(spots) < 0.5).all() and np.ptp(spots[:, 0]) > 0.3
