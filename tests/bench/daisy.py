@@ -8,7 +8,7 @@ centred and scaled by the first half. The state at the start of the second half 
 least squares over its first tenth (at least 30 samples), the weakest echo breaking ties. A peer's order (1..10; with
 sippy also whether there is a D) is the one whose model of the first two thirds of that half runs best over the last
 third of it; that order is then identified on all of it. Ours is
-`twin_worker.identification.linear.order_selection` as it is, with orders 1..10 and feedthrough allowed: the median run
+`tests.bench.order_selection` as it is, with orders 1..10 and feedthrough allowed: the median run
 of its committee.
 """
 
@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tests.bench.daisy_peers import Peer, peers, quietly
-from twin_worker.identification.linear.order_selection import select_order
+from tests.bench.order_selection import select_order
 from twin_worker.identification.linear.state_space import StateSpace
 
 # name: columns to skip, inputs, outputs

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from test_subspace import closed_loop, miss
 
+from tests.bench.order_selection import select_order
 from twin_worker.identification.linear.black_box_prediction_error import (
     fit_inputs,
     normal_equations,
     refine_black_box,
     squared_errors,
 )
-from twin_worker.identification.linear.order_selection import select_order
 from twin_worker.identification.linear.state_space import StateSpace
 from twin_worker.identification.linear.subspace import pbsid, projection
 

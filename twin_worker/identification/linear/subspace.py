@@ -1,6 +1,6 @@
 """Predictor-based subspace identification of a state-space model.
 
-The paper projects future outputs orthogonally to the inputs (Huang 2021, eq. 5-15; `subspace_open_loop.py`), which is
+The paper projects future outputs orthogonally to the inputs (Huang 2021, eq. 5-15; `projection`), which is
 biased when an autopilot closes the loop. This form is consistent in closed loop: a vector autoregression models the
 past, so that the innovations are uncorrelated with it.
 
