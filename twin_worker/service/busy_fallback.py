@@ -39,8 +39,11 @@ def fallback_prediction(owned: OwnedTwin) -> Prediction | None:
 
 
 def publish_fallbacks(owned_twins: list[OwnedTwin], publish: Callable[[Message, OwnedTwin], None]) -> None:
-    """Propagate the predictions of all twins that are overdue, due to lack of CPU time or a lock."""
-    for owned in owned_twins:
+    """Propagate the predictions of all twins that are overdue, due to lack of CPU time or a lock; oldest first.
+
+    With little CPU time a pass takes longer than a period, and the same order each time would let the last ones wait.
+    """
+    for owned in sorted(owned_twins, key=lambda one: one.published_at):
         overdue = time.monotonic() - owned.published_at > _due_s(owned)
         if overdue and (prediction := fallback_prediction(owned)) is not None:
             publish(prediction, owned)

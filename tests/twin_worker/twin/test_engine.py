@@ -146,7 +146,7 @@ def test_work_beside_the_sweep_rests_until_the_others_had_their_cpu_time(monkeyp
     now = dict.fromkeys(("wall", "mine", "all"), 0.0)
     names = {"monotonic": "wall", "thread_time": "mine", "process_time": "all"}
     for name, clock in names.items():
-        monkeypatch.setattr(f"twin_worker.service.cpu_share.time.{name}", lambda clock=clock: now[clock])
+        monkeypatch.setattr(f"twin_worker.service.identification_thread.time.{name}", lambda clock=clock: now[clock])
     beside, granted = CpuShareLimiter(), 0.0
 
     class Stop:
@@ -218,6 +218,15 @@ def test_who_is_not_reached_in_time_is_renewed_from_the_position_received_last(h
     assert is_superseded(late, held) and not is_superseded(msgspec.structs.replace(late, t=times[-1] + 1.0), held)
     held.last_position = f.rows([times[0] - 25.0], [[0.0, 0.0, 0.0]])
     assert not is_superseded(late, held), "the clock was set back"
+
+
+def test_who_waits_longest_is_renewed_first(twin: Twin, monkeypatch: pytest.MonkeyPatch) -> None:
+    held, told = [OwnedTwin(twin, k) for k in range(4)], []
+    monkeypatch.setattr("twin_worker.service.busy_fallback.fallback_prediction", lambda owned: owned.epoch)
+    for one, waited in zip(held, (3.0, 0.1, 9.0, 5.0), strict=True):
+        one.published_at = time.monotonic() - waited
+    publish_fallbacks(held, lambda made, _: told.append(made))
+    assert told == [2, 3, 0]
 
 
 def test_what_is_shed_is_said() -> None:
