@@ -13,7 +13,7 @@ PACKAGES = ("fleet", "gateway", "twin_worker", "viewer")
 
 ORDER = (  # a folder, or a module in the root of a package, imports only from itself and from those on lines above
     ("fleet.process",),
-    ("fleet", "fleet.frames", "fleet.commands"),
+    ("fleet", "fleet.frames", "fleet.vehicles", "fleet.commands"),
     ("fleet.contract",),
     ("fleet.metrics", "fleet.mission", "fleet.window", "fleet.access"),
     ("fleet.config", "fleet.bus", "fleet.cli"),

@@ -16,7 +16,7 @@ from twin_worker.prediction.autopilot_parameters import SPEED_PARAMETERS, RouteO
 from twin_worker.prediction.kinematic import wind_and_airspeed
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.twin.state.state import ROUTE_MODES, Twin
-from twin_worker.twin.state.vehicle_class import WINGLESS, recent_track
+from twin_worker.twin.steps.kinematic_prediction import recent_track
 from twin_worker.twin.steps.predict_step import predict
 
 
@@ -146,7 +146,7 @@ def _move_flight(twin: Twin, query: WhatIf) -> None:
             np.append(wind_and_airspeed(track, None)[0], 0.0) if track is not None and track.ok.any() else np.zeros(3)
         )
     wind_after = wind_before if query.wind is None else np.array([*query.wind, 0.0])
-    winds = (np.zeros(3), np.zeros(3)) if twin.vehicle in WINGLESS else (wind_before, wind_after)
+    winds = (np.zeros(3), np.zeros(3)) if twin.vehicle_class.is_rotorcraft else (wind_before, wind_after)
     if (start := query.start) is None:
         move_history(twin.telemetry.history, twin.telemetry.origin, Motion(None, None, *winds))
     else:

@@ -4,6 +4,7 @@ Every look-ahead is scored as soon as it has been flown, for all predictions at 
 look-aheads unscored and censors the first passage. An event ends the prediction and censors it too.
 """
 
+from dataclasses import dataclass
 from math import sqrt
 from typing import NamedTuple
 
@@ -150,6 +151,7 @@ _STRIDE_S = 1.0  # interval at which the path length flown is measured [s]
 _STRIDES = int(1.3 * AHEAD[-1] / _STRIDE_S)  # intervals stored
 
 
+@dataclass(init=False, eq=False)
 class PredictionLog:
     """Ring buffer of predictions, one array per quantity, over the first n of `AHEAD`.
 
@@ -158,31 +160,56 @@ class PredictionLog:
         n: look-aheads of each
     """
 
+    t0: np.ndarray  # [s since 1970]
+    group: np.ndarray
+    method: np.ndarray
+    size: np.ndarray  # look-aheads of each
+    path: np.ndarray  # NED [m]
+    direction: np.ndarray  # unit vector along the path
+    tube: np.ndarray  # half-axes as published [m]
+    factor: np.ndarray  # published half-axes over those of the table [-]
+    ratio: np.ndarray  # running maximum of table half-axes over path length [-]
+    horizon: np.ndarray  # as published [s]
+    score: np.ndarray  # largest error over its half-axis [-]
+    next_column: np.ndarray  # first look-ahead not yet flown
+    live: np.ndarray  # look-aheads remain to be scored
+    followed: np.ndarray  # follow-up time: first passage of 10 %, or censoring time [s]
+    exceeded: np.ndarray  # the error has exceeded 10 %
+    uncensored: np.ndarray  # neither exceeded nor censored
+    horizon_pending: np.ndarray  # its horizon is neither met nor missed yet
+    evaluated_until: float  # end of the scored flight [s since 1970]
+    _min_length: np.ndarray  # least path length [m]
+    _start_length: np.ndarray  # path length at t0 [m]
+    _last_error: np.ndarray  # relative error at the previous look-ahead [-]
+    _odometer: np.ndarray  # time, and path length flown until then [s since 1970, m]
+    _stride_start: np.ndarray  # position at the end of the last interval
+    _newest_row: int  # newest row
+
     def __init__(self, rows: int = CAPACITY, n: int = len(AHEAD)) -> None:
-        self.t0 = np.full(rows, -np.inf)  # [s since 1970]
+        self.t0 = np.full(rows, -np.inf)
         self.group = np.full(rows, "", dtype=object)
         self.method = np.full(rows, "", dtype=object)
-        self.size = np.zeros(rows, int)  # look-aheads of each
-        self.path = np.zeros((rows, n, 3))  # NED [m]
-        self.direction = np.zeros((rows, n, 2), np.float32)  # unit vector along the path
-        self.tube = np.ones((rows, n, 3), np.float32)  # half-axes as published [m]
-        self.factor = np.ones((rows, len(KNOTS)))  # published half-axes over those of the table [-]
-        self.ratio = np.zeros((rows, n), np.float32)  # running maximum of table half-axes over path length [-]
-        self.horizon = np.zeros(rows)  # as published [s]
-        self.score = np.full((rows, n), np.nan, np.float32)  # largest error over its half-axis [-]
-        self.next_column = np.zeros(rows, int)  # first look-ahead not yet flown
-        self.live = np.zeros(rows, bool)  # look-aheads remain to be scored
-        self.followed = np.zeros(rows)  # follow-up time: first passage of 10 %, or censoring time [s]
-        self.exceeded = np.zeros(rows, bool)  # the error has exceeded 10 %
-        self.uncensored = np.zeros(rows, bool)  # neither exceeded nor censored
-        self.horizon_pending = np.zeros(rows, bool)  # its horizon is neither met nor missed yet
-        self.evaluated_until = -np.inf  # end of the scored flight [s since 1970]
-        self._min_length = np.ones(rows)  # least path length [m]
-        self._start_length = np.full(rows, np.nan)  # path length at t0 [m]
-        self._last_error = np.zeros(rows)  # relative error at the previous look-ahead [-]
-        self._odometer = np.empty((0, 2))  # time, and path length flown until then [s since 1970, m]
-        self._stride_start = np.zeros(3)  # position at the end of the last interval
-        self._newest_row = -1  # newest row
+        self.size = np.zeros(rows, int)
+        self.path = np.zeros((rows, n, 3))
+        self.direction = np.zeros((rows, n, 2), np.float32)
+        self.tube = np.ones((rows, n, 3), np.float32)
+        self.factor = np.ones((rows, len(KNOTS)))
+        self.ratio = np.zeros((rows, n), np.float32)
+        self.horizon = np.zeros(rows)
+        self.score = np.full((rows, n), np.nan, np.float32)
+        self.next_column = np.zeros(rows, int)
+        self.live = np.zeros(rows, bool)
+        self.followed = np.zeros(rows)
+        self.exceeded = np.zeros(rows, bool)
+        self.uncensored = np.zeros(rows, bool)
+        self.horizon_pending = np.zeros(rows, bool)
+        self.evaluated_until = -np.inf
+        self._min_length = np.ones(rows)
+        self._start_length = np.full(rows, np.nan)
+        self._last_error = np.zeros(rows)
+        self._odometer = np.empty((0, 2))
+        self._stride_start = np.zeros(3)
+        self._newest_row = -1
 
     @property
     def newest_t(self) -> float:

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -97,12 +96,11 @@ class TableFile(msgspec.Struct, frozen=True):
     tables: tuple[TableRecord, ...]
 
 
-@dataclass(frozen=True)
 class TableSet:
     """All tables by group, and the errors of the files."""
 
-    by_group: dict[str, CalibrationTable]
-    sentence: str = ""
+    def __init__(self, by_group: dict[str, CalibrationTable], sentence: str = "") -> None:
+        self.by_group, self.sentence = by_group, sentence
 
     def choose(self, group: str) -> tuple[CalibrationTable, str]:
         """Return the narrowest table for a group, and a description of it."""

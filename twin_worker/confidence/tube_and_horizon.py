@@ -33,11 +33,11 @@ _MIN_AGE_S, _MAX_AGE_S = 4.0, 21.0  # age of the predictions used [s]
 _MEMBERS = 3  # predictions stored
 
 
+@dataclass(eq=False)
 class LaggedForecasts:
     """The last few predictions of one aircraft, as curves over time."""
 
-    def __init__(self) -> None:
-        self._members: deque[tuple[float, float, CubicSpline]] = deque(maxlen=_MEMBERS)
+    _members: deque[tuple[float, float, CubicSpline]] = field(default_factory=lambda: deque(maxlen=_MEMBERS))
 
     def add(self, t: float, ahead: np.ndarray, path: np.ndarray) -> None:
         """Store a prediction made at `t` [s since 1970], path (n, 3) [m] at look-aheads (n,) [s]."""

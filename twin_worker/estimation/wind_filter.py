@@ -2,6 +2,7 @@
 
 from bisect import bisect_left
 from collections.abc import Iterable
+from dataclasses import dataclass
 from math import atan2, cos, exp, hypot, inf, isfinite, sin, sqrt
 
 import numpy as np
@@ -87,6 +88,7 @@ def _correct(
                 P[i, j] += AP[i, k] * A[j, k]
 
 
+@dataclass(init=False, eq=False)
 class WindFilter:
     """Estimate a, b, mean, drift, gust of  v = Va cos(gamma) (a e(psi) + b e(psi + 90 deg)) + mean + drift + gust.
 
@@ -94,6 +96,12 @@ class WindFilter:
     first-order Gauss-Markov processes, which separates gusts from wind.
     Source: Beard & McLain 2012, sec. 2.4 (wind triangle); Bar-Shalom 2001, 5.4 (gating), 8.2 (coloured noise).
     """
+
+    t: float
+    x: np.ndarray
+    P: np.ndarray
+    _row_count: int
+    _mean_nis: float
 
     def __init__(self) -> None:
         self.t = -np.inf

@@ -38,7 +38,6 @@ from twin_worker.prediction.method_selection import constant_turn_prediction
 from twin_worker.prediction.multirotor.rollout import items_in_force
 from twin_worker.telemetry.track import STEP, Track
 from twin_worker.twin.state.state import Twin
-from twin_worker.twin.state.vehicle_class import WINGLESS
 
 _CIRCLES = (LOITER_TURNS, LOITER_UNLIMITED, LOITER_TIME, LOITER_TO_ALT)
 _STEP = 5.0  # between points [m]
@@ -212,7 +211,7 @@ def route_at_ground_speed(inputs: BaselineInput) -> np.ndarray | None:
 
 def route_in_wind(inputs: BaselineInput) -> np.ndarray | None:
     """Predict along the mission at the commanded airspeed in the estimated wind, (k, 3) [m]; None without a mission."""
-    if inputs.twin.vehicle in WINGLESS:
+    if inputs.twin.vehicle_class.is_rotorcraft:
         return _follow_route(inputs, lambda points: _multirotor_speed(inputs, points))
     wind = inputs.twin.environment.wind.wind if np.isfinite(inputs.twin.environment.wind.t) else None
     wind_ne, airspeed = wind_and_airspeed(inputs.track, wind)

@@ -12,8 +12,8 @@ from twin_worker.evaluation.scoring.compare import MIN_EVENT_FREE_S, MIN_FIRST_S
 from twin_worker.evaluation.scoring.log import OURS, EvaluationCase, EvaluationStart, MethodForecast, ReferenceFlight
 from twin_worker.identification.fixed_wing.plant import DYNAMICS, PAPER
 from twin_worker.twin.state.state import AUTO, ingest
-from twin_worker.twin.state.vehicle_class import recent_track
 from twin_worker.twin.step import Twin, advance, silent_step_times
+from twin_worker.twin.steps.kinematic_prediction import recent_track
 
 FALLBACK = "imm"  # fallback of a method that cannot predict
 _HISTORY_S = 62.0  # telemetry available to the baselines [s]

@@ -27,7 +27,6 @@ from twin_worker.mismatch.job import (
     with_adaptation,
 )
 from twin_worker.twin.state.state import ROUTE_MODES, Twin
-from twin_worker.twin.state.vehicle_class import WINGED
 
 BASELINE_S = 105.0  # own past used as the comparison model [s]
 FLIGHT_S = 120.0  # flight used for a diagnosis [s]
@@ -82,7 +81,7 @@ class DiagnosisState:
             newest < max(self.next_t, self.suspended_until)
             or twin.telemetry.link_lost
             or twin.environment.flight_phase.landed
-            or twin.vehicle not in WINGED
+            or not twin.vehicle_class.has_wings
             or twin.telemetry.origin is None
         ):
             return None

@@ -1,42 +1,23 @@
-"""Serialise the complete twin of one aircraft for a handover, so that its new owner continues without a gap."""
+"""Serialise the complete twin of one aircraft for a handover, so that its new owner continues without a gap.
 
+msgspec encodes and checks everything by the annotations of the state; hooks convert the types that it does not know.
+Untrusted bytes give a snapshot of these types or a `ValueError`.
+"""
+
+from collections import deque
 from dataclasses import dataclass, field
+from typing import Any, get_args, get_origin
 
+import msgspec
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from fleet import contract as c
-from fleet.airframes import Airframe
-from fleet.airframes.airframe import ServoMap
-from fleet.contract import Message, Mismatch
-from fleet.frames import Origin
-from twin_worker.alerts.hysteresis import AlertState, PendingAlert
-from twin_worker.confidence.adaptive_conformal import AdaptiveLevels, ScaleFactors
-from twin_worker.confidence.prediction_log import PredictionLog
+from fleet.contract import TOPICS, Message, Mismatch
+from twin_worker.alerts.hysteresis import AlertState
 from twin_worker.confidence.table_files import TableSet
 from twin_worker.confidence.table_files import load as load_tables
-from twin_worker.confidence.tube_and_horizon import Confidence, ConfidenceTracker, LaggedForecasts, PointForecast
-from twin_worker.estimation.wind_filter import WindFilter
-from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
-from twin_worker.identification.fixed_wing.energy_balance import RegressionResult
-from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel
-from twin_worker.identification.linear.linear_model import AxisModel
-from twin_worker.ownership.typed_serialization import ClassCodec, ClassRegistry, deserialise, serialise
-from twin_worker.prediction.autopilot_identification import AutopilotEstimate
-from twin_worker.prediction.autopilot_parameters import ControllerTwin
-from twin_worker.prediction.kinematic import KinematicModel
-from twin_worker.prediction.method_selection import MethodSelector
-from twin_worker.prediction.multirotor.rollout import MultirotorModel
-from twin_worker.telemetry.history import ArrivalDelay, RowBuffer, TelemetryHistory
-from twin_worker.telemetry.resample import Resampler
-from twin_worker.twin.state.budget import ComputeBudget, Schedule, Timer
-from twin_worker.twin.state.events import FlightEvent
-from twin_worker.twin.state.flight_phase import FlightPhase
-from twin_worker.twin.state.inputs import Environment, OnboardState, Telemetry
-from twin_worker.twin.state.models import ActiveEffects, Checkpoint, Identification, ModelBank, VerifiedModel
-from twin_worker.twin.state.outputs import AlertingState, ConfidenceState, PredictionState
-from twin_worker.twin.state.state import Twin, TwinConfig
-from twin_worker.validation.forecast_shrinkage import Shrinkage
+from twin_worker.telemetry.history import RowBuffer
+from twin_worker.twin.state.state import Twin
 
 
 @dataclass
@@ -56,89 +37,25 @@ class Snapshot:
     mismatch: Mismatch | None = None
 
 
-def _build_spline(parts: tuple[np.ndarray, np.ndarray]) -> CubicSpline:
-    x, coefficients = parts
-    if coefficients.ndim != 3 or coefficients.shape[:2] != (4, len(x) - 1):
-        raise TypeError(f"a spline of {coefficients.shape} over {len(x)}")
-    return CubicSpline.construct_fast(coefficients, x, extrapolate=True, axis=0)
+class _Encoded(msgspec.Struct, array_like=True):
+    """A snapshot as bytes: every queued message with its topic."""
 
-
-def _build_rows(parts: tuple[np.ndarray, np.ndarray]) -> RowBuffer:
-    t, x = parts
-    if t.ndim != 1 or x.ndim != 2 or len(t) != len(x) or {t.dtype, x.dtype} != {np.dtype(float)}:
-        raise TypeError(f"rows of {x.shape} at {t.shape}")
-    return RowBuffer(t, x)
-
-
-_MESSAGE_TYPES = (
-    c.Status,
-    c.Mission,
-    c.Params,
-    c.Sample,
-    c.Model,
-    c.Prediction,
-    c.Mismatch,
-    c.Alert,
-    c.Verdict,
-    c.Item,
-)
-_VALUE_TYPES = (c.TwinState, c.Event, c.AlertKind, Origin)
-_STATE_TYPES = (
-    *(
-        Snapshot,
-        Twin,
-        TwinConfig,
-        Telemetry,
-        OnboardState,
-        Environment,
-        Identification,
-        ModelBank,
-        PredictionState,
-        ConfidenceState,
-        AlertingState,
-        Timer,
-        TelemetryHistory,
-        Resampler,
-        WindFilter,
-        ConfidenceTracker,
-        AlertState,
-        PendingAlert,
-        MultirotorModel,
-        KinematicModel,
-        AutopilotEstimate,
-        MethodSelector,
-        Shrinkage,
-        Checkpoint,
-    ),
-    *(
-        DerivativesModel,
-        AxisModel,
-        PointMassModel,
-        RegressionResult,
-        VerifiedModel,
-        ActiveEffects,
-        FlightPhase,
-        FlightEvent,
-        ControllerTwin,
-        LaggedForecasts,
-        PredictionLog,
-        AdaptiveLevels,
-        ScaleFactors,
-    ),
-    *(PointForecast, Confidence, Airframe, ServoMap, Schedule, ArrivalDelay),
-)
-REGISTRY: ClassRegistry = {
-    **{one.__name__: one for one in (*_MESSAGE_TYPES, *_VALUE_TYPES, *_STATE_TYPES)},
-    "RowBuffer": (RowBuffer, ClassCodec(RowBuffer.rows, _build_rows)),
-    "CubicSpline": (CubicSpline, ClassCodec(lambda one: (one.x, one.c), _build_spline)),
-    "ComputeBudget": (ComputeBudget, ClassCodec(lambda _: None, lambda _: None)),  # the new driver has its own
-    "TableSet": (TableSet, ClassCodec(lambda _: None, lambda _: load_tables())),  # installed with every worker
-}
+    twin: Twin
+    inbox: list[tuple[str, msgspec.Raw]]
+    traffic_alerts: AlertState
+    mismatch: Mismatch | None
 
 
 def encode_snapshot(snapshot: Snapshot) -> bytes:
-    """Encode a snapshot."""
-    return serialise(snapshot, REGISTRY)
+    """Encode a snapshot.
+
+    Raises:
+        TypeError: when a part of the state has a type that neither msgspec nor a hook encodes.
+    """
+    encode = msgspec.msgpack.Encoder(enc_hook=_to_parts).encode
+    inbox = [(message.topic, msgspec.Raw(encode(message))) for message in snapshot.inbox]
+    twin = msgspec.structs.replace(snapshot.twin, budget=None)  # the new owner has its own
+    return encode(_Encoded(twin, inbox, snapshot.traffic_alerts, snapshot.mismatch))
 
 
 def decode_snapshot(data: bytes, uav: int) -> Snapshot:
@@ -147,12 +64,69 @@ def decode_snapshot(data: bytes, uav: int) -> Snapshot:
     Raises:
         ValueError: when the bytes are not a twin of this aircraft; start it from published data instead.
     """
-    snapshot = deserialise(data, REGISTRY)
-    if not isinstance(snapshot, Snapshot) or not isinstance(snapshot.twin, Twin) or snapshot.twin.config.uav != uav:
-        raise ValueError(f"uav-{uav}: found another object, expected its twin; it starts without a snapshot")
-    if (
-        not isinstance(snapshot.twin.telemetry.history, TelemetryHistory)
-        or not snapshot.twin.telemetry.history.is_consistent()
-    ):
+    try:
+        encoded = msgspec.msgpack.decode(data, type=_Encoded, dec_hook=_from_parts)
+        inbox: list[Message] = [msgspec.msgpack.decode(message, type=TOPICS[topic]) for topic, message in encoded.inbox]
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+        raise ValueError(
+            f"uav-{uav}: found {len(data)} invalid bytes ({error}), expected its twin; it starts without a snapshot"
+        ) from None
+    if encoded.twin.config.uav != uav:
+        raise ValueError(
+            f"uav-{uav}: found the twin of uav-{encoded.twin.config.uav}, expected its own; "
+            "it starts without a snapshot"
+        )
+    if not encoded.twin.telemetry.history.is_consistent():
         raise ValueError(f"uav-{uav}: found other telemetry columns, expected ours; it starts without a snapshot")
-    return snapshot
+    return Snapshot(encoded.twin, inbox, encoded.traffic_alerts, encoded.mismatch)
+
+
+def _to_parts(value: Any) -> Any:
+    """Return the parts of a value that msgspec encodes."""
+    if isinstance(value, np.ndarray):
+        data = value.tolist() if value.dtype == object else value.tobytes()
+        return value.dtype.str, value.shape, data
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, deque):
+        return value.maxlen, list(value)
+    if isinstance(value, RowBuffer):
+        return value.rows()
+    if isinstance(value, CubicSpline):
+        return value.x, value.c
+    if isinstance(value, TableSet):  # installed with every worker
+        return None
+    raise TypeError(f"{type(value).__module__}.{type(value).__qualname__}: no hook encodes it; add one")
+
+
+def _from_parts(kind: Any, parts: Any) -> Any:
+    """Return a value of an annotated type from its parts.
+
+    Raises:
+        ValueError, TypeError: when the parts do not make one.
+    """
+    if kind is np.ndarray:
+        return _array(*msgspec.convert(parts, tuple[str, tuple[int, ...], bytes | list[str]]))
+    if get_origin(kind) is deque:
+        item_type = get_args(kind)[0]
+        maxlen, items = msgspec.convert(parts, tuple[int | None, list[item_type]], dec_hook=_from_parts)  # type: ignore[valid-type]
+        return deque(items, maxlen)
+    if kind is TableSet:
+        return load_tables()
+    first, second = msgspec.convert(parts, tuple[np.ndarray, np.ndarray], dec_hook=_from_parts)
+    if {first.dtype, second.dtype} != {np.dtype(float)} or first.ndim != 1:
+        raise ValueError(f"{first.dtype} {first.shape} and {second.dtype} {second.shape}")
+    if kind is RowBuffer and second.ndim == 2 and len(first) == len(second):
+        return RowBuffer(first, second)
+    if kind is CubicSpline and second.ndim == 3 and second.shape[:2] == (4, len(first) - 1):
+        return CubicSpline.construct_fast(second, first, extrapolate=True, axis=0)
+    raise ValueError(f"{kind} of {first.shape} and {second.shape}")
+
+
+def _array(dtype: str, shape: tuple[int, ...], data: bytes | list[str]) -> np.ndarray:
+    """Return a writable array of numbers, or of text."""
+    if isinstance(data, list):
+        return np.array(data, object).reshape(shape)
+    if np.dtype(dtype).kind not in "biuf" or min(shape, default=0) < 0:
+        raise ValueError(f"an array of {dtype!r} {shape}")
+    return np.frombuffer(data, dtype).reshape(shape).copy()

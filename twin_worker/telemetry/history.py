@@ -1,6 +1,6 @@
 """Telemetry of one aircraft over the last minutes, as received: row buffers and arrival delays."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from struct import Struct
 
 import numba as nb
@@ -154,13 +154,13 @@ _SIZES = {name: np.dtype(name).itemsize for name in DTYPES}
 _UNPACK_TIMES = tuple(Struct(f"<{n}d").unpack for n in range(17))  # by number of rows; faster than an array
 
 
+@dataclass(eq=False)
 class TelemetryHistory:
     """Buffer rows of every kind over the last `keep_s` seconds; reading sorts rows and drops duplicates."""
 
-    def __init__(self, keep_s: float = 160.0) -> None:
-        self.keep_s = keep_s
-        self.newest = -np.inf
-        self._buffers: dict[str, RowBuffer] = {}
+    keep_s: float = 160.0
+    newest: float = -np.inf
+    _buffers: dict[str, RowBuffer] = field(default_factory=dict)
 
     def add(self, sample: Sample) -> int:
         """Add one message; return how many of its kinds violate the contract."""
@@ -233,8 +233,7 @@ class TelemetryHistory:
     def is_consistent(self) -> bool:
         """Return whether every kind has its columns; compiled code does not check bounds."""
         widths = dict(_WIDTHS)
-        kinds = self._buffers.items() if isinstance(self._buffers, dict) else [("", None)]
-        return all(isinstance(buffer, RowBuffer) and buffer.x.shape[1] == widths.get(name) for name, buffer in kinds)
+        return all(buffer.x.shape[1] == widths.get(name) for name, buffer in self._buffers.items())
 
     def clear(self) -> None:
         """Remove all rows, for example after a clock jump."""

@@ -3,6 +3,7 @@
 Source: Huang 2021, section 3.2 (time-stamp calibration, eq. 18; Lagrange interpolation, eq. 19).
 """
 
+from dataclasses import dataclass, field
 from math import ceil, cos, floor, sin
 
 import numba as nb
@@ -101,17 +102,19 @@ def _interpolate_each(
                 out[g, k] += weight[i] * y[first + i, k]
 
 
+@dataclass(eq=False)
 class Resampler:
     """Resample telemetry of one aircraft on multiples of `DT`; final rows are computed once, the tail every time."""
 
-    def __init__(self, keep_s: float = 160.0) -> None:
-        self.keep_s = keep_s
-        self._origin: Origin | None = None
-        self._servos: ServoMap | None = None
-        self._first, self._stop = 0, 0  # range in use of the three arrays below
-        self._k = np.empty(0, np.int64)  # grid times in steps of DT
-        self._values = np.empty((0, _N_COLUMNS))  # attitude, velocity, position, inputs, cosines and sines
-        self._ok = np.empty((0, 2), bool)  # measured or filled; filled
+    keep_s: float = 160.0
+    _origin: Origin | None = None
+    _servos: ServoMap | None = None
+    _first: int = 0  # range in use of the three arrays below
+    _stop: int = 0
+    _k: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))  # grid times in steps of DT
+    # attitude, velocity, position, inputs, cosines and sines
+    _values: np.ndarray = field(default_factory=lambda: np.empty((0, _N_COLUMNS)))
+    _ok: np.ndarray = field(default_factory=lambda: np.empty((0, 2), bool))  # measured or filled; filled
 
     def clear(self) -> None:
         """Discard all rows, for example after a clock jump."""

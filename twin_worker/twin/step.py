@@ -13,10 +13,10 @@ from twin_worker.twin.state.budget import EARLY_FRACTION, Work
 from twin_worker.twin.state.events import record_event
 from twin_worker.twin.state.flight_phase import update_flight_phase
 from twin_worker.twin.state.state import Twin, ingest
-from twin_worker.twin.state.vehicle_class import active_command
 from twin_worker.twin.steps.alerts import link_alerts, prediction_alerts
 from twin_worker.twin.steps.extrapolate import can_propagate, extrapolate, rollout_overdue
 from twin_worker.twin.steps.identify_step import identify_and_verify
+from twin_worker.twin.steps.kinematic_prediction import active_command
 from twin_worker.twin.steps.predict_step import LOOK_BACK_S, predict
 from twin_worker.twin.steps.rollouts import run_deferred_ensemble
 

@@ -15,7 +15,6 @@ from fleet.telemetry.inspection.survey import (
     AIRBORNE_SPEED,
     MAX_INTERVAL_S,
     ROTOR_AIRBORNE_SPEED,
-    VERTICAL_TAKEOFF,
     Survey,
     airborne,
     mode_spans,
@@ -33,8 +32,6 @@ MIN_EXCITATION = {"phi": 0.04, "theta": 0.04, "q": 0.05}  # standard deviations 
 MIN_AIRSPEED, MAX_PAIR_AGE_S = 3.0, 0.5  # airspeed [m/s], age of rows paired with a ground velocity [s]
 MIN_WIND_TRIANGLES = 50  # wind triangles that a wind estimate requires
 ROUTE_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
-WINGLESS = ("multirotor", "helicopter")
-WINGED = ("fixed_wing", "quadplane")
 MIN_DIAGNOSE_S, MIN_DIAGNOSE_ROWS = 25.0, 50  # gap-free flight, and rows of each required field, for a diagnosis
 MIN_OWN_PAST_S = 50.0  # gap-free flight for a comparison with earlier flight data [s]
 GUST_SENSING_HZ = 18.0  # accelerometer rate for gust estimation [Hz]
@@ -117,7 +114,9 @@ def max_coverage(spans: list[TimeInterval], window_s: float) -> float:
 
 
 def _model_obstacle(survey: Survey) -> str:
-    return f"a {survey.vehicle} is not modelled, turn-rate prediction only" if survey.vehicle in WINGLESS else ""
+    return (
+        f"a {survey.vehicle} is not modelled, turn-rate prediction only" if survey.vehicle_class.is_rotorcraft else ""
+    )
 
 
 def _data_obstacle(survey: Survey, in_air: list[TimeInterval], complete: list[TimeInterval]) -> str:
@@ -125,7 +124,7 @@ def _data_obstacle(survey: Survey, in_air: list[TimeInterval], complete: list[Ti
     if missing := _missing_fields(survey):
         return missing
     if not in_air:
-        fast = ROTOR_AIRBORNE_SPEED if survey.vehicle in VERTICAL_TAKEOFF else AIRBORNE_SPEED
+        fast = ROTOR_AIRBORNE_SPEED if survey.vehicle_class.can_hover else AIRBORNE_SPEED
         return f"never in flight: no 5 s faster than {fast:.0f} m/s"
     for name in REQUIRED_FIELDS:
         covered = seconds(overlap(survey.rows[name].stretches(), in_air))
@@ -200,7 +199,7 @@ def _check_verify(survey: Survey, unidentified: str, spans: list[TimeInterval]) 
 def _check_route(survey: Survey, unidentified: str, in_air: list[TimeInterval]) -> AbilityCheck:
     """Check route prediction with an identified model, else with the kinematic model of the vehicle type."""
     name = "predict on the route"
-    if unidentified and survey.vehicle not in (*WINGED, *WINGLESS):
+    if unidentified and not (survey.vehicle_class.has_wings or survey.vehicle_class.can_hover):
         return AbilityCheck(
             name, False, f"{unidentified}, and a vehicle of kind {survey.vehicle} has no kinematic model"
         )
@@ -231,7 +230,7 @@ def _check_route(survey: Survey, unidentified: str, in_air: list[TimeInterval]) 
         "" if supported else f"; guidance law of autopilot {autopilot} is identified from its bank commands, if any"
     )
     items = f"{len(survey.items)} mission items" + ("" if survey.mission and survey.mission.complete else ", not all")
-    if survey.vehicle in WINGLESS:
+    if survey.vehicle_class.is_rotorcraft:
         return AbilityCheck(name, True, f"{on_route_s:.0f} s on the route, {items}; from speed and acceleration limits")
     method = (
         f"kinematic fixed-wing model, since {unidentified}" if unidentified else "take-off and landing not modelled"
@@ -284,7 +283,7 @@ def _check_wind(survey: Survey) -> AbilityCheck:
 def _check_diagnose(survey: Survey, in_air: list[TimeInterval]) -> AbilityCheck:
     """Check the requirements of `fleet diagnose`."""
     name = "diagnose"
-    if survey.vehicle in WINGLESS:
+    if survey.vehicle_class.is_rotorcraft:
         return AbilityCheck(
             name, False, f"no diagnosis of a {survey.vehicle}: the reference simulation is a fixed wing"
         )

@@ -9,6 +9,7 @@ import numpy as np
 from fleet.contract import COLUMNS, Item, Link, Message, Mission, Params, Rows, Sample, Status
 from fleet.frames import Origin
 from fleet.telemetry.inspection.thinned import MAX_ROWS, DecimatedRows, TimeInterval, inside
+from fleet.vehicles import UNKNOWN, VehicleClass, vehicle_class
 
 MAX_INTERVAL_S = {
     "attitude": 0.5,
@@ -21,7 +22,6 @@ MAX_EVENTS = 2_000
 ROW_BUDGET = 5_000_000  # rows stored for all aircraft and fields
 AIRBORNE_SPEED = 6.0  # a small fixed wing above this speed is in flight [m/s]
 _AIRBORNE_HEIGHT = 5.0  # an armed aircraft this far above the lowest point is in flight [m]
-VERTICAL_TAKEOFF = ("multirotor", "helicopter", "quadplane")
 ROTOR_AIRBORNE_SPEED, ROTOR_AIRBORNE_HEIGHT = 2.0, 1.5  # the same for aircraft that take off vertically [m/s, m]
 _MIN_LANDING_S, _MIN_FLIGHT_S = 10.0, 5.0  # shorter landings and flights are ignored [s]
 _AUTOMATIC_PARAMS = ("STAT_", "BARO1_GND_", "BARO2_GND_", "BARO3_GND_", "GND_ABS_")  # set by the autopilot
@@ -78,7 +78,12 @@ class Survey:
     @property
     def vehicle(self) -> str:
         """Return the kind of vehicle, e.g. fixed_wing."""
-        return self.status.vehicle if self.status else "unknown"
+        return self.status.vehicle if self.status else UNKNOWN
+
+    @property
+    def vehicle_class(self) -> VehicleClass:
+        """Return the vehicle class."""
+        return vehicle_class(self.vehicle)
 
     @property
     def items(self) -> tuple[Item, ...]:
@@ -233,7 +238,7 @@ def airborne(survey: Survey) -> list[TimeInterval]:
     position_t, position = survey.rows["position"].rows()
     if not len(velocity_t) or not len(position_t):
         return []
-    vertical_takeoff = survey.vehicle in VERTICAL_TAKEOFF
+    vertical_takeoff = survey.vehicle_class.can_hover
     min_speed, min_height = (
         (ROTOR_AIRBORNE_SPEED, ROTOR_AIRBORNE_HEIGHT) if vertical_takeoff else (AIRBORNE_SPEED, _AIRBORNE_HEIGHT)
     )

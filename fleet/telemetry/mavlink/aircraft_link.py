@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable, Hashable
 from typing import Any
 
+from fleet import vehicles
 from fleet.contract import Link, Mission, Params, Status
 from fleet.telemetry.mavlink import heartbeat
 from fleet.telemetry.mavlink.arrays.counts import LAST_ARRIVAL, LAST_COUNTED, MISSED, RECEIVED
@@ -47,7 +48,7 @@ class AircraftLink:
         self.number = arrays.add_aircraft(uav) if number is None else number
         self.link = Link.LIVE
         self.autopilot, self.mode, self.armed = "generic", "", False
-        self.vehicle_type = heartbeat.UNKNOWN  # vehicle type from the heartbeat
+        self.vehicle_type = vehicles.UNKNOWN  # vehicle type from the heartbeat
         self.firmware = ""
         self.board_id = ""  # hardware id and firmware version of the autopilot, or empty
         self.texts: deque[tuple[float, int, str]] = deque(maxlen=MAX_TEXTS)  # fleet time, severity, text
@@ -65,8 +66,8 @@ class AircraftLink:
     @property
     def vehicle(self) -> str:
         """Return the vehicle type; an ArduPlane quadplane also sends MAV_TYPE_FIXED_WING."""
-        is_quadplane = self.vehicle_type == heartbeat.FIXED_WING and self.params.values.get("Q_ENABLE", 0.0) > 0
-        return heartbeat.QUADPLANE if is_quadplane else self.vehicle_type
+        is_quadplane = self.vehicle_type == vehicles.FIXED_WING and self.params.values.get("Q_ENABLE", 0.0) > 0
+        return vehicles.QUADPLANE if is_quadplane else self.vehicle_type
 
     @property
     def last_arrival(self) -> float:

@@ -11,7 +11,7 @@ from fleet.commands.offline import inspect
 from fleet.contract import Mission, Prediction, Status
 from fleet.process.sanitise import format_below
 from fleet.telemetry.inspection import abilities as needs
-from fleet.telemetry.inspection.survey import ROTOR_AIRBORNE_HEIGHT, VERTICAL_TAKEOFF, airborne, survey_recording
+from fleet.telemetry.inspection.survey import ROTOR_AIRBORNE_HEIGHT, airborne, survey_recording
 from tests.support import flights
 from tests.support.flights import T0
 from tests.support.ulog_writer import flight as flight_of
@@ -24,14 +24,14 @@ from twin_worker.evaluation.replay import run_offline
 from twin_worker.prediction import method_selection as turn_rate
 from twin_worker.telemetry import resample
 from twin_worker.telemetry.history import TelemetryHistory
-from twin_worker.twin.state import flight_phase, state, vehicle_class
+from twin_worker.twin.state import flight_phase, state
 from twin_worker.twin.steps import identify_step
 from twin_worker.validation import verify
 
 
 def test_the_figures_are_those_the_twin_works_by():
     assert resample.LONGEST_GAP == needs.MAX_INTERVAL_S
-    assert (identify_step.MIN_WINDOW_S, identify_step.WINGLESS) == (needs.MIN_IDENTIFY_S, needs.WINGLESS)
+    assert identify_step.MIN_WINDOW_S == needs.MIN_IDENTIFY_S
     least, papers, most = identify_step._HOLD_OUT_S  # held out beside what is identified
     assert (
         max(identify_step._WINDOW_LIMITS_S[1] + most, identify_step._PAPER_WINDOW_S + papers) == needs.MAX_IDENTIFY_S
@@ -41,11 +41,10 @@ def test_the_figures_are_those_the_twin_works_by():
     assert min(verify.HORIZONS_S) == needs.MIN_STRETCH_S
     assert verify._STEADY_STD == needs.MIN_EXCITATION
     assert max(4 * turn_rate.STEP, 50 * resample.DT) == needs.TURN_RATE_S
-    assert (vehicle_class.WINGLESS, vehicle_class.WINGED) == (needs.WINGLESS, needs.WINGED)
     assert (flight._MIN_FLIGHT_S, flight.VANE_HZ) == (needs.MIN_DIAGNOSE_S, needs.GUST_SENSING_HZ)
     assert (needs._SKIP_BEGIN_S, needs._SKIP_END_S) == flight._TRANSIENT_S
     assert past.MIN_PAST_S + own_past.MIN_AFTER_S == needs.MIN_OWN_PAST_S
-    assert (flight_phase.VTOL_TYPES, flight_phase._AIRBORNE_HEIGHT_M) == (VERTICAL_TAKEOFF, ROTOR_AIRBORNE_HEIGHT)
+    assert flight_phase._AIRBORNE_HEIGHT_M == ROTOR_AIRBORNE_HEIGHT
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,9 @@ import pytest
 from fleet.contract import COLUMNS, FIRST_OPTIONAL_COLUMN, Array, Rows, Sample
 from tests.support import flights as f
 from tests.support.flights import T0
-from twin_worker.ownership.handover import REGISTRY
-from twin_worker.ownership.typed_serialization import deserialise, serialise
+from twin_worker.ownership.handover import Snapshot, decode_snapshot, encode_snapshot
 from twin_worker.telemetry.history import TelemetryHistory
+from twin_worker.twin.state.state import Twin
 
 MOST = {"position": 2e9, "leg": 1e5, "command": 1e5}
 KINDS = tuple(MOST)
@@ -112,9 +112,12 @@ def test_a_history_goes_to_another_worker_with_what_waits(seed: int) -> None:
         history.add(sample)
         plain.add(sample)
         if k == 50:
-            before = copy.deepcopy(history)
-            history = deserialise(serialise(history, REGISTRY), REGISTRY)
-            assert serialise(history, REGISTRY) == serialise(before, REGISTRY)
+            twin = Twin.of(1)
+            twin.telemetry.history = copy.deepcopy(history)
+            data = encode_snapshot(Snapshot(twin))
+            received = decode_snapshot(data, 1)
+            assert encode_snapshot(received) == data
+            history = received.twin.telemetry.history
     for name in KINDS:
         same(history, plain, name, -np.inf)
 

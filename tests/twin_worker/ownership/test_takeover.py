@@ -37,7 +37,6 @@ from tests.bench.asking.answerer import prediction
 from tests.support import flights as f
 from twin_worker.ownership.history_decoder import decode_history
 from twin_worker.ownership.protocol import OwnershipProtocol
-from twin_worker.ownership.typed_serialization import serialise
 from twin_worker.service.worker import Worker
 from twin_worker.twin.state.budget import Schedule
 
@@ -126,7 +125,7 @@ def test_a_copy_that_was_long_on_its_way_says_nothing_older_than_what_was_said_m
     assert told and min(told) > said.t
 
 
-ODD = ({"code": "another"}, {"snapshot": b""}, {"snapshot": b"\xc1"}, {"snapshot": serialise([1], {})})
+ODD = ({"code": "another"}, {"snapshot": b""}, {"snapshot": b"\xc1"}, {"snapshot": msgspec.msgpack.encode([1])})
 
 
 @pytest.mark.parametrize("odd", ODD)

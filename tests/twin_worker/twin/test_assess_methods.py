@@ -8,8 +8,8 @@ from fleet.mission import unroll_route
 from tests.support.flights import HERE, T0, item, messages, turn
 from twin_worker.evaluation.baselines import BASELINES, BaselineInput, LineInputs, route_line
 from twin_worker.twin.state.state import Twin, ingest
-from twin_worker.twin.state.vehicle_class import recent_track
 from twin_worker.twin.step import advance
+from twin_worker.twin.steps.kinematic_prediction import recent_track
 
 AHEAD = np.arange(0.0, 61.0)
 VA = 20.0

@@ -10,6 +10,7 @@ from fleet.contract import Params, Sample, Status
 from fleet.frames import Origin, to_ned
 from fleet.process.sanitise import format_below
 from fleet.telemetry.recording.recordings import replay_messages
+from fleet.vehicles import vehicle_class
 from twin_worker.diagnosis.data.card import AircraftCard
 from twin_worker.telemetry.history import TelemetryHistory
 
@@ -70,7 +71,6 @@ _GYRO_GAP_RATIO = 0.5  # rates come from the gyros if their gaps are below this 
 _AROUND_GAP_S = 0.3
 _TRANSIENT_S = 5.0, 1.5  # excluded at the start and at the end [s]
 _MIN_FLIGHT_S = 25.0  # least length of valid flight
-_ROTORS = ("multirotor", "helicopter")
 _MIN_HEIGHT_M = 30.0  # above the ground after a take-off in the recording
 _MIN_SPEED = 6.0  # [m/s]
 
@@ -127,7 +127,7 @@ def read_flights(path: Path, card: AircraftCard) -> list[FlightData]:
             history.add(message)
         elif isinstance(message, Params):
             params.update(message.values)
-        elif isinstance(message, Status) and message.vehicle in _ROTORS:
+        elif isinstance(message, Status) and vehicle_class(message.vehicle).is_rotorcraft:
             rotors[uav] = message.vehicle
     stem = path.name.split(".")[0]
     flights, refused = [], []

@@ -14,7 +14,6 @@ from twin_worker.twin.state.events import invalidate_prediction, record_event
 if TYPE_CHECKING:
     from twin_worker.twin.state.state import Twin
 
-VTOL_TYPES = ("multirotor", "helicopter", "quadplane")
 LANDING_COMMANDS = (21, 85)  # MAV_CMD: NAV_LAND, NAV_VTOL_LAND
 _CONFIRM_S = 3.0  # a change of phase must last this long [s]
 _STANDSTILL_SPEED, _FLYING_SPEED = (
@@ -77,10 +76,10 @@ def _is_flying(twin: "Twin") -> bool | None:
     if len(t) < 3 or not len(positions) or t[-1] - t[0] < 0.6 * _CONFIRM_S:
         return None
     min_level, max_level, max_vertical, max_speed = speed_extremes(v)
-    if twin.vehicle not in VTOL_TYPES and min_level > _FLYING_SPEED:  # the usual case
+    if not twin.vehicle_class.can_hover and min_level > _FLYING_SPEED:  # the usual case
         return True
     down = to_ned(twin.telemetry.origin, *positions.T)[:, 2]
-    if twin.vehicle in VTOL_TYPES:
+    if twin.vehicle_class.can_hover:
         airborne = twin.environment.flight_phase.ground_down - down.max() > _AIRBORNE_HEIGHT_M  # false for nan
         standing = (
             max_speed < _ROTOR_STANDSTILL_SPEED

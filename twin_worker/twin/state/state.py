@@ -20,6 +20,7 @@ from fleet.contract import (
     Verdict,
 )
 from fleet.mission import FIRST_ITEM
+from fleet.vehicles import UNKNOWN, VehicleClass, vehicle_class
 from fleet.window import Window
 from twin_worker.prediction.autopilot_identification import LAW_OF_AUTOPILOT
 from twin_worker.prediction.closed_loop import AutopilotConfig, PredictionContext
@@ -142,7 +143,12 @@ class Twin(msgspec.Struct):
     @property
     def vehicle(self) -> str:
         """Return the vehicle type from the heartbeat, e.g. fixed_wing."""
-        return self.onboard.status.vehicle if self.onboard.status else "unknown"
+        return self.onboard.status.vehicle if self.onboard.status else UNKNOWN
+
+    @property
+    def vehicle_class(self) -> VehicleClass:
+        """Return the vehicle class."""
+        return vehicle_class(self.vehicle)
 
     def window(self, seconds: float) -> Window | None:
         """Return the newest `seconds`, equally sampled; None if a required kind of row is missing."""

@@ -19,7 +19,7 @@ from twin_worker.confidence.table_files import UNCALIBRATED
 from twin_worker.prediction.closed_loop import cached_route
 from twin_worker.prediction.multirotor.rollout import RETURN_MODES
 from twin_worker.twin.state.state import Twin
-from twin_worker.twin.state.vehicle_class import WINGED, is_hovering
+from twin_worker.twin.steps.kinematic_prediction import is_hovering
 
 _SHORT_S, _LONG_S = 10.0, 12.0  # an alert is raised below the first confidence horizon and cleared above the second [s]
 _MIN_SCORED = 30  # minimum number of scored predictions; below it, the 90 % horizon comes from the prior table [-]
@@ -153,7 +153,7 @@ def _mission_feasibility(twin: Twin, now: float) -> HazardEstimate:
     """Evaluate the feasibility of the legs ahead for a fixed wing that follows its mission."""
     no_alert = HazardEstimate(AlertKind.NOT_ACHIEVABLE, 0.0, "", "the mission is achievable")
     _, position = twin.telemetry.history.rows_since("position", twin.telemetry.history.newest - 3.0)
-    if twin.vehicle not in WINGED or twin.no_route_reason() or is_hovering(twin) or not len(position):
+    if not twin.vehicle_class.has_wings or twin.no_route_reason() or is_hovering(twin) or not len(position):
         return no_alert
     assert twin.telemetry.origin is not None and twin.onboard.mission is not None
     if twin.onboard.mission.seq < twin.first_item:

@@ -19,7 +19,7 @@ from twin_worker.telemetry.resample import DT
 from twin_worker.telemetry.track import SETTLING_S, hovering_mask
 from twin_worker.twin.state.models import VerifiedModel
 from twin_worker.twin.state.state import Twin
-from twin_worker.twin.state.vehicle_class import QUADPLANE, WINGED, WINGLESS, fit_kinematic_models
+from twin_worker.twin.steps.kinematic_prediction import fit_kinematic_models
 from twin_worker.twin.steps.point_mass_step import update_point_mass
 from twin_worker.validation.held_out import HeldOut
 from twin_worker.validation.verify import verify, with_diagnostics
@@ -183,7 +183,7 @@ _PUBLISH_PERIOD_S = 5.0  # between published models without a changed outcome [s
 def identify_and_verify(twin: Twin) -> list[Message]:
     """Identify and verify once; return the model with its verdict if it is due, nothing if data are insufficient."""
     fit_kinematic_models(twin)
-    if twin.vehicle in WINGED:
+    if twin.vehicle_class.has_wings:
         update_point_mass(twin)
     window = _fixed_wing_part(twin, twin.window(_window_length_s(twin) + _max_hold_out_s(twin)))
     no_data_verdict = _insufficient_data(twin, window)
@@ -248,13 +248,13 @@ def _hold_out_limits(twin: Twin) -> tuple[float, float]:
 
 def _insufficient_data(twin: Twin, window: Window | None) -> Verdict | None:
     """Return a verdict with the reason if identification is not possible yet; None otherwise."""
-    if twin.vehicle in WINGLESS:
+    if twin.vehicle_class.is_rotorcraft:
         sentence = f"{twin.name}: a {twin.vehicle} has no wings to identify; {twin.models.multirotor}"
         return Verdict(outcome=Outcome.NOT_IDENTIFIABLE, sentence=sentence)
     available_s = 0.0 if window is None else float(window.ok.sum() * DT)
     if window is not None and available_s >= MIN_WINDOW_S:
         return None
-    condition = " on its wings" if twin.vehicle == QUADPLANE else ""
+    condition = " on its wings" if twin.vehicle_class.is_vtol else ""
     missing = missing_telemetry(twin.telemetry.history) or "wait"
     sentence = (
         f"{twin.name}: {format_below(available_s, MIN_WINDOW_S)} s of complete data{condition}, "
@@ -294,7 +294,7 @@ def _fixed_wing_part(twin: Twin, window: Window | None) -> Window | None:
         return None
     slow = window.ok & (window.columns(("u",))[:, 0] < MIN_WING_SPEED)
     start = max(_row_after(slow, 0), int(np.searchsorted(window.t, twin.identification.data_from)))
-    if twin.vehicle == QUADPLANE:
+    if twin.vehicle_class.is_vtol:
         hovering = hovering_mask(
             window.t,
             twin.telemetry.history,

@@ -16,7 +16,7 @@ from twin_worker.prediction.method_selection import constant_turn_prediction
 from twin_worker.telemetry.track import Track
 from twin_worker.twin.state.events import record_event
 from twin_worker.twin.state.state import Twin
-from twin_worker.twin.state.vehicle_class import (
+from twin_worker.twin.steps.kinematic_prediction import (
     PathForecast,
     is_hovering,
     no_prediction,

@@ -18,7 +18,7 @@ from twin_worker.prediction.fixed_wing import ensemble
 from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_point_mass
 from twin_worker.twin.state.budget import EARLY_FRACTION, Work
 from twin_worker.twin.state.state import Twin
-from twin_worker.twin.state.vehicle_class import PathForecast, no_prediction
+from twin_worker.twin.steps.kinematic_prediction import PathForecast, no_prediction
 
 HYBRID, BOTH = "hybrid", "both"
 _DYNAMICS_SPAN_S = 60.0  # look-ahead of the identified dynamics; beyond it the point-mass path continues [s]

@@ -10,9 +10,9 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from fleet.contract import MAX_ITEMS, Item
-from fleet.telemetry.mavlink.heartbeat import FIXED_WING, HELICOPTER, MULTIROTOR, QUADPLANE
 from fleet.telemetry.mavlink.onboard_log import OnboardEvent
 from fleet.telemetry.onboard_logs.dataflash.records import Records
+from fleet.vehicles import FIXED_WING, HELICOPTER, MULTIROTOR, QUADPLANE
 
 SEVERITY_TEXT, SEVERITY_ERROR = 6, 3  # as in STATUSTEXT: information, error
 _MAV_TYPE = {FIXED_WING: dialect.MAV_TYPE_FIXED_WING, QUADPLANE: dialect.MAV_TYPE_FIXED_WING}

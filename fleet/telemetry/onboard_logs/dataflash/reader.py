@@ -13,7 +13,6 @@ from typing import IO
 
 import numpy as np
 
-from fleet.telemetry.mavlink.heartbeat import FIXED_WING, HELICOPTER, MULTIROTOR, QUADPLANE, UNKNOWN
 from fleet.telemetry.mavlink.onboard_log import Chunk, OnboardEvent
 from fleet.telemetry.onboard_logs.dataflash import binary as dataflash_binary
 from fleet.telemetry.onboard_logs.dataflash import reader as dataflash_text
@@ -24,6 +23,7 @@ from fleet.telemetry.onboard_logs.dataflash.records import Damage, Format, Recor
 from fleet.telemetry.onboard_logs.dataflash.rows import RowBuilder, SourceSelector, derived_fields
 from fleet.telemetry.tables.dataflash import ROWS
 from fleet.telemetry.tables.row import FieldSource
+from fleet.vehicles import FIXED_WING, HELICOPTER, MULTIROTOR, QUADPLANE, UNKNOWN
 
 _FIRMWARE = re.compile(r"\b(?:Ardu|APM:)(Plane|Copter|Rover|Sub)\b.*V?\d")
 _PLANE_PARAMS = {"TRIM_ARSPD_CM", "AIRSPEED_CRUISE", "LIM_ROLL_CD", "ROLL_LIMIT_DEG", "TECS_CLMB_MAX"}

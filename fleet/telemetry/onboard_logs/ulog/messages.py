@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from fleet import vehicles
 from fleet.telemetry.mavlink import heartbeat
 from fleet.telemetry.mavlink.onboard_log import OnboardEvent
 from fleet.telemetry.onboard_logs.ulog.topic import Topic
@@ -27,17 +28,17 @@ def system_id(params: Mapping[str, float], topics: Topics) -> int:
 def vehicle_kind(params: Mapping[str, float], topics: Topics) -> str:
     """Return the vehicle type as in `Status.vehicle`."""
     if _most_common(topics, "is_vtol"):
-        return heartbeat.QUADPLANE
+        return vehicles.QUADPLANE
     for mav_type in (_most_common(topics, "system_type"), params.get("MAV_TYPE")):
         kind = heartbeat.vehicle(SimpleNamespace(type=int(mav_type or 0)))
-        if kind != heartbeat.UNKNOWN:
+        if kind != vehicles.UNKNOWN:
             return kind
     rotary = _most_common(topics, "is_rotary_wing")  # until 1.8
     if rotary is not None:
-        return heartbeat.MULTIROTOR if rotary else heartbeat.FIXED_WING
+        return vehicles.MULTIROTOR if rotary else vehicles.FIXED_WING
     by_type = VEHICLE_TYPE.get(int(_most_common(topics, "vehicle_type") or 0))
     autostart = int(params.get("SYS_AUTOSTART", 0))
-    return by_type or next((kind for ids, kind in AUTOSTART if autostart in ids), heartbeat.UNKNOWN)
+    return by_type or next((kind for ids, kind in AUTOSTART if autostart in ids), vehicles.UNKNOWN)
 
 
 def release(info: Mapping[str, Any]) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""Dispatch by vehicle class, and predictions that need no identified model."""
+"""Predictions that need no identified model, by vehicle class: kinematic fixed wing, multirotor."""
 
 from dataclasses import dataclass, replace
 from math import isfinite
@@ -13,9 +13,6 @@ from twin_worker.prediction.multirotor import fit, rollout
 from twin_worker.telemetry.track import SETTLING_S, Track, hovering_mask, resample_track
 from twin_worker.twin.state.state import ROUTE_MODES, Twin
 
-WINGLESS = ("multirotor", "helicopter")
-QUADPLANE = "quadplane"
-WINGED = ("fixed_wing", QUADPLANE)
 _FIT_WINDOW_S = 130.0  # flight time used to fit the kinematic models [s]
 _VTOL_COMMANDS = (84, 85)  # MAV_CMD: NAV_VTOL_TAKEOFF, NAV_VTOL_LAND
 _VELOCITY_ROWS = 11  # rows used for a multirotor's velocity and acceleration
@@ -61,9 +58,9 @@ def recent_track(twin: Twin, seconds: float = _FIT_WINDOW_S, *, with_attitude: b
 
 def is_hovering(twin: Twin) -> bool:
     """Return whether the aircraft hovers on rotors now, or is about to by its mission."""
-    if twin.vehicle in WINGLESS:
+    if twin.vehicle_class.is_rotorcraft:
         return True
-    if twin.vehicle != QUADPLANE:
+    if not twin.vehicle_class.is_vtol:
         return False
     newest = twin.telemetry.history.newest
     times = np.linspace(newest - SETTLING_S, newest, 7)
@@ -98,13 +95,9 @@ def _multirotor_config(twin: Twin, recent: Track, override: RouteOverride | None
         twin.onboard.plan_changed_t,
         origin=twin.telemetry.origin,
         flown=recent,
-        prefix=_param_prefix(twin),
+        prefix=twin.vehicle_class.rotor_prefix,
     )
-    return rollout.with_wing_limits(config) if _param_prefix(twin) else config
-
-
-def _param_prefix(twin: Twin) -> str:
-    return "Q_" if twin.vehicle == QUADPLANE else ""
+    return rollout.with_wing_limits(config) if twin.vehicle_class.rotor_prefix else config
 
 
 def _fixed_wing_config(twin: Twin) -> kinematic.KinematicConfig:
@@ -125,14 +118,15 @@ def _fixed_wing_config(twin: Twin) -> kinematic.KinematicConfig:
 def fit_kinematic_models(twin: Twin) -> None:
     """Fit the parameters of the kinematic models to the last minutes of flight."""
     if twin.no_route_reason() or (
-        twin.vehicle not in WINGLESS and (twin.vehicle not in WINGED or twin.models.active_model is not None)
+        not twin.vehicle_class.is_rotorcraft
+        and (not twin.vehicle_class.has_wings or twin.models.active_model is not None)
     ):
         return
     recent = recent_track(twin)
     if recent is None or len(recent) < 100:
         return
     seq = rollout.items_in_force(recent.t, twin.telemetry.history.rows_since("leg"), twin.onboard.mission)
-    if twin.vehicle in WINGLESS:
+    if twin.vehicle_class.is_rotorcraft:
         config = _multirotor_config(twin, recent)
         twin.models.store_multirotor(fit.fit_model(recent, seq, config, twin.models.multirotor))
     elif not is_hovering(twin):
@@ -147,11 +141,11 @@ def predict_without_model(twin: Twin, recent: Track, ahead: np.ndarray) -> PathF
         return no_prediction("less than 2 s of unbroken positions")
     if is_hovering(twin):
         return _predict_multirotor(twin, unbroken, ahead)
-    if twin.vehicle not in WINGED:
+    if not twin.vehicle_class.has_wings:
         return no_prediction(f"vehicle {twin.vehicle}: no controller model available")
     if reason := twin.no_route_reason():
         return no_prediction(reason)
-    if twin.vehicle == QUADPLANE:
+    if twin.vehicle_class.is_vtol:
         hover_rows = np.flatnonzero(
             hovering_mask(unbroken.t, twin.telemetry.history, twin.received_params, twin.onboard.mode_changes)
         )
@@ -177,7 +171,7 @@ def _predict_multirotor(twin: Twin, recent: Track, ahead: np.ndarray) -> PathFor
     mode = twin.onboard.status.mode if twin.onboard.status else ""
     config = _multirotor_config(twin, recent, twin.prediction.override)
     overridden = twin.prediction.override.parameters if twin.prediction.override else {}
-    control = multirotor_controller(twin.received_params, _param_prefix(twin), config.limit, overridden)
+    control = multirotor_controller(twin.received_params, twin.vehicle_class.rotor_prefix, config.limit, overridden)
     if twin.onboard.status is None or not twin.onboard.status.armed:
         return no_prediction("not armed")
     if mode in rollout.HOLD_MODES:
@@ -188,7 +182,7 @@ def _predict_multirotor(twin: Twin, recent: Track, ahead: np.ndarray) -> PathFor
             return no_prediction(f"mode {mode}, but under manual control")
         hover_path = rollout.stop_and_hold(recent, config, twin.models.multirotor, ahead)
         return PathForecast(hover_path, "copter", copter.LAW, -1, f"mode {mode} holds position", control)
-    if mode in rollout.RETURN_MODES and twin.vehicle in WINGLESS:
+    if mode in rollout.RETURN_MODES and twin.vehicle_class.is_rotorcraft:
         path = rollout.fly_home(recent, config, twin.models.multirotor, ahead)
         text = f"returns to launch; {rollout.describe(config, twin.models.multirotor)}"
         if path is None:
@@ -203,6 +197,6 @@ def _predict_multirotor(twin: Twin, recent: Track, ahead: np.ndarray) -> PathFor
     item = int(seq[-1]) if np.isfinite(seq[-1]) else -1
     if path is None:
         return no_prediction(problem, item)
-    hover_text = "hovering on rotors; " if twin.vehicle == QUADPLANE else ""
+    hover_text = "hovering on rotors; " if twin.vehicle_class.is_vtol else ""
     text = " ".join(filter(None, (hover_text + rollout.describe(config, twin.models.multirotor), problem)))
     return PathForecast(path, "copter", copter.LAW, item, text, control)
