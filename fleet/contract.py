@@ -230,7 +230,7 @@ class Outcome(StrEnum):
     """Outcome of an identification; an outcome other than VERIFIED is not an error."""
 
     VERIFIED = "verified"
-    INSUFFICIENT_DATA = "starved"
+    INSUFFICIENT_DATA = "insufficient_data"
     NOT_IDENTIFIABLE = "not_identifiable"
     BELOW_THRESHOLD = "below_threshold"
     WORSE_THAN_LAST = "worse_than_last"
@@ -359,10 +359,10 @@ class Event(StrEnum):
     LANDING = "landing"
     TOUCH_DOWN = "touch_down"
     LINK_LOST = "link_lost"
-    LINK_RESTORED = "link_back"
-    COASTING_EXPIRED = "horizon_over"
-    POSITION_LOST = "telemetry_broken"
-    POSITION_RESTORED = "telemetry_whole"
+    LINK_RESTORED = "link_restored"
+    COASTING_EXPIRED = "coasting_expired"
+    POSITION_LOST = "position_lost"
+    POSITION_RESTORED = "position_restored"
     CLOCK = "clock"
     ORIGIN = "origin"
 

@@ -145,7 +145,7 @@ STORIES = {
         [
             (2, EventKind.PARAMETERS, "L1"),
             (9, EventKind.GROUND, "down"),
-            (12, EventKind.TELEMETRY_LOST, "horizon over"),
+            (12, EventKind.TELEMETRY_LOST, "coasting expired"),
         ],
     ),
     "a prediction repeats nothing that others tell": (
@@ -175,7 +175,7 @@ STORIES = {
     ),
     "a model that was never verified is none": (
         [model(0, Outcome.INSUFFICIENT_DATA, in_force=False), model(4, Outcome.INSUFFICIENT_DATA, in_force=False)],
-        [(0, EventKind.NO_MODEL, "no model yet: starved")],
+        [(0, EventKind.NO_MODEL, "no model yet: insufficient data")],
     ),
     "a model is verified, doubted, and sound again": (
         [
@@ -198,7 +198,7 @@ STORIES = {
     ),
     "a model that is withdrawn is none": (
         [model(0, Outcome.VERIFIED, in_force=True), model(4, Outcome.INSUFFICIENT_DATA, in_force=False)],
-        [(0, EventKind.VERIFIED, "model verified: mean fit 88 %"), (4, EventKind.NO_MODEL, "no model yet: starved")],
+        [(0, EventKind.VERIFIED, "model verified: mean fit 88 %"), (4, EventKind.NO_MODEL, "no model yet: insufficient data")],
     ),
     "a late viewer meets a model in force whose newest try failed": (
         [model(0, Outcome.INSUFFICIENT_DATA, in_force=True)],

@@ -197,12 +197,12 @@ def _model(state: DetectorState, model: Model) -> Detection:
         status, event = "none", TimelineEvent(model.t, EventKind.NO_MODEL, f"no model yet: {_outcome(newest)}")
     elif before in (None, "none"):
         summary = _without_uav_prefix(model.active_verdict.sentence, model.uav)
-        status, event = "sound", TimelineEvent(model.t, EventKind.VERIFIED, f"model verified: {summary}")
+        status, event = "accepted", TimelineEvent(model.t, EventKind.VERIFIED, f"model verified: {summary}")
     elif newest.outcome in ACCEPTED:
-        status, event = "sound", TimelineEvent(model.t, EventKind.ACCEPTED, "model verified again")
+        status, event = "accepted", TimelineEvent(model.t, EventKind.ACCEPTED, "model verified again")
     elif model.t - accepted_t >= UNVERIFIED_S:
         text = f"no verification for {UNVERIFIED_S:.0f} s ({_outcome(newest)}); an earlier model stays active"
-        status, event = "doubted", TimelineEvent(model.t, EventKind.UNVERIFIED, text)
+        status, event = "unverified", TimelineEvent(model.t, EventKind.UNVERIFIED, text)
     else:
         return state, []
     return (state, []) if status == before else (state._replace(verdict=status), [event])

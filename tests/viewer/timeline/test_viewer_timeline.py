@@ -362,7 +362,7 @@ def test_the_bar_marks_events_in_their_colours_and_escapes_their_words() -> None
     others = [TimelineEvent(T + 20, EventKind.MODE, "y"), TimelineEvent(T + 30, EventKind.LINK_LOST, "z")]
     bar = strip.strip(own, others, TimelineRange(T, T + 100), T + 50, DARK)
     assert bar.count('class="mark"') == 3 and "<img" not in bar and "before" not in bar
-    assert DARK.event(EventKind.ALERT) in bar and 'data-kind="lost"' in bar and 'x="500.0"' in bar
+    assert DARK.event(EventKind.ALERT) in bar and 'data-kind="link lost"' in bar and 'x="500.0"' in bar
     flood = [TimelineEvent(T + k / 100, EventKind.ALERT, "x" * 200) for k in range(9_000)]
     assert len(strip.strip(flood, flood, TimelineRange(T, T + 100), None, DARK)) < 120_000
     assert strip.strip([], [], TimelineRange(T, T), None, DARK).count("<rect") < 9
