@@ -216,7 +216,9 @@ def test_what_happened_is_listed_and_marked_in_one_batch(page, errors: list[str]
     assert page.evaluate("'/selected/events' in window.__viserMutable.nodeRefFromName")
     page.locator('tr[data-uav="1"]').click()  # its model was never verified
     selected(page, "UAV-001")
-    page.locator('.uav .event[data-kind="no model"]', has_text="no model yet: insufficient data").wait_for(timeout=PATIENCE_MS)
+    page.locator('.uav .event[data-kind="no model"]', has_text="no model yet: insufficient data").wait_for(
+        timeout=PATIENCE_MS
+    )
     assert page.locator('.uav .event[data-kind="verified"]').count() == 0
     assert page.evaluate(NODES) == before and errors == []
 

@@ -198,7 +198,10 @@ STORIES = {
     ),
     "a model that is withdrawn is none": (
         [model(0, Outcome.VERIFIED, in_force=True), model(4, Outcome.INSUFFICIENT_DATA, in_force=False)],
-        [(0, EventKind.VERIFIED, "model verified: mean fit 88 %"), (4, EventKind.NO_MODEL, "no model yet: insufficient data")],
+        [
+            (0, EventKind.VERIFIED, "model verified: mean fit 88 %"),
+            (4, EventKind.NO_MODEL, "no model yet: insufficient data"),
+        ],
     ),
     "a late viewer meets a model in force whose newest try failed": (
         [model(0, Outcome.INSUFFICIENT_DATA, in_force=True)],
