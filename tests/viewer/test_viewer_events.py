@@ -24,7 +24,7 @@ from viewer.panels.panels import MAX_EVENT_ROWS, event_list_html
 from viewer.store.event_detection import MAX_STEPS, MAX_TEXT, DetectorState, detect_events
 from viewer.store.inbox import SampleSubset
 from viewer.theme.events import MAX_ALERTS, MAX_EVENTS, EventKind, TimelineEvent, closed_at, merged
-from viewer.theme.palette import DARK, LIGHT, MARK
+from viewer.theme.palette import DARK, LIGHT
 
 
 def told(*messages) -> list[tuple[float, EventKind, str]]:
@@ -254,11 +254,11 @@ def test_wild_messages_stay_within_bounds() -> None:
 
 
 def test_every_kind_has_its_mark_and_only_verified_looks_verified() -> None:
-    assert set(MARK) == set(EventKind)
+    assert all(kind.glyph for kind in EventKind)
     for palette in (DARK, LIGHT):
         green = {kind for kind in EventKind if palette.event(kind) == palette.verified}
         assert green == {EventKind.VERIFIED, EventKind.ACCEPTED}
-    assert MARK[EventKind.NO_MODEL] != MARK[EventKind.VERIFIED] != MARK[EventKind.UNVERIFIED]
+    assert EventKind.NO_MODEL.glyph != EventKind.VERIFIED.glyph != EventKind.UNVERIFIED.glyph
 
 
 def test_the_end_takes_away_only_losses_after_it() -> None:

@@ -18,7 +18,7 @@ from viewer.store.vehicle import Vehicle
 from viewer.text.missed_events import missed_events_html, parse_click
 from viewer.text.words import MAX_ROWS, alerts_html, empty_html, legend_html, severity, summary_html, table
 from viewer.theme.events import TimelineEvent
-from viewer.theme.palette import MARK, STATE_TEXT, Palette, triple
+from viewer.theme.palette import STATE_TEXT, Palette, triple
 
 MAX_EVENT_ROWS = 40  # events shown; earlier ones are counted
 
@@ -47,7 +47,7 @@ def _row(event: TimelineEvent, palette: Palette, seek: str) -> str:
     return (
         f'<div class="event" data-kind="{event.kind.value}" title="{timestamp(event.t)}"{press}>'
         f'<span class="num soft">{time_of_day(event.t)}</span>'
-        f'<b style="color:{palette.event(event.kind)}">{MARK[event.kind]}</b><span>{escape(event.text)}</span></div>'
+        f'<b style="color:{palette.event(event.kind)}">{event.kind.glyph}</b><span>{escape(event.text)}</span></div>'
     )
 
 

@@ -8,6 +8,7 @@ from viewer.store.place import UNIT_M, scene_quat
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.text.words import in_force
+from viewer.theme.palette import STATE_STYLE, STATUS_COLOURS
 
 CHUNKS, STEPS = 5, 12  # the trail: chunks of 12 s and a head of up to 12 s, one point per second
 TRAIL_AGES_S = np.arange(float(CHUNKS + 1) * STEPS, -1.0, -1.0)  # age of each trail point, (73,) [s]
@@ -17,21 +18,7 @@ COAST_S, STALE_S = 1.5, 2.5  # longest extrapolation; longest interval for a vel
 MAX_SPEED = 30.0  # a higher speed is a jump [10 m/s]
 JUMP_M = 1_000.0  # a larger step in one second restarts the trail, as for a restarted recording [m]
 ROTORCRAFT = ("multirotor", "helicopter")  # vehicle types drawn with rotors
-STATUS_COLOURS = (
-    "muted",
-    "predicting",
-    "verified",
-    "identifying",
-    "lost",
-    "mismatch",
-)  # palette colour of each display status
-WAITING, PREDICTING, VERIFIED, IDENTIFYING, LOST, MISMATCH = range(len(STATUS_COLOURS))
-_STATUS_OF_STATE = {
-    TwinState.PREDICTING: PREDICTING,
-    TwinState.VERIFIED: VERIFIED,
-    TwinState.IDENTIFYING: IDENTIFYING,
-    TwinState.LINK_LOST: LOST,
-}
+WAITING, LOST, MISMATCH = (STATUS_COLOURS.index(name) for name in ("muted", "lost", "mismatch"))  # display statuses
 
 
 def display_status(vehicle: Vehicle, now: float) -> int:
@@ -41,7 +28,7 @@ def display_status(vehicle: Vehicle, now: float) -> int:
         return WAITING
     if state is not TwinState.LINK_LOST and (vehicle.alerts or in_force(vehicle.mismatch)):
         return MISMATCH
-    return _STATUS_OF_STATE.get(state, WAITING)
+    return STATUS_COLOURS.index(STATE_STYLE[state][1])
 
 
 class FleetArrays:

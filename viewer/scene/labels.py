@@ -8,7 +8,7 @@ from fleet.contract import TwinState
 from viewer.scene.fleet_arrays import FleetArrays
 from viewer.store.vehicle import Vehicle
 from viewer.text.words import age_text, in_force, severity, short_text
-from viewer.theme.palette import GLYPH
+from viewer.theme.palette import STATE_STYLE
 
 MAX_LABELS = 8
 SCALE = 0.82  # font scale of every label: one size, as the page rasterises each size separately
@@ -131,7 +131,7 @@ def alert_labels(fleet_arrays: FleetArrays, selected: int | None, unit: float) -
 def alert_text(vehicle: Vehicle, now: float) -> str:
     """Describe the problems of a UAV in a short label."""
     if vehicle.state(now) is TwinState.LINK_LOST:
-        return f"{GLYPH[TwinState.LINK_LOST]} {vehicle.name} link lost {age_text(vehicle.sample_age_s(now))}"
+        return f"{STATE_STYLE[TwinState.LINK_LOST][0]} {vehicle.name} link lost {age_text(vehicle.sample_age_s(now))}"
     kinds = ", ".join(dict.fromkeys(alert.kind.value.replace("_", " ") for alert in vehicle.alerts.values()))
     if vehicle.mismatch is not None and in_force(vehicle.mismatch):
         kinds = ", ".join(filter(None, (short_text(vehicle.mismatch), kinds)))

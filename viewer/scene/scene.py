@@ -26,7 +26,7 @@ class Glyphs:
 
     def __init__(self, scene: Any, palette: Palette, on_click: Callable[[int], None]) -> None:
         self._scene, self._palette, self._on_click = scene, palette, on_click
-        self._colours = np.array([rgb(colour) for colour in palette.status_colours()])
+        self._colours = palette.status_colours()
         self._batches: list[tuple[Any, np.ndarray]] = []  # batch and the fleet rows it shows
         self._members: tuple[int, int, bool] = (-1, -1, False)
         self._statuses = np.zeros(0, int)
@@ -197,7 +197,7 @@ class Scene:
             for forecast, clock in forecasts
         ]
         statuses = fleet_arrays.statuses[[i for v in vehicles if (i := fleet_arrays.index(v.uav)) is not None]]
-        tints = 0.35 * np.array([rgb(c) for c in self._palette.status_colours()]) + 0.65 * rgb(self._palette.ink)
+        tints = 0.35 * self._palette.status_colours() + 0.65 * rgb(self._palette.ink)
         shades = faded(tints, rgb(self._palette.ground), np.linspace(0.9, 0.1, 2 * dashes))[:, ::2]
         self.predicted.draw(np.concatenate(lines), shades[statuses].reshape(-1, 2, 3))
 
@@ -210,7 +210,7 @@ class Scene:
         lines = np.concatenate(
             [np.stack([fleet_arrays.at, foot], axis=1)[:, None], foot[:, None, None] + hexagon], axis=1
         )
-        tints = np.array([mix(colour, self._palette.ground, 0.5) for colour in self._palette.status_colours()])
+        tints = 0.5 * self._palette.status_colours() + 0.5 * rgb(self._palette.ground)
         self.stems.draw(lines.reshape(-1, 2, 3), np.repeat(tints[fleet_arrays.statuses], lines.shape[1], axis=0))
 
     def draw_alerts(self, fleet_arrays: FleetArrays) -> None:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from viewer.store.inbox import time_of_day
 from viewer.store.vehicle import Vehicle
 from viewer.theme.events import LATEST, EventKind, TimelineEvent
-from viewer.theme.palette import MARK, Palette
+from viewer.theme.palette import Palette
 
 
 def encode_click(uav: int, t: float) -> str:
@@ -96,7 +96,7 @@ def missed_events_html(fleet: list[Vehicle], absence: Absence | None, palette: P
     rows = "".join(
         f'<div class="event pick" onpointerdown="{pick.format(encode_click(v.uav, event.t))}">'
         f'<span class="num soft">{time_of_day(event.t)}</span>'
-        f'<b style="color:{palette.event(event.kind)}">{MARK[event.kind]}</b>'
+        f'<b style="color:{palette.event(event.kind)}">{event.kind.glyph}</b>'
         f"<span>{v.name} {escape(event.text)}</span></div>"
         for v, event in events[:MAX_ROWS]
     )

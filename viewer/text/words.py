@@ -13,7 +13,7 @@ from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.text.missed_events import encode_click
 from viewer.theme.events import EventKind
-from viewer.theme.palette import GLYPH, MARK, STATE_TEXT, Palette
+from viewer.theme.palette import STATE_STYLE, STATE_TEXT, Palette
 
 MAX_SHOWN = 12  # segments and causes shown of one UAV
 MAX_TEXT = 600  # characters of a text
@@ -87,14 +87,6 @@ def _proof(mismatch: Mismatch) -> list[tuple[str, str]]:
     ]
 
 
-SEVERITY = (
-    TwinState.LINK_LOST,
-    TwinState.UNCLAIMED,
-    TwinState.WAITING,
-    TwinState.IDENTIFYING,
-    TwinState.PREDICTING,
-    TwinState.VERIFIED,
-)
 MAX_ROWS = 50
 MIN_HORIZON_S = 0.5  # a shorter horizon counts as none [s]
 FULL_BAR_S = 10.0  # smallest horizon of a full bar in the table [s]
@@ -111,18 +103,19 @@ class StatusLabel(NamedTuple):
 def status_label(vehicle: Vehicle, palette: Palette, now: float) -> StatusLabel:
     """Return the status of a UAV: state of its twin, mismatch, alert or end of recording."""
     if vehicle.ended:
-        return StatusLabel(MARK[EventKind.END], "recording ended", palette.event(EventKind.END))
+        return StatusLabel(EventKind.END.glyph, "recording ended", palette.event(EventKind.END))
     state = vehicle.state(now)
     if state is not TwinState.LINK_LOST and in_force(vehicle.mismatch):
         return StatusLabel("▲", "mismatch", palette.mismatch)
     if state is not TwinState.LINK_LOST and vehicle.alerts:
         return StatusLabel("▲", next(iter(vehicle.alerts.values())).kind.value.replace("_", " "), palette.mismatch)
-    return StatusLabel(GLYPH[state], STATE_TEXT[state], palette.state(state))
+    glyph, colour = STATE_STYLE[state]
+    return StatusLabel(glyph, STATE_TEXT[state], getattr(palette, colour))
 
 
 def severity(vehicle: Vehicle, now: float) -> tuple[bool, int, float, int]:
     """Return a sort key: alerts first, then worst state, then shortest horizon; ended recordings last."""
-    rank = len(SEVERITY) if vehicle.ended else SEVERITY.index(vehicle.state(now))
+    rank = len(STATE_STYLE) if vehicle.ended else list(STATE_STYLE).index(vehicle.state(now))
     return (not (vehicle.alerts or in_force(vehicle.mismatch)), rank, horizon_s(vehicle), vehicle.uav)
 
 

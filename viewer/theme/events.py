@@ -12,31 +12,40 @@ LATEST = 4e9  # later times are invalid [s since 1970]
 
 
 class EventKind(StrEnum):
-    """Kind of event; each has a glyph and a colour."""
+    """Kind of event, with its glyph and the `Palette` field of its colour."""
 
-    MODE = "mode"
-    ITEM = "item"
-    MISSION = "mission"
-    ARMED = "armed"
-    DISARMED = "disarmed"
-    WARNING = "warning"
-    ALERT = "alert"
-    MISMATCH = "mismatch"
-    CLEARED = "cleared"
-    LINK_LOST = "link lost"
-    LINK_RESTORED = "link restored"
-    VERIFIED = "verified"
-    ACCEPTED = "accepted"
-    UNVERIFIED = "unverified"
-    NO_MODEL = "no model"
-    PARAMETERS = "parameters"
-    TAKE_OFF = "take-off"
-    LANDING = "landing"
-    GROUND = "ground"
-    TELEMETRY_LOST = "telemetry lost"
-    TELEMETRY_RESTORED = "telemetry restored"
-    FRAME = "frame"
-    END = "end"
+    glyph: str
+    colour: str
+
+    def __new__(cls, value: str, glyph: str, colour: str) -> "EventKind":
+        """Create a member from its value, glyph and colour."""
+        kind = str.__new__(cls, value)
+        kind._value_, kind.glyph, kind.colour = value, glyph, colour
+        return kind
+
+    MODE = "mode", "◆", "predicting"
+    ITEM = "item", "›", "route"
+    MISSION = "mission", "≡", "route"
+    ARMED = "armed", "●", "ink"
+    DISARMED = "disarmed", "○", "ink"
+    WARNING = "warning", "!", "mismatch"
+    ALERT = "alert", "▲", "mismatch"
+    MISMATCH = "mismatch", "≠", "mismatch"
+    CLEARED = "cleared", "△", "lost"
+    LINK_LOST = "link lost", "✕", "lost"
+    LINK_RESTORED = "link restored", "↺", "lost"
+    VERIFIED = "verified", "✓", "verified"
+    ACCEPTED = "accepted", "✓", "verified"
+    UNVERIFIED = "unverified", "◑", "identifying"
+    NO_MODEL = "no model", "◌", "identifying"
+    PARAMETERS = "parameters", "≈", "route"
+    TAKE_OFF = "take-off", "↗", "ink"
+    LANDING = "landing", "↘", "ink"
+    GROUND = "ground", "▁", "ink"
+    TELEMETRY_LOST = "telemetry lost", "⊘", "lost"
+    TELEMETRY_RESTORED = "telemetry restored", "⊙", "lost"
+    FRAME = "frame", "⌖", "mismatch"
+    END = "end", "■", "ink"
 
 
 class TimelineEvent(NamedTuple):

@@ -8,86 +8,49 @@ from fleet.contract import TwinState
 from viewer.theme.events import EventKind
 
 
+STATE_STYLE = {  # glyph and `Palette` field of each state, the most severe first
+    TwinState.LINK_LOST: ("✕", "lost"),
+    TwinState.UNCLAIMED: ("○", "muted"),
+    TwinState.WAITING: ("◌", "muted"),
+    TwinState.IDENTIFYING: ("◐", "identifying"),
+    TwinState.PREDICTING: ("➤", "predicting"),
+    TwinState.VERIFIED: ("✓", "verified"),
+}
+STATE_TEXT = {state: state.value.replace("_", " ") for state in TwinState}
+STATUS_COLOURS = ("muted", "predicting", "verified", "identifying", "lost", "mismatch")  # of the display statuses
+
+
 @dataclass(frozen=True)
 class Palette:
-    """Colours of one theme, as sRGB hex."""
+    """Colours of one theme, as sRGB hex; the defaults are the dark theme."""
 
-    dark: bool
-    predicting: str
-    verified: str
-    identifying: str
-    lost: str
-    mismatch: str
-    horizon: str
-    ground: str
-    ink: str
-    muted: str
-    panel: str
-    grid: str
-    section: str
-    ring: str
-    tube: str
-    route: str
-    actual: str
-    sky: tuple[str, str]
+    dark: bool = True
+    predicting: str = "#3E96DC"
+    verified: str = "#2BC49A"
+    identifying: str = "#F0B8E0"
+    lost: str = "#7F8894"
+    mismatch: str = "#FF6B35"
+    horizon: str = "#F0E442"
+    ground: str = "#0E141E"
+    ink: str = "#E6EDF5"
+    muted: str = "#8B98A8"
+    section: str = "#2A3849"
+    ring: str = "#3B4D63"
+    tube: str = "#56B4E9"
+    route: str = "#9A8FD0"
+    actual: str = "#DCE6F0"
+    sky: tuple[str, str] = ("#0B0F17", "#1A2433")
 
-    def state(self, state: TwinState) -> str:
-        """Return the colour of a state."""
-        return {
-            TwinState.PREDICTING: self.predicting,
-            TwinState.VERIFIED: self.verified,
-            TwinState.IDENTIFYING: self.identifying,
-            TwinState.LINK_LOST: self.lost,
-        }.get(state, self.muted)
-
-    def status_colours(self) -> tuple[str, ...]:
-        """Return the colours of the display statuses, in the order of `STATUS_COLOURS`."""
-        return self.muted, self.predicting, self.verified, self.identifying, self.lost, self.mismatch
+    def status_colours(self) -> np.ndarray:
+        """Return the colours of the display statuses, (6, 3) [0..255]."""
+        return np.array([rgb(getattr(self, name)) for name in STATUS_COLOURS])
 
     def event(self, kind: EventKind) -> str:
         """Return the colour of an event kind."""
-        return {
-            EventKind.MODE: self.predicting,
-            EventKind.ITEM: self.route,
-            EventKind.MISSION: self.route,
-            EventKind.ARMED: self.ink,
-            EventKind.DISARMED: self.ink,
-            EventKind.WARNING: self.mismatch,
-            EventKind.ALERT: self.mismatch,
-            EventKind.MISMATCH: self.mismatch,
-            EventKind.VERIFIED: self.verified,
-            EventKind.ACCEPTED: self.verified,
-            EventKind.UNVERIFIED: self.identifying,
-            EventKind.NO_MODEL: self.identifying,
-            EventKind.PARAMETERS: self.route,
-            EventKind.TAKE_OFF: self.ink,
-            EventKind.LANDING: self.ink,
-            EventKind.GROUND: self.ink,
-            EventKind.FRAME: self.mismatch,
-            EventKind.END: self.ink,
-        }.get(kind, self.lost)
+        return getattr(self, kind.colour)
 
 
-DARK = Palette(
-    dark=True,
-    predicting="#3E96DC",
-    verified="#2BC49A",
-    identifying="#F0B8E0",
-    lost="#7F8894",
-    mismatch="#FF6B35",
-    horizon="#F0E442",
-    ground="#0E141E",
-    ink="#E6EDF5",
-    muted="#8B98A8",
-    panel="#111925",
-    grid="#1B2533",
-    section="#2A3849",
-    ring="#3B4D63",
-    tube="#56B4E9",
-    route="#9A8FD0",
-    actual="#DCE6F0",
-    sky=("#0B0F17", "#1A2433"),
-)
+DARK = Palette()
 LIGHT = Palette(
     dark=False,
     predicting="#0072B2",
@@ -99,8 +62,6 @@ LIGHT = Palette(
     ground="#F4F6F9",
     ink="#17212E",
     muted="#64748B",
-    panel="#FFFFFF",
-    grid="#E2E8EF",
     section="#CBD5E0",
     ring="#94A3B8",
     tube="#0072B2",
@@ -108,41 +69,6 @@ LIGHT = Palette(
     actual="#334155",
     sky=("#DCE6F0", "#FFFFFF"),
 )
-
-GLYPH = {
-    TwinState.PREDICTING: "➤",
-    TwinState.VERIFIED: "✓",
-    TwinState.IDENTIFYING: "◐",
-    TwinState.LINK_LOST: "✕",
-    TwinState.WAITING: "◌",
-    TwinState.UNCLAIMED: "○",
-}
-MARK = {
-    EventKind.MODE: "◆",
-    EventKind.ITEM: "›",
-    EventKind.MISSION: "≡",
-    EventKind.ARMED: "●",
-    EventKind.DISARMED: "○",
-    EventKind.WARNING: "!",
-    EventKind.ALERT: "▲",
-    EventKind.MISMATCH: "≠",
-    EventKind.CLEARED: "△",
-    EventKind.LINK_LOST: "✕",
-    EventKind.LINK_RESTORED: "↺",
-    EventKind.VERIFIED: "✓",
-    EventKind.ACCEPTED: "✓",
-    EventKind.UNVERIFIED: "◑",
-    EventKind.NO_MODEL: "◌",
-    EventKind.PARAMETERS: "≈",
-    EventKind.TAKE_OFF: "↗",
-    EventKind.LANDING: "↘",
-    EventKind.GROUND: "▁",
-    EventKind.TELEMETRY_LOST: "⊘",
-    EventKind.TELEMETRY_RESTORED: "⊙",
-    EventKind.FRAME: "⌖",
-    EventKind.END: "■",
-}
-STATE_TEXT = {state: state.value.replace("_", " ") for state in TwinState}
 
 # ACES filmic fit as the renderer applies it to every line. Source: Hill, "BakingLab" 2016, ACES.hlsl.
 _IN = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]])
@@ -152,13 +78,13 @@ _EXPOSURE = 0.6
 
 def rgb(colour: str) -> np.ndarray:
     """Parse `#RRGGBB` as (3,) floats [0..255]."""
-    return np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)], float)
+    return np.array(triple(colour), float)
 
 
 def triple(colour: str) -> tuple[int, int, int]:
     """Parse `#RRGGBB` as three integers, as viser expects them."""
-    r, g, b = rgb(colour)
-    return int(r), int(g), int(b)
+    r, g, b = bytes.fromhex(colour[1:])
+    return r, g, b
 
 
 def mix(colour: str, other: str, share: float) -> np.ndarray:

@@ -6,7 +6,7 @@ from math import inf
 
 from viewer.store.inbox import time_of_day
 from viewer.theme.events import EventKind, TimelineEvent
-from viewer.theme.palette import MARK, Palette
+from viewer.theme.palette import Palette
 from viewer.timeline.past import STEPS_S, LeadTimeError
 from viewer.timeline.recordings import TimelineRange
 
@@ -55,7 +55,7 @@ def _marks(events: list[TimelineEvent], span: TimelineRange, palette: Palette, t
     return "".join(
         f'<rect x="{WIDTH * span.fraction(event.t) - 2.5:.1f}" y="{top}" width="5" height="{height}" '
         f'fill="{palette.event(event.kind)}" class="mark" data-kind="{event.kind.value}">'
-        f"<title>{time_of_day(event.t)} {MARK[event.kind]} {escape(event.text)}</title></rect>"
+        f"<title>{time_of_day(event.t)} {event.kind.glyph} {escape(event.text)}</title></rect>"
         for event in shown
     )
 

@@ -8,7 +8,7 @@ from viewer.scene.labels import Tag
 from viewer.store.inbox import time_of_day
 from viewer.store.track import positions_at
 from viewer.theme.events import EventKind, TimelineEvent
-from viewer.theme.palette import MARK, Palette, mesh_colour, rgb
+from viewer.theme.palette import Palette, mesh_colour, rgb
 from viewer.theme.shapes import diamond
 
 MAX_MARKERS = 40  # newest markers on the path
@@ -105,7 +105,7 @@ def event_text(event: TimelineEvent) -> str:
     """Describe an event in one short line."""
     text = event.text.split(":")[0] if event.kind in MODEL_KINDS else event.text
     text = text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 1] + "…"
-    return f"{MARK[event.kind]} {text} {time_of_day(event.t)}"
+    return f"{event.kind.glyph} {text} {time_of_day(event.t)}"
 
 
 SIDES = 20  # corners of one ring
