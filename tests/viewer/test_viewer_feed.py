@@ -106,7 +106,7 @@ def test_of_two_conflicts_one_may_end(clock: Clock) -> None:
     feed, _, bus = feed_of(clock, 1)
     for other, active in ((4, True), (5, True), (4, False)):
         bus.publish(Alert(uav=0, t=T, kind=AlertKind.CONFLICT, other=other, active=active, sentence=f"near {other}"))
-    assert [alert.other for _, _, alert in feed.alerts()] == [5]
+    assert [alert.other for _, alert in feed.alerts()] == [5]
     for other in range(100):
         bus.publish(Alert(uav=0, t=T, kind=AlertKind.CONFLICT, other=other, sentence="x"))
     assert len(feed.alerts()) == MAX_ALERTS

@@ -20,7 +20,7 @@ from viewer.scene.ground import RINGS_M
 from viewer.scene.labels import CameraView
 from viewer.store import store as feeds
 from viewer.store.place import UNIT_M
-from viewer.store.states import MAX_TEXT, RouterStatus, notices
+from viewer.store.states import MAX_TEXT, notices
 from viewer.store.store import FleetStore
 from viewer.text.words import empty_html, summary_html
 from viewer.theme.palette import DARK
@@ -40,11 +40,13 @@ def damaged(sentence: str, link: str = "replay:flight.tlog?speed=4") -> GatewayC
 
 
 def test_a_router_that_is_away_is_said_with_its_seconds_and_forgotten_when_it_is_back(clock: Clock) -> None:
-    feed, router = FleetStore(Adrift(), clock), RouterStatus()
-    assert not feed.router_available and "No router</b> for 0 s" in router.describe(feed.router_available, 50.0)
-    assert "for 12 s" in notices(feed, router.describe(feed.router_available, 62.0), "", DARK)
-    assert router.describe(True, 63.0) == "" == notices(FleetStore(MemoryBus(), clock), "", "", DARK)
-    assert "for 0 s" in router.describe(False, 70.0)
+    feed = FleetStore(bus := Adrift(), clock)
+    assert "No router</b> for 0 s" in notices(feed, "", DARK, 50.0)
+    assert "for 12 s" in notices(feed, "", DARK, 62.0)
+    bus.router = "back"
+    assert notices(feed, "", DARK, 63.0) == "" == notices(FleetStore(MemoryBus(), clock), "", DARK, 63.0)
+    bus.router = ""
+    assert "for 0 s" in notices(feed, "", DARK, 70.0)
 
 
 def test_more_uavs_than_fit_are_counted_once_each(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -55,18 +57,19 @@ def test_more_uavs_than_fit_are_counted_once_each(clock: Clock, monkeypatch: pyt
         for uav in (7, 8, 5_000_000, -1, 9, 10):
             bus.publish(Status(uav=uav, t=T))
     assert len(feed.vehicles) == 3 and len(feed.rejected_uavs) == 4
-    assert "Too many UAVs" in notices(feed, "", "", DARK) and ", 4 more are received" in notices(feed, "", "", DARK)
+    said = notices(feed, "", DARK, clock.now)
+    assert "Too many UAVs" in said and ", 4 more are received" in said
     assert "3 UAVs" in summary_html(feed.all(), feed, DARK, clock.now)
 
 
 def test_what_could_not_be_read_of_a_recording_is_said_and_escaped(clock: Clock) -> None:
     feed, _, bus = feed_of(clock, 1)
     bus.publish(damaged(f"flight.tlog: 73750 damaged bytes skipped {HOSTILE} {'x' * 10_000}"))
-    said = notices(feed, "", "", DARK)
+    said = notices(feed, "", DARK, clock.now)
     assert "Recording damaged" in said and "73750 damaged bytes" in said
     assert "<img" not in said and len(said) < 3 * MAX_TEXT
     bus.publish(damaged(""))
-    assert notices(feed, "", "", DARK) == ""
+    assert notices(feed, "", DARK, clock.now) == ""
 
 
 def test_a_damaged_recording_reaches_the_page(clock: Clock, tmp_path: Path) -> None:
@@ -76,7 +79,7 @@ def test_a_damaged_recording_reaches_the_page(clock: Clock, tmp_path: Path) -> N
     path.write_bytes(good)
     feed = FleetStore(bus := MemoryBus(), clock)
     Pipeline([ReplayLink(read_spec(f"replay:{path}?speed=max"))], bus).run(threading.Event())
-    said = notices(feed, "", "", DARK)
+    said = notices(feed, "", DARK, clock.now)
     assert (
         "Recording damaged</b>: flight.tlog: " in said and "damaged bytes skipped" in said and len(feed.vehicles) == 1
     )
@@ -86,7 +89,7 @@ def test_links_without_end_are_bounded(clock: Clock) -> None:
     feed, _, bus = feed_of(clock, 1)
     for k in range(500):
         bus.publish(damaged("late", f"udpin:0.0.0.0:{k}"))
-    assert len(feed.links) == feeds.MAX_LINKS and "<b>Link</b>: late" in notices(feed, "", "", DARK)
+    assert len(feed.links) == feeds.MAX_LINKS and "<b>Link</b>: late" in notices(feed, "", DARK, clock.now)
 
 
 def test_no_fleet_is_said_with_what_is_listened_to_and_what_to_check(clock: Clock) -> None:

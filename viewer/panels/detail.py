@@ -8,6 +8,7 @@ from viewer.store.inbox import rate_text, timestamp
 from viewer.store.vehicle import Vehicle
 from viewer.text import words as mismatch_text
 from viewer.text.words import MIN_HORIZON_S, age_text, fit, horizon_s, status_label
+from viewer.theme.events import clip
 from viewer.theme.palette import Palette
 
 MAX_TEXT = 500  # characters of a received text
@@ -62,9 +63,9 @@ def limitations(vehicle: Vehicle, now: float) -> list[str]:
             "check that `twin_worker` runs on this router."
         )
     elif vehicle.forecast is None:
-        texts.append(
-            f"No horizon yet after {age_text(_observed_s(vehicle, now))} of telemetry; it needs a verified model."
-        )
+        rows = vehicle.track_rows()
+        observed_s = vehicle.data_time(now) - float(rows[0, 0]) if len(rows) else 0.0
+        texts.append(f"No horizon yet after {age_text(observed_s)} of telemetry; it needs a verified model.")
     if lag_s := vehicle.prediction_lag_s(now):
         replay_advice = "play the recording more slowly, or " if vehicle.recorded else ""
         advice = f": its worker is overloaded; {replay_advice}assign fewer UAVs to each worker"
@@ -80,25 +81,14 @@ def limitations(vehicle: Vehicle, now: float) -> list[str]:
     return texts
 
 
-def _observed_s(vehicle: Vehicle, now: float) -> float:
-    """Return the data time since the start of its track [s]."""
-    rows = vehicle.track.rows()
-    return vehicle.data_time(now) - float(rows[0, 0]) if len(rows) else 0.0
-
-
-def clip(text: str) -> str:
-    """Truncate received text to `MAX_TEXT` characters."""
-    return text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 1] + "…"
-
-
 def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
     cards = [
-        f'<div class="say" style="border-color:{palette.mismatch}">▲ {escape(clip(a.sentence))}</div>'
+        f'<div class="say" style="border-color:{palette.mismatch}">▲ {escape(clip(a.sentence, MAX_TEXT))}</div>'
         for a in vehicle.alerts.values()
     ]
     cards.insert(0, mismatch_text.mismatch_html(vehicle.mismatch, palette))
     texts = limitations(vehicle, now)
-    cards += [f'<div class="say">{escape(clip(text))}</div>' for text in texts]
+    cards += [f'<div class="say">{escape(clip(text, MAX_TEXT))}</div>' for text in texts]
     verdict = vehicle.model.verdict if vehicle.model is not None else None
     if verdict is not None:
         colour = palette.verified if verdict.outcome is Outcome.VERIFIED else palette.identifying
@@ -106,10 +96,10 @@ def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
         cards.append(
             f'<div class="say" style="border-color:{colour}"><b>{escape(verdict.outcome.value.replace("_", " "))}</b> '
             f'<span class="soft">newest verification, number {verdict.attempts}{least}</span><br>'
-            f"{escape(clip(verdict.sentence))}</div>"
+            f"{escape(clip(verdict.sentence, MAX_TEXT))}</div>"
         )
     elif vehicle.row is not None and not any(vehicle.row.verdict in text for text in ("", *texts)):
-        cards.append(f'<div class="say">{escape(clip(vehicle.row.verdict))}</div>')
+        cards.append(f'<div class="say">{escape(clip(vehicle.row.verdict, MAX_TEXT))}</div>')
     return "".join(cards)
 
 
@@ -199,7 +189,7 @@ def _facts(vehicle: Vehicle, now: float) -> str:
     return (
         "<table>"
         + "".join(
-            f'<tr><td class="soft key">{k}</td><td class="value">{escape(clip(v))}</td></tr>'
+            f'<tr><td class="soft key">{k}</td><td class="value">{escape(clip(v, MAX_TEXT))}</td></tr>'
             for k, v in figures.items()
         )
         + "</table>"

@@ -12,7 +12,7 @@ from viewer.browser.http_server import Browser
 from viewer.panels.charts import Charts
 from viewer.panels.detail import figures_html, status_html
 from viewer.store.inbox import date_text, time_of_day, timestamp
-from viewer.store.states import RouterStatus, notices
+from viewer.store.states import notices
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.text.missed_events import missed_events_html, parse_click
@@ -97,7 +97,6 @@ class Panels:
         self._presence, self._browser = browser.presence, browser
         self._commands = Commands(self._gui, choose, actions)
         self._pulse = False
-        self._router = RouterStatus()
         self.ground_error = ""  # error of the terrain files
         self.seek = ""  # page code that seeks to the time of an event
         self._gui.configure_theme(
@@ -176,10 +175,7 @@ class Panels:
         missed = missed_events_html(fleet, self._presence.absence, palette, pick)
         contents = (
             (self._banner, f'<div class="stale {"a" if self._pulse else "b"}">{STALE}</div>'),
-            (
-                self._notices,
-                notices(store, self._router.describe(store.router_available, now), self.ground_error, palette),
-            ),
+            (self._notices, notices(store, self.ground_error, palette, now)),
             (self._summary, summary_html(fleet, store, palette, now) if fleet else empty_html(store, now)),
             (self._table, table(shown, palette, now, total=len(fleet), pick=pick, selected=selected) if fleet else ""),
             (self._legend, legend_html(fleet, palette)),

@@ -30,10 +30,8 @@ def frame(
     """
     azimuth, elevation = VIEW_ANGLES
     if direction is not None and np.linalg.norm(direction[:2]) > 1e-6:
-        azimuth, elevation = (
-            np.arctan2(direction[1], direction[0]),
-            np.arctan2(direction[2], np.linalg.norm(direction[:2])),
-        )
+        azimuth = np.arctan2(direction[1], direction[0])
+        elevation = np.arctan2(direction[2], np.linalg.norm(direction[:2]))
     to_camera = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     up = np.cross(to_camera, right)
@@ -41,8 +39,7 @@ def frame(
     for _ in range(3):  # centre and distance depend on each other: iterate
         x, y, z = (points - look_at) @ right, (points - look_at) @ up, (points - look_at) @ to_camera
         wide, tall = np.tan(FOV / 2) * aspect, np.tan(FOV / 2) * (1 - BOTTOM_SHARE)
-        distance = float(np.max(np.maximum(np.abs(x) / wide, np.abs(y) / tall) * margin + z))
-        distance = max(distance, CLOSEST)
+        distance = max(float(np.max(np.maximum(np.abs(x) / wide, np.abs(y) / tall) * margin + z)), CLOSEST)
         depth = distance - z
         look_at = look_at + right * _middle(x / depth) * distance + up * _middle(y / depth) * distance
     position = look_at + to_camera * distance - up * BOTTOM_SHARE * np.tan(FOV / 2) * distance

@@ -47,9 +47,7 @@ class FleetArrays:
         self.revision = 0  # counts changes of the drawn UAVs and restarted trails
         self.trail_steps = 0  # seconds of trail
         self.trails = np.zeros((0, len(TRAIL_AGES_S), 3))  # a minute of trail, newest last
-        self._predicted_only: list[
-            tuple[int, Vehicle]
-        ] = []  # UAVs without telemetry, drawn at a predicted or last position
+        self._predicted_only: list[tuple[int, Vehicle]] = []  # without telemetry: at a predicted or last position
         self._read_part = 0  # part of a large fleet decoded last
         self._read_positions = np.zeros((0, 3))  # large fleet: last decoded positions [10 m]
         self._read_times = np.zeros(0)  # their arrival, monotonic [s]
@@ -112,11 +110,8 @@ class FleetArrays:
         self.trails, self.uavs, self.at, self.revision = trails, uavs, at, self.revision + 1
         self._rows = {uav: i for i, uav in enumerate(uavs)}
         self.quat = np.tile([1.0, 0.0, 0.0, 0.0], (len(uavs), 1))
-        self._read_positions, self._read_times, self._velocities = (
-            at.copy(),
-            np.full(len(uavs), -np.inf),
-            np.zeros_like(at),
-        )
+        self._read_positions, self._velocities = at.copy(), np.zeros_like(at)
+        self._read_times = np.full(len(uavs), -np.inf)
 
     def update_poses(self, store: FleetStore, now: float) -> None:
         """Update positions and attitudes; call it once per frame.
@@ -127,8 +122,7 @@ class FleetArrays:
         if not self.uavs:
             return
         if not self.large_fleet:
-            self._read_all(store, now)
-            return
+            return self._read_all(store, now)
         self._read_part = (self._read_part + 1) % READ_PARTS
         selected = np.zeros(len(self.uavs), bool)
         selected[self._read_part :: READ_PARTS] = True

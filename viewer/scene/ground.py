@@ -4,8 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from viewer.scene.routes import circle
-from viewer.scene.strokes import Strokes, chain
+from viewer.scene.strokes import Strokes, chain, circle
 from viewer.store.place import UNIT_M
 from viewer.theme.palette import Palette, rgb
 from viewer.theme.shapes import digit_strokes
@@ -67,6 +66,5 @@ def _grid(palette: Palette, spacing: float, reach: float, strength: float) -> tu
 def _ring_label(metres: int) -> np.ndarray:
     """Return the strokes of a ring's distance, inside its southern edge: (n, 2, 3)."""
     height = 0.035 * metres / UNIT_M + 0.8
-    return digit_strokes(f"{metres / 1000:g} km", height) + np.array(
-        [0.4 * height, -metres / UNIT_M + 0.4 * height, 0.02]
-    )
+    corner = np.array([0.4 * height, -metres / UNIT_M + 0.4 * height, 0.02])
+    return digit_strokes(f"{metres / 1000:g} km", height) + corner

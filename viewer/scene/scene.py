@@ -8,8 +8,8 @@ import numpy as np
 from viewer.scene.fleet_arrays import CHUNKS, LOST, MISMATCH, STEPS, FleetArrays
 from viewer.scene.ground import GroundGrid
 from viewer.scene.labels import CameraView
-from viewer.scene.routes import NOTHING, RouteLines, circle
-from viewer.scene.strokes import Strokes, chain, dash_lines, faded, smooth_curve
+from viewer.scene.routes import NOTHING, RouteLines
+from viewer.scene.strokes import Strokes, chain, circle, dash_lines, faded, smooth_curve
 from viewer.store.vehicle import Vehicle
 from viewer.theme.palette import Palette, mesh_colour, mix, rgb
 from viewer.theme.shapes import aircraft, dart, rotorcraft
@@ -58,48 +58,43 @@ class Glyphs:
         focus_distance = float(np.linalg.norm(camera_view.look_at - camera_view.position)) or 1.0
         points, depth = camera_view.project(fleet_arrays.at)
         visible_count = int(((depth > 0) & (np.abs(points) < [camera_view.aspect / 2, 0.5]).all(axis=1)).sum())
-        self.unit = (
-            size
-            * focus_distance
-            * max(SPAN_SHARE * min(1.0, LARGE_GLYPH_COUNT / max(visible_count, 1)) ** 0.5, MIN_SPAN_SHARE)
-        )
+        share = SPAN_SHARE * min(1.0, LARGE_GLYPH_COUNT / max(visible_count, 1)) ** 0.5
+        self.unit = size * focus_distance * max(share, MIN_SPAN_SHARE)
         relative_distance = np.linalg.norm(fleet_arrays.at - camera_view.position, axis=1) / focus_distance
         scale = self.unit * np.clip(relative_distance, 0.05, 20.0) ** DISTANCE_EXPONENT
         if fleet_arrays.large_fleet:
             scale = np.where(fleet_arrays.exceptions, EXCEPTION_SCALE * scale, scale)
         if (row := fleet_arrays.index(selected)) is not None:
             scale[row] *= SELECTED_SCALE
-        for batch, batch_rows in self._batches:
-            batch.batched_scales = scale[batch_rows].astype(np.float32)
-        if not np.array_equal(fleet_arrays.statuses, self._statuses):
-            self._statuses = fleet_arrays.statuses.copy()
-            colours = self.colours(fleet_arrays)
-            for batch, batch_rows in self._batches:
-                batch.batched_colors = mesh_colour(colours[batch_rows] * 0.85)
+        recoloured = not np.array_equal(fleet_arrays.statuses, self._statuses)
+        self._statuses = fleet_arrays.statuses.copy()
+        for batch, rows in self._batches:
+            batch.batched_scales = scale[rows].astype(np.float32)
+            if recoloured:
+                batch.batched_colors = mesh_colour(self.colours(fleet_arrays)[rows] * 0.85)
 
     def colours(self, fleet_arrays: FleetArrays) -> np.ndarray:
         """Return the colours, (n, 3) [0..255]; in a large fleet nominal UAVs are muted."""
         colours = self._colours[fleet_arrays.statuses]
         if not fleet_arrays.large_fleet:
             return colours
-        is_normal = ~np.isin(fleet_arrays.statuses, (MISMATCH, LOST))[:, None]
-        return np.where(is_normal, MUTED_SHARE * colours + (1 - MUTED_SHARE) * rgb(self._palette.ground), colours)
+        muted = MUTED_SHARE * colours + (1 - MUTED_SHARE) * rgb(self._palette.ground)
+        return np.where(fleet_arrays.exceptions[:, None], colours, muted)
 
     def _rebuild(self, fleet_arrays: FleetArrays) -> None:
         for batch, _ in self._batches:
             batch.remove()
         fixed, rotors = np.flatnonzero(~fleet_arrays.has_rotors), np.flatnonzero(fleet_arrays.has_rotors)
         wings = dart() if fleet_arrays.large_fleet else aircraft()
-        specifications = [("/fleet/vehicles", fixed, wings), ("/fleet/rotors", rotors, rotorcraft())]
+        shapes = (("/fleet/vehicles", fixed, wings), ("/fleet/rotors", rotors, rotorcraft()))
         self._statuses = np.zeros(0, int)
         self._batches = [
-            (self._batch(name, fleet_arrays, rows, shape), rows) for name, rows, shape in specifications if len(rows)
+            (self._batch(name, fleet_arrays, rows, shape), rows) for name, rows, shape in shapes if len(rows)
         ]
 
     def _batch(
         self, name: str, fleet_arrays: FleetArrays, rows: np.ndarray, shape: tuple[np.ndarray, np.ndarray]
     ) -> Any:
-        uavs = [fleet_arrays.uavs[row] for row in rows]
         batch = self._scene.add_batched_meshes_simple(
             name,
             *shape,
@@ -112,12 +107,14 @@ class Glyphs:
             receive_shadow=False,
             flat_shading=True,
         )
-        batch.on_click(lambda event: self._click(uavs, event.instance_index))
-        return batch
+        uavs = dict(enumerate(fleet_arrays.uavs[row] for row in rows))
 
-    def _click(self, uavs: list[int], index: int | None) -> None:
-        if index is not None and 0 <= index < len(uavs):
-            self._on_click(uavs[index])
+        def click(event: Any) -> None:
+            if (uav := uavs.get(event.instance_index)) is not None:
+                self._on_click(uav)
+
+        batch.on_click(click)
+        return batch
 
 
 DASHES, SMALL_FLEET = 30, 60  # dashes of one predicted path; half as many, without ground marks, in a larger fleet
@@ -145,39 +142,31 @@ class Scene:
 
     def draw_trails(self, fleet_arrays: FleetArrays, selected: int | None) -> None:
         """Draw changed chunks: one when a chunk closes, all when the drawn UAVs or the selection change."""
-        closed, recoloured = (
-            fleet_arrays.trail_steps // STEPS,
-            not np.array_equal(fleet_arrays.statuses, self._statuses),
-        )
+        closed = fleet_arrays.trail_steps // STEPS
+        recoloured = not np.array_equal(fleet_arrays.statuses, self._statuses)
         changes, previous = self._drawn
         if (key := (fleet_arrays.revision, selected)) == changes and closed == previous and not recoloured:
             return
         redrawn = range(CHUNKS) if key != changes or closed > previous + 1 else range(closed - previous)
         if redrawn == range(1):  # the node of the oldest chunk draws the newest; the others only fade
             self.trails = [self.trails[-1], *self.trails[:-1]]
-        colours, parts = self.glyphs.colours(fleet_arrays), _parts(fleet_arrays)
+        colours, n = self.glyphs.colours(fleet_arrays), _parts(fleet_arrays) * STEPS // fleet_arrays.stride + 1
+        brightness = 0.6 if fleet_arrays.large_fleet else 1.0
         for age, strokes in enumerate(self.trails):
-            ages = age * STEPS + np.linspace(STEPS, 0, parts * STEPS // fleet_arrays.stride + 1)
-            shares = np.interp(ages, [-STEPS, CHUNKS * STEPS], [0.95, 0.03]) * (
-                0.6 if fleet_arrays.large_fleet else 1.0
-            )
-            shades = faded(colours, rgb(self._palette.ground), shares)
+            ages = age * STEPS + np.linspace(STEPS, 0, n)
+            shares = np.interp(ages, [-STEPS, CHUNKS * STEPS], [0.95, 0.03]) * brightness
+            shades = faded(colours, rgb(self._palette.ground), shares).reshape(-1, 2, 3)
             if age >= fleet_arrays.chunks:
                 strokes.draw(NOTHING.legs)
             elif age in redrawn:
-                strokes.draw(
-                    chain(smooth_curve(_without_selected(fleet_arrays, fleet_arrays.chunk(age), selected), parts)),
-                    shades.reshape(-1, 2, 3),
-                )
+                strokes.draw(_curves(fleet_arrays, fleet_arrays.chunk(age), selected), shades)
             else:
-                strokes.colour(shades.reshape(-1, 2, 3), shades.shape[0] * shades.shape[1])
+                strokes.colour(shades, len(shades))
         self._drawn, self._statuses = (key, closed), fleet_arrays.statuses.copy()
 
     def draw_heads(self, fleet_arrays: FleetArrays, selected: int | None) -> None:
         """Draw the newest stretch of every trail up to the aircraft; the array size is constant."""
-        lines = chain(
-            smooth_curve(_without_selected(fleet_arrays, fleet_arrays.head(), selected), _parts(fleet_arrays))
-        )
+        lines = _curves(fleet_arrays, fleet_arrays.head(), selected)
         if np.array_equal(fleet_arrays.statuses, self._head_statuses):
             return self.head.draw(lines)
         self._head_statuses = fleet_arrays.statuses.copy()
@@ -192,10 +181,7 @@ class Scene:
             return self.predicted.draw(NOTHING.legs)
         dashes = DASHES if len(fleet_arrays.uavs) <= SMALL_FLEET else DASHES // 2
         forecasts = [(v.forecast, v.data_time(now)) for v in vehicles if v.forecast is not None]
-        lines = [
-            cut_at_horizon(forecast.ahead, forecast.path, clock - forecast.t, forecast.horizon_s, dashes)
-            for forecast, clock in forecasts
-        ]
+        lines = [cut_at_horizon(f.ahead, f.path, clock - f.t, f.horizon_s, dashes) for f, clock in forecasts]
         statuses = fleet_arrays.statuses[[i for v in vehicles if (i := fleet_arrays.index(v.uav)) is not None]]
         tints = 0.35 * self._palette.status_colours() + 0.65 * rgb(self._palette.ink)
         shades = faded(tints, rgb(self._palette.ground), np.linspace(0.9, 0.1, 2 * dashes))[:, ::2]
@@ -207,9 +193,8 @@ class Scene:
             return self.stems.draw(NOTHING.legs)
         foot = fleet_arrays.at * [1, 1, 0] + [0, 0, self.ground.height + 0.05]
         hexagon = circle(np.zeros(3), 0.3 * self.glyphs.unit, 6)[: 6 if len(fleet_arrays.uavs) <= SMALL_FLEET else 0]
-        lines = np.concatenate(
-            [np.stack([fleet_arrays.at, foot], axis=1)[:, None], foot[:, None, None] + hexagon], axis=1
-        )
+        stems = np.stack([fleet_arrays.at, foot], axis=1)[:, None]
+        lines = np.concatenate([stems, foot[:, None, None] + hexagon], axis=1)
         tints = 0.5 * self._palette.status_colours() + 0.5 * rgb(self._palette.ground)
         self.stems.draw(lines.reshape(-1, 2, 3), np.repeat(tints[fleet_arrays.statuses], lines.shape[1], axis=0))
 
@@ -229,12 +214,12 @@ class Scene:
         self.routes.draw(np.concatenate([*lines, NOTHING.legs]), mix(self._palette.route, self._palette.ground, 0.45))
 
 
-def _without_selected(fleet_arrays: FleetArrays, points: np.ndarray, selected: int | None) -> np.ndarray:
-    """Collapse the trail of the selected UAV in points (n, k, 3), as it has a finer path."""
+def _curves(fleet_arrays: FleetArrays, points: np.ndarray, selected: int | None) -> np.ndarray:
+    """Return smooth curves through trails (n, k, 3) as segments; none of the selected UAV, as it has a finer path."""
     if (row := fleet_arrays.index(selected)) is not None:
         points = points.copy()
         points[row] = points[row, :1]
-    return points
+    return chain(smooth_curve(points, _parts(fleet_arrays)))
 
 
 def _parts(fleet_arrays: FleetArrays) -> int:

@@ -17,6 +17,12 @@ class Strokes:
             name, _EMPTY, np.zeros((1, 2, 3), np.uint8), thickness=width, thickness_units="screen"
         )
 
+    def draw_parts(self, parts: list[tuple[np.ndarray, np.ndarray]]) -> None:
+        """Show segments of several colours: pairs of segments (..., 2, 3) [10 m] and their one colour (3,)."""
+        lines = [np.zeros((0, 2, 3)), *(segments.reshape(-1, 2, 3) for segments, _ in parts)]
+        colours = [np.broadcast_to(colour, (len(part), 3)) for part, (_, colour) in zip(lines[1:], parts, strict=True)]
+        self.draw(np.concatenate(lines), np.concatenate([np.zeros((0, 3)), *colours]))
+
     def draw(self, segments: np.ndarray, colours: np.ndarray | None = None) -> None:
         """Show segments (n, 2, 3) [10 m]; colours (3,), (n, 3) or (n, 2, 3), sRGB [0..255]; None keeps them."""
         segments = np.asarray(segments, np.float32).reshape(-1, 2, 3)
@@ -82,24 +88,7 @@ def closed_loops(ring: np.ndarray) -> np.ndarray:
     return np.stack([ring, np.roll(ring, -1, axis=-2)], axis=-2)
 
 
-def circle_corners(centre: np.ndarray, radius: float, sides: int = 40) -> np.ndarray:
-    """Return the corners of a horizontal circle around a point (3,): (sides, 3)."""
+def circle(centre: np.ndarray, radius: float, sides: int = 48) -> np.ndarray:
+    """Return a horizontal circle around a point (3,) as segments: (sides, 2, 3)."""
     turn = np.linspace(0, 2 * np.pi, sides, endpoint=False)
-    return centre + radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(sides)], axis=-1)
-
-
-class SegmentBatch:
-    """Segments of several colours for one node."""
-
-    def __init__(self) -> None:
-        self._lines: list[np.ndarray] = [np.zeros((0, 2, 3))]
-        self._colours: list[np.ndarray] = [np.zeros((0, 3))]
-
-    def add(self, lines: np.ndarray, colour: np.ndarray) -> None:
-        """Add segments (n, 2, 3) of one colour (3,), or of one each (n, 3)."""
-        self._lines.append(lines.reshape(-1, 2, 3))
-        self._colours.append(np.broadcast_to(colour, (len(self._lines[-1]), 3)))
-
-    def all(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return all segments and colours for `Strokes.draw`."""
-        return np.concatenate(self._lines), np.concatenate(self._colours)
+    return closed_loops(centre + radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(sides)], axis=-1))

@@ -9,7 +9,7 @@ import viser
 
 from viewer.browser.http_server import Browser
 from viewer.export import Export
-from viewer.panels.detail import clip
+from viewer.panels.detail import MAX_TEXT
 from viewer.panels.panels import Panels
 from viewer.scene.camera import IN_VIEW_M, Camera, within_reach
 from viewer.scene.fleet_arrays import LOST, MISMATCH, FleetArrays, display_status
@@ -20,6 +20,7 @@ from viewer.scene.selection.selected import BEYOND_S, Selection
 from viewer.store.place import UNIT_M, SceneFrame
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
+from viewer.theme.events import clip
 from viewer.theme.palette import Palette
 from viewer.timeline.deck import Timeline
 from viewer.timeline.recordings import RecordingStore
@@ -77,7 +78,7 @@ class View:
         self._error = error
         with contextlib.suppress(RuntimeError, AssertionError):  # the page may be closing
             self.panels.show_error(
-                f"This page could not be drawn ({clip(error)}) and may show old data; other pages continue. "
+                f"This page could not be drawn ({clip(error, MAX_TEXT)}) and may show old data; other pages continue. "
                 "Reload it; if the error remains, see the log of the viewer."
             )
         return True

@@ -25,7 +25,7 @@ from fleet.contract import (
     Verdict,
 )
 from viewer.store.inbox import SampleSubset
-from viewer.theme.events import LATEST, MAX_ALERTS, EventKind, TimelineEvent
+from viewer.theme.events import LATEST, MAX_ALERTS, EventKind, TimelineEvent, clip
 
 # MAV_CMD. Source: MAVLink common.xml.
 WAYPOINT, LOITER_UNLIM, LOITER_TURNS, LOITER_TIME, RTL, LAND, TAKEOFF, LOITER_TO_ALT = 16, 17, 18, 19, 20, 21, 22, 31
@@ -81,8 +81,7 @@ def detect_events(state: DetectorState, message: Any) -> Detection:
     Raises:
         ValueError: when rows of a sample have a wrong shape; the gateway must resend.
     """
-    detector = _DETECTORS.get(type(message))
-    if detector is None:
+    if (detector := _DETECTORS.get(type(message))) is None:
         return state, []
     state, events = detector(state, message)
     return state, [event for event in events if 0 < event.t < LATEST]
@@ -95,7 +94,7 @@ def _status(state: DetectorState, status: Status) -> Detection:
     state, events = _link(state, status.t, lost) if state.lost is not None else (state, [])
     state = state._replace(status_t=status.t)
     if status.mode and status.mode != state.mode:
-        events.append(TimelineEvent(status.t, EventKind.MODE, _clip(status.mode)))
+        events.append(TimelineEvent(status.t, EventKind.MODE, clip(status.mode, MAX_TEXT)))
     if status.armed != state.armed:
         kind = EventKind.ARMED if status.armed else EventKind.DISARMED
         events.append(TimelineEvent(status.t, kind, kind.value))
@@ -108,12 +107,8 @@ def _status(state: DetectorState, status: Status) -> Detection:
 def _link(state: DetectorState, t: float, lost: bool) -> Detection:
     if lost == bool(state.lost):
         return state, []
-    event = (
-        TimelineEvent(t, EventKind.LINK_LOST, "link lost")
-        if lost
-        else TimelineEvent(t, EventKind.LINK_RESTORED, "link back")
-    )
-    return state._replace(lost=lost), [event]
+    kind, text = (EventKind.LINK_LOST, "link lost") if lost else (EventKind.LINK_RESTORED, "link back")
+    return state._replace(lost=lost), [TimelineEvent(t, kind, text)]
 
 
 def _alert(state: DetectorState, alert: Alert) -> Detection:
@@ -123,9 +118,8 @@ def _alert(state: DetectorState, alert: Alert) -> Detection:
         return state, []
     name = alert.kind.value.replace("_", " ") + (f" with uav-{alert.other}" if alert.other >= 0 else "")
     if not alert.active:
-        return state._replace(raised=state.raised - {alert.about}), [
-            TimelineEvent(alert.t, EventKind.CLEARED, f"{name} cleared")
-        ]
+        state = state._replace(raised=state.raised - {alert.about})
+        return state, [TimelineEvent(alert.t, EventKind.CLEARED, f"{name} cleared")]
     if len(state.raised) >= MAX_ALERTS:
         return state, []
     text = _without_uav_prefix(alert.sentence, alert.uav) or name
@@ -141,11 +135,8 @@ def _mismatch(state: DetectorState, mismatch: Mismatch) -> Detection:
     state = state._replace(mismatch=names)
     if not reported:
         return state, [TimelineEvent(mismatch.t, EventKind.CLEARED, "mismatch cleared")]
-    return state, [
-        TimelineEvent(
-            mismatch.t, EventKind.MISMATCH, _without_uav_prefix(mismatch.sentence, mismatch.uav) or "mismatch"
-        )
-    ]
+    text = _without_uav_prefix(mismatch.sentence, mismatch.uav) or "mismatch"
+    return state, [TimelineEvent(mismatch.t, EventKind.MISMATCH, text)]
 
 
 def _mission(state: DetectorState, mission: Mission) -> Detection:
@@ -173,9 +164,8 @@ def _sample(state: DetectorState, sample: SampleSubset) -> Detection:
     steps = np.flatnonzero(np.diff(seqs, prepend=state.seq))[-MAX_STEPS:]
     if not len(steps):
         return state, []
-    events = [
-        TimelineEvent(float(t[k]), EventKind.ITEM, _item(state.items, int(seqs[k]))) for k in steps if seqs[k] > 0
-    ]
+    changes = [(float(t[k]), int(seqs[k])) for k in steps if seqs[k] > 0]
+    events = [TimelineEvent(at, EventKind.ITEM, _item(state.items, seq)) for at, seq in changes]
     return state._replace(seq=int(seqs[-1])), events
 
 
@@ -225,11 +215,11 @@ def _prediction(state: DetectorState, prediction: Prediction) -> Detection:
     """Detect the event that restarted a prediction, once."""
     if prediction.event is None or prediction.event_t == state.prediction_event_t:
         return state, []
-    kind = _PREDICTION_EVENTS.get(prediction.event)
-    text = _clip(prediction.event_text) or prediction.event.value.replace("_", " ")
-    return state._replace(prediction_event_t=prediction.event_t), [
-        TimelineEvent(prediction.event_t, kind, text)
-    ] if kind else []
+    state = state._replace(prediction_event_t=prediction.event_t)
+    if (kind := _PREDICTION_EVENTS.get(prediction.event)) is None:
+        return state, []
+    text = clip(prediction.event_text, MAX_TEXT) or prediction.event.value.replace("_", " ")
+    return state, [TimelineEvent(prediction.event_t, kind, text)]
 
 
 def _outcome(verdict: Verdict) -> str:
@@ -237,11 +227,7 @@ def _outcome(verdict: Verdict) -> str:
 
 
 def _without_uav_prefix(sentence: str, uav: int) -> str:
-    return _clip(sentence.removeprefix(f"uav-{uav}: "))
-
-
-def _clip(text: str) -> str:
-    return text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 1] + "…"
+    return clip(sentence.removeprefix(f"uav-{uav}: "), MAX_TEXT)
 
 
 _DETECTORS: dict[type, Callable[[DetectorState, Any], Detection]] = {

@@ -5,9 +5,10 @@ fleet only what is drawn is decoded.
 """
 
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from functools import cache
+from itertools import takewhile
 from math import inf, isfinite
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from fleet.access.roles import TOPIC_RULES
 from fleet.bus.bus_protocol import RawMessage
 from fleet.bus.codec import Stamp
 from fleet.contract import Array, Rows, Sample
+from viewer.theme.events import LATEST
 
 LARGE_FLEET = 300  # UAVs above which only the newest sample of each is decoded
 MAX_QUEUED = 40  # queued samples of one UAV; then the newest replaces the last
@@ -63,51 +65,66 @@ def decode_sample(payload: bytes) -> SampleSubset:
         ) from None
 
 
-class QueuedMessage:
-    """Queued payload, its arrival time, monotonic [s], and its fencing token; slots make it cheap to create."""
+class QueuedMessage(NamedTuple):
+    """Undecoded message."""
 
-    __slots__ = ("now", "payload", "stamp")
-
-    def __init__(self, payload: bytes, now: float, stamp: Stamp | None = None) -> None:
-        self.payload, self.now, self.stamp = payload, now, stamp
-
-
-class PendingMessages(NamedTuple):
-    """Queued messages of one UAV and the arrival time of the first, monotonic [s]."""
-
-    first_received: float
-    messages: list[QueuedMessage]
+    payload: bytes
+    now: float  # arrival, monotonic [s]
+    stamp: Stamp | None = None  # fencing token
 
 
-class Inbox:
-    """Queue of samples; the caller must own one common lock to fill or empty it."""
+class CoalescingQueue:
+    """Queue of messages per UAV, in order of the first one; the caller must own one common lock to fill or empty it."""
 
     def __init__(self) -> None:
+        self._pending: dict[int, tuple[float, list[QueuedMessage]]] = {}  # arrival of the first, monotonic [s]
+
+    def add(self, uav: int, message: QueuedMessage, *, keep: bool = False) -> bool:
+        """Queue a message in place of the previous one, or with `keep` after it; return False beyond `MAX_UAVS`."""
+        pending = self._pending.get(uav)
+        if pending is None:
+            if len(self._pending) >= MAX_UAVS:
+                return False
+            self._pending[uav] = message.now, [message]
+        elif keep and len(pending[1]) < MAX_QUEUED:
+            pending[1].append(message)
+        else:
+            pending[1][-1] = message
+        return True
+
+    def take(self, uavs: Iterable[int] | None = None) -> list[tuple[int, QueuedMessage]]:
+        """Remove and return the messages of all or some UAVs, each UAV in order of arrival."""
+        taken = [(uav, self._pending.pop(uav, None)) for uav in (list(self._pending) if uavs is None else uavs)]
+        return [(uav, message) for uav, pending in taken if pending is not None for message in pending[1]]
+
+    def waiting_since(self, before: float) -> list[int]:
+        """Return the UAVs with a message queued since before a time, monotonic [s]."""
+        return [uav for uav, _ in takewhile(lambda item: item[1][0] <= before, self._pending.items())]
+
+
+class Inbox(CoalescingQueue):
+    """Queue of samples."""
+
+    def __init__(self) -> None:
+        super().__init__()
         self.large_fleet = False
         self.full_rate_uavs: frozenset[int] = frozenset()  # UAVs of which every sample is kept, also in a large fleet
         self.dropped = 0  # messages without a UAV id, or beyond the limit
-        self._pending: dict[int, PendingMessages] = {}  # oldest first
         self._leg_changed_uavs: set[int] = set()  # UAVs whose last queued sample changes the mission item
         self._last_leg: dict[int, bytes] = {}  # last mission item of each UAV
 
     def put(self, samples: list[RawMessage], now: float) -> None:
         """Queue samples in order of arrival."""
-        large_fleet, full_rate, leg_changed = self.large_fleet, self.full_rate_uavs, self._leg_changed_uavs
+        leg_changed = self._leg_changed_uavs
         for uav, payload, _, _ in samples:
             if uav is None:
                 self.dropped += 1
                 continue
-            is_new_leg = large_fleet and _LEG_KEY in payload and self._is_new_leg(uav, payload)
-            pending = self._pending.get(uav)
-            if pending is None:
-                if len(self._pending) >= MAX_UAVS:
-                    self.dropped += 1
-                    continue
-                self._pending[uav] = PendingMessages(now, [QueuedMessage(payload, now)])
-            elif (not large_fleet or uav in full_rate or uav in leg_changed) and len(pending.messages) < MAX_QUEUED:
-                pending.messages.append(QueuedMessage(payload, now))
-            else:
-                pending.messages[-1] = QueuedMessage(payload, now)
+            is_new_leg = self.large_fleet and _LEG_KEY in payload and self._is_new_leg(uav, payload)
+            keep = not self.large_fleet or uav in self.full_rate_uavs or uav in leg_changed
+            if not self.add(uav, QueuedMessage(payload, now), keep=keep):
+                self.dropped += 1
+                continue
             leg_changed.discard(uav)
             if is_new_leg:
                 leg_changed.add(uav)
@@ -123,55 +140,9 @@ class Inbox:
             self._last_leg[uav] = leg.data
         return previous != leg.data
 
-    def take(self, uavs: Iterable[int] | None = None) -> Iterator[tuple[int, QueuedMessage]]:
-        """Remove and yield the messages of all or some UAVs, each UAV in order of arrival."""
-        for uav in list(self._pending) if uavs is None else uavs:
-            if (pending := self._pending.pop(uav, None)) is not None:
-                self._leg_changed_uavs.discard(uav)
-                yield from ((uav, message) for message in pending.messages)
-
-    def waiting_since(self, before: float) -> list[int]:
-        """Return the UAVs with a message queued since before a time, monotonic [s]."""
-        uavs = []
-        for uav, pending in self._pending.items():
-            if pending.first_received > before:
-                break
-            uavs.append(uav)
-        return uavs
-
-
-class CoalescingQueue:
-    """Queue of the newest message per UAV; a message is due `wait_s` after the first one it replaced."""
-
-    def __init__(self, wait_s: float) -> None:
-        self._wait_s = wait_s
-        self._pending: dict[int, tuple[float, QueuedMessage]] = {}  # first arrival, monotonic [s]; oldest first
-
-    def put(self, uav: int, message: QueuedMessage) -> None:
-        """Queue a message in place of the previous one."""
-        previous = self._pending.get(uav)
-        if previous is not None or len(self._pending) < MAX_UAVS:
-            self._pending[uav] = (previous[0] if previous is not None else message.now), message
-
-    def drop(self, uav: int) -> None:
-        """Discard the queued message of a UAV."""
-        self._pending.pop(uav, None)
-
-    def due(self, now: float) -> list[tuple[int, QueuedMessage]]:
-        """Remove and return the messages that are due at `now`, monotonic [s]."""
-        messages = []
-        while (
-            self._pending
-            and (uav := next(iter(self._pending))) is not None
-            and self._pending[uav][0] + self._wait_s <= now
-        ):
-            messages.append((uav, self._pending.pop(uav)[1]))
-        return messages
-
 
 UNDATED_EPOCH_S = 946_684_800.0  # 2000-01-01: start time of a log without a date [s since 1970]
 MAX_UNDATED_S = 30 * 86_400.0  # longest undated log; later times have a date [s]
-LATEST = 4e9  # later times are invalid [s since 1970]
 RATE_WINDOW_S = 2.0  # wall time over which the rate is measured [s]
 COAST_S = 1.0  # data time advances at the last rate for this long without data, then at 1 [s]
 REALTIME_TOLERANCE = 0.2  # a rate within this of 1 is real time
@@ -248,17 +219,13 @@ def last_row(x: Array) -> tuple[float, ...]:
     Raises:
         ValueError: when dtype, shape and byte count disagree; correct the sender.
     """
-    shape = x.shape
-    if len(shape) != 2 or not shape[0]:
+    if len(x.shape) != 2 or not x.shape[0]:
         return ()
-    if (
-        x.dtype not in _STRUCT_CODES
-        or not 0 < shape[1] < 100
-        or len(x.data) != shape[0] * _packed(x.dtype, shape[1]).size
-    ):
+    n, width = x.shape
+    if x.dtype not in _STRUCT_CODES or not 0 < width < 100 or len(x.data) != n * _packed(x.dtype, width).size:
         return tuple(map(float, x.numpy()[-1]))  # raises with the reason
-    pack = _packed(x.dtype, shape[1])
-    return pack.unpack_from(x.data, (shape[0] - 1) * pack.size)
+    pack = _packed(x.dtype, width)
+    return pack.unpack_from(x.data, (n - 1) * pack.size)
 
 
 def position_rows(uav: int, rows: Rows) -> tuple[Any, Any]:

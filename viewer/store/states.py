@@ -11,28 +11,15 @@ from viewer.theme.palette import Palette
 MAX_TEXT = 300  # characters of a received text
 
 
-class RouterStatus:
-    """Availability of the router."""
-
-    def __init__(self) -> None:
-        self._lost_since: float | None = None
-
-    def describe(self, available: bool, now: float) -> str:
-        """Describe a missing router and for how long; empty while it is available. `now` is monotonic [s]."""
-        if available:
-            self._lost_since = None
-            return ""
-        self._lost_since = now if self._lost_since is None else self._lost_since
-        return (
-            f"<b>No router</b> for {now - self._lost_since:.0f} s at the configured endpoint. "
+def notices(store: FleetStore, ground: str, palette: Palette, now: float) -> str:
+    """Return the notices as HTML cards; `ground` is the text for terrain files, `now` monotonic [s]."""
+    notes = []
+    if (lost_s := store.router_lost_s(now)) is not None:
+        notes.append(
+            f"<b>No router</b> for {lost_s:.0f} s at the configured endpoint. "
             "The page shows the last received data. Start <code>zenohd</code> or <code>fleet up</code>, or choose "
             "another <code>--router</code>; the page reconnects automatically."
         )
-
-
-def notices(store: FleetStore, router: str, ground: str, palette: Palette) -> str:
-    """Return the notices as HTML cards; `router` and `ground` are the texts for router and terrain files."""
-    notes = [router] if router else []
     notes += [f"<b>No ground</b>: {escape(ground)}"] if ground else []
     if store.rejected_uavs:
         notes.append(

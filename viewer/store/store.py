@@ -12,7 +12,6 @@ from fleet.bus.bus_protocol import WRITER_TIMEOUT_S, Bus, EpochFence, RawMessage
 from fleet.bus.codec import Stamp, decode_for_key, encoding
 from fleet.contract import (
     Alert,
-    AlertKind,
     FleetState,
     GatewayCounters,
     Mismatch,
@@ -53,12 +52,13 @@ class FleetStore:
         self.links: dict[str, str] = {}  # texts of gateways about their links
         self.rejected_uavs: set[int] = set()  # UAVs beyond MAX_VEHICLES
         self.started = clock()
+        self._router_lost_since: float | None = None
         self.lock = threading.Lock()
         self._bus, self._clock, self._fence = bus, clock, EpochFence(clock)
         handlers: dict[type, Callable[[Any, Stamp | None, float], None]] = {
             Sample: self._sample,
-            Status: self._latest_setter("status"),
-            Mission: self._latest_setter("mission"),
+            Status: self._latest,
+            Mission: self._latest,
             GatewayCounters: self._account,
             Model: self._model,
             Prediction: self._prediction,
@@ -68,9 +68,7 @@ class FleetStore:
         }
         self._handlers = handlers
         self.immediate_uavs: frozenset[int] = frozenset()  # UAVs decoded on arrival, also in a large fleet
-        self._coalescing: dict[type, CoalescingQueue] = {
-            kind: CoalescingQueue(wait_s) for kind, wait_s in COALESCE_S.items()
-        }
+        self._coalescing: dict[type, CoalescingQueue] = {kind: CoalescingQueue() for kind in COALESCE_S}
         for kind in handlers:
             bus.subscribe_buffered(kind, self._receiver(kind))
 
@@ -107,11 +105,11 @@ class FleetStore:
         self._bus.dispatch((Sample,) if self.inbox.large_fleet else ())
         with self.lock:
             for kind, queue in self._coalescing.items():
-                for uav, queued in queue.due(self._clock()):
+                for uav, queued in queue.take(queue.waiting_since(self._clock() - COALESCE_S[kind])):
                     self._decode(kind, uav, queued)
 
     def _receiver(self, kind: type) -> Callable[[list[RawMessage]], None]:
-        """Return the callback of one class: it queues samples and deferrable messages and decodes the others."""
+        """Return the callback of one class: it queues samples and messages that may wait and decodes the others."""
         queue, expected_encoding = self._coalescing.get(kind), encoding(kind)
 
         def receive(messages: list[RawMessage]) -> None:
@@ -123,12 +121,12 @@ class FleetStore:
                     return self.inbox.put(valid, now)
                 for uav, payload, _, stamp in valid:
                     message = QueuedMessage(payload, now, stamp)
-                    if queue is None or uav is None or not self._is_deferrable(kind, uav):
-                        if queue is not None and uav is not None:
-                            queue.drop(uav)
-                        self._decode(kind, uav, message)
-                    else:
-                        queue.put(uav, message)
+                    if queue is not None and uav is not None:
+                        if self._is_deferrable(kind, uav):
+                            queue.add(uav, message)
+                            continue
+                        queue.take((uav,))  # outdated by this one
+                    self._decode(kind, uav, message)
 
         return receive
 
@@ -164,10 +162,13 @@ class FleetStore:
                 self._counts["strange"] += 1
         self.inbox.large_fleet = len(self._vehicles) > LARGE_FLEET
 
-    @property
-    def router_available(self) -> bool:
-        """Return whether a router is connected."""
-        return bool(self._bus.router)
+    def router_lost_s(self, now: float) -> float | None:
+        """Return for how long the router is missing [s], since the first call without it; None while connected."""
+        if self._bus.router:
+            self._router_lost_since = None
+            return None
+        self._router_lost_since = now if self._router_lost_since is None else self._router_lost_since
+        return now - self._router_lost_since
 
     @property
     def sample_key(self) -> str:
@@ -177,16 +178,14 @@ class FleetStore:
     def request_latest(self) -> None:
         """Request the latest messages published before the start; keep newer ones."""
         for kind in INITIAL_TOPICS:
-            handle = self._locked_handler(kind)
             for message, stamp in self._bus.get(kind):
-                if not self._has_newer(message):
-                    handle(message, stamp)
-
-    def _has_newer(self, message: Any) -> bool:
-        """Return whether an equally new message arrived during the request."""
-        with self.lock:
-            current = getattr(self._vehicles.get(getattr(message, "uav", -1)), message.topic, None)
-        return current is not None and current.t >= message.t
+                with self.lock:
+                    current = getattr(self._vehicles.get(getattr(message, "uav", -1)), message.topic, None)
+                    if current is not None and current.t >= message.t:
+                        continue
+                    if not self.inbox.large_fleet:
+                        self._read_samples()
+                    self._handle(kind, message, stamp, self._clock())
 
     def all(self) -> list[Vehicle]:
         """Return snapshots of all UAVs in the order of their ids."""
@@ -202,15 +201,12 @@ class FleetStore:
         Returns:
             scene ENU (n, 3) [10 m], NaN where unknown; phi theta psi (n, 3) [rad]; monotonic (n,) [s]
         """
-        no_position = np.full(3, np.nan)
         with self.lock:
             self._read_samples(uavs if self.inbox.large_fleet else None)
             vehicles = [self._vehicles[uav] for uav in uavs]
-            positions = [vehicle.at if vehicle.at is not None else no_position for vehicle in vehicles]
-            attitudes, received = (
-                [vehicle.attitude for vehicle in vehicles],
-                [vehicle.sample_received for vehicle in vehicles],
-            )
+            positions = [vehicle.at if vehicle.at is not None else [np.nan] * 3 for vehicle in vehicles]
+            attitudes = [vehicle.attitude for vehicle in vehicles]
+            received = [vehicle.sample_received for vehicle in vehicles]
         return np.array(positions).reshape(-1, 3), np.array(attitudes).reshape(-1, 3), np.array(received)
 
     def get(self, uav: int) -> Vehicle | None:
@@ -228,12 +224,12 @@ class FleetStore:
     def trail(self, vehicle: Vehicle) -> np.ndarray:
         """Copy the flown trail: (n, 5) data time [s], scene ENU [10 m], Va [m/s]."""
         with self.lock:
-            return vehicle.trail.rows()
+            return vehicle.trail_rows()
 
     def track(self, vehicle: Vehicle) -> np.ndarray:
         """Copy the whole flown path, thinned: (n, 4) data time [s], scene ENU [10 m]."""
         with self.lock:
-            return vehicle.track.rows()
+            return vehicle.track_rows()
 
     def past(self, vehicle: Vehicle) -> list[PastPrediction]:
         """Copy the past predictions of the last minute, oldest first."""
@@ -244,17 +240,6 @@ class FleetStore:
         """Copy the history of fits: (n, 2) data time [s], mean over the states [%]."""
         with self.lock:
             return np.array(vehicle.fits, float).reshape(-1, 2)
-
-    def _locked_handler(self, kind: type) -> Callable[[Any, Stamp | None], None]:
-        """Return a handler of one class that takes the lock and counts malformed messages."""
-
-        def handle(message: Any, stamp: Stamp | None) -> None:
-            with self.lock:
-                if not self.inbox.large_fleet:
-                    self._read_samples()
-                self._handle(kind, message, stamp, self._clock())
-
-        return handle
 
     def _handle(self, kind: type, message: Any, stamp: Stamp | None, now: float) -> None:
         try:
@@ -291,23 +276,16 @@ class FleetStore:
                 now - v.sample_received < WRITER_TIMEOUT_S for v in other_vehicles
             ):
                 raise
-            self._set_frame(SceneFrame(origin))
+            self._scene_frame = SceneFrame(origin)  # no UAV flies near the old one, as after a wrong first position
+            for other in self._vehicles.values():
+                other.reset()
             vehicle.update_from_sample(sample, self._scene_frame, now)
         vehicle.process(sample, now)
 
-    def _set_frame(self, scene_frame: SceneFrame) -> None:
-        """Move the scene origin: no UAV flies near the old one, as after a wrong first position."""
-        self._scene_frame = scene_frame
-        for vehicle in self._vehicles.values():
-            vehicle.reset()
-
-    def _latest_setter(self, name: str) -> Callable[[Any, Stamp | None, float], None]:
-        def set_latest(message: Any, _: Stamp | None, now: float) -> None:
-            vehicle = self._vehicle(message.uav)
-            setattr(vehicle, name, message)
-            vehicle.process(message, now)
-
-        return set_latest
+    def _latest(self, message: Any, _: Stamp | None, now: float) -> None:
+        vehicle = self._vehicle(message.uav)
+        setattr(vehicle, message.topic, message)
+        vehicle.process(message, now)
 
     def _accept(self, vehicle: Vehicle, stamp: Stamp | None, now: float) -> bool:
         """Return whether the fencing token of a worker message is current for a UAV."""
@@ -386,10 +364,10 @@ class FleetStore:
             if row.state is not TwinState.UNCLAIMED and self._accept(vehicle, stamp_of(row), now):
                 vehicle.row = row
 
-    def alerts(self) -> list[tuple[Vehicle, AlertKind, Alert]]:
+    def alerts(self) -> list[tuple[Vehicle, Alert]]:
         """Return the active alerts, newest first."""
         with self.lock:
             now = self._clock()
             copies = [vehicle.snapshot(now) for vehicle in self._vehicles.values() if vehicle.alerts]
-            active = [(copy, alert.kind, alert) for copy in copies for alert in copy.alerts.values()]
-        return sorted(active, key=lambda entry: -entry[2].t)
+            active = [(copy, alert) for copy in copies for alert in copy.alerts.values()]
+        return sorted(active, key=lambda entry: -entry[1].t)

@@ -73,6 +73,14 @@ class Vehicle:
     last_updated_forecast: ScenePrediction | None = None  # newest prediction made with current telemetry
     fits: deque = field(default_factory=lambda: deque(maxlen=64))  # t, mean fit [%]
 
+    def trail_rows(self) -> np.ndarray:
+        """Copy the newest stretch of the flown path: (n, 5) data time [s], scene ENU [10 m], Va [m/s]."""
+        return self.trail.rows()
+
+    def track_rows(self) -> np.ndarray:
+        """Copy the whole flown path, thinned: (n, 4) data time [s], scene ENU [10 m]."""
+        return self.track.rows()
+
     @property
     def name(self) -> str:
         """Return the display name of the UAV."""
@@ -110,9 +118,7 @@ class Vehicle:
         copy.state_cache = np.nan, TwinState.WAITING
         if self.recorded and now - self.replay_seen > ENDED_S and now - self.sample_received > ENDED_S:
             copy.ended, copy.events = True, closed_at(self.events, self.time.t)
-            copy.alerts = {
-                about: alert for about, alert in self.alerts.items() if alert.kind is not AlertKind.LINK_LOST
-            }
+            copy.alerts = {key: alert for key, alert in self.alerts.items() if alert.kind is not AlertKind.LINK_LOST}
             copy.forecast = self.last_updated_forecast
             copy.prediction = copy.forecast.message if copy.forecast is not None else self.prediction
         return copy
@@ -143,18 +149,13 @@ class Vehicle:
         """Update data time and events from a message."""
         if isinstance(message, SampleSubset | Status) and abs(message.t - self.t) < OTHER_FLIGHT_S:  # also rejects NaN
             self.time = self.time.update(message.t, now)
-        if isinstance(message, SampleSubset) and self._leg_unchanged(message):
-            return
+        if isinstance(message, SampleSubset):
+            leg, active = message.leg, (self.detector_state.seq,)
+            if leg is None or (leg.x.shape == (1, 1) and leg.t.shape == (1,) and last_row(leg.x) == active):
+                return
         self.detector_state, new_events = detect_events(self.detector_state, message)
         if new_events:
             self.events = merged(self.events, new_events)
-
-    def _leg_unchanged(self, sample: SampleSubset) -> bool:
-        """Return whether a sample has no mission item or the active one."""
-        leg = sample.leg
-        return leg is None or (
-            leg.x.shape == (1, 1) and leg.t.shape == (1,) and last_row(leg.x) == (self.detector_state.seq,)
-        )
 
     def position(self, now: float) -> np.ndarray | None:
         """Return the position to draw, (3,) [10 m]: last sample, or the prediction when the link is lost."""

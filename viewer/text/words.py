@@ -226,7 +226,7 @@ def alerts_html(fleet: list[Vehicle], store: FleetStore, palette: Palette, pick:
         (v, "mismatch", item.t, short_text(item))
         for v, item in sorted(mismatched, key=lambda item: -item[1].t)[:MAX_ROWS]
     ]
-    alert_rows = [(v, kind.value.replace("_", " "), a.t, a.sentence) for v, kind, a in store.alerts()[:MAX_ROWS]]
+    alert_rows = [(v, a.kind.value.replace("_", " "), a.t, a.sentence) for v, a in store.alerts()[:MAX_ROWS]]
     cards = "".join(
         f'<div class="say pick" style="border-color:{palette.mismatch}" '
         f'onpointerdown="{pick.format(encode_click(vehicle.uav, t))}">'

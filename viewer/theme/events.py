@@ -65,3 +65,8 @@ def closed_at(events: tuple[TimelineEvent, ...], t: float) -> tuple[TimelineEven
     """End the events at the end of the recording, t [s]; drop a link loss after it."""
     remaining = tuple(event for event in events if event.t <= t or event.kind is not EventKind.LINK_LOST)
     return merged(remaining, [TimelineEvent(t, EventKind.END, "end of the recording")] if 0 < t < LATEST else [])
+
+
+def clip(text: str, n: int) -> str:
+    """Truncate a received text to n characters."""
+    return text if len(text) <= n else text[: n - 1] + "…"

@@ -7,7 +7,6 @@ import numpy as np
 from fleet.contract import TwinState
 from viewer.theme.events import EventKind
 
-
 STATE_STYLE = {  # glyph and `Palette` field of each state, the most severe first
     TwinState.LINK_LOST: ("✕", "lost"),
     TwinState.UNCLAIMED: ("○", "muted"),

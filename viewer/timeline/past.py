@@ -21,17 +21,6 @@ PAST_S = 60.0  # age of the past predictions [s]
 NO_PREDICTION = (TwinState.IDENTIFYING, TwinState.WAITING, TwinState.UNCLAIMED)  # states without a predicted path
 
 
-class PathRows:
-    """Path up to the time shown, with the interface of `FlightTrack` and `Trail`."""
-
-    def __init__(self, rows: np.ndarray) -> None:
-        self._rows = rows
-
-    def rows(self) -> np.ndarray:
-        """Return all points, (n, 4) or (n, 5): t [s], scene ENU [10 m], for a trail also Va [m/s]."""
-        return self._rows
-
-
 class PastVehicle(Vehicle):
     """One UAV at a past time; immutable, its histories end there."""
 
@@ -60,15 +49,13 @@ class PastVehicle(Vehicle):
         """Return True: it is replayed, so trails use data time."""
         return True
 
-    @property
-    def trail(self) -> PathRows:  # type: ignore[override]
-        """Return the fine trail up to the time shown: time [s], scene ENU [10 m], Va [m/s]."""
-        return PathRows(self.recording.trail_rows(self.shown_t - TRAIL_S, self.t))
+    def trail_rows(self) -> np.ndarray:
+        """Return the fine trail up to the time shown: (n, 5) time [s], scene ENU [10 m], Va [m/s]."""
+        return self.recording.trail_rows(self.shown_t - TRAIL_S, self.t)
 
-    @property
-    def track(self) -> PathRows:  # type: ignore[override]
-        """Return the recorded path up to the time shown."""
-        return PathRows(self.recording.path(-np.inf, self.t))
+    def track_rows(self) -> np.ndarray:
+        """Return the recorded path up to the time shown: (n, 4) time [s], scene ENU [10 m]."""
+        return self.recording.path(-np.inf, self.t)
 
     @property
     def past(self) -> list[ScenePrediction]:  # type: ignore[override]
@@ -121,7 +108,7 @@ def vehicle_at(vehicle: Vehicle, recording: UavRecording, shown_t: float, rate: 
     return past
 
 
-_OVERRIDDEN = ("trail", "track", "past", "fits", "events")
+_OVERRIDDEN = ("past", "fits", "events")
 
 
 def _past_fields(

@@ -7,7 +7,7 @@ import numpy as np
 from viewer.scene.labels import Tag
 from viewer.store.inbox import time_of_day
 from viewer.store.track import positions_at
-from viewer.theme.events import EventKind, TimelineEvent
+from viewer.theme.events import EventKind, TimelineEvent, clip
 from viewer.theme.palette import Palette, mesh_colour, rgb
 from viewer.theme.shapes import diamond
 
@@ -16,12 +16,8 @@ MAX_LABELS = 3  # more labels would overlap
 MAX_TEXT = 26  # characters of a label
 CLEARANCE = 3.0  # distance of a label to the aircraft and other labels [drawn spans of an aircraft]
 RADIUS = 0.22  # marker radius [drawn spans of an aircraft]
-MINOR_KINDS = {
-    EventKind.ITEM,
-    EventKind.MISSION,
-    EventKind.ACCEPTED,
-    EventKind.UNVERIFIED,
-}  # frequent: smaller, without label
+# frequent kinds: smaller, without label
+MINOR_KINDS = {EventKind.ITEM, EventKind.MISSION, EventKind.ACCEPTED, EventKind.UNVERIFIED}
 MODEL_KINDS = {EventKind.VERIFIED, EventKind.NO_MODEL}  # the label shows only the text before the colon
 
 
@@ -58,14 +54,10 @@ class EventMarkers:
         """
         points = positions_at(rows, np.array([event.t for event in events]))
         located = [(event, point) for event, point in zip(events, points, strict=True) if np.isfinite(point).all()]
-        located = sorted(located, key=lambda entry: entry[0].kind not in MINOR_KINDS)[
-            -MAX_MARKERS:
-        ]  # major events take precedence
-        positions, scales, colours = (
-            np.zeros((MAX_MARKERS, 3)),
-            np.zeros(MAX_MARKERS, np.float32),
-            np.zeros((MAX_MARKERS, 3)),
-        )
+        located.sort(key=lambda entry: entry[0].kind not in MINOR_KINDS)  # major events take precedence
+        located = located[-MAX_MARKERS:]
+        positions, colours = np.zeros((MAX_MARKERS, 3)), np.zeros((MAX_MARKERS, 3))
+        scales = np.zeros(MAX_MARKERS, np.float32)
         for k, (event, point) in enumerate(located):
             positions[k], colours[k] = point, rgb(self._palette.event(event.kind))
             scales[k] = RADIUS * size * (0.6 if event.kind in MINOR_KINDS else 1.0)
@@ -104,8 +96,7 @@ def labelled_events(
 def event_text(event: TimelineEvent) -> str:
     """Describe an event in one short line."""
     text = event.text.split(":")[0] if event.kind in MODEL_KINDS else event.text
-    text = text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 1] + "…"
-    return f"{event.kind.glyph} {text} {time_of_day(event.t)}"
+    return f"{event.kind.glyph} {clip(text, MAX_TEXT)} {time_of_day(event.t)}"
 
 
 SIDES = 20  # corners of one ring

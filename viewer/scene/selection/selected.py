@@ -9,7 +9,7 @@ from fleet.contract import DiagnosisOutcome, Mismatch, TwinState
 from viewer.scene.labels import CameraView, Tag
 from viewer.scene.routes import NOTHING, RouteLines
 from viewer.scene.selection.pins import EventMarkers, curtain, marked_look_aheads, rings, sample_paths, tube_faces
-from viewer.scene.strokes import SegmentBatch, Strokes, chain, circle_corners, closed_loops, dash_lines, dashed
+from viewer.scene.strokes import Strokes, chain, circle, closed_loops, dash_lines, dashed
 from viewer.store.forecast import PastPrediction, ScenePrediction
 from viewer.store.store import FleetStore
 from viewer.store.track import positions_at
@@ -20,46 +20,7 @@ from viewer.theme.palette import Palette, mix, rgb, triple
 from viewer.theme.shapes import digit_strokes, face_camera
 
 MAX_NUMBERS = 60  # items up to which numbers are drawn
-
-
-class MissionDrawing:
-    """Two nodes: the route and its active leg."""
-
-    def __init__(self, scene: Any, palette: Palette) -> None:
-        self._palette = palette
-        self._route = Strokes(scene, "/selected/route", 1.6)
-        self._leg = Strokes(scene, "/selected/leg", 3.0)
-
-    def draw(self, route: RouteLines, seq: int, camera_view: CameraView, unit: float) -> None:
-        """Draw a route: legs and loiters solid, jumps and returns dashed, a ring and its number at each item.
-
-        Args:
-            route: lines of the mission
-            seq: active item; -1 when unknown
-            camera_view: view that the numbers face
-            unit: drawn span of an aircraft [10 m]
-        """
-        p, lines, leg = self._palette, SegmentBatch(), SegmentBatch()
-        lines.add(np.concatenate([route.legs, route.circles]), mix(p.route, p.ground, 0.7))
-        lines.add(dash_lines(route.returns, 1.2 * unit), mix(p.route, p.ground, 0.5))
-        for point, item in zip(route.points, route.items.tolist(), strict=True):
-            is_active = item == seq
-            (leg if is_active else lines).add(
-                closed_loops(circle_corners(point, 0.22 * unit, 14)), rgb(p.ink if is_active else p.route)
-            )
-            if len(route.items) <= MAX_NUMBERS:
-                lines.add(
-                    self._number(item, point, camera_view, unit), rgb(p.ink) if is_active else mix(p.ink, p.route, 0.35)
-                )
-        leg.add(route.legs[route.ends == seq], rgb(p.route))
-        self._route.draw(*lines.all())
-        self._leg.draw(*leg.all())
-
-    @staticmethod
-    def _number(item: int, point: np.ndarray, camera_view: CameraView, unit: float) -> np.ndarray:
-        """Return the strokes of an item number beside its ring, facing the camera: (n, 2, 3)."""
-        right, up = camera_view.axes()
-        return face_camera(digit_strokes(str(item), 0.42 * unit), right, up) + point + 0.34 * unit * (right + up)
+Parts = list[tuple[np.ndarray, np.ndarray]]  # segments (n, 2, 3) [10 m] and their colour (3,)
 
 
 def active_seq(vehicle: Vehicle) -> int:
@@ -93,12 +54,8 @@ def hindcast(past: list[PastPrediction], trail: np.ndarray, clock: float) -> tup
         return NO_HINDCAST
     at = np.arange(5.0, reach, 5.0)
     actual = np.stack([np.interp(prediction.t + at, trail[:, 0], trail[:, i]) for i in (1, 2, 3)], axis=-1)
-    lines = np.concatenate(
-        [
-            dashed(prediction.position_at(np.linspace(0, reach, 2 * int(reach) + 2))),
-            np.stack([prediction.position_at(at), actual], axis=1),
-        ]
-    )
+    path = dashed(prediction.position_at(np.linspace(0, reach, 2 * int(reach) + 2)))
+    lines = np.concatenate([path, np.stack([prediction.position_at(at), actual], axis=1)])
     return lines, Tag("then", f"predicted {clock - prediction.t:.0f} s ago", prediction.position_at(0.4 * reach))
 
 
@@ -124,7 +81,9 @@ class Selection:
         self._mismatch = Strokes(scene, "/selected/mismatch", 5.5)
         self._bold = Strokes(scene, "/selected/bold", 2.6)
         self._horizon = Strokes(scene, "/selected/horizon", 4.0)
-        self._event_markers, self._mission = EventMarkers(scene, palette), MissionDrawing(scene, palette)
+        self._route = Strokes(scene, "/selected/route", 1.6)
+        self._leg = Strokes(scene, "/selected/leg", 3.0)
+        self._event_markers = EventMarkers(scene, palette)
         self._trail_start = np.inf  # start of the bright newest stretch of the path [s since 1970]
         self._track_colour = mix(palette.actual, palette.ground, 0.5)
         self.tube = True
@@ -156,32 +115,33 @@ class Selection:
         at, p = vehicle.position(now), self._palette
         if at is None:
             return self.clear()
-        thin, bold, clock = SegmentBatch(), SegmentBatch(), vehicle.data_time(now)
+        clock = vehicle.data_time(now)
         self.tags = [Tag("name", selection_text(vehicle, now), at + np.array([0, 0, 0.85 * unit]), "bottom-center")]
         foot = at * [1, 1, 0] + [0, 0, ground + 0.06]
-        bold.add(closed_loops(circle_corners(foot, 1.1 * unit)), rgb(p.ink))
-        bold.add(closed_loops(circle_corners(at, 0.85 * unit)), rgb(p.ink))
-        thin.add(np.stack([at, foot]), rgb(p.ink))
+        bold = [(circle(foot, 1.1 * unit, 40), rgb(p.ink)), (circle(at, 0.85 * unit, 40), rgb(p.ink))]
+        thin = [(np.stack([at, foot]), rgb(p.ink))]
         trail = store.trail(vehicle)
-        self._trail_start = trail[0, 0] if len(trail) > 1 else np.inf
+        self._trail_start = np.inf
         if len(trail) > 1:
+            self._trail_start = trail[0, 0]
             path = np.vstack([trail[::2], trail[-1:]])
             normal = ~mismatch_text.is_located(path[:, 0], vehicle.mismatch)[1:]
-            bold.add(chain(path[:, 1:4])[normal], rgb(p.actual))
+            bold.append((chain(path[:, 1:4])[normal], rgb(p.actual)))
         self._draw_forecast(vehicle, clock, ground, thin, bold)
         lines, label = hindcast(store.past(vehicle), trail, clock)
-        thin.add(lines, mix(p.horizon, p.ground, 0.85))
+        thin.append((lines, mix(p.horizon, p.ground, 0.85)))
         self.tags += [label] if label is not None else []
-        self._thin.draw(*thin.all())
-        self._bold.draw(*bold.all())
+        self._thin.draw_parts(thin)
+        self._bold.draw_parts(bold)
 
-    def _draw_forecast(
-        self, vehicle: Vehicle, clock: float, ground: float, thin: SegmentBatch, bold: SegmentBatch
-    ) -> None:
+    def _draw_forecast(self, vehicle: Vehicle, clock: float, ground: float, thin: Parts, bold: Parts) -> None:
         forecast, p = vehicle.forecast, self._palette
-        start = max(clock - forecast.t, 0.0) if forecast is not None else 0.0
-        if forecast is None or start >= forecast.horizon_s - 0.2:
-            return self._draw_without_tube(forecast, start, thin)
+        if forecast is None:
+            return self._hide_tube()
+        start = max(clock - forecast.t, 0.0)
+        if start >= forecast.horizon_s - 0.2:
+            self._hide_tube()
+            return thin.append((_beyond_horizon(forecast, start), rgb(p.muted)))
         horizon_s = forecast.horizon_s
         at = np.linspace(start, horizon_s, BANDS * BAND_STEPS + 1)
         path, axes = forecast.position_at(at), forecast.half_axes_at(at)
@@ -190,28 +150,24 @@ class Selection:
             band.vertices = sections[b * BAND_STEPS : (b + 1) * BAND_STEPS + 1].reshape(-1, 3)
             band.visible = self.tube
         self._curtain.vertices, self._curtain.visible = curtain(path, ground)[0], self.tube
-        bold.add(chain(path), rgb(p.ink))
+        bold.append((chain(path), rgb(p.ink)))
         foot = path * [1, 1, 0] + [0, 0, ground + 0.05]
-        thin.add(chain(foot), mix(p.tube, p.ground, 0.5))
-        thin.add(np.stack([path[-1], foot[-1]]), mix(p.horizon, p.ground, 0.5))
+        thin.append((chain(foot), mix(p.tube, p.ground, 0.5)))
+        thin.append((np.stack([path[-1], foot[-1]]), mix(p.horizon, p.ground, 0.5)))
         if self.tube:
-            sample_aheads = np.linspace(start, horizon_s, SAMPLE_STEPS)
-            drawn = sample_paths(
-                forecast.position_at(sample_aheads), forecast.half_axes_at(sample_aheads), SAMPLES, vehicle.uav
-            )
-            thin.add(chain(drawn), mix(p.tube, p.ground, 0.6))
+            at = np.linspace(start, horizon_s, SAMPLE_STEPS)
+            paths = sample_paths(forecast.position_at(at), forecast.half_axes_at(at), SAMPLES, vehicle.uav)
+            thin.append((chain(paths), mix(p.tube, p.ground, 0.6)))
         self._draw_marks(forecast, start, thin)
-        thin.add(_beyond_horizon(forecast, horizon_s), rgb(p.muted))
+        thin.append((_beyond_horizon(forecast, horizon_s), rgb(p.muted)))
 
-    def _draw_marks(self, forecast: ScenePrediction, start: float, thin: SegmentBatch) -> None:
+    def _draw_marks(self, forecast: ScenePrediction, start: float, thin: Parts) -> None:
         """Draw rings of the tube at marked look-aheads and at the horizon."""
         p, horizon_s = self._palette, forecast.horizon_s
         steps = [s for s in marked_look_aheads(horizon_s) if s > start + 1.0][-4:]
-        sections = rings(
-            forecast.position_at(np.array([0.0, *steps, horizon_s])),
-            forecast.half_axes_at(np.array([0.0, *steps, horizon_s])),
-        )[1:]
-        thin.add(closed_loops(sections[:-1]), mix(p.tube, p.ink, 0.7))
+        at = np.array([0.0, *steps, horizon_s])
+        sections = rings(forecast.position_at(at), forecast.half_axes_at(at))[1:]
+        thin.append((closed_loops(sections[:-1]), mix(p.tube, p.ink, 0.7)))
         self._horizon.draw(closed_loops(sections[-1]), rgb(p.horizon))
         claim = "below 10 % to the end" if forecast.message.horizon_open else "error reaches 10 %"
         top = sections[-1][np.argmax(sections[-1][:, 2])]
@@ -223,12 +179,6 @@ class Selection:
         for node in (*self._bands, self._curtain):
             node.visible = False
         self._horizon.draw(NOTHING.legs)
-
-    def _draw_without_tube(self, forecast: ScenePrediction | None, start: float, thin: SegmentBatch) -> None:
-        """Hide band and horizon; draw a path without horizon as grey dashes."""
-        self._hide_tube()
-        if forecast is not None:
-            thin.add(_beyond_horizon(forecast, start), rgb(self._palette.muted))
 
     def draw_flight(self, vehicle: Vehicle, rows: np.ndarray, now: float, unit: float) -> None:
         """Draw the flown path (n, 4) before its newest stretch, with events and mismatch; `unit` as for `draw`."""
@@ -242,8 +192,34 @@ class Selection:
             self.marks.insert(0, Tag("mismatch", f"▲ {mismatch_text.short_text(mismatch)} from here", onset))
 
     def draw_route(self, vehicle: Vehicle, route: RouteLines, camera_view: CameraView, unit: float) -> None:
-        """Draw its mission; numbers face the camera."""
-        self._mission.draw(route, active_seq(vehicle), camera_view, unit)
+        """Draw its mission: legs and loiters solid, jumps and returns dashed, a ring and its number at each item.
+
+        Args:
+            vehicle: the UAV; its active item and leg are highlighted
+            route: lines of the mission
+            camera_view: view that the numbers face
+            unit: drawn span of an aircraft [10 m]
+        """
+        p, seq = self._palette, active_seq(vehicle)
+        right, up = camera_view.axes()
+        lines = [
+            (np.concatenate([route.legs, route.circles]), mix(p.route, p.ground, 0.7)),
+            (dash_lines(route.returns, 1.2 * unit), mix(p.route, p.ground, 0.5)),
+        ]
+        leg = []
+        for point, item in zip(route.points, route.items.tolist(), strict=True):
+            ring = circle(point, 0.22 * unit, 14)
+            if item == seq:
+                leg.append((ring, rgb(p.ink)))
+            else:
+                lines.append((ring, rgb(p.route)))
+            if len(route.items) <= MAX_NUMBERS:
+                number = face_camera(digit_strokes(str(item), 0.42 * unit), right, up)
+                colour = rgb(p.ink) if item == seq else mix(p.ink, p.route, 0.35)
+                lines.append((number + point + 0.34 * unit * (right + up), colour))
+        leg.append((route.legs[route.ends == seq], rgb(p.route)))
+        self._route.draw_parts(lines)
+        self._leg.draw_parts(leg)
 
 
 def _beyond_horizon(forecast: ScenePrediction, start: float) -> np.ndarray:
@@ -278,12 +254,9 @@ def lines(mismatch: Mismatch | None, track: np.ndarray) -> np.ndarray:
         mismatch: the latest mismatch
         track: flown path: data time [s], scene ENU [10 m], (m, 4)
     """
-    segments = [np.zeros((0, 2, 3))]
-    if mismatch is None or mismatch.outcome is DiagnosisOutcome.NONE or len(track) < 2:
-        return segments[0]
-    newest, oldest = float(track[-1, 0]), float(track[0, 0])
-    for begin, last in located_spans(mismatch, newest):
-        if last > (first := max(begin, oldest)):
+    segments = [NOTHING.legs]
+    for begin, last in located_spans(mismatch, float(track[-1, 0])) if len(track) > 1 else []:
+        if last > (first := max(begin, float(track[0, 0]))):
             points = positions_at(track, np.linspace(first, last, min(int(last - first) + 2, MAX_POINTS)))
             segments.append(chain(points[np.isfinite(points).all(axis=1)]))
     return np.concatenate(segments)
@@ -291,12 +264,9 @@ def lines(mismatch: Mismatch | None, track: np.ndarray) -> np.ndarray:
 
 def onset_position(mismatch: Mismatch | None, track: np.ndarray) -> np.ndarray | None:
     """Return the position of the mismatch onset, (3,) [10 m]; None when it is unknown."""
-    if (
-        mismatch is None
-        or mismatch.outcome is DiagnosisOutcome.NONE
-        or mismatch.onset is None
-        or not isfinite(mismatch.onset)
-    ):
+    if mismatch is None or mismatch.outcome is DiagnosisOutcome.NONE:
+        return None
+    if mismatch.onset is None or not isfinite(mismatch.onset):
         return None
     (point,) = positions_at(track, np.array([mismatch.onset]))
     return point if np.isfinite(point).all() else None
