@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Iterator
 from types import SimpleNamespace
-from unittest.mock import MagicMock
+from unittest.mock import MagicMock, call
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from conftest import unused_port
 from fleet.bus.memory_bus import MemoryBus
 from tests.bench.viewing.watcher import Watcher
 from tests.support.pretend_feed import PretendFleet
-from viewer.browser.http_server import PagePreferences, serve, without_stdout
+from viewer.browser.http_server import Browser, serve, without_stdout
 from viewer.panels.panels import NO_UAV
 from viewer.server.app import App
 from viewer.server.view import View
@@ -139,35 +139,42 @@ def test_a_click_is_written_as_it_is_read() -> None:
     )
 
 
-def remembered(text: str | None, *, error: type[Exception] | None = None) -> PagePreferences:
+def remembered(text: str | None, *, error: type[Exception] | None = None) -> Browser:
     client = MagicMock()
     client.local_storage.get_item.side_effect = error
     client.local_storage.get_item.return_value = text
     told = threading.Event()
-    one = PagePreferences(client, told.set)
+    one = Browser(client, DARK, told.set)
     assert told.wait(10)
     return one
 
 
+def remember(view: View, text: str) -> MagicMock:
+    """Let the browser of a page answer with stored preferences; return its storage."""
+    storage = view.browser._storage = MagicMock()
+    storage.get_item.return_value = text
+    view.browser._load_preferences()
+    return storage
+
+
 def test_a_page_that_reloads_has_its_aircraft_and_colours_again(site) -> None:
-    one = remembered('{"uav": 3, "light": true}')
-    assert one.uav == 3 and one.light is True
     view = site.views[0]
-    view.browser.preferences = one
+    storage = remember(view, '{"uav": 3, "light": true}')
+    assert view.browser.uav == 3 and view.browser.light is True
     site.run()
     again = site.app.views[view.client.client_id]
-    assert again.selected == 3 and again.palette is LIGHT and one.uav is None
+    assert again.selected == 3 and again.palette is LIGHT and again.browser.uav is None
     again.select(1)
     site.run()
-    assert one._client.local_storage.set_item.call_args.args[1] == '{"uav": 1, "light": true}'
+    assert call("parauav-page", '{"uav": 1, "light": true}') in storage.set_item.call_args_list
 
 
 def test_colours_are_stored_before_the_page_is_drawn_again(site) -> None:
     view = site.views[0]
-    view.browser.preferences = one = remembered('{"uav": 3, "light": false}')
+    storage = remember(view, '{"uav": 3, "light": false}')
     site.run()
     view.browser.set_theme(light=True)  # a page may be reloaded as soon as it has the colours
-    assert one._client.local_storage.set_item.call_args.args[1] == '{"uav": 3, "light": true}'
+    assert storage.set_item.call_args.args[1] == '{"uav": 3, "light": true}'
 
 
 @pytest.mark.parametrize(
@@ -182,7 +189,7 @@ def test_who_was_selected_is_not_forgotten_before_it_is_there_again() -> None:
     one = remembered('{"uav": 40}')
     one.save(1)  # another is shown meanwhile
     with contextlib.suppress(IndexError):
-        assert one._client.local_storage.set_item.call_args.args[1] == '{"uav": 40, "light": null}'
+        assert one._storage.set_item.call_args.args[1] == '{"uav": 40, "light": null}'
     assert one.uav == 40 and remembered(None, error=TimeoutError).uav is None
 
 

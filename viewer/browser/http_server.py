@@ -8,6 +8,7 @@ import io
 import json
 import logging
 import threading
+import time
 import warnings
 import zipfile
 from collections.abc import Awaitable, Callable, Iterator
@@ -21,7 +22,7 @@ from viser import Icon, _icons, _messages
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from viewer.text.missed_events import Presence
+from viewer.text.missed_events import Absence
 from viewer.theme.palette import DARK, LIGHT, Palette
 
 LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")  # loopback names
@@ -68,12 +69,9 @@ def serve(host: str, port: int, name: str = "") -> viser.ViserServer:
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     logging.getLogger("websockets.server").setLevel(logging.WARNING)  # it logs page requests as rejected connections
     _read_icons()
-    with (
-        without_stdout(),
-        _guarded_sockets(
-            {*LOCAL_NAMES, host.strip("[]").lower(), *filter(None, [name.lower()])}, any_host=_is_any(host)
-        ),
-    ):
+    names = {*LOCAL_NAMES, host.strip("[]").lower(), *filter(None, [name.lower()])}
+    any_host = host in ("", "0.0.0.0", "::", "[::]")  # every interface: the host name is unknown
+    with without_stdout(), _guarded_sockets(names, any_host=any_host):
         server = viser.ViserServer(host=host, port=port, verbose=False)
     for kind in REFUSED:
         server._websock_server.unregister_handler(kind)
@@ -101,11 +99,6 @@ def _read_icons() -> None:
 def without_stdout() -> contextlib.redirect_stdout:
     """Suppress the banner that viser prints."""
     return contextlib.redirect_stdout(io.StringIO())
-
-
-def _is_any(host: str) -> bool:
-    """Return whether an address binds every interface; then the host name is unknown."""
-    return host in ("", "0.0.0.0", "::", "[::]")
 
 
 @contextlib.contextmanager
@@ -227,13 +220,10 @@ def _host_name(address: str) -> str:
 def _page() -> bytes:
     """Return the page of viser, gzipped, with title and a text for browsers without WebGL."""
     source = Path(viser.__file__).with_name("client") / "build" / "index.html"
-    text, loading_html = (
-        source.read_text(encoding="utf-8"),
-        Path(__file__).with_name("first.html").read_text(encoding="utf-8"),
-    )
-    at = text.index("<body")
-    at = text.index(">", at) + 1
-    return gzip.compress((text[:at] + loading_html + text[at:]).encode())
+    text = source.read_text(encoding="utf-8")
+    first = Path(__file__).with_name("first.html").read_text(encoding="utf-8")
+    at = text.index(">", text.index("<body")) + 1
+    return gzip.compress((text[:at] + first + text[at:]).encode())
 
 
 def _refusal(sentence: str) -> Response:
@@ -246,28 +236,44 @@ def _response(status: http.HTTPStatus, body: bytes, more: dict[str, str]) -> Res
     return Response(status.value, status.phrase, headers, body)
 
 
-KEY = "parauav-page"  # in the local storage of the browser
+PREFERENCES_KEY, SEEN_KEY = "parauav-page", "parauav-seen"  # in the local storage of the browser
 LOAD_TIMEOUT_S = 60.0  # a busy browser answers late, and unread preferences would be overwritten
+MIN_ABSENCE_S = 5.0  # a shorter interruption is ignored [s]
+MAX_ABSENCE_S = 12 * 3600.0  # a longer absence lists nothing [s]
 
 
-class PagePreferences:
-    """Preferences of one page; text from the browser is untrusted."""
+class Browser:
+    """State of a page that survives a redraw and, in part, a reload; text from the browser is untrusted."""
 
-    def __init__(self, client: Any, on_loaded: Callable[[], None]) -> None:
-        self._client, self._on_loaded = client, on_loaded
+    def __init__(self, client: Any, palette: Palette, wake: Callable[[], None]) -> None:
+        self.client, self._default_palette, self._wake = client, palette, wake
+        self._storage = client.local_storage
+        self.absence: Absence | None = None  # until its events are marked as read
         self.uav: int | None = None  # stored selection, until a UAV is selected
         self.light: bool | None = None  # light theme; None: not chosen
         self._saved, self._loaded = "", False
         self._selected: int | None = None  # UAV stored last
-        threading.Thread(target=self._load, name="viewer-remembered", daemon=True).start()
+        for load in (self._load_absence, self._load_preferences):
+            threading.Thread(target=load, name="viewer-browser", daemon=True).start()
 
-    def _load(self) -> None:
+    def _load_absence(self) -> None:
+        """Compute the absence from the time of the last visit."""
+        with contextlib.suppress(RuntimeError, TimeoutError, ValueError):
+            stored, now = self._storage.get_item(SEEN_KEY, timeout=10.0), time.time()
+            left = float(stored) if stored is not None else now
+            self.absence = Absence(left, now) if MIN_ABSENCE_S < now - left < MAX_ABSENCE_S else None
+
+    def mark_present(self) -> None:
+        """Store the current time in the browser."""
+        self._storage.set_item(SEEN_KEY, f"{time.time():.1f}")
+
+    def _load_preferences(self) -> None:
         with contextlib.suppress(RuntimeError, TimeoutError):
-            self.parse(self._client.local_storage.get_item(KEY, timeout=LOAD_TIMEOUT_S) or "")
+            self._parse(self._storage.get_item(PREFERENCES_KEY, timeout=LOAD_TIMEOUT_S) or "")
         self._loaded = True
-        self._on_loaded()
+        self._wake()
 
-    def parse(self, text: str) -> None:
+    def _parse(self, text: str) -> None:
         """Parse stored preferences; ignore invalid text."""
         with contextlib.suppress(ValueError, RecursionError):
             values = json.loads(text[:200])
@@ -276,10 +282,16 @@ class PagePreferences:
                 self.uav = uav if isinstance(uav, int) and not isinstance(uav, bool) else None
                 self.light = light if isinstance(light, bool) else None
 
+    @property
+    def palette(self) -> Palette:
+        """Return the theme chosen in this browser, else the default theme."""
+        return self._default_palette if self.light is None else LIGHT if self.light else DARK
+
     def set_theme(self, *, light: bool) -> None:
         """Select a theme and store it at once: a page reloaded before its next redraw has it."""
         self.light = light
         self.save(self._selected)
+        self._wake()
 
     def save(self, uav: int | None) -> None:
         """Store selection and theme in the browser when they changed and were loaded before."""
@@ -287,23 +299,4 @@ class PagePreferences:
         text = json.dumps({"uav": uav if self.uav is None else self.uav, "light": self.light})
         if self._loaded and text != self._saved:
             self._saved = text
-            self._client.local_storage.set_item(KEY, text)
-
-
-class Browser:
-    """State of a page that survives a redraw."""
-
-    def __init__(self, client: Any, palette: Palette, wake: Callable[[], None]) -> None:
-        self.client, self._default_palette, self._wake = client, palette, wake
-        self.presence, self.preferences = Presence(client), PagePreferences(client, wake)
-
-    @property
-    def palette(self) -> Palette:
-        """Return the theme chosen in this browser, else the default theme."""
-        light = self.preferences.light
-        return self._default_palette if light is None else LIGHT if light else DARK
-
-    def set_theme(self, *, light: bool) -> None:
-        """Select the light or the dark theme."""
-        self.preferences.set_theme(light=light)
-        self._wake()
+            self._storage.set_item(PREFERENCES_KEY, text)

@@ -6,8 +6,7 @@ from math import isfinite
 from fleet.contract import Controller, Outcome, TwinState
 from viewer.store.inbox import rate_text, timestamp
 from viewer.store.vehicle import Vehicle
-from viewer.text import words as mismatch_text
-from viewer.text.words import MIN_HORIZON_S, age_text, fit, horizon_s, status_label
+from viewer.text.words import MIN_HORIZON_S, age_text, fit, horizon_s, key_value_table, mismatch_html, status_label
 from viewer.theme.events import clip
 from viewer.theme.palette import Palette
 
@@ -39,11 +38,8 @@ def _cards(vehicle: Vehicle) -> str:
         "horizon": horizon,
         "airspeed": f"{vehicle.Va:.1f} m/s" if isfinite(vehicle.Va) else "–",
     }
-    return (
-        '<div class="cards">'
-        + "".join(f'<div class="card"><span class="soft">{k}</span><b>{v}</b></div>' for k, v in cards.items())
-        + "</div>"
-    )
+    html = "".join(f'<div class="card"><span class="soft">{k}</span><b>{v}</b></div>' for k, v in cards.items())
+    return f'<div class="cards">{html}</div>'
 
 
 def limitations(vehicle: Vehicle, now: float) -> list[str]:
@@ -59,8 +55,7 @@ def limitations(vehicle: Vehicle, now: float) -> list[str]:
     elif state is TwinState.UNCLAIMED:
         texts.append(
             f"No worker result for this UAV for {age_text(now - vehicle.result_accepted)}; the page shows the "
-            "last one; "
-            "check that `twin_worker` runs on this router."
+            "last one; check that `twin_worker` runs on this router."
         )
     elif vehicle.forecast is None:
         rows = vehicle.track_rows()
@@ -70,23 +65,17 @@ def limitations(vehicle: Vehicle, now: float) -> list[str]:
         replay_advice = "play the recording more slowly, or " if vehicle.recorded else ""
         advice = f": its worker is overloaded; {replay_advice}assign fewer UAVs to each worker"
         texts.append(f"The newest prediction is {age_text(lag_s)} old{'' if state is TwinState.LINK_LOST else advice}.")
-    if vehicle.prediction is not None and vehicle.prediction.sentence:
-        texts.append(vehicle.prediction.sentence)
-    if vehicle.status is not None and vehicle.status.sentence:
-        texts.append(vehicle.status.sentence)
-    if vehicle.mission is not None and vehicle.mission.sentence:
-        texts.append(vehicle.mission.sentence)
+    messages = (vehicle.prediction, vehicle.status, vehicle.mission)
+    texts += [message.sentence for message in messages if message is not None and message.sentence]
     if now - vehicle.refusal[0] < REFUSED_S:
         texts.append(vehicle.refusal[1])
     return texts
 
 
 def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
-    cards = [
-        f'<div class="say" style="border-color:{palette.mismatch}">▲ {escape(clip(a.sentence, MAX_TEXT))}</div>'
-        for a in vehicle.alerts.values()
-    ]
-    cards.insert(0, mismatch_text.mismatch_html(vehicle.mismatch, palette))
+    alert = f'<div class="say" style="border-color:{palette.mismatch}">▲ '
+    cards = [mismatch_html(vehicle.mismatch, palette)]
+    cards += [f"{alert}{escape(clip(a.sentence, MAX_TEXT))}</div>" for a in vehicle.alerts.values()]
     texts = limitations(vehicle, now)
     cards += [f'<div class="say">{escape(clip(text, MAX_TEXT))}</div>' for text in texts]
     verdict = vehicle.model.verdict if vehicle.model is not None else None
@@ -104,9 +93,9 @@ def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
 
 
 def _fits(vehicle: Vehicle) -> str:
-    if vehicle.model is None or not (vehicle.model.active_verdict or vehicle.model.verdict).fit:
+    verdict = (vehicle.model.active_verdict or vehicle.model.verdict) if vehicle.model is not None else None
+    if verdict is None or not verdict.fit:
         return ""
-    verdict = vehicle.model.active_verdict or vehicle.model.verdict
     names = list(verdict.fit)[:12]
     head = "".join(f'<th class="num">{escape(name)}</th>' for name in names)
     fits = "".join(f'<td class="num">{verdict.fit[name]:.0f}</td>' for name in names)
@@ -127,10 +116,8 @@ def coverage_text(vehicle: Vehicle) -> str:
     prediction = vehicle.prediction
     if prediction is None or prediction.coverage_n <= 0 or not isfinite(prediction.coverage):
         return "not measured yet"
-    return (
-        f"{prediction.quantile * 100:.0f} % region: coverage {prediction.coverage * 100:.0f} %, n = "
-        f"{prediction.coverage_n}"
-    )
+    coverage = f"coverage {prediction.coverage * 100:.0f} %, n = {prediction.coverage_n}"
+    return f"{prediction.quantile * 100:.0f} % region: {coverage}"
 
 
 PROVENANCE = {
@@ -146,51 +133,48 @@ def law_html(controller: Controller | None) -> str:
     """Return the active control law and its parameters by provenance as HTML."""
     if controller is None:
         return ""
-    parts = [(source, getattr(controller, source)) for source in PROVENANCE]
-    rows = "".join(
-        f'<tr><td class="soft key">{PROVENANCE[source]}</td><td class="value">'
-        + escape(", ".join(f"{name[:20]} {value:g}" for name, value in list(values.items())[:MAX_PARAMETERS]))
-        + "</td></tr>"
-        for source, values in parts
-        if values
-    )
+    rows = []
+    for source, text in PROVENANCE.items():
+        if values := list(getattr(controller, source).items())[:MAX_PARAMETERS]:
+            rows.append((text, escape(", ".join(f"{name[:20]} {value:g}" for name, value in values))))
     head = f'<div class="soft">active law: <b class="law">{escape(controller.law[:100])}</b></div>'
-    return f'{head}<table class="law">{rows}</table>'
+    return head + key_value_table(rows, ' class="law"')
 
 
 def _facts(vehicle: Vehicle, now: float) -> str:
     prediction, status, row = vehicle.prediction, vehicle.status, vehicle.row
-    at = vehicle.data_time(now)
-    figures = {
-        "coverage": coverage_text(vehicle),
-        "calibration": prediction.calibration or "–" if prediction is not None else "–",
-        "method": f"{prediction.method} · {prediction.law or 'no law'}" if prediction is not None else "–",
-        "mode": f"{status.mode or '–'} · {status.autopilot} · {'armed' if status.armed else 'disarmed'}"
-        if status is not None
-        else "–",
-        "link": f"{status.received} received, {status.missed} missed, {status.rejected} rejected"
-        if status is not None
-        else "–",
-        "recorded" if vehicle.recorded else "data time": timestamp(at)
-        + (
-            f", played {rate_text(vehicle.time.rate)}"
-            if vehicle.recorded and vehicle.time.rate and not vehicle.ended
-            else ""
-        ),
-        "sample": f"{age_text(vehicle.sample_age_s(now))} old" if isfinite(vehicle.sample_age_s(now)) else "none yet",
-        "prediction": f"{age_text(max(at - vehicle.forecast.t, 0.0))} old, coasted {prediction.coast_s:.0f} s"
-        if vehicle.forecast and prediction
-        else "–",
-        "within 10 %": f"{row.t10_s:.1f} s median, n = {row.t10_n}"
-        if row is not None and row.t10_s is not None
-        else "–",
-        "worker": f"{row.worker} · epoch {row.epoch}" if row is not None else "–",
-    }
-    return (
-        "<table>"
-        + "".join(
-            f'<tr><td class="soft key">{k}</td><td class="value">{escape(clip(v, MAX_TEXT))}</td></tr>'
-            for k, v in figures.items()
-        )
-        + "</table>"
+    at, age_s, rate = vehicle.data_time(now), vehicle.sample_age_s(now), vehicle.time.rate
+    time_name = "recorded" if vehicle.recorded else "data time"
+    names = (
+        "coverage",
+        "calibration",
+        "method",
+        "mode",
+        "link",
+        time_name,
+        "sample",
+        "prediction",
+        "within 10 %",
+        "worker",
     )
+    figures = dict.fromkeys(names, "–")
+    figures["coverage"] = coverage_text(vehicle)
+    figures[time_name] = timestamp(at)
+    if vehicle.recorded and rate and not vehicle.ended:
+        figures[time_name] += f", played {rate_text(rate)}"
+    figures["sample"] = f"{age_text(age_s)} old" if isfinite(age_s) else "none yet"
+    if prediction is not None:
+        figures["calibration"] = prediction.calibration or "–"
+        figures["method"] = f"{prediction.method} · {prediction.law or 'no law'}"
+        if vehicle.forecast is not None:
+            prediction_age_s = max(at - vehicle.forecast.t, 0.0)
+            figures["prediction"] = f"{age_text(prediction_age_s)} old, coasted {prediction.coast_s:.0f} s"
+    if status is not None:
+        armed = "armed" if status.armed else "disarmed"
+        figures["mode"] = f"{status.mode or '–'} · {status.autopilot} · {armed}"
+        figures["link"] = f"{status.received} received, {status.missed} missed, {status.rejected} rejected"
+    if row is not None:
+        figures["worker"] = f"{row.worker} · epoch {row.epoch}"
+        if row.t10_s is not None:
+            figures["within 10 %"] = f"{row.t10_s:.1f} s median, n = {row.t10_n}"
+    return key_value_table((name, escape(clip(text, MAX_TEXT))) for name, text in figures.items())

@@ -1,7 +1,6 @@
 """Panels of the page: fleet, alerts and display options on the left, selected UAV on the right."""
 
 from collections.abc import Callable
-from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -54,31 +53,6 @@ def _row(event: TimelineEvent, palette: Palette, seek: str) -> str:
 MAX_OFFERED = 200  # UAVs in the palette; the search field finds the others
 
 
-class Commands:
-    """Commands of the palette."""
-
-    def __init__(self, gui: Any, choose: Callable[[int], None], actions: dict[str, Callable[[], None]]) -> None:
-        self._gui, self._choose = gui, choose
-        self._offered: set[int] = set()
-        for label, act in actions.items():
-            gui.add_command(label).on_trigger(partial(self._act, act))
-
-    def offer(self, fleet: list[Vehicle]) -> None:
-        """Add selection commands for the first `MAX_OFFERED` UAVs."""
-        for vehicle in fleet[:MAX_OFFERED]:
-            if vehicle.uav not in self._offered and len(self._offered) < MAX_OFFERED:
-                command = self._gui.add_command(f"Select {vehicle.name}", icon=viser.Icon.DRONE)
-                command.on_trigger(partial(self._pick, vehicle.uav))
-                self._offered.add(vehicle.uav)
-
-    def _pick(self, uav: int, _: Any) -> None:
-        self._choose(uav)
-
-    @staticmethod
-    def _act(act: Callable[[], None], _: Any) -> None:
-        act()
-
-
 STALE = "No data from the viewer: this page is out of date. Restart the viewer; the page reconnects automatically."
 NO_UAV = "–"  # menu entry without a selection
 
@@ -94,8 +68,10 @@ class Panels:
         actions: dict[str, Callable[[], None]],
     ) -> None:
         self._gui, self._palette, self._choose = browser.client.gui, palette, choose
-        self._presence, self._browser = browser.presence, browser
-        self._commands = Commands(self._gui, choose, actions)
+        self._browser = browser
+        self._offered: set[int] = set()  # UAVs with a selection command
+        for label, act in actions.items():
+            self._gui.add_command(label).on_trigger(lambda _, act=act: act())
         self._pulse = False
         self.ground_error = ""  # error of the terrain files
         self.seek = ""  # page code that seeks to the time of an event
@@ -112,7 +88,7 @@ class Panels:
         self._build_right()
 
     def _build_left(self) -> None:
-        gui, tabs = self._gui, self._gui.add_tab_group()
+        gui, tabs, browser = self._gui, self._gui.add_tab_group(), self._browser
         with tabs.add_tab("Fleet", viser.Icon.DRONE):
             self._notices = gui.add_html("")
             self._summary = gui.add_html("")
@@ -135,10 +111,10 @@ class Panels:
             self.follow: Any = gui.add_checkbox("Follow selected", False)
             light = gui.add_checkbox("Light colours", not self._palette.dark)
             self.glyph = gui.add_slider("Aircraft size", min=0.5, max=4.0, step=0.1, initial_value=1.0)
-        self._acknowledge.on_click(lambda _: self._presence.acknowledge())
+        self._acknowledge.on_click(lambda _: setattr(browser, "absence", None))
         self._menu.on_update(lambda _: self._pick(self._menu.value.removeprefix("UAV-")))
         self._pick_input.on_update(lambda _: self._pick(self._pick_input.value))
-        light.on_update(lambda _: self._browser.set_theme(light=light.value))
+        light.on_update(lambda _: browser.set_theme(light=light.value))
         self._show.on_click(lambda _: setattr(self, "_filter", self._show.value))
 
     def _build_right(self) -> None:
@@ -158,12 +134,8 @@ class Panels:
 
     def show_error(self, sentence: str) -> None:
         """Show a drawing error; an empty sentence removes it."""
-        html = (
-            f'<div class="uav"><div class="say" style="border-color:{self._palette.mismatch}">{escape(sentence)}</div>'
-        )
-        html = f"{html}</div>" if sentence else ""
-        if self._error.content != html:
-            self._error.content = html
+        card = f'<div class="say" style="border-color:{self._palette.mismatch}">{escape(sentence)}</div>'
+        _update(self._error, f'<div class="uav">{card}</div>' if sentence else "")
 
     def draw(self, fleet: list[Vehicle], store: FleetStore, now: float, selected: int | None) -> None:
         """Update all panels; call it about once per second and when the selection changes."""
@@ -171,8 +143,8 @@ class Panels:
         selected_vehicle = next((vehicle for vehicle in fleet if vehicle.uav == selected), None)
         shown = [vehicle for vehicle in fleet if self._passes(vehicle, now, selected)]
         shown = sorted(shown, key=lambda vehicle: severity(vehicle, now))[:MAX_ROWS]
-        self._presence.mark_present()
-        missed = missed_events_html(fleet, self._presence.absence, palette, pick)
+        self._browser.mark_present()
+        missed = missed_events_html(fleet, self._browser.absence, palette, pick)
         contents = (
             (self._banner, f'<div class="stale {"a" if self._pulse else "b"}">{STALE}</div>'),
             (self._notices, notices(store, self.ground_error, palette, now)),
@@ -186,23 +158,28 @@ class Panels:
         with self._browser.client.atomic():  # contents first: the block delays all other messages
             for html, text in contents:
                 html.content = text
-            self._update_menu(shown)
+            names = NO_UAV, *(vehicle.name for vehicle in shown)
+            if self._menu.options != names:
+                self._menu.options = names
             self._acknowledge.visible = bool(missed)
             self.show(selected_vehicle, now)
-            events_html = (
-                event_list_html(selected_vehicle.events, palette, self.seek) if selected_vehicle is not None else ""
-            )
-            if events_html != self._events.content:  # an unchanged list keeps its scroll position
-                self._events.content = events_html
+            events = selected_vehicle.events if selected_vehicle is not None else None
+            _update(self._events, "" if events is None else event_list_html(events, palette, self.seek))
         self._charts.draw(selected_vehicle, store, now)
-        self._commands.offer(fleet)
+        self._offer(fleet)
+
+    def _offer(self, fleet: list[Vehicle]) -> None:
+        """Add selection commands for the first `MAX_OFFERED` UAVs."""
+        for vehicle in fleet[:MAX_OFFERED]:
+            if vehicle.uav not in self._offered and len(self._offered) < MAX_OFFERED:
+                command = self._gui.add_command(f"Select {vehicle.name}", icon=viser.Icon.DRONE)
+                command.on_trigger(lambda _, uav=vehicle.uav: self._choose(uav))
+                self._offered.add(vehicle.uav)
 
     def show(self, vehicle: Vehicle | None, now: float) -> None:
         """Show the status of the selected UAV."""
         placeholder = '<div class="uav soft">No UAV selected: click a row or an aircraft, or press Ctrl+K.</div>'
-        html = status_html(vehicle, self._palette, now) if vehicle is not None else placeholder
-        if html != self._about.content:
-            self._about.content = html
+        _update(self._about, status_html(vehicle, self._palette, now) if vehicle is not None else placeholder)
 
     def _passes(self, vehicle: Vehicle, now: float, selected: int | None) -> bool:
         if self._filter == "Alerts" and not vehicle.alerts:
@@ -220,8 +197,8 @@ class Panels:
         message = f"{{{{type:'GuiUpdateMessage',uuid:'{self._pick_input._impl.uuid}',updates:{{{{value:'{{}}'}}}}}}}}"
         return f"var m=window.__viserMutable;m&&m.sendMessage({message})"
 
-    def _update_menu(self, shown: list[Vehicle]) -> None:
-        """List the rows of the table in the menu."""
-        names = NO_UAV, *(vehicle.name for vehicle in shown)
-        if self._menu.options != names:
-            self._menu.options = names
+
+def _update(html: Any, text: str) -> None:
+    """Update a text only when it differs: an unchanged list keeps its scroll position."""
+    if html.content != text:
+        html.content = text

@@ -14,8 +14,7 @@ MAX_LABELS = 8
 SCALE = 0.82  # font scale of every label: one size, as the page rasterises each size separately
 CHAR_WIDTH, LINE_HEIGHT = 0.0068 * SCALE, 0.020 * SCALE  # character width and line height over image height [-]
 EDGE_MARGIN = 0.02  # margin to the image edge [image heights]
-_SHIFT = {"bottom-center": (-0.5, 0.0), "bottom-left": (0.0, 0.0), "top-center": (-0.5, -1.0), "top-left": (0.0, -1.0)}
-_SHIFT |= {"bottom-right": (-1.0, 0.0), "top-right": (-1.0, -1.0)}
+_SHIFT = {"bottom": 0.0, "top": -1.0, "left": 0.0, "center": -0.5, "right": -1.0}  # anchor to low corner [label sizes]
 _OTHER_SIDE = {"bottom-left": "bottom-right", "top-left": "top-right"}  # fallback anchor at the image edge
 
 
@@ -41,8 +40,7 @@ class Labels:
     def draw(self, tags: list[Tag], camera_view: "CameraView") -> None:
         """Show the labels that fit, in order of priority."""
         shown = visible_labels(tags, camera_view)
-        keys = {tag.key for tag in shown}
-        for key in [key for key in self._assigned if key not in keys]:
+        for key in self._assigned.keys() - {tag.key for tag in shown}:
             self._assigned.pop(key).visible = False
         free = iter([node for node in self._nodes if not any(node is used for used in self._assigned.values())])
         for tag in shown:
@@ -89,7 +87,7 @@ def visible_labels(tags: list[Tag], camera_view: CameraView) -> list[Tag]:
         for anchor in (tag.anchor, *filter(None, (_OTHER_SIDE.get(tag.anchor),))):
             box = _box(candidate := tag._replace(anchor=anchor), point)
             inside = label_depth > 0 and (np.abs(box) <= half).all()
-            if inside and not any(_overlap(box, other) for other in boxes):
+            if inside and not any((box[0] < other[1]).all() and (other[0] < box[1]).all() for other in boxes):
                 shown.append(candidate)
                 boxes.append(box)
                 break
@@ -101,12 +99,9 @@ def visible_labels(tags: list[Tag], camera_view: CameraView) -> list[Tag]:
 def _box(tag: Tag, point: np.ndarray) -> np.ndarray:
     """Return the corners of a label in the image, (2, 2) [image heights]."""
     size = np.array([CHAR_WIDTH * len(tag.text), LINE_HEIGHT])
-    low = point + np.array(_SHIFT[tag.anchor]) * size
+    vertical, horizontal = tag.anchor.split("-")
+    low = point + np.array([_SHIFT[horizontal], _SHIFT[vertical]]) * size
     return np.stack([low, low + size])
-
-
-def _overlap(box: np.ndarray, other: np.ndarray) -> bool:
-    return bool((box[0] < other[1]).all() and (other[0] < box[1]).all())
 
 
 MAX_ALERT_LABELS = 6  # most labels at once; overlapping ones are omitted

@@ -10,12 +10,7 @@ from viewer.store import event_detection as mav
 from viewer.store.place import UNIT_M, SceneFrame
 
 POSITIONED = mav.ITEM_NAMES.keys() - {mav.RTL, mav.DO_JUMP}
-RADIUS_FIELD = {
-    mav.LOITER_UNLIM: "param3",
-    mav.LOITER_TURNS: "param3",
-    mav.LOITER_TIME: "",
-    mav.LOITER_TO_ALT: "param2",
-}
+RADIUS_FIELD = {mav.LOITER_UNLIM: "param3", mav.LOITER_TURNS: "param3", mav.LOITER_TO_ALT: "param2"}
 LOITERS = {*RADIUS_FIELD, mav.LOITER_TIME}
 ABSOLUTE = {0, 5}  # MAV_FRAME: GLOBAL, GLOBAL_INT; every other altitude counts from home
 RADIUS_M = 60.0  # default loiter radius: WP_LOITER_RAD of ArduPlane [m]

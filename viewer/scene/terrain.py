@@ -15,11 +15,7 @@ from viewer.theme.palette import Palette, mix, rgb
 _A, _F = 6_378_137.0, 1 / 298.257223563  # WGS 84: semi-major axis [m], flattening
 _N = _F / (2 - _F)
 _RADIUS = _A / (1 + _N) * (1 + _N**2 / 4 + _N**4 / 64)
-_ALPHA = (
-    _N / 2 - 2 * _N**2 / 3 + 5 * _N**3 / 16,
-    13 * _N**2 / 48 - 3 * _N**3 / 5,
-    61 * _N**3 / 240,
-)
+_ALPHA = _N / 2 - 2 * _N**2 / 3 + 5 * _N**3 / 16, 13 * _N**2 / 48 - 3 * _N**3 / 5, 61 * _N**3 / 240
 _SCALE, _EAST_M, _SOUTH_M = 0.9996, 500_000.0, 10_000_000.0
 
 
@@ -62,9 +58,8 @@ class Raster(NamedTuple):
         outside = (column < -0.5) | (row < -0.5)
         outside |= (column > self.values.shape[1] - 0.5) | (row > self.values.shape[0] - 0.5)
         planes = self.values.reshape(*self.values.shape[:2], -1).astype(np.float32)
-        channels = [
-            map_coordinates(planes[..., k], [row, column], order=1, mode="nearest") for k in range(planes.shape[2])
-        ]
+        at = [row, column]
+        channels = [map_coordinates(plane, at, order=1, mode="nearest") for plane in np.moveaxis(planes, -1, 0)]
         values = np.where(outside[:, None], np.nan, np.stack(channels, axis=-1))
         return values.reshape((*np.shape(lat_deg), *self.values.shape[2:]))
 
@@ -86,16 +81,15 @@ def read_raster(text: str, *, colours: bool) -> Raster:
                 raise ValueError(
                     f"{path.name}: found {image.width} x {image.height} pixels, expected <= {MAX_PIXELS:,}; crop it"
                 )
-            values = _colours(image) if colours else _heights(image)
+            values = np.asarray(image.convert("RGB")) if colours else _heights(image)
             affine, zone = (_bounded(bounds, image), None) if bounds else _georeference(path, image)
     except (Image.UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, EOFError) as error:
         raise ValueError(f"{path.name}: found no readable raster ({error}), expected GeoTIFF, PNG or JPEG") from None
     except OSError as error:
         if error.errno is not None:
             raise
-        raise ValueError(
-            f"{path.name}: found a damaged raster ({error}), expected a complete one; download it again"
-        ) from None
+        text = f"{path.name}: found a damaged raster ({error}), expected a complete one; download it again"
+        raise ValueError(text) from None
     return Raster(path.name, values, affine, zone)
 
 
@@ -112,10 +106,6 @@ def _split(text: str) -> tuple[Path, list[float]]:
             f"{name}: found bounds {numbers}, expected south,west,north,east in degrees; correct their order"
         )
     return Path(name), [south, west, north, east]
-
-
-def _colours(image: Any) -> np.ndarray:
-    return np.asarray(image.convert("RGB"))
 
 
 def _heights(image: Any) -> np.ndarray:
@@ -260,25 +250,17 @@ class TerrainLayer:
         """Return the texture: imagery, or hill shading in the page colours."""
         (west, south), (east, north) = self._extent
         e, n = np.meshgrid(np.linspace(west, east, TEXELS), np.linspace(north, south, TEXELS))
+        shading = Image.fromarray(shade(grid)[::-1].astype(np.float32))
+        light = np.asarray(shading.resize((TEXELS, TEXELS), Image.Resampling.BICUBIC))[..., None]
         base_colour = rgb(palette.ground)
-        light = shade(grid)[::-1]
-        scaled = np.asarray(
-            Image.fromarray(light.astype(np.float32)).resize((TEXELS, TEXELS), Image.Resampling.BICUBIC)
-        )
         if self._imagery is None:
             tint = 0.45 * rgb(palette.section) + 0.55 * base_colour
-            return Image.fromarray(
-                np.clip(LIGHT_GAIN * tint * (0.55 + 0.9 * scaled[..., None]), 0, 255).astype(np.uint8)
-            )
-        colours = (
-            self._imagery.sample(*_degrees(scene_frame, e, n))
-            * LIGHT_GAIN
-            * IMAGERY_GAIN[palette.dark]
-            * (0.75 + 0.5 * scaled[..., None])
-        )
-        return Image.fromarray(
-            np.clip(np.where(np.isfinite(colours), colours, LIGHT_GAIN * base_colour), 0, 255).astype(np.uint8)
-        )
+            colours = LIGHT_GAIN * tint * (0.55 + 0.9 * light)
+        else:
+            image = self._imagery.sample(*_degrees(scene_frame, e, n)) * LIGHT_GAIN * IMAGERY_GAIN[palette.dark]
+            colours = image * (0.75 + 0.5 * light)
+        colours = np.where(np.isfinite(colours), colours, LIGHT_GAIN * base_colour)
+        return Image.fromarray(np.clip(colours, 0, 255).astype(np.uint8))
 
 
 def _degrees(scene_frame: SceneFrame, east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -316,10 +298,8 @@ def contours(grid: HeightGrid) -> np.ndarray:
     maker = contourpy.contour_generator(grid.east, grid.north, np.ma.masked_invalid(grid.up))
     segments = [np.zeros((0, 2, 3))]
     for level in np.arange(np.ceil(low / step), high / step) * step / UNIT_M:
-        for line in maker.lines(float(level)):
-            flat = np.asarray(line, float)
-            points = np.column_stack([flat, np.full(len(flat), level + 0.05)])
-            segments.append(chain(points))
+        lines = maker.lines(float(level))
+        segments += [chain(np.column_stack([line, np.full(len(line), level + 0.05)])) for line in lines]
     return np.concatenate(segments)
 
 

@@ -126,7 +126,7 @@ class View:
         """Select a known UAV and draw it immediately."""
         if self._store.get(uav) is not None:
             self.selected, self.dirty = uav, True
-            self.browser.preferences.uav = None
+            self.browser.uav = None
             self.panels.show(self.selected_vehicle(), time.monotonic())  # before the slower 3-D content
             self.client.flush()
             self._wake()
@@ -215,14 +215,14 @@ class View:
 
     def _restore_selection(self, fleet_arrays: FleetArrays) -> None:
         """Restore the selection of the browser; without one, select the first UAV with a prediction."""
-        preferences = self.browser.preferences
-        if fleet_arrays.index(preferences.uav) is not None:
-            self.selected, preferences.uav = preferences.uav, None
+        browser = self.browser
+        if fleet_arrays.index(browser.uav) is not None:
+            self.selected, browser.uav = browser.uav, None
         if self.selected is None and (
             drawn := [v for v in fleet_arrays.fleet if fleet_arrays.index(v.uav) is not None]
         ):
             self.selected = max(drawn, key=lambda v: (v.forecast is not None, -v.uav)).uav
-        preferences.save(self.selected)
+        browser.save(self.selected)
 
     def _draw_selected(self, now: float, ground: float) -> None:
         """Draw the selected UAV's flown path and mission."""

@@ -1,10 +1,7 @@
 """Events during an absence of the operator; the browser stores the time of its last visit."""
 
-import contextlib
-import threading
-import time
 from html import escape
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from viewer.store.inbox import time_of_day
 from viewer.store.vehicle import Vehicle
@@ -28,9 +25,6 @@ def parse_click(text: str) -> tuple[int, float | None] | None:
     return (int(uav), float(t)) if valid else None
 
 
-KEY = "parauav-seen"  # in the local storage of the browser
-MIN_ABSENCE_S = 5.0  # a shorter interruption is ignored [s]
-MAX_ABSENCE_S = 12 * 3600.0  # a longer absence lists nothing [s]
 MAX_ROWS = 40
 REPORTED_KINDS = {
     EventKind.ALERT,
@@ -50,39 +44,11 @@ class Absence(NamedTuple):
     returned: float
 
 
-class Presence:
-    """Time of the last visit of one browser."""
-
-    def __init__(self, client: Any) -> None:
-        self._client = client
-        self.absence: Absence | None = None
-        threading.Thread(target=self._load, name="viewer-presence", daemon=True).start()
-
-    def _load(self) -> None:
-        with contextlib.suppress(RuntimeError, TimeoutError, ValueError):
-            stored, now = self._client.local_storage.get_item(KEY, timeout=10.0), time.time()
-            left = float(stored) if stored is not None else now
-            self.absence = Absence(left, now) if MIN_ABSENCE_S < now - left < MAX_ABSENCE_S else None
-
-    def mark_present(self) -> None:
-        """Store the current time in the browser."""
-        self._client.local_storage.set_item(KEY, f"{time.time():.1f}")
-
-    def acknowledge(self) -> None:
-        """Clear the absence after the operator has read its events."""
-        self.absence = None
-
-
 def missed_events(fleet: list[Vehicle], absence: Absence) -> list[tuple[Vehicle, TimelineEvent]]:
     """Return the reported events of live UAVs during an absence, newest first."""
-    live = [vehicle for vehicle in fleet if not vehicle.recorded]
-    events = [
-        (v, event)
-        for v in live
-        for event in v.events
-        if event.kind in REPORTED_KINDS and absence.left < event.t <= absence.returned + 1.0
-    ]
-    return sorted(events, key=lambda entry: -entry[1].t)
+    events = [(v, event) for v in fleet if not v.recorded for event in v.events if event.kind in REPORTED_KINDS]
+    missed = [(v, event) for v, event in events if absence.left < event.t <= absence.returned + 1.0]
+    return sorted(missed, key=lambda entry: -entry[1].t)
 
 
 def missed_events_html(fleet: list[Vehicle], absence: Absence | None, palette: Palette, pick: str) -> str:
@@ -90,9 +56,8 @@ def missed_events_html(fleet: list[Vehicle], absence: Absence | None, palette: P
     if absence is None:
         return ""
     events = missed_events(fleet, absence)
-    head = (
-        f"<b>Since you left</b> <span class=soft>{time_of_day(absence.left)} to {time_of_day(absence.returned)}</span>"
-    )
+    interval = f"{time_of_day(absence.left)} to {time_of_day(absence.returned)}"
+    head = f"<b>Since you left</b> <span class=soft>{interval}</span>"
     rows = "".join(
         f'<div class="event pick" onpointerdown="{pick.format(encode_click(v.uav, event.t))}">'
         f'<span class="num soft">{time_of_day(event.t)}</span>'

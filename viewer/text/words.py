@@ -1,6 +1,7 @@
 """Texts of the page as HTML. Received texts are escaped here."""
 
 from collections import Counter
+from collections.abc import Iterable
 from html import escape
 from math import isfinite
 from typing import NamedTuple
@@ -31,16 +32,14 @@ def in_force(mismatch: Mismatch | None) -> bool:
 
 def short_text(mismatch: Mismatch) -> str:
     """Return a short description, not escaped."""
-    names = " and ".join(
-        _cause_text(cause.name, cause.surface) for cause in mismatch.causes[:3] if cause.name != "unknown"
-    )
     if mismatch.outcome is DiagnosisOutcome.UNKNOWN:
         return f"unknown physics in {mismatch.causes[0].channel[:40]}" if mismatch.causes else "unknown physics"
-    return names or _OUTCOME_TEXT.get(mismatch.outcome, "")
-
-
-def _cause_text(name: str, surface: str) -> str:
-    return name[:40].replace("_", " ") + (f" of the {surface[:20]}" if surface else "")
+    names = [
+        cause.name[:40].replace("_", " ") + (f" of the {cause.surface[:20]}" if cause.surface else "")
+        for cause in mismatch.causes[:3]
+        if cause.name != "unknown"
+    ]
+    return " and ".join(names) or _OUTCOME_TEXT.get(mismatch.outcome, "")
 
 
 def located_spans(mismatch: Mismatch | None, newest: float) -> list[tuple[float, float]]:
@@ -66,12 +65,18 @@ def mismatch_html(mismatch: Mismatch | None, palette: Palette) -> str:
         return ""
     colour = palette.mismatch if in_force(mismatch) else palette.identifying
     head = f"{'▲' if in_force(mismatch) else '△'} mismatch {_OUTCOME_TEXT[mismatch.outcome]}"
-    rows = "".join(f'<tr><td class="soft key">{k}</td><td class="value">{v}</td></tr>' for k, v in _proof(mismatch))
+    proof = key_value_table(_proof(mismatch))
     model = "included in the prediction model" if mismatch.adapted else "not in the prediction model"
     return (
         f'<div class="say mismatch" style="border-color:{colour}"><b style="color:{colour}">{head}</b> '
-        f'<span class="soft">{model}</span><br>{escape(mismatch.sentence[:MAX_TEXT])}<table>{rows}</table></div>'
+        f'<span class="soft">{model}</span><br>{escape(mismatch.sentence[:MAX_TEXT])}{proof}</div>'
     )
+
+
+def key_value_table(pairs: Iterable[tuple[str, str]], attributes: str = "") -> str:
+    """Return names and values as an HTML table; the caller escapes them."""
+    rows = "".join(f'<tr><td class="soft key">{k}</td><td class="value">{v}</td></tr>' for k, v in pairs)
+    return f"<table{attributes}>{rows}</table>"
 
 
 def _proof(mismatch: Mismatch) -> list[tuple[str, str]]:
@@ -126,13 +131,9 @@ def horizon_s(vehicle: Vehicle) -> float:
 
 def fit(vehicle: Vehicle) -> float | None:
     """Return the mean fit over the states of the active model [%]; None before the first."""
-    source = (
-        (vehicle.model.active_verdict or vehicle.model.verdict).fit
-        if vehicle.model is not None
-        else vehicle.row.fit
-        if vehicle.row is not None
-        else {}
-    )
+    source: dict[str, float] = vehicle.row.fit if vehicle.row is not None else {}
+    if vehicle.model is not None:
+        source = (vehicle.model.active_verdict or vehicle.model.verdict).fit
     values = [value for value in source.values() if isfinite(value)]
     return sum(values) / len(values) if values else None
 
@@ -160,9 +161,11 @@ def summary_html(fleet: list[Vehicle], store: FleetStore, palette: Palette, now:
     )
     horizons = sorted(h for vehicle in fleet if (h := horizon_s(vehicle)) >= MIN_HORIZON_S)
     median = f" · median horizon {horizons[len(horizons) // 2]:.0f} s" if horizons else ""
+    n, coverage, quantile = fleet_coverage(fleet)
+    covered = f" · cov. {coverage * 100:.0f}/{quantile * 100:.0f} %" if n else ""
     notes = "".join(f'<div class="soft">{escape(text)}</div>' for text in store.worker_texts())
     plural = "UAV" if len(fleet) == 1 else "UAVs"
-    head = f"<h1>{len(fleet)} {plural}<small>{median}{_coverage_text(fleet)}</small></h1>"
+    head = f"<h1>{len(fleet)} {plural}<small>{median}{covered}</small></h1>"
     return f'<div class="uav">{head}{chips}{_recording(fleet, now)}{notes}</div>'
 
 
@@ -176,16 +179,10 @@ def _recording(fleet: list[Vehicle], now: float) -> str:
     return f'<div class="soft">Recording · <span class="now">{timestamp(newest.data_time(now))}</span> · {rate}</div>'
 
 
-def _coverage_text(fleet: list[Vehicle]) -> str:
-    n, coverage, quantile = fleet_coverage(fleet)
-    return f" · cov. {coverage * 100:.0f}/{quantile * 100:.0f} %" if n else ""
-
-
 def table(fleet: list[Vehicle], palette: Palette, now: float, *, total: int, pick: str, selected: int | None) -> str:
     """Return the table of up to 50 UAVs, most severe first; `pick` is the click handler with `{}` for the UAV."""
     worst = sorted(fleet, key=lambda vehicle: severity(vehicle, now))[:MAX_ROWS]
-    longest = max((horizon_s(vehicle) for vehicle in worst), default=0.0)
-    longest = max(longest, FULL_BAR_S)
+    longest = max([FULL_BAR_S, *(horizon_s(vehicle) for vehicle in worst)])
     rows = "".join(_row(vehicle, palette, now, pick, on=vehicle.uav == selected, longest=longest) for vehicle in worst)
     return (
         '<div class="uav list"><table><tr><th></th><th>UAV</th><th>status</th><th class="num">fit %</th>'
@@ -196,11 +193,8 @@ def table(fleet: list[Vehicle], palette: Palette, now: float, *, total: int, pic
 
 def _row(vehicle: Vehicle, palette: Palette, now: float, pick: str, *, on: bool, longest: float) -> str:
     label, horizon, mean = status_label(vehicle, palette, now), horizon_s(vehicle), fit(vehicle)
-    text = (
-        f"{label.text} {age_text(vehicle.sample_age_s(now))}"
-        if label.text == STATE_TEXT[TwinState.LINK_LOST]
-        else label.text
-    )
+    is_lost = label.text == STATE_TEXT[TwinState.LINK_LOST]
+    text = f"{label.text} {age_text(vehicle.sample_age_s(now))}" if is_lost else label.text
     bar = f'<i><i style="width:{min(horizon / longest, 1) * 100:.0f}%;background:{label.colour}"></i></i>'
     percent, seconds = "–" if mean is None else f"{mean:.0f}", f"{horizon:.0f} s" if horizon >= MIN_HORIZON_S else "–"
     return (
@@ -222,10 +216,8 @@ def _problem_text(vehicle: Vehicle) -> str:
 def alerts_html(fleet: list[Vehicle], store: FleetStore, palette: Palette, pick: str = "") -> str:
     """Return active mismatches and alerts, newest first, at most 50 each; `pick` is the click handler."""
     mismatched = [(v, v.mismatch) for v in fleet if v.mismatch is not None and in_force(v.mismatch)]
-    mismatch_rows = [
-        (v, "mismatch", item.t, short_text(item))
-        for v, item in sorted(mismatched, key=lambda item: -item[1].t)[:MAX_ROWS]
-    ]
+    mismatched = sorted(mismatched, key=lambda item: -item[1].t)[:MAX_ROWS]
+    mismatch_rows = [(v, "mismatch", mismatch.t, short_text(mismatch)) for v, mismatch in mismatched]
     alert_rows = [(v, a.kind.value.replace("_", " "), a.t, a.sentence) for v, a in store.alerts()[:MAX_ROWS]]
     cards = "".join(
         f'<div class="say pick" style="border-color:{palette.mismatch}" '
@@ -256,11 +248,8 @@ def fleet_coverage(fleet: list[Vehicle]) -> tuple[int, float, float]:
     predictions = [v.prediction for v in fleet if v.prediction is not None]
     measured = [p for p in predictions if p.coverage_n > 0 and isfinite(p.coverage)]
     n = sum(p.coverage_n for p in measured)
-    return (
-        n,
-        sum(p.coverage * p.coverage_n for p in measured) / n if n else 0.0,
-        predictions[0].quantile if predictions else 0.9,
-    )
+    coverage = sum(p.coverage * p.coverage_n for p in measured) / n if n else 0.0
+    return n, coverage, predictions[0].quantile if predictions else 0.9
 
 
 def age_text(seconds: float) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 import viser
 
 from viewer.scene.fleet_arrays import FleetArrays
+from viewer.scene.routes import NOTHING
 from viewer.scene.strokes import Strokes, chain
 from viewer.store.inbox import timestamp
 from viewer.store.store import FleetStore
@@ -59,11 +60,9 @@ class Panel:
 
     def draw(self, bar: str, head: str, comparison: str, banner: str) -> None:
         """Update the parts that changed."""
+        drag = drag_attributes(self.send_code("share:"))
         for node, text in (
-            (
-                self._bar,
-                f'<div class="uav time"><div {drag_attributes(self.send_code("share:"))}>{bar}</div>{head}</div>',
-            ),
+            (self._bar, f'<div class="uav time"><div {drag}>{bar}</div>{head}</div>'),
             (self._comparison, f'<div class="uav time soft">{comparison}</div>'),
             (self._banner, f'<div class="then">{banner}</div>' if banner else ""),
         ):
@@ -72,37 +71,6 @@ class Panel:
 
 
 SHOWN_S = 60.0  # shortest path drawn after the time shown; at least to the prediction horizon [s]
-NO_LINES = np.zeros((0, 2, 3))
-
-
-class ActualPath:
-    """Two nodes: the path flown after the time shown, and error lines to the prediction."""
-
-    def __init__(self, scene: Any, palette: Palette) -> None:
-        self._palette = palette
-        self._path = Strokes(scene, "/timeline/flown", 2.2)
-        self._error_lines = Strokes(scene, "/timeline/whiskers", 1.6)
-        self._drawn = False
-
-    def draw(self, past: PastVehicle | None) -> list[compare.LeadTimeError]:
-        """Draw the path after the time shown and return the prediction errors; None clears it."""
-        if past is None:
-            if self._drawn:
-                self._path.draw(NO_LINES)
-                self._error_lines.draw(NO_LINES)
-            self._drawn = False
-            return []
-        forecast, self._drawn = past.forecast, True
-        horizon_s = max(forecast.t + forecast.horizon_s - past.shown_t, 0.0) if forecast is not None else 0.0
-        path = past.recording.path(past.shown_t, past.shown_t + max(horizon_s, SHOWN_S))
-        self._path.draw(chain(path[:, 1:]), mix(self._palette.verified, self._palette.ground, 0.9))
-        if forecast is None or not len(path):
-            self._error_lines.draw(NO_LINES)
-            return []
-        self._error_lines.draw(compare.error_lines(forecast, path, past.shown_t), rgb(self._palette.horizon))
-        return compare.lead_time_errors(forecast, path, past.shown_t)
-
-
 SNAP = 0.008  # share of the bar within which a press snaps to an event
 MAX_OTHER_EVENTS = 40  # newest events used of each other UAV
 
@@ -121,9 +89,9 @@ class Timeline:
         self._range_time = -np.inf  # fleet update for which the range was computed
         self._past_arrays, self._drawn_at = FleetArrays(), (-np.inf, -np.inf)  # past fleet; wall and data time of it
         self._panel = Panel(client.gui, palette, self.on_command)
-        self._actual_path = ActualPath(client.scene, palette)
-
-    # --- what is shown ---
+        self._actual_path = Strokes(client.scene, "/timeline/flown", 2.2)  # flown after the time shown
+        self._error_lines = Strokes(client.scene, "/timeline/whiskers", 1.6)  # from it to the prediction
+        self._path_drawn = False
 
     def fleet_arrays(self, fleet_arrays: FleetArrays, selected: int | None, now: float) -> FleetArrays:
         """Return the fleet to draw: the given live one, or the fleet at the time shown."""
@@ -153,13 +121,8 @@ class Timeline:
         return vehicle_at(vehicle, self._recordings.by_uav[vehicle.uav], shown_t, self.player.rate)
 
     def _update_past(self, fleet: list[Vehicle], t: float, now: float) -> None:
-        """Update the fleet of a past time."""
-        pasts = [
-            past
-            for vehicle in fleet
-            if vehicle.uav in self._recordings.by_uav and (past := self._past_vehicle(vehicle, t)) is not None
-        ]
-        update_past_arrays(self._past_arrays, pasts, now)
+        pasts = [self._past_vehicle(vehicle, t) for vehicle in fleet if vehicle.uav in self._recordings.by_uav]
+        update_past_arrays(self._past_arrays, [past for past in pasts if past is not None], now)
 
     def _update_range(self, fleet: list[Vehicle], selected: int | None) -> None:
         """Update the available time range, on the clock of the selected UAV."""
@@ -167,12 +130,9 @@ class Timeline:
         if not recorded:
             self._span, self._shift, self._clock_uav = TimelineRange(0.0, 0.0), {}, None
             return self.player.go_live()
-        self._clock_uav = (
-            selected if selected in recorded else max(recorded, key=lambda uav: recorded[uav].sample_received)
-        )
+        latest = max(recorded, key=lambda uav: recorded[uav].sample_received)
+        self._clock_uav = selected if selected in recorded else latest
         self._span, self._shift = self._recordings.playback_range(recorded[self._clock_uav], list(recorded.values()))
-
-    # --- commands ---
 
     def tab(self, label: str, icon: Any) -> Any:
         """Add a tab beside the timeline; use it in a `with` statement."""
@@ -228,11 +188,10 @@ class Timeline:
         self.player.pause(self._span)
         t = self.player.t or 0.0
         if unit == "1 s":
-            target: float | None = t + direction
-        else:
-            rows = self._recordings.by_uav[self._clock_uav or 0].t.tolist()
-            times = [event.t for event in self._events()] if unit == "event" else rows
-            target = next_after(t, times) if direction > 0 else last_before(t, times)
+            return self.player.seek(t + direction, self._span)
+        rows = self._recordings.by_uav[self._clock_uav or 0].t.tolist()
+        times = [event.t for event in self._events()] if unit == "event" else rows
+        target = next_after(t, times) if direction > 0 else last_before(t, times)
         if target is not None:
             self.player.seek(target, self._span)
 
@@ -240,29 +199,41 @@ class Timeline:
         recording = self._recordings.by_uav.get(-1 if self._clock_uav is None else self._clock_uav)
         return list(recording.events) if recording is not None else []
 
-    # --- the panel ---
-
     def draw(self, selected: int | None) -> None:
         """Draw the panel and the path after the time shown; call it about once per second and on changes."""
         vehicle = self.vehicle(selected) if selected is not None and not self.player.live else None
         past = vehicle if isinstance(vehicle, PastVehicle) else None
-        lead_errors = self._actual_path.draw(past)
+        lead_errors = self._draw_actual_path(past)
         t, span = self.player.t, self._span
         if self._clock_uav is None:
             return self._panel.draw("", '<span class="soft">no recording yet</span>', "", "")
         recordings = [recording for uav, recording in list(self._recordings.by_uav.items()) if uav != self._clock_uav]
-        others = [
-            e for recording in recordings for e in recording.events[-MAX_OTHER_EVENTS:] if span.begin <= e.t <= span.end
-        ]
+        others = [event for recording in recordings for event in recording.events[-MAX_OTHER_EVENTS:]]
         bar = strip.strip(self._events(), others, span, t, self._palette)
         comparison = ""
         if past is not None:
-            forecast = past.forecast
-            horizon_s = forecast.t + forecast.horizon_s - past.shown_t if forecast is not None else 0.0
-            comparison = strip.comparison_html(
-                lead_errors, forecast.t if forecast is not None else None, past.shown_t, self._palette, horizon_s
-            )
+            issued_t = past.forecast.t if past.forecast is not None else None
+            horizon_s = past.forecast.t + past.forecast.horizon_s - past.shown_t if past.forecast is not None else 0.0
+            comparison = strip.comparison_html(lead_errors, issued_t, past.shown_t, self._palette, horizon_s)
         self._panel.draw(bar, self._head(t, span), comparison, self._banner(t, span))
+
+    def _draw_actual_path(self, past: PastVehicle | None) -> list[compare.LeadTimeError]:
+        """Draw the path flown after the time shown and return the prediction errors; None clears it."""
+        if past is None:
+            if self._path_drawn:
+                self._actual_path.draw(NOTHING.legs)
+                self._error_lines.draw(NOTHING.legs)
+            self._path_drawn = False
+            return []
+        forecast, self._path_drawn = past.forecast, True
+        horizon_s = max(forecast.t + forecast.horizon_s - past.shown_t, 0.0) if forecast is not None else 0.0
+        path = past.recording.path(past.shown_t, past.shown_t + max(horizon_s, SHOWN_S))
+        self._actual_path.draw(chain(path[:, 1:]), mix(self._palette.verified, self._palette.ground, 0.9))
+        if forecast is None or not len(path):
+            self._error_lines.draw(NOTHING.legs)
+            return []
+        self._error_lines.draw(compare.error_lines(forecast, path, past.shown_t), rgb(self._palette.horizon))
+        return compare.lead_time_errors(forecast, path, past.shown_t)
 
     def _head(self, t: float | None, span: TimelineRange) -> str:
         lag_text = "live" if t is None else f"{strip.duration_text(span.end - t)} ago"
@@ -278,7 +249,5 @@ class Timeline:
     def _banner(self, t: float | None, span: TimelineRange) -> str:
         if t is None:
             return ""
-        return (
-            f"Not live: showing {timestamp(t)}, {strip.duration_text(span.end - t)} before the newest. Press ● "
-            "Live to return."
-        )
+        lag = strip.duration_text(span.end - t)
+        return f"Not live: showing {timestamp(t)}, {lag} before the newest. Press ● Live to return."

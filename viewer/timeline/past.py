@@ -1,6 +1,6 @@
 """A UAV at a past time, with the interface of `Vehicle` for drawing and texts; comparison with what was flown."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -60,20 +60,14 @@ class PastVehicle(Vehicle):
     @property
     def past(self) -> list[ScenePrediction]:  # type: ignore[override]
         """Return the predictions of the preceding minute, oldest first."""
-        return [
-            prediction
-            for prediction in self.recording.predictions
-            if self.shown_t - PAST_S <= prediction.t <= self.shown_t
-        ]
+        begin, end = self.shown_t - PAST_S, self.shown_t
+        return [prediction for prediction in self.recording.predictions if begin <= prediction.t <= end]
 
     @property
     def fits(self) -> list[tuple[float, float]]:  # type: ignore[override]
         """Return the fits up to the time shown: time [s], mean over the states [%]."""
-        return [
-            (record.t, record.fit)
-            for record in self.recording.states
-            if record.fit is not None and record.t <= self.shown_t
-        ]
+        records = [record for record in self.recording.states if record.t <= self.shown_t]
+        return [(record.t, record.fit) for record in records if record.fit is not None]
 
     @property
     def events(self) -> tuple[TimelineEvent, ...]:  # type: ignore[override]
@@ -95,50 +89,27 @@ def vehicle_at(vehicle: Vehicle, recording: UavRecording, shown_t: float, rate: 
     record = recording.state_at(shown_t)
     if record is None or not len(recording) or shown_t < recording.t[0] - 1.0:
         return None
-    row, forecast = (
-        recording.row_at(shown_t),
-        recording.prediction_at(shown_t) if record.state not in NO_PREDICTION else None,
-    )
+    row, status = recording.row_at(shown_t), vehicle.status
+    forecast = recording.prediction_at(shown_t) if record.state not in NO_PREDICTION else None
+    if status is not None:
+        fields = {"mode": record.mode, "armed": record.armed, "link": record.link, "sentence": record.sentence}
+        status = msgspec.structs.replace(status, **fields)
+    fit = {} if record.fit is None else {"mean": record.fit}
     past = object.__new__(PastVehicle)
     past.__dict__.update({name: value for name, value in vehicle.__dict__.items() if name not in _OVERRIDDEN})
-    past.__dict__.update(_past_fields(vehicle, row, record, forecast))
     past.recording, past.shown_t, past.state_record = recording, shown_t, record
-    past.t = float(min(shown_t, recording.t[-1]))
-    past.time = DataTime(shown_t, rate=rate)
+    past.t, past.time = float(min(shown_t, recording.t[-1])), DataTime(shown_t, rate=rate)
+    past.at, past.Va = row[:3], float(row[6])
+    past.alt_m = vehicle.alt_m + (row[2] - vehicle.at[2]) * UNIT_M if vehicle.at is not None else np.nan
+    past.attitude = float(row[3]), float(row[4]), float(row[5])
+    past.status, past.model, past.forecast = status, None, forecast
+    past.prediction = forecast.message if forecast is not None else None
+    past.mismatch, past.alerts, past.ended = record.mismatch, record.alerts, False
+    past.row = FleetRow(uav=vehicle.uav, state=record.state, verdict=record.verdict, fit=fit)
     return past
 
 
 _OVERRIDDEN = ("past", "fits", "events")
-
-
-def _past_fields(
-    vehicle: Vehicle, row: np.ndarray, record: StateRecord, forecast: ScenePrediction | None
-) -> dict[str, Any]:
-    """Return the fields of a UAV that differ at a past time."""
-    status = vehicle.status
-    if status is not None:
-        status = msgspec.structs.replace(
-            status, mode=record.mode, armed=record.armed, link=record.link, sentence=record.sentence
-        )
-    return {
-        "at": row[:3],
-        "alt_m": vehicle.alt_m + (row[2] - vehicle.at[2]) * UNIT_M if vehicle.at is not None else np.nan,
-        "attitude": tuple(float(angle) for angle in row[3:6]),
-        "Va": float(row[6]),
-        "status": status,
-        "model": None,
-        "prediction": forecast.message if forecast is not None else None,
-        "forecast": forecast,
-        "mismatch": record.mismatch,
-        "alerts": record.alerts,
-        "row": FleetRow(
-            uav=vehicle.uav,
-            state=record.state,
-            verdict=record.verdict,
-            fit={} if record.fit is None else {"mean": record.fit},
-        ),
-        "ended": False,
-    }
 
 
 def update_past_arrays(fleet_arrays: FleetArrays, pasts: list[PastVehicle], now: float) -> None:
@@ -147,16 +118,14 @@ def update_past_arrays(fleet_arrays: FleetArrays, pasts: list[PastVehicle], now:
     shown = [past for past in pasts if fleet_arrays.index(past.uav) is not None]
     fleet_arrays.at = np.array([past.position(now) for past in shown]).reshape(-1, 3)
     fleet_arrays.quat = scene_quat(*np.array([past.attitude for past in shown]).reshape(-1, 3).T)
-    paths = [
-        positions_at(past.recording.path(past.shown_t - TRAIL_AGES_S[0], past.t), past.shown_t - TRAIL_AGES_S, np.inf)
-        for past in shown
-    ]
-    trails = [np.where(np.isfinite(rows), rows, at) for rows, at in zip(paths, fleet_arrays.at, strict=True)]
+    trails = []
+    for past, at in zip(shown, fleet_arrays.at, strict=True):
+        path = past.recording.path(past.shown_t - TRAIL_AGES_S[0], past.t)
+        rows = positions_at(path, past.shown_t - TRAIL_AGES_S, np.inf)
+        trails.append(np.where(np.isfinite(rows), rows, at))
     fleet_arrays.trails = np.array(trails).reshape(-1, len(TRAIL_AGES_S), 3)
-    fleet_arrays.revision, fleet_arrays.trail_steps = (
-        min(fleet_arrays.revision, 0) - 1,
-        0,
-    )  # differs from live revisions and on every call
+    fleet_arrays.revision = min(fleet_arrays.revision, 0) - 1  # differs from live revisions and on every call
+    fleet_arrays.trail_steps = 0
 
 
 STEPS_S = (5.0, 10.0, 20.0, 30.0, 60.0, 120.0)  # look-aheads compared in the text [s]
@@ -172,20 +141,10 @@ class LeadTimeError(NamedTuple):
     inside: bool  # flown position within all three half-axes
 
 
-def predicted_and_actual(
-    forecast: ScenePrediction, track: np.ndarray, times: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return predicted and flown positions at some times.
-
-    Args:
-        forecast: the prediction
-        track: the flown path, (n, 4) time [s], scene ENU [10 m]
-        times: data times [s since 1970], (k,)
-    Returns:
-        predicted and flown, each (k, 3) [10 m]
-    """
-    actual = np.stack([np.interp(times, track[:, 0], track[:, k]) for k in (1, 2, 3)], axis=-1)
-    return forecast.position_at(times - forecast.t), actual
+def predicted_and_actual(forecast: ScenePrediction, track: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return predicted and flown positions at times (k,) [s since 1970], each (k, 3) [10 m]; `track` is (n, 4)."""
+    actual = np.stack([np.interp(t, track[:, 0], track[:, k]) for k in (1, 2, 3)], axis=-1)
+    return forecast.position_at(t - forecast.t), actual
 
 
 def answered_until(forecast: ScenePrediction, track: np.ndarray) -> float:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from fleet.contract import Alert, AlertKey, Array, Link, Mismatch, TwinState
+from fleet.contract import Alert, AlertKey, Array, Link, Mismatch, Status, TwinState
 from fleet.frames import wrap
 from viewer.store.forecast import ScenePrediction
 from viewer.store.track import TRAIL_ROWS
@@ -31,14 +31,14 @@ class StateRecord(NamedTuple):
 
 def state_record(vehicle: Vehicle, at: float, now: float) -> StateRecord:
     """Return the state of a UAV at data time `at` [s since 1970]; `now` is monotonic [s]."""
-    status, mean = vehicle.status, fit(vehicle)
+    status, mean = vehicle.status or Status(uav=vehicle.uav, t=at), fit(vehicle)
     return StateRecord(
         at,
         vehicle.state(now),
-        status.link if status is not None else Link.LIVE,
-        status.mode if status is not None else "",
-        status.armed if status is not None else False,
-        status.sentence if status is not None else "",
+        status.link,
+        status.mode,
+        status.armed,
+        status.sentence,
         vehicle.model.verdict.sentence if vehicle.model is not None else "",
         None if mean is None else float(round(mean)),
         vehicle.alerts,
@@ -48,17 +48,9 @@ def state_record(vehicle: Vehicle, at: float, now: float) -> StateRecord:
 
 RETENTION_S = 600.0  # retention of a live flight; a recording is kept completely [s]
 PREDICTION_STEP_S = 5.0  # between two recorded predictions [s]
-NEAR_STEP_S, NEAR_S, FAR_STEP_S = (
-    1.0,
-    20.0,
-    2.5,
-)  # step up to NEAR_S of look-ahead, and step beyond; drawn as cubic splines [s]
+NEAR_STEP_S, NEAR_S, FAR_STEP_S = 1.0, 20.0, 2.5  # step up to NEAR_S of look-ahead, and beyond; drawn as splines [s]
 AFTER_S = 20.0  # look-ahead recorded beyond the horizon [s]
-GAP_S, GAP_MARGIN_S, MAX_FILLED = (
-    1.6,
-    0.4,
-    100,
-)  # gaps filled from the trail, margin at their ends, most rows [s]
+GAP_S, GAP_MARGIN_S, MAX_FILLED = 1.6, 0.4, 100  # gaps filled from the trail, margin at their ends [s], most rows
 INITIAL_ROWS = 64  # initial capacity, and rows between two checks for expired rows
 MAX_ROWS = 8_000  # rows of one UAV; beyond it every second row is dropped
 MAX_STATES = 500  # state changes of one UAV; the oldest are dropped first
@@ -126,27 +118,18 @@ class UavRecording:
             self._append(float(row[0]), [*row[1:4], 0.0, 0.0, psi, row[4]], vehicle.recorded)
 
     def _append(self, t: float, row: list[float], recorded: bool) -> None:
-        if self._n and self._n % INITIAL_ROWS == 0:
-            self._drop_old(recorded)
-        if self._n == len(self._t):
-            self._grow_or_thin()
-        self._t[self._n], self._x[self._n] = t, row
-        self._n += 1
-
-    def _drop_old(self, recorded: bool) -> None:
-        """Drop expired rows of a live flight once they are an eighth of all."""
-        old = 0 if recorded else int(np.searchsorted(self.t, self._t[self._n - 1] - RETENTION_S))
-        if old > self._n // 8:
-            self._retain(slice(old, self._n))
-
-    def _grow_or_thin(self) -> None:
-        """Grow the arrays, or drop every second row."""
-        if self._n >= MAX_ROWS:
+        if self._n and self._n % INITIAL_ROWS == 0 and not recorded:
+            old = int(np.searchsorted(self.t, self._t[self._n - 1] - RETENTION_S))
+            if old > self._n // 8:  # expired rows of a live flight
+                self._retain(slice(old, self._n))
+        if self._n == len(self._t) and self._n >= MAX_ROWS:
             self._step = 2 * float(np.median(np.diff(self.t)))
             self._retain(slice(self._n % 2, self._n, 2))
-        else:
+        elif self._n == len(self._t):
             self._t = np.concatenate([self._t, np.empty(self._n)])
             self._x = np.concatenate([self._x, np.empty((self._n, COLUMNS), np.float32)])
+        self._t[self._n], self._x[self._n] = t, row
+        self._n += 1
 
     def _retain(self, rows: slice) -> None:
         t, x = self.t[rows].copy(), self.x[rows].copy()
@@ -167,17 +150,13 @@ class UavRecording:
             self.states.append(record)
         del self.states[:-MAX_STATES]
         if not vehicle.recorded:
-            self._drop_before(at - RETENTION_S)
+            if self.predictions and self.predictions[0].t < at - RETENTION_S:
+                self._prediction_bytes -= _size_bytes(self.predictions.pop(0))
+            if len(self.states) > 1 and self.states[1].t < at - RETENTION_S:  # the first is valid until the second
+                del self.states[0]
         if len(self.predictions) > MAX_PREDICTIONS:
             self.predictions = self.predictions[::2]
             self._prediction_bytes = sum(map(_size_bytes, self.predictions))
-
-    def _drop_before(self, before: float) -> None:
-        """Drop the oldest prediction and state if earlier than a time [s since 1970]."""
-        if self.predictions and self.predictions[0].t < before:
-            self._prediction_bytes -= _size_bytes(self.predictions.pop(0))
-        if len(self.states) > 1 and self.states[1].t < before:  # the first is valid until the second
-            del self.states[0]
 
     def row_at(self, t: float) -> np.ndarray:
         """Interpolate a row at a time: (7,); angles the short way round, constant beyond both ends."""
@@ -230,14 +209,10 @@ def _reduced(forecast: ScenePrediction, previous: ScenePrediction | None) -> Sce
     same = {name: getattr(last, name) for name in TEXT_FIELDS if getattr(last, name, None) == getattr(message, name)}
     first, last_s = float(ahead[0]), float(ahead[:n][-1])
     near_end = min(first + NEAR_S, last_s)
-    look_aheads = np.concatenate(
-        [np.arange(first, near_end, NEAR_STEP_S), np.arange(near_end, last_s, FAR_STEP_S), [last_s]]
-    )
-    indices = np.unique(np.searchsorted(ahead[:n], look_aheads))
-    arrays = {
-        name: Array.of(getattr(message, name).numpy()[indices])
-        for name in ("ahead", "path", "prediction_region_half_axes")
-    }
+    near, far = np.arange(first, near_end, NEAR_STEP_S), np.arange(near_end, last_s, FAR_STEP_S)
+    indices = np.unique(np.searchsorted(ahead[:n], np.concatenate([near, far, [last_s]])))
+    names = ("ahead", "path", "prediction_region_half_axes")
+    arrays = {name: Array.of(getattr(message, name).numpy()[indices]) for name in names}
     if last is not None and last.ahead == arrays["ahead"]:
         arrays["ahead"] = last.ahead
     return ScenePrediction(

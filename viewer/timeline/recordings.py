@@ -98,9 +98,7 @@ class RecordingStore:
             return
         fleet = copies()
         self._due = now + (SMALL_FLEET_STEP_S if len(fleet) <= SMALL_FLEET else STEP_S)
-        self.prediction_step_s = PREDICTION_STEP_S * max(
-            len(fleet) / LARGE_FLEET, 1.0
-        )  # bounded memory for a large fleet
+        self.prediction_step_s = PREDICTION_STEP_S * max(len(fleet) / LARGE_FLEET, 1.0)  # bounds the memory
         self._second_half, large_fleet = not self._second_half, len(fleet) > LARGE_FLEET
         for vehicle in fleet[self._second_half :: 2] if large_fleet else fleet:
             recording = self.by_uav.setdefault(vehicle.uav, UavRecording())
@@ -122,12 +120,9 @@ class RecordingStore:
         """
         recordings = {vehicle.uav: self.by_uav[vehicle.uav] for vehicle in fleet}
         reference_t = recordings[clock_vehicle.uav].t[0]
-        ahead = {
-            vehicle.uav: float(recordings[vehicle.uav].t[0] - reference_t) for vehicle in fleet if vehicle.recorded
-        }
+        ahead = {v.uav: float(recordings[v.uav].t[0] - reference_t) for v in fleet if v.recorded}
         shift = {uav: t for uav, t in ahead.items() if abs(t) > MAX_START_GAP_S}
         end = max(recording.t[-1] - shift.get(uav, 0.0) for uav, recording in recordings.items())
         begin = min(recording.t[0] - shift.get(uav, 0.0) for uav, recording in recordings.items())
-        return TimelineRange(
-            float(begin if clock_vehicle.recorded else max(begin, end - RETENTION_S)), float(end)
-        ), shift
+        begin = begin if clock_vehicle.recorded else max(begin, end - RETENTION_S)
+        return TimelineRange(float(begin), float(end)), shift

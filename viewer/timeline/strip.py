@@ -11,13 +11,8 @@ from viewer.timeline.past import STEPS_S, LeadTimeError
 from viewer.timeline.recordings import TimelineRange
 
 WIDTH = 1000  # width of the drawing; the page scales it
-SEVERE = {
-    EventKind.ALERT,
-    EventKind.MISMATCH,
-    EventKind.LINK_LOST,
-    EventKind.NO_MODEL,
-    EventKind.TELEMETRY_LOST,
-}  # events marked of other UAVs
+# kinds marked of other UAVs
+SEVERE = {EventKind.ALERT, EventKind.MISMATCH, EventKind.LINK_LOST, EventKind.NO_MODEL, EventKind.TELEMETRY_LOST}
 MAX_MARKS = 150  # newest marks drawn of one row
 TICKS_S = (10, 30, 60, 120, 300, 600, 1800, 3600)  # between ticks, at most twelve
 
