@@ -15,9 +15,7 @@ from viewer.scene.terrain import TerrainLayer, read_raster
 from viewer.server.app import App
 
 GC_THRESHOLDS = 50_000, 10, 10  # a large fleet allocates 10,000 objects per second, almost none in cycles
-LARGE_BLOCK_BYTES = (
-    48 * 1024
-)  # smaller than a receive buffer of the bus, which one queued message keeps allocated [bytes]
+LARGE_BLOCK_BYTES = 48 * 1024  # below a receive buffer of the bus, which one queued message keeps allocated [bytes]
 EXAMPLES = """
   viewer
   viewer --port 8081 --light

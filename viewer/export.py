@@ -31,49 +31,48 @@ MAX_FRAMES, FRAME_S = 400, 0.1  # most frames of an animation, and duration of e
 ASPECT = 1.6  # aspect ratio for the camera [-]
 
 
-class FlightAnimation:
-    """Render every frame on a hidden server and serialise the scene."""
+def flight_html(
+    store: FleetStore,
+    recordings: RecordingStore,
+    palette: Palette,
+    selected: int,
+    on_progress: Callable[[float], None] = lambda _: None,
+) -> str:
+    """Render every frame of the recording on a hidden server; return the scene as HTML, on the clock of one UAV.
 
-    def __init__(self, store: FleetStore, recordings: RecordingStore, palette: Palette) -> None:
-        self._store, self._recordings, self._palette = store, recordings, palette
+    Args:
+        store: the UAVs
+        recordings: their recordings
+        palette: colours
+        selected: the UAV
+        on_progress: called with the progress, 0..1
+    Raises:
+        ValueError: when there is no recording of it yet; wait for its first sample.
+    """
+    fleet = {vehicle.uav: vehicle for vehicle in store.all() if len(recordings.by_uav.get(vehicle.uav, ()))}
+    if selected not in fleet:
+        raise ValueError(f"export: found no recording of uav-{selected}, expected a flight; wait for its samples")
+    span, shift = recordings.playback_range(fleet[selected], list(fleet.values()))
+    times = np.linspace(span.begin, span.end, int(np.clip((span.end - span.begin) / 0.5, 2, MAX_FRAMES)))
 
-    def html(self, selected: int, on_progress: Callable[[float], None] = lambda _: None) -> str:
-        """Return the recording as HTML, on the clock of one UAV.
-
-        Args:
-            selected: the UAV
-            on_progress: called with the progress, 0..1
-        Raises:
-            ValueError: when there is no recording of it yet; wait for its first sample.
-        """
-        fleet = [vehicle for vehicle in self._store.all() if len(self._recordings.by_uav.get(vehicle.uav, ()))]
-        clock_vehicle = next((vehicle for vehicle in fleet if vehicle.uav == selected), None)
-        if clock_vehicle is None:
-            raise ValueError(f"export: found no recording of uav-{selected}, expected a flight; wait for its samples")
-        span, shift = self._recordings.playback_range(clock_vehicle, fleet)
-        times = np.linspace(span.begin, span.end, int(np.clip((span.end - span.begin) / 0.5, 2, MAX_FRAMES)))
-        server = serve("127.0.0.1", 0)
-        try:
-            scene = _AnimationScene(server, self._store, self._palette, selected)
-            frames = [self._pasts(fleet, shift, t) for t in times[[0, len(times) // 2, -1]]]
-            scene.look_at([past for pasts in frames for past in pasts])
-            serializer = server.get_scene_serializer()
-            for k, t in enumerate(times):
-                scene.draw(self._pasts(fleet, shift, float(t)))
-                serializer.insert_sleep(FRAME_S)
-                on_progress((k + 1) / len(times))
-            text = serializer.as_html(dark_mode=self._palette.dark)
-        finally:
-            with without_stdout():
-                server.stop()
-        return text.replace("<title>Viser</title>", "<title>ParaUAV: a flight</title>", 1)
-
-    def _pasts(self, fleet: list[Any], shift: dict[int, float], t: float) -> list[PastVehicle]:
-        pasts = (
-            vehicle_at(vehicle, self._recordings.by_uav[vehicle.uav], t + shift.get(vehicle.uav, 0.0))
-            for vehicle in fleet
-        )
+    def fleet_at(t: float) -> list[PastVehicle]:
+        pasts = (vehicle_at(v, recordings.by_uav[uav], t + shift.get(uav, 0.0)) for uav, v in fleet.items())
         return [past for past in pasts if past is not None]
+
+    server = serve("127.0.0.1", 0)
+    try:
+        scene = _AnimationScene(server, store, palette, selected)
+        scene.look_at([past for t in times[[0, len(times) // 2, -1]] for past in fleet_at(float(t))])
+        serializer = server.get_scene_serializer()
+        for k, t in enumerate(times):
+            scene.draw(fleet_at(float(t)))
+            serializer.insert_sleep(FRAME_S)
+            on_progress((k + 1) / len(times))
+        text = serializer.as_html(dark_mode=palette.dark)
+    finally:
+        with without_stdout():
+            server.stop()
+    return text.replace("<title>Viser</title>", "<title>ParaUAV: a flight</title>", 1)
 
 
 class _AnimationScene:
@@ -116,9 +115,8 @@ class _AnimationScene:
             return self._selection.clear()
         self._selection.draw(vehicle, self._store, 0.0, ground=ground, unit=unit)
         self._selection.draw_flight(vehicle, self._store.track(vehicle), 0.0, unit)
-        self._selection.draw_route(
-            vehicle, mission_lines(vehicle.mission, scene_frame, ground), self._camera_view, unit
-        )
+        route = mission_lines(vehicle.mission, scene_frame, ground)
+        self._selection.draw_route(vehicle, route, self._camera_view, unit)
         tags = self._selection.tags
         tags[:1] = [tag._replace(text=f"{tag.text} · {timestamp(vehicle.shown_t)}") for tag in tags[:1]]
         self._labels.draw([*tags, *self._selection.marks], self._camera_view)
@@ -132,14 +130,7 @@ FORMULA = ("=", "+", "-", "@", "\t", "\r")  # first characters of a formula in a
 
 
 def table(recording: UavRecording, scene_frame: SceneFrame) -> str:
-    """Return every recorded row of a UAV with its state at that time.
-
-    Args:
-        recording: its recording
-        scene_frame: frame of the scene
-    Returns:
-        CSV with a header; times in seconds since 1970, angles in degrees
-    """
+    """Return every recorded row of a UAV with its state as CSV with a header; times [s since 1970], angles [deg]."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(COLUMNS)
@@ -150,17 +141,14 @@ def table(recording: UavRecording, scene_frame: SceneFrame) -> str:
         angles_deg = np.degrees(row[3:6])
         when = datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds") if is_dated(at) else ""
         where = [f"{at:.3f}", when, f"{lat * 1e-7:.7f}", f"{lon * 1e-7:.7f}", f"{alt * 1e-3:.2f}"]
-        writer.writerow(
-            [*where, *(f"{angle:.2f}" for angle in angles_deg), f"{row[6]:.2f}", *_state_fields(recording, float(at))]
-        )
+        motion = [f"{value:.2f}" for value in (*angles_deg, row[6])]
+        writer.writerow([*where, *motion, *_state_fields(recording, float(at))])
     return out.getvalue()
 
 
 def _state_fields(recording: UavRecording, t: float) -> list[str]:
-    record, forecast = (
-        recording.state_at(t),
-        next((prediction for prediction in reversed(recording.predictions) if prediction.t <= t), None),
-    )
+    record = recording.state_at(t)
+    forecast = next((prediction for prediction in reversed(recording.predictions) if prediction.t <= t), None)
     horizon = [f"{forecast.horizon_s:.1f}", f"{forecast.t:.3f}"] if forecast is not None else ["", ""]
     if record is None:
         return ["", "", "", "", "", *horizon, ""]
@@ -180,11 +168,8 @@ TIMEOUT_S = 20.0  # software rendering is slow [s]
 
 
 def picture(client: Any, palette: Palette) -> bytes:
-    """Request the rendered view of a page.
+    """Request the rendered view of a page as PNG.
 
-    Args:
-        client: client of the page
-        palette: its colours
     Raises:
         TimeoutError: when the page does not answer; keep it in the foreground.
     """
@@ -218,13 +203,8 @@ class Export:
         palette: Palette,
         selected_uav: Callable[[], int | None],
     ) -> None:
-        self._client, self._store, self._recordings, self._palette, self._selected_uav = (
-            client,
-            store,
-            recordings,
-            palette,
-            selected_uav,
-        )
+        self._client, self._store, self._recordings = client, store, recordings
+        self._palette, self._selected_uav = palette, selected_uav
         gui = client.gui
         for label, icon, make in (
             ("View as PNG", viser.Icon.CAMERA, self._picture),
@@ -257,8 +237,11 @@ class Export:
 
     def _film(self) -> tuple[str, bytes]:
         uav = self._uav()
-        animation = FlightAnimation(self._store, self._recordings, self._palette)
-        text = animation.html(uav, lambda share: self._set_status(f"exporting: {share:.0%}"))
+
+        def on_progress(share: float) -> None:
+            self._set_status(f"exporting: {share:.0%}")
+
+        text = flight_html(self._store, self._recordings, self._palette, uav, on_progress)
         return f"{self._name(f'uav-{uav}')}.html", text.encode()
 
     def _table(self) -> tuple[str, bytes]:
@@ -270,7 +253,6 @@ class Export:
 
     def _name(self, what: str) -> str:
         """Return a file name with its content and the newest data time."""
-        newest = max(
-            (recording.t[-1] for recording in list(self._recordings.by_uav.values()) if len(recording)), default=0.0
-        )
+        recordings = list(self._recordings.by_uav.values())
+        newest = max((recording.t[-1] for recording in recordings if len(recording)), default=0.0)
         return f"parauav-{what}-{timestamp(float(newest))}".replace(":", "").replace(" ", "-").replace("+", "")

@@ -145,20 +145,8 @@ def _facts(vehicle: Vehicle, now: float) -> str:
     prediction, status, row = vehicle.prediction, vehicle.status, vehicle.row
     at, age_s, rate = vehicle.data_time(now), vehicle.sample_age_s(now), vehicle.time.rate
     time_name = "recorded" if vehicle.recorded else "data time"
-    names = (
-        "coverage",
-        "calibration",
-        "method",
-        "mode",
-        "link",
-        time_name,
-        "sample",
-        "prediction",
-        "within 10 %",
-        "worker",
-    )
-    figures = dict.fromkeys(names, "–")
-    figures["coverage"] = coverage_text(vehicle)
+    names = "calibration", "method", "mode", "link", time_name, "sample", "prediction", "within 10 %", "worker"
+    figures = {"coverage": coverage_text(vehicle)} | dict.fromkeys(names, "–")
     figures[time_name] = timestamp(at)
     if vehicle.recorded and rate and not vehicle.ended:
         figures[time_name] += f", played {rate_text(rate)}"

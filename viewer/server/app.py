@@ -207,48 +207,29 @@ class App:
             self.fleet_arrays.update_poses(self.store, now)
         exceptional = [self.fleet_arrays.uavs[i] for i in np.flatnonzero(self.fleet_arrays.exceptions)[:MAX_IMMEDIATE]]
         selected = [view.selected for view in self.views.values() if view.selected is not None]
-        self.store.inbox.full_rate_uavs, self.store.immediate_uavs = (
-            frozenset(selected),
-            frozenset((*exceptional, *selected)),
-        )
+        self.store.inbox.full_rate_uavs = frozenset(selected)
+        self.store.immediate_uavs = frozenset((*exceptional, *selected))
+        backfilled, is_small = self._backfill.take_filled(), len(fleet) <= SMALL_FLEET
         played = [(v, rows) for v in fleet if v.recorded and len(rows := self.store.track(v))]
-        self.fleet_arrays.extend_trails(
-            {
-                v.uav: positions_at(rows, v.t - TRAIL_AGES_S, np.inf)
-                for v, rows in [*played, *self._irregular_tracks(fleet)]
-            }
-        )
+        uneven = [v for v in fleet if not v.recorded and (v.uav in backfilled or (is_small and v.time.rate != 1.0))]
+        tracks = [*played, *((v, rows) for v in uneven if len(rows := self.store.track(v)))]
+        self.fleet_arrays.extend_trails({v.uav: positions_at(rows, v.t - TRAIL_AGES_S, np.inf) for v, rows in tracks})
         self.fleet_arrays.update_fleet(fleet, now)
         if scene_frame is None or not self.fleet_arrays.uavs:
             return
         self._ground_height = estimate_ground(fleet, scene_frame.origin.alt_mm * 1e-3, self._ground_height)
         forecasts = [] if self.fleet_arrays.large_fleet else [v.forecast for v in fleet if v.forecast is not None]
-        predicted_paths = [
-            forecast.position_at(np.linspace(0, max(forecast.horizon_s, BEYOND_S), 8)) for forecast in forecasts
-        ]
-        paths = [rows[:, 1:] for _, rows in played]
-        self._framing_points = within_reach(
-            np.vstack([self.fleet_arrays.at, *predicted_paths, *paths]), IN_VIEW_M / UNIT_M
-        )
+        paths = [f.position_at(np.linspace(0, max(f.horizon_s, BEYOND_S), 8)) for f in forecasts]
+        paths += [rows[:, 1:] for _, rows in played]
+        self._framing_points = within_reach(np.vstack([self.fleet_arrays.at, *paths]), IN_VIEW_M / UNIT_M)
         if not self.views:
             set_initial_view(self._server, self._framing_points)
-
-    def _irregular_tracks(self, fleet: list[Vehicle]) -> list[tuple[Vehicle, np.ndarray]]:
-        """Return the tracks of UAVs that are not in real time or were just backfilled."""
-        backfilled, is_small = self._backfill.take_filled(), len(fleet) <= SMALL_FLEET
-        vehicles = [v for v in fleet if not v.recorded and (v.uav in backfilled or (is_small and v.time.rate != 1.0))]
-        return [(v, rows) for v in vehicles if len(rows := self.store.track(v))]
 
     def _framing_key(self) -> tuple:
         """Return the values whose change requires new framing."""
         fleet, scene_frame = self.fleet_arrays.fleet, self.store.scene_frame
-        predicted_count = sum(v.forecast is not None for v in fleet)
-        return (
-            scene_frame.origin if scene_frame else None,
-            len(self.fleet_arrays.uavs),
-            predicted_count,
-            sum(v.ended for v in fleet),
-        )
+        counts = len(self.fleet_arrays.uavs), sum(v.forecast is not None for v in fleet), sum(v.ended for v in fleet)
+        return scene_frame.origin if scene_frame else None, *counts
 
 
 def draw_guarded(view: View, draw: Callable[[], None]) -> None:

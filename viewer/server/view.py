@@ -45,7 +45,12 @@ class View:
         self.client, self.browser, self._store, self.palette, self._wake = client, browser, store, palette, wake
         self.scene = Scene(client.scene, palette, self.select)
         self.selection, self._labels = Selection(client.scene, palette), Labels(client.scene)
-        self.panels = Panels(browser, palette, self.focus_on, self._actions())
+        commands = {
+            "Show the whole fleet": self.show_all,
+            "Next aircraft with an alert": self.next_exception,
+            "Toggle following the selected aircraft": self.toggle_follow,
+        }
+        self.panels = Panels(browser, palette, self.focus_on, commands)
         self.timeline = Timeline(client, store, recordings, palette, self._redraw)
         self.panels.seek = self.timeline.send_code()
         with self.timeline.tab("Export", viser.Icon.DOWNLOAD):
@@ -64,11 +69,8 @@ class View:
         """Restore selection, time shown and camera of the view before a theme change."""
         self.selected, self.camera, self.offset = previous.selected, previous.camera, previous.offset
         self.timeline.player = previous.timeline.player
-        self._framed_key, self._framed_box, self._followed = (
-            previous._framed_key,
-            previous._framed_box,
-            previous._followed,
-        )
+        self._framed_key, self._framed_box = previous._framed_key, previous._framed_box
+        self._followed = previous._followed
 
     def show_error(self, error: str) -> bool:
         """Show a drawing error on the page; return whether it is new."""
@@ -83,24 +85,10 @@ class View:
             )
         return True
 
-    def _clear_error(self) -> None:
-        """Remove the error text once everything is drawn again."""
-        if self._error and time.monotonic() - self._error_time > RECOVERY_S:
-            self._error = ""
-            self.panels.show_error("")
-
     def _redraw(self) -> None:
         """Request an immediate redraw after a change of the time shown."""
         self.dirty = True
         self._wake()
-
-    def _actions(self) -> dict[str, Callable[[], None]]:
-        """Return the commands of the palette other than selection."""
-        return {
-            "Show the whole fleet": self.show_all,
-            "Next aircraft with an alert": self.next_exception,
-            "Toggle following the selected aircraft": self.toggle_follow,
-        }
 
     def show_all(self) -> None:
         """Frame everything again, even if the camera was moved."""
@@ -180,12 +168,9 @@ class View:
             self.selection.clear()
         else:
             self.selection.draw(vehicle, self._store, now, ground=scene.ground.height, unit=scene.glyphs.unit)
-        tags = [
-            *self.selection.tags,
-            *self.selection.marks[:1],
-            *alert_labels(fleet_arrays, self.selected, scene.glyphs.unit),
-        ]
-        self._labels.draw([*tags, *self.selection.marks[1:]], camera_view)
+        tags, marks = self.selection.tags, self.selection.marks
+        alerts = alert_labels(fleet_arrays, self.selected, scene.glyphs.unit)
+        self._labels.draw([*tags, *marks[:1], *alerts, *marks[1:]], camera_view)
 
     def draw_slow(self, fleet_arrays: FleetArrays, now: float, ground: float) -> None:
         """Draw slow content once per second and on a new selection: trails, predictions, routes, panels."""
@@ -197,7 +182,9 @@ class View:
         if (scene_frame := self._store.scene_frame) is not None and fleet_arrays.uavs:
             with self.client.atomic():
                 self._draw(fleet_arrays, now, scene_frame, ground)
-        self._clear_error()
+        if self._error and time.monotonic() - self._error_time > RECOVERY_S:
+            self._error = ""
+            self.panels.show_error("")
 
     def _draw(self, fleet_arrays: FleetArrays, now: float, scene_frame: SceneFrame, ground: float) -> None:
         options, scene = self.panels, self.scene
@@ -218,9 +205,8 @@ class View:
         browser = self.browser
         if fleet_arrays.index(browser.uav) is not None:
             self.selected, browser.uav = browser.uav, None
-        if self.selected is None and (
-            drawn := [v for v in fleet_arrays.fleet if fleet_arrays.index(v.uav) is not None]
-        ):
+        drawn = [v for v in fleet_arrays.fleet if fleet_arrays.index(v.uav) is not None]
+        if self.selected is None and drawn:
             self.selected = max(drawn, key=lambda v: (v.forecast is not None, -v.uav)).uav
         browser.save(self.selected)
 
@@ -244,15 +230,11 @@ class View:
         if not self.timeline.player.live:
             return
         vehicle, scene_frame = self.selected_vehicle(), self._store.scene_frame
-        lines = (
-            mission_lines(vehicle.mission, scene_frame, ground)
-            if vehicle is not None and scene_frame is not None
-            else NOTHING
-        )
-        track = self._store.track(vehicle)[:, 1:] if vehicle is not None else NOTHING.points
-        points = within_reach(
-            np.vstack([points, lines.points, lines.circles.reshape(-1, 3), track]), IN_VIEW_M / UNIT_M
-        )
+        lines, track = NOTHING, NOTHING.points
+        if vehicle is not None and scene_frame is not None:
+            lines, track = mission_lines(vehicle.mission, scene_frame, ground), self._store.track(vehicle)[:, 1:]
+        content = np.vstack([points, lines.points, lines.circles.reshape(-1, 3), track])
+        points = within_reach(content, IN_VIEW_M / UNIT_M)
         key = (*key, bool(len(lines.points)), round(self.camera.aspect, 1))
         if key == self._framed_key and not outgrown(points, self._framed_box):
             return

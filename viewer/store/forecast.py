@@ -46,9 +46,8 @@ class ScenePrediction:
     @cached_property
     def _scene_arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         message = self.message
-        ahead, path, tube = (
-            a.numpy().astype(float) for a in (message.ahead, message.path, message.prediction_region_half_axes)
-        )
+        arrays = (message.ahead, message.path, message.prediction_region_half_axes)
+        ahead, path, tube = (array.numpy().astype(float) for array in arrays)
         tube = np.clip(np.nan_to_num(tube / UNIT_M), 0.0, 1e4)
         return refined(ahead, self.scene_frame.from_ned(message.ned_origin(), path), tube)
 
@@ -65,10 +64,9 @@ class ScenePrediction:
         path, ahead = self.message.path.numpy(), self.message.ahead.numpy()
         ahead = ahead[: int(np.searchsorted(ahead, PAST_AHEAD_S, side="right"))]
         same = previous is not None and np.array_equal(previous.ahead, ahead)
-        shared_ahead = previous.ahead if previous is not None and same else ahead.copy()
-        return PastPrediction(
-            self.t, self.horizon_s, shared_ahead, path[: len(ahead)].copy(), self.message.origin, self.scene_frame
-        )
+        ahead = previous.ahead if previous is not None and same else ahead.copy()
+        ned = path[: len(ahead)].copy()
+        return PastPrediction(self.t, self.horizon_s, ahead, ned, self.message.origin, self.scene_frame)
 
 
 class PastPrediction(NamedTuple):

@@ -34,10 +34,8 @@ class SceneFrame:
         scene = ned_to_scene(to_ned(self.origin, lat, lon, alt))
         if (np.abs(scene) > REACH_M / UNIT_M).any():
             distance_km = np.abs(scene).max() * UNIT_M / 1000
-            raise OutOfRangeError(
-                f"position: found {distance_km:.0f} km from the scene origin, expected at most 100 km; open "
-                "another viewer"
-            )
+            found = f"position: found {distance_km:.0f} km from the scene origin"
+            raise OutOfRangeError(f"{found}, expected at most 100 km; open another viewer")
         return scene
 
     def from_geodetic_point(self, lat_e7: float, lon_e7: float, alt_mm: float) -> tuple[float, float, float]:
@@ -53,10 +51,9 @@ class SceneFrame:
         reach = REACH_M / UNIT_M
         if -reach <= east <= reach and -reach <= north <= reach and -reach <= up <= reach:
             return east, north, up
-        point = self.from_geodetic(*(np.array([x]) for x in (lat_e7, lon_e7, alt_mm)))[
-            0
-        ]  # raises, or crosses 180 degrees
-        return float(point[0]), float(point[1]), float(point[2])
+        # raises, or crosses 180 degrees
+        (point,) = self.from_geodetic(*(np.array([x]) for x in (lat_e7, lon_e7, alt_mm))).tolist()
+        return point[0], point[1], point[2]
 
     def from_ned(self, origin: tuple[int, int, int], ned: np.ndarray) -> np.ndarray:
         """Map NED positions relative to another origin, (n, 3) [m], to the scene: (n, 3) ENU [10 m]."""
@@ -80,15 +77,9 @@ def scene_quat(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarra
     """
     a, b, c = (np.pi / 2 - psi) / 2, -np.asarray(theta) / 2, np.asarray(phi) / 2
     cy, sy, cp, sp, cr, sr = np.cos(a), np.sin(a), np.cos(b), np.sin(b), np.cos(c), np.sin(c)
-    return np.stack(
-        [
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ],
-        axis=-1,
-    )
+    w, x = cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy
+    y, z = cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy
+    return np.stack([w, x, y, z], axis=-1)
 
 
 def first_fix(sample: SampleSubset) -> Origin | None:

@@ -1,5 +1,6 @@
 """State of one UAV in the viewer: the latest message of each topic and bounded histories."""
 
+import re
 from collections import deque
 from dataclasses import dataclass, field
 from math import isfinite
@@ -212,5 +213,4 @@ class Vehicle:
 
 def stamp_of(row: FleetRow) -> Stamp:
     """Return the fencing token of a fleet table row; the writer is untrusted text."""
-    hexadecimal = len(row.worker) == 16 and all(character in "0123456789abcdef" for character in row.worker)
-    return Stamp(row.epoch, int(row.worker, 16) if hexadecimal else 0)
+    return Stamp(row.epoch, int(row.worker, 16) if re.fullmatch("[0-9a-f]{16}", row.worker) else 0)

@@ -22,11 +22,10 @@ def aircraft() -> tuple[np.ndarray, np.ndarray]:
         vertices.append(box)
         faces.append((quads if half[1] > 0 else quads[:, ::-1]) + 8 * k)
     n = 8 * len(boxes)
-    vertices.append(
-        np.array([[-0.25, 0.01, 0.03], [-0.38, 0.01, 0.03], [-0.40, 0.0, 0.20], [-0.32, 0.0, 0.20], [0.58, 0, 0]])
-    )
+    fin = [[-0.25, 0.01, 0.03], [-0.38, 0.01, 0.03], [-0.40, 0.0, 0.20], [-0.32, 0.0, 0.20]]
+    vertices.append(np.array([*fin, [0.58, 0, 0]]))
     faces.append(np.array([(0, 1, 2), (0, 2, 3), (2, 1, 0), (3, 2, 0)]) + n)
-    faces.append(np.array([(4, n + 4, 5), (6, n + 4, 4), (7, n + 4, 6), (5, n + 4, 7)]) * 1)
+    faces.append(np.array([(4, n + 4, 5), (6, n + 4, 4), (7, n + 4, 6), (5, n + 4, 7)]))
     return 1.1 * np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.uint32)
 
 

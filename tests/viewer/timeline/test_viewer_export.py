@@ -14,7 +14,7 @@ from test_viewer_timeline import fly, tape_of, timeline
 from fleet.contract import Alert, AlertKind, Status
 from fleet.frames import to_geodetic
 from tests.support.pretend_feed import Clock, PretendUav, T, feed_of
-from viewer.export import COLUMNS, Export, FlightAnimation, escape_formula, picture, png, table
+from viewer.export import COLUMNS, Export, escape_formula, flight_html, picture, png, table
 from viewer.theme.palette import DARK, rgb
 
 
@@ -50,13 +50,13 @@ def test_the_table_says_where_it_was_and_no_word_becomes_a_formula(flown) -> Non
 def test_the_flight_is_a_page_that_needs_nobody(flown) -> None:
     one, feed = flown
     shares: list[float] = []
-    text = FlightAnimation(feed, one._recordings, DARK).html(0, shares.append)
+    text = flight_html(feed, one._recordings, DARK, 0, shares.append)
     data = re.search(r'__VISER_EMBED_DATA__="([^"]+)"', text)
     assert data is not None and len(base64.b64decode(data[1])) > 20_000 and len(text) < 8_000_000
     assert "<title>ParaUAV" in text and shares == sorted(shares) and shares[-1] == 1.0
     assert len(shares) == pytest.approx(50, abs=3)  # two instants a second
     with pytest.raises(ValueError, match="export: found no recording of uav-9"):
-        FlightAnimation(feed, one._recordings, DARK).html(9)
+        flight_html(feed, one._recordings, DARK, 9)
 
 
 def test_a_picture_has_the_sky_where_nothing_is_drawn() -> None:
