@@ -34,7 +34,7 @@ from viewer.server.view import FRAME_MARGIN, outgrown
 from viewer.store.place import UNIT_M, SceneFrame, scene_quat
 from viewer.store.store import FleetStore
 from viewer.text.words import empty_html, summary_html, table
-from viewer.theme.palette import DARK, LIGHT, displayed_colour, line_colour, rgb
+from viewer.theme.palette import _EXPOSURE, _IN, _OUT, DARK, LIGHT, line_colour, rgb
 from viewer.theme.shapes import aircraft, diamond, rotorcraft
 
 
@@ -44,6 +44,14 @@ def clock() -> Clock:
 
 
 # --- colours ---
+
+
+def displayed_colour(vertex: np.ndarray) -> np.ndarray:
+    """As the renderer shows a vertex colour: (..., 3) [0..255] -> (..., 3) sRGB [0..255]."""
+    v = (np.asarray(vertex, float) / 255 / _EXPOSURE) @ _IN.T
+    v = (v * (v + 0.0245786) - 0.000090537) / (v * (0.983729 * v + 0.4329510) + 0.238081)
+    c = np.clip(v @ _OUT.T, 0, 1)
+    return 255 * np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
 
 
 @pytest.mark.parametrize("palette", [DARK, LIGHT], ids=["dark", "light"])

@@ -96,11 +96,7 @@ def axis_range(y: np.ndarray) -> tuple[float, float]:
 def band(vehicle: Vehicle | None, distances: np.ndarray) -> tuple[np.ndarray, ...] | None:
     """Return measured error and largest half-axis of the band against look-ahead, and a vertical horizon line.
 
-    Args:
-        vehicle: the UAV
-        distances: from `prediction_errors`, (k, 30) [m]
-    Returns:
-        x [s], measured, band, horizon [m]
+    `distances` is (k, 30) from `prediction_errors`. Returns x [s], measured, band, horizon [m].
     """
     if vehicle is None or (forecast := vehicle.forecast) is None:
         return None

@@ -25,10 +25,7 @@ MAX_EVENT_ROWS = 40  # events shown; earlier ones are counted
 def event_list_html(events: tuple[TimelineEvent, ...], palette: Palette, seek: str = "") -> str:
     """Return the events as HTML, newest first; texts are escaped here.
 
-    Args:
-        events: oldest first
-        palette: colours
-        seek: page code that seeks to the time inserted at `{}`; empty: rows are not clickable
+    `seek` is page code that seeks to the time inserted at `{}`; empty: rows are not clickable.
     """
     if not events:
         return '<div class="uav"><b>Events</b> <span class="soft">none yet</span></div>'

@@ -156,11 +156,7 @@ class FleetArrays:
         self._read_positions[rows], self._read_times[rows] = positions, received
 
     def extend_trails(self, played: dict[int, np.ndarray]) -> None:
-        """Append the positions to the trails, once per second.
-
-        Args:
-            played: trails of UAVs that are not in real time, positions `TRAIL_AGES_S` ago, (n, 3) [10 m]
-        """
+        """Append the positions, once per second; `played`: whole trails (73, 3) [10 m] of UAVs not in real time."""
         if not self.uavs:
             return
         self.trails = np.concatenate([self.trails[:, 1:], self.at[:, None]], axis=1)

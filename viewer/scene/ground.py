@@ -19,7 +19,9 @@ class GroundGrid:
 
     def __init__(self, scene: Any, palette: Palette) -> None:
         self.height = 0.0  # scene [10 m]
-        scene.set_background_image(_sky(palette), format="png")
+        share = np.clip(np.linspace(0, 3, 256), 0, 1)[:, None, None] ** 0.7  # sky in the upper third, ground below
+        sky = rgb(palette.sky[0]) * (1 - share) + rgb(palette.ground) * share
+        scene.set_background_image(np.repeat(sky, 2, axis=1).astype(np.uint8), format="png")
         scene.configure_default_lights(True, cast_shadow=False)
         # No fog: with fog the client fails to draw the outline of a hovered aircraft and loses the frame.
         self._node = scene.add_frame("/env", show_axes=False)
@@ -36,22 +38,10 @@ class GroundGrid:
             self._node.position = (0.0, 0.0, height)
 
 
-def _sky(palette: Palette) -> np.ndarray:
-    """Return the background: sky in the upper third, ground colour below, (256, 2, 3)."""
-    share = np.clip(np.linspace(0, 3, 256), 0, 1)[:, None, None] ** 0.7
-    return np.repeat(rgb(palette.sky[0]) * (1 - share) + rgb(palette.ground) * share, 2, axis=1).astype(np.uint8)
-
-
 def _grid(palette: Palette, spacing: float, reach: float, strength: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return grid lines that fade outwards; the built-in grid is too slow for software rendering.
+    """Return grid lines that fade outwards, (n, 2, 3) [10 m], and the colours of their ends, (n, 2, 3).
 
-    Args:
-        palette: colours
-        spacing: of the lines [m]
-        reach: of the lines [m]
-        strength: share of the full colour at the centre [-]
-    Returns:
-        segments (n, 2, 3) [10 m] and the colours of their ends (n, 2, 3)
+    The built-in grid is too slow for software rendering. `spacing` and `reach` are in metres.
     """
     offsets = np.arange(-reach, reach + 1, spacing) / UNIT_M
     along = np.linspace(-reach, reach, PARTS + 1) / UNIT_M

@@ -45,14 +45,7 @@ class Glyphs:
     def update_appearance(
         self, fleet_arrays: FleetArrays, camera_view: CameraView, *, selected: int | None, size: float
     ) -> None:
-        """Update colours and sizes; call it a few times per second.
-
-        Args:
-            fleet_arrays: drawn UAVs
-            camera_view: view of the camera
-            selected: selected UAV of this page
-            size: scale set by the operator, 1 is the default [-]
-        """
+        """Update colours and sizes, a few times per second; `size` is the operator's scale, 1 is the default [-]."""
         if not self._batches or not len(fleet_arrays.statuses):
             return
         focus_distance = float(np.linalg.norm(camera_view.look_at - camera_view.position)) or 1.0
@@ -237,16 +230,10 @@ def predicted_vehicles(fleet_arrays: FleetArrays) -> list[Vehicle]:
 def cut_at_horizon(
     ahead: np.ndarray, path: np.ndarray, start: float, horizon_s: float, dashes: int = DASHES
 ) -> np.ndarray:
-    """Cut a path into dashes of equal duration between two look-aheads, at most `MAX_AHEAD_S`.
+    """Cut a path (n, 3) at look-aheads `ahead`, (n,) [s], into dashes of equal duration between `start` and horizon.
 
-    Args:
-        ahead: look-ahead of each point, increasing, (n,) [s]
-        path: positions, (n, 3)
-        start: first look-ahead [s]
-        horizon_s: last look-ahead [s]
-        dashes: number of dashes
     Returns:
-        (dashes, 2, 3); zero length beyond the horizon
+        (dashes, 2, 3) up to `MAX_AHEAD_S`; zero length beyond the horizon
     """
     at = np.minimum(max(start, 0.0) + np.linspace(0.0, MAX_AHEAD_S, 2 * dashes), horizon_s)
     points = np.stack([np.interp(at, ahead, path[:, i]) for i in range(3)], axis=-1)

@@ -136,19 +136,17 @@ class View:
     def draw_moving(self, fleet_arrays: FleetArrays, now: float, tick: int) -> None:
         """Draw moving content: aircraft at the full rate, trail heads, stems and the selected UAV more slowly."""
         with self.client.atomic():
-            self._draw_moving(self.timeline.fleet_arrays(fleet_arrays, self.selected, now), now, tick)
-
-    def _draw_moving(self, fleet_arrays: FleetArrays, now: float, tick: int) -> None:
-        self.scene.glyphs.draw(fleet_arrays)
-        if tick % (10 if fleet_arrays.large_fleet else 2) == 0:
-            self.scene.draw_heads(fleet_arrays, self.selected)
-            self.scene.draw_stems(fleet_arrays)
-            self.scene.draw_alerts(fleet_arrays)
-        if tick % 5 == 0 and not self.timeline.player.live:
-            self.timeline.draw(self.selected)
-        if tick % 2 == 0:
-            self._draw_labels(fleet_arrays, now)
-        self._follow(now)
+            fleet_arrays = self.timeline.fleet_arrays(fleet_arrays, self.selected, now)
+            self.scene.glyphs.draw(fleet_arrays)
+            if tick % (10 if fleet_arrays.large_fleet else 2) == 0:
+                self.scene.draw_heads(fleet_arrays, self.selected)
+                self.scene.draw_stems(fleet_arrays)
+                self.scene.draw_alerts(fleet_arrays)
+            if tick % 5 == 0 and not self.timeline.player.live:
+                self.timeline.draw(self.selected)
+            if tick % 2 == 0:
+                self._draw_labels(fleet_arrays, now)
+            self._follow(now)
 
     def draw_selection(self, fleet_arrays: FleetArrays, now: float, ground: float) -> None:
         """Draw the selected UAV immediately: path, route, tube, labels."""

@@ -134,11 +134,8 @@ MIN_PREDICTIONS = 3  # fewer errors at a look-ahead give no RMS
 
 
 def prediction_errors(predictions: list[PastPrediction], trail: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the position error of every prediction at every elapsed look-ahead.
+    """Compute the position error of every prediction at every look-ahead, from a trail (n, 4 or more).
 
-    Args:
-        predictions: oldest first
-        trail: fleet time [s], scene ENU [10 m], (n, 4 or more)
     Returns:
         issue times (k,) [s] and errors (k, 30) [m]; NaN where the flown position is not available
     """

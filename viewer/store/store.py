@@ -190,10 +190,10 @@ class FleetStore:
     def all(self) -> list[Vehicle]:
         """Return snapshots of all UAVs in the order of their ids."""
         with self.lock:
-            self._read_samples(
-                self.inbox.waiting_since(self._clock() - MAX_SAMPLE_WAIT_S) if self.inbox.large_fleet else None
-            )
-            return [self._vehicles[uav].snapshot(self._clock()) for uav in sorted(self._vehicles)]
+            now = self._clock()
+            waiting = self.inbox.waiting_since(now - MAX_SAMPLE_WAIT_S) if self.inbox.large_fleet else None
+            self._read_samples(waiting)
+            return [self._vehicles[uav].snapshot(now) for uav in sorted(self._vehicles)]
 
     def poses(self, uavs: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return positions, attitudes and arrival times of some UAVs; do not decode others.

@@ -102,13 +102,6 @@ def line_colour(displayed: np.ndarray) -> np.ndarray:
     return np.rint(255 * np.clip(_EXPOSURE * v @ np.linalg.inv(_IN).T, 0, 1)).astype(np.uint8)
 
 
-def displayed_colour(vertex: np.ndarray) -> np.ndarray:
-    """Return the displayed colour of a vertex colour: (..., 3) [0..255] -> (..., 3) sRGB [0..255]."""
-    v = (np.asarray(vertex, float) / 255 / _EXPOSURE) @ _IN.T
-    v = (v * (v + 0.0245786) - 0.000090537) / (v * (0.983729 * v + 0.4329510) + 0.238081)
-    return 255 * _companded(np.clip(v @ _OUT.T, 0, 1))
-
-
 def mesh_colour(displayed: np.ndarray) -> np.ndarray:
     """Return linear instance colours of a lit mesh: (n, 3) sRGB [0..255] -> uint8."""
     return np.rint(255 * _linear(np.clip(np.asarray(displayed, float), 0, 255) / 255)).astype(np.uint8)
@@ -116,7 +109,3 @@ def mesh_colour(displayed: np.ndarray) -> np.ndarray:
 
 def _linear(s: np.ndarray) -> np.ndarray:
     return np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
-
-
-def _companded(c: np.ndarray) -> np.ndarray:
-    return np.where(c <= 0.0031308, 12.92 * c, 1.055 * np.clip(c, 0, None) ** (1 / 2.4) - 0.055)

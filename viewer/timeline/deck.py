@@ -19,7 +19,7 @@ from viewer.theme.palette import Palette, mix, rgb
 from viewer.timeline import past as compare
 from viewer.timeline import strip
 from viewer.timeline.past import PastVehicle, update_past_arrays, vehicle_at
-from viewer.timeline.recordings import Player, RecordingStore, TimelineRange, last_before, next_after
+from viewer.timeline.recordings import Player, RecordingStore, TimelineRange
 from viewer.timeline.strip import drag_attributes
 
 TRANSPORT = ("Pause", "1×", "4×", "● Live")
@@ -106,7 +106,9 @@ class Timeline:
         if t is None:
             return fleet_arrays
         if self._drawn_at != previous:
-            self._update_past(fleet_arrays.fleet, t, now)
+            recorded = [vehicle for vehicle in fleet_arrays.fleet if vehicle.uav in self._recordings.by_uav]
+            pasts = [past for vehicle in recorded if (past := self._past_vehicle(vehicle, t)) is not None]
+            update_past_arrays(self._past_arrays, pasts, now)
         return self._past_arrays
 
     def vehicle(self, uav: int) -> Vehicle | None:
@@ -119,10 +121,6 @@ class Timeline:
     def _past_vehicle(self, vehicle: Vehicle, t: float) -> PastVehicle | None:
         shown_t = t + self._shift.get(vehicle.uav, 0.0)
         return vehicle_at(vehicle, self._recordings.by_uav[vehicle.uav], shown_t, self.player.rate)
-
-    def _update_past(self, fleet: list[Vehicle], t: float, now: float) -> None:
-        pasts = [self._past_vehicle(vehicle, t) for vehicle in fleet if vehicle.uav in self._recordings.by_uav]
-        update_past_arrays(self._past_arrays, [past for past in pasts if past is not None], now)
 
     def _update_range(self, fleet: list[Vehicle], selected: int | None) -> None:
         """Update the available time range, on the clock of the selected UAV."""
@@ -191,7 +189,10 @@ class Timeline:
             return self.player.seek(t + direction, self._span)
         rows = self._recordings.by_uav[self._clock_uav or 0].t.tolist()
         times = [event.t for event in self._events()] if unit == "event" else rows
-        target = next_after(t, times) if direction > 0 else last_before(t, times)
+        if direction > 0:
+            target = min((other for other in times if other > t + 1e-3), default=None)
+        else:
+            target = max((other for other in times if other < t - 1e-3), default=None)
         if target is not None:
             self.player.seek(target, self._span)
 

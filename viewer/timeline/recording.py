@@ -90,13 +90,9 @@ class UavRecording:
         return self._t.nbytes + self._x.nbytes + self._prediction_bytes
 
     def record(self, vehicle: Vehicle, trail: np.ndarray, now: float, step_s: float = PREDICTION_STEP_S) -> None:
-        """Record the current state of a UAV.
+        """Record the current state of a UAV; `trail`, (n, 5), fills gaps since the last row.
 
-        Args:
-            vehicle: immutable snapshot
-            trail: newest positions, (n, 5): time, scene ENU, Va; fills gaps since the last row
-            now: monotonic time [s]
-            step_s: shortest time between two recorded predictions [s]
+        `now` is monotonic [s], `step_s` the shortest time between two recorded predictions [s].
         """
         if self._n and vehicle.t < self._t[self._n - 1] - JUMP_S:
             self.__init__()  # type: ignore[misc]  # clock step back: another flight

@@ -64,16 +64,6 @@ class Player:
             self.go_live()
 
 
-def next_after(t: float, times: list[float]) -> float | None:
-    """Return the first time after t by more than 1 ms; None when there is none."""
-    return min((candidate for candidate in times if candidate > t + 1e-3), default=None)
-
-
-def last_before(t: float, times: list[float]) -> float | None:
-    """Return the last time before t by more than 1 ms; None when there is none."""
-    return max((candidate for candidate in times if candidate < t - 1e-3), default=None)
-
-
 MAX_START_GAP_S = 3600.0  # recordings that start farther apart are shown as simultaneous [s]
 SMALL_FLEET, LARGE_FLEET = 50, 300  # UAVs up to which rows are recorded at 5 Hz; at 1 Hz, with predictions every 5 s
 SMALL_FLEET_STEP_S, STEP_S = 0.15, 0.9  # shortest time between two records [s]
@@ -110,11 +100,8 @@ class RecordingStore:
         return sum(recording.nbytes() for recording in list(self.by_uav.values()))
 
     def playback_range(self, clock_vehicle: Vehicle, fleet: list[Vehicle]) -> tuple[TimelineRange, dict[int, float]]:
-        """Compute the available time range on the clock of one UAV.
+        """Compute the available time range on the clock of one of the recorded UAVs `fleet`.
 
-        Args:
-            clock_vehicle: UAV whose clock is used
-            fleet: UAVs with a recording
         Returns:
             the range, and the clock offsets of recordings of other days [s]
         """

@@ -24,15 +24,7 @@ def strip(
     t: float | None,
     palette: Palette,
 ) -> str:
-    """Return the bar as SVG.
-
-    Args:
-        own: events of the selected UAV, above
-        others: events of the other UAVs, below; only severe ones are drawn
-        span: available time range
-        t: the time shown [s since 1970]; None is live
-        palette: colours
-    """
+    """Return the bar as SVG: own events above, severe ones of the other UAVs below; `t` [s since 1970], None: live."""
     severe = [event for event in others if event.kind in SEVERE]
     marks = _marks(list(own), span, palette, 3, 11) + _marks(severe, span, palette, 18, 5)
     at = WIDTH * span.fraction(span.end if t is None else t)
@@ -63,11 +55,7 @@ def _ticks(span: TimelineRange) -> list[float]:
 
 
 def drag_attributes(send: str) -> str:
-    """Return HTML attributes that send the relative position of a press or drag on the bar.
-
-    Args:
-        send: page code with the value inserted at `{}`
-    """
+    """Return HTML attributes that send the relative position of a press or drag; `send` is page code with `{}`."""
     fraction = "((event.clientX-r.left)/r.width).toFixed(5)"
     code = f"var r=this.getBoundingClientRect();{send.format(fraction)}"
     return f'onpointerdown="{code}" onpointermove="if(event.buttons&1){{{code}}}"'

@@ -44,13 +44,9 @@ class EventMarkers:
     def draw(
         self, events: tuple[TimelineEvent, ...], rows: np.ndarray, at: np.ndarray | None, size: float
     ) -> list[Tag]:
-        """Draw events at their positions; return the labels of the newest few.
+        """Draw events, oldest first, on the flown path (n, 4); return the labels of the newest few.
 
-        Args:
-            events: oldest first
-            rows: the flown path, (n, 4) time [s] and scene ENU [10 m]
-            at: drawn position of the aircraft, (3,) [10 m]
-            size: drawn span of an aircraft [10 m]
+        `at` is the drawn position of the aircraft, (3,), and `size` its drawn span [10 m].
         """
         points = positions_at(rows, np.array([event.t for event in events]))
         located = [(event, point) for event, point in zip(events, points, strict=True) if np.isfinite(point).all()]
@@ -73,23 +69,16 @@ class EventMarkers:
 def labelled_events(
     located: list[tuple[TimelineEvent, np.ndarray]], at: np.ndarray | None, clearance: float
 ) -> list[tuple[TimelineEvent, np.ndarray]]:
-    """Return the events with a label: the newest with clearance to the aircraft and each other.
-
-    Args:
-        located: events with positions (3,) [10 m], oldest first
-        at: drawn position of the aircraft, (3,) [10 m]; None when it is not drawn
-        clearance: shortest distance [10 m]
-    """
+    """Return the events with a label: the newest, `clearance` [10 m] apart and from the drawn aircraft `at`, (3,)."""
     selected: list[tuple[TimelineEvent, np.ndarray]] = []
     taken = [] if at is None else [at]
     for event, point in reversed(located):
-        if (
-            len(selected) < MAX_LABELS
-            and event.kind not in MINOR_KINDS
-            and all(np.linalg.norm(point - x) > clearance for x in taken)
-        ):
+        is_clear = all(np.linalg.norm(point - other) > clearance for other in taken)
+        if event.kind not in MINOR_KINDS and is_clear:
             selected.append((event, point))
             taken.append(point)
+        if len(selected) == MAX_LABELS:
+            break
     return selected
 
 
@@ -121,29 +110,19 @@ def path_frame(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return cross, np.cross(along, cross)
 
 
-def rings(path: np.ndarray, axes: np.ndarray, sides: int = SIDES) -> np.ndarray:
-    """Return the cross-section of the tube at each point.
-
-    Args:
-        path: mean position, (n, 3) [10 m]
-        axes: half-axes along, cross, vertical, (n, 3) [10 m]
-    Returns:
-        corners, (n, sides, 3) [10 m]
-    """
+def rings(path: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Return the cross-sections (n, SIDES, 3) of the tube around a path (n, 3) with half-axes (n, 3) [10 m]."""
     cross, up = path_frame(path)
-    turn = np.linspace(0, 2 * np.pi, sides, endpoint=False)[None, :, None]
-    return (
-        path[:, None]
-        + np.cos(turn) * (axes[:, 1, None, None] * cross[:, None])
-        + np.sin(turn) * (axes[:, 2, None, None] * up[:, None])
-    )
+    turn = np.linspace(0, 2 * np.pi, SIDES, endpoint=False)[None, :, None]
+    across = np.cos(turn) * (axes[:, 1, None, None] * cross[:, None])
+    return path[:, None] + across + np.sin(turn) * (axes[:, 2, None, None] * up[:, None])
 
 
-def tube_faces(n: int, sides: int = SIDES) -> np.ndarray:
-    """Return the triangles between n rings: (2 (n - 1) sides, 3) indices into the flattened corners."""
-    near = np.arange(n - 1)[:, None] * sides + np.arange(sides)
-    next_ = np.arange(n - 1)[:, None] * sides + (np.arange(sides) + 1) % sides
-    halves = [np.stack([near, next_, near + sides], -1), np.stack([next_, next_ + sides, near + sides], -1)]
+def tube_faces(n: int) -> np.ndarray:
+    """Return the triangles between n rings: (2 (n - 1) SIDES, 3) indices into the flattened corners."""
+    near = np.arange(n - 1)[:, None] * SIDES + np.arange(SIDES)
+    next_ = np.arange(n - 1)[:, None] * SIDES + (np.arange(SIDES) + 1) % SIDES
+    halves = [np.stack([near, next_, near + SIDES], -1), np.stack([next_, next_ + SIDES, near + SIDES], -1)]
     return np.concatenate([half.reshape(-1, 3) for half in halves]).astype(np.uint32)
 
 
@@ -155,22 +134,16 @@ def curtain(path: np.ndarray, ground: float) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([path, foot], axis=1).reshape(-1, 3), faces.astype(np.uint32)
 
 
-def marked_look_aheads(horizon_s: float, steps: tuple[float, ...] = (5, 10, 20, 30, 60, 120)) -> list[float]:
+def marked_look_aheads(horizon_s: float) -> list[float]:
     """Return the look-aheads to mark [s]: those with enough distance to the horizon."""
-    return [step for step in steps if step < horizon_s - max(2.0, 0.12 * horizon_s)]
+    return [step for step in (5, 10, 20, 30, 60, 120) if step < horizon_s - max(2.0, 0.12 * horizon_s)]
 
 
 def sample_paths(path: np.ndarray, axes: np.ndarray, n: int, seed: int) -> np.ndarray:
-    """Sample paths that the tube contains with its nominal coverage: (n, k, 3).
+    """Sample paths that the tube around a path (k, 3) with half-axes (k, 3) [10 m] contains: (n, k, 3).
 
     Cross and vertical offsets are standard normal in units of the half-axes over `BAND_SIGMA` and rotate slowly into
-    a second pair, so that errors are correlated along the path.
-
-    Args:
-        path: mean position, (k, 3) [10 m]
-        axes: half-axes along, cross, vertical, (k, 3) [10 m]
-        n: number of paths
-        seed: constant per UAV, so that paths do not flicker
+    a second pair, so that errors are correlated along the path. A constant seed per UAV avoids flicker.
     """
     cross, up = path_frame(path)
     begin, end = np.random.default_rng(seed).standard_normal((2, n, 2, 1))

@@ -14,8 +14,7 @@ from viewer.store.forecast import PastPrediction, ScenePrediction
 from viewer.store.store import FleetStore
 from viewer.store.track import positions_at
 from viewer.store.vehicle import Vehicle
-from viewer.text import words as mismatch_text
-from viewer.text.words import MIN_HORIZON_S, fit, located_spans
+from viewer.text.words import MIN_HORIZON_S, fit, is_located, located_spans, short_text
 from viewer.theme.palette import Palette, mix, rgb, triple
 from viewer.theme.shapes import digit_strokes, face_camera
 
@@ -36,14 +35,9 @@ NO_HINDCAST = np.zeros((0, 2, 3)), None
 
 
 def hindcast(past: list[PastPrediction], trail: np.ndarray, clock: float) -> tuple[np.ndarray, Tag | None]:
-    """Return an earlier prediction and error lines to the flown trail every 5 s.
+    """Return an earlier prediction and error lines to the flown trail every 5 s: segments (k, 2, 3) and a label.
 
-    Args:
-        past: predictions, oldest first
-        trail: data time [s], scene ENU [10 m], (n, 4 or more)
-        clock: current data time [s]
-    Returns:
-        segments (k, 2, 3) and their label
+    `past` is oldest first, `trail` (n, 4 or more), `clock` the current data time [s].
     """
     old = [prediction for prediction in past if AGE_S - SPAN_S <= clock - prediction.t <= AGE_S + SPAN_S]
     if not old or len(trail) < 2:
@@ -125,7 +119,7 @@ class Selection:
         if len(trail) > 1:
             self._trail_start = trail[0, 0]
             path = np.vstack([trail[::2], trail[-1:]])
-            normal = ~mismatch_text.is_located(path[:, 0], vehicle.mismatch)[1:]
+            normal = ~is_located(path[:, 0], vehicle.mismatch)[1:]
             bold.append((chain(path[:, 1:4])[normal], rgb(p.actual)))
         self._draw_forecast(vehicle, clock, ground, thin, bold)
         lines, label = hindcast(store.past(vehicle), trail, clock)
@@ -182,23 +176,19 @@ class Selection:
 
     def draw_flight(self, vehicle: Vehicle, rows: np.ndarray, now: float, unit: float) -> None:
         """Draw the flown path (n, 4) before its newest stretch, with events and mismatch; `unit` as for `draw`."""
-        normal = ~mismatch_text.is_located(rows[:, 0], vehicle.mismatch)[1:] & (rows[:-1, 0] < self._trail_start)
+        normal = ~is_located(rows[:, 0], vehicle.mismatch)[1:] & (rows[:-1, 0] < self._trail_start)
         self._track.draw(chain(rows[:, 1:])[normal] if len(rows) > 1 else NOTHING.legs, self._track_colour)
         mismatch = vehicle.mismatch
         self._mismatch.draw(lines(mismatch, rows), rgb(self._palette.mismatch))
         onset = onset_position(mismatch, rows)
         self.marks = self._event_markers.draw(vehicle.events, rows, vehicle.position(now), unit)
         if mismatch is not None and onset is not None:
-            self.marks.insert(0, Tag("mismatch", f"▲ {mismatch_text.short_text(mismatch)} from here", onset))
+            self.marks.insert(0, Tag("mismatch", f"▲ {short_text(mismatch)} from here", onset))
 
     def draw_route(self, vehicle: Vehicle, route: RouteLines, camera_view: CameraView, unit: float) -> None:
-        """Draw its mission: legs and loiters solid, jumps and returns dashed, a ring and its number at each item.
+        """Draw its mission: legs and loiters solid, jumps and returns dashed, a ring and a number at each item.
 
-        Args:
-            vehicle: the UAV; its active item and leg are highlighted
-            route: lines of the mission
-            camera_view: view that the numbers face
-            unit: drawn span of an aircraft [10 m]
+        The numbers face the camera. The active item and its leg are highlighted. `unit` is as for `draw`.
         """
         p, seq = self._palette, active_seq(vehicle)
         right, up = camera_view.axes()
@@ -248,12 +238,7 @@ MAX_POINTS = 200  # points of a segment
 
 
 def lines(mismatch: Mismatch | None, track: np.ndarray) -> np.ndarray:
-    """Return the located stretches of the flown path as segments (n, 2, 3) [10 m].
-
-    Args:
-        mismatch: the latest mismatch
-        track: flown path: data time [s], scene ENU [10 m], (m, 4)
-    """
+    """Return the located stretches of the flown path, (m, 4) data time [s], scene ENU [10 m], as (n, 2, 3) [10 m]."""
     segments = [NOTHING.legs]
     for begin, last in located_spans(mismatch, float(track[-1, 0])) if len(track) > 1 else []:
         if last > (first := max(begin, float(track[0, 0]))):
