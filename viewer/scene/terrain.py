@@ -298,7 +298,7 @@ def contours(grid: HeightGrid) -> np.ndarray:
     maker = contourpy.contour_generator(grid.east, grid.north, np.ma.masked_invalid(grid.up))
     segments = [np.zeros((0, 2, 3))]
     for level in np.arange(np.ceil(low / step), high / step) * step / UNIT_M:
-        lines = maker.lines(float(level))
+        lines = [np.asarray(line, float) for line in maker.lines(float(level))]
         segments += [chain(np.column_stack([line, np.full(len(line), level + 0.05)])) for line in lines]
     return np.concatenate(segments)
 

@@ -31,7 +31,10 @@ from viewer.theme.events import MAX_ALERTS
 MAX_VEHICLES = 2_000  # ids are untrusted input: further UAVs are counted, not stored
 COASTING_S = 1.0  # a prediction later than this after the last sample is not compared with the flight [s]
 MAX_SAMPLE_WAIT_S = 1.2  # longest delay of a sample in a large fleet [s]
-COALESCE_S = {Prediction: 3.0, Status: 2.0}  # decoding interval in a large fleet for UAVs without alerts [s]
+COALESCE_S: dict[type, float] = {
+    Prediction: 3.0,
+    Status: 2.0,
+}  # decoding interval in a large fleet for UAVs without alerts [s]
 PAST_S = 65.0  # age up to which past predictions are compared with the flight [s]
 MAX_AWAY = 10_000  # rejected UAVs that are counted
 MAX_LINKS = 64  # links whose texts are stored
@@ -178,6 +181,7 @@ class FleetStore:
     def request_latest(self) -> None:
         """Request the latest messages published before the start; keep newer ones."""
         for kind in INITIAL_TOPICS:
+            message: Any
             for message, stamp in self._bus.get(kind):
                 with self.lock:
                     current = getattr(self._vehicles.get(getattr(message, "uav", -1)), message.topic, None)
