@@ -98,7 +98,7 @@ def faults_of(args: argparse.Namespace, uavs: range) -> "dict[int, tuple[Fault, 
     Raises:
         ValueError: when a fault is not applicable to the aircraft type, or the id is not simulated.
     """
-    from fleet.simulator.faults.oddities import parse_fault
+    from fleet.simulator.faults.kinds import parse_fault
 
     uav = uavs[0] if args.fault_uav is None else args.fault_uav
     if args.fault_uav is not None and not args.fault:

@@ -9,7 +9,6 @@ import numpy as np
 from fleet.simulator.conceal.paths import PlannedFlight
 from fleet.simulator.conceal.record import ExamFlightLog, fly
 from fleet.simulator.faults.carried import FaultSet
-from fleet.simulator.faults.oddities import UNCATALOGUED
 from fleet.simulator.faults.physics import PHYSICS_FAULTS, WIND_FAULTS, Fault
 from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.jsbsim import DT
@@ -101,7 +100,7 @@ def _instant_changes(uav: SimulatedUav, fault: Fault) -> np.ndarray:
     t, fault_set = uav.tick * DT, uav.fault_set
     assert fault_set is not None
     reactions, wind = np.zeros(6), np.zeros(3)
-    if fault.name in PHYSICS_FAULTS or fault.name in UNCATALOGUED:
+    if fault.name in PHYSICS_FAULTS or fault.name.startswith("_"):
         reactions = _reaction_changes(uav, fault_set, fault, t)
     if fault.name in WIND_FAULTS:
         wind = fault.intensity(t) * WIND_FAULTS[fault.name](fault.values, -float(uav.estimate.p[2]))

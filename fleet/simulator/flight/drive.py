@@ -178,9 +178,7 @@ class _SimulationClock:
     def __init__(self, start: float, log: Callable[[str], None]) -> None:
         self.t = 0.0  # simulated time [s]
         self._start, self._log = start, log
-        self._slow_since: tuple[float, float] | None = (
-            None  # simulated and real time at the start of slow operation [s]
-        )
+        self._slow_since: tuple[float, float] | None = None  # simulated and real time at its start [s]
         self._reported = False
 
     def due(self, now: float) -> float:
