@@ -16,7 +16,8 @@ from fleet.access.entry import BusConfig, parse_endpoint
 from fleet.access.knock import probe_router
 from fleet.access.papers import check_private, expiry_of, find_certificate
 from fleet.access.roles import ROLES, ROUTER_ROLE
-from fleet.bus.bus_protocol import Bus, parse_token
+from fleet.bus.bus_protocol import parse_token
+from fleet.bus.session import Bus
 from fleet.contract import Claim, GatewayCounters, Status
 from fleet.health.machine import BAD, NOTE, OK, CheckResult, is_port_free
 from fleet.report.report_text import id_ranges

@@ -13,9 +13,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from fleet.bus.bus_protocol import Bus
 from fleet.bus.codec import Stamp, encode, encoding
-from fleet.bus.session import connect
+from fleet.bus.session import Bus, connect
 from fleet.cli import stop_on_signal
 from fleet.config import bus_config_from, router_arguments
 from fleet.contract import TOPICS, Sample

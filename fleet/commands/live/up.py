@@ -13,8 +13,7 @@ from rich.live import Live
 from rich.text import Text
 
 from fleet.access.knock import probe_router
-from fleet.bus.bus_protocol import Bus
-from fleet.bus.session import connect, open_router
+from fleet.bus.session import Bus, connect, open_router
 from fleet.cli import stop_on_signal
 from fleet.commands.live.fly import AIRCRAFT, AUTOPILOTS, fault_arguments, faults_of
 from fleet.commands.live.replay import check_arguments as check_playing

@@ -9,8 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from fleet.bus.bus_protocol import Bus
-from fleet.bus.session import connect
+from fleet.bus.session import Bus, connect
 from fleet.config import bus_config_from, router_arguments
 from fleet.contract import Prediction, WhatIf, WhatIfStart
 from fleet.frames import to_geodetic, to_ned

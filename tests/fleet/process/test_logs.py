@@ -13,7 +13,6 @@ import pytest
 from conftest import ROOT, unused_port
 from prometheus_client.parser import text_string_to_metric_families
 
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import FleetRow, FleetState, TwinState
 from fleet.metrics import serve
 from fleet.process.children import Children
@@ -27,6 +26,7 @@ from fleet.process.logs import (
     strip_time,
 )
 from tests.bench.security.bombs import ESCAPES
+from tests.support.memory_bus import MemoryBus
 from twin_worker.service.work_rates import counters
 
 PATIENCE_S = 10.0
