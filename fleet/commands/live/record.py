@@ -55,11 +55,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Validate the options before anything is opened.
-
-    Raises:
-        ValueError: when an option is invalid; the text names it.
-    """
+    """Validate the options before anything is opened."""
     if not 0 <= args.seconds < math.inf:
         raise ValueError(f"--for: found {args.seconds} s, expected 0 (until Ctrl-C) or more; change it")
     if args.file.suffix != SUFFIX:

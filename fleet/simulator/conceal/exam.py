@@ -30,15 +30,14 @@ from fleet.simulator.vehicle.jsbsim import DT, KG_TO_LB, Aircraft
 from fleet.simulator.vehicle.sensors import pressure_at
 from fleet.simulator.vehicle.weather import FT
 
+Label = dict[str, Any]
 _R = 287.05  # of dry air [J/(kg K)]
 _SEA_LEVEL_K, _LAPSE_K = 288.15, 0.0065  # standard atmosphere [K, K/m]
 _SPEEDS, _THROTTLES = (44.0, 48.0, 52.0), (0.6, 0.75, 0.9)  # operating range of the Cessna [m/s, -]
 _SPOOL_S = 6.0  # time for the propeller to reach steady speed
 
 
-def describe_effect(
-    planned: PlannedFlight, fault: Fault, log: ExamFlightLog, first_attitude_s: float
-) -> dict[str, object]:
+def describe_effect(planned: PlannedFlight, fault: Fault, log: ExamFlightLog, first_attitude_s: float) -> Label:
     """Describe one hidden effect.
 
     Args:
@@ -55,7 +54,7 @@ def describe_effect(
         params["density_ratio"] = density_ratio(log)
     if fault.name == "thrust_loss" and airframe == "c172p":
         params["fraction"] = thrust_lost(planned, fault)
-    label: dict[str, object] = {"name": fault.name, "params": {key: round(x, 6) for key, x in params.items()}}
+    label: Label = {"name": fault.name, "params": {key: round(x, 6) for key, x in params.items()}}
     if fault.part:
         label["surface" if fault.name.startswith(("actuator", "control")) else "of"] = fault.part
     if fault.t0 > 0:
@@ -127,7 +126,6 @@ def card(airframe: str) -> dict[str, object]:
 
 AIRFRAMES = ("c172p", "small")
 _ATTEMPTS = 25
-Label = dict[str, Any]
 Labels = dict[str, Label]
 EffectNames = tuple[str, ...]
 """Names of the hidden effects of one flight."""
@@ -240,10 +238,9 @@ def _try_flight(planned: PlannedFlight, path: Path, rejections: list[str]) -> La
     strengths: list[Label] = []
     for fault in planned.hidden_faults if not reason else ():
         strengths.append(effect_strength(planned, fault, log))
-        if strengths[-1]["over_noise"] < MIN_OVER_NOISE:
-            reason = (
-                f"{fault.name} {fault.part} has strength {strengths[-1]['over_noise']} in {strengths[-1]['channel']}"
-            )
+        strength, channel = strengths[-1]["over_noise"], strengths[-1]["channel"]
+        if strength < MIN_OVER_NOISE:
+            reason = f"{fault.name} {fault.part} has strength {strength} in {channel}"
     if reason:
         rejections.append(reason)
         path.unlink()

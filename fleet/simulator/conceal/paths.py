@@ -73,7 +73,11 @@ def draw_exam_mission(
             items.append(mission_item(len(items), WAYPOINT, EXAM_HOME, waypoint))
     first = next(i.seq for i in items[1:] if i.command == WAYPOINT)
     items.append(mission_item(len(items), DO_JUMP, EXAM_HOME, params=(1.0, -1.0)))
-    return tuple(items), _start_before(rng, waypoints[0], waypoints[1], limits, first)
+    (n, e, d), (next_n, next_e, _) = waypoints[:2]
+    course = wrap(atan2(next_e - e, next_n - n) + rng.uniform(-0.6, 0.6))  # roughly towards the second waypoint
+    distance = 10.0 * limits.cruise
+    p = np.array([n - distance * cos(course), e - distance * sin(course), d])
+    return tuple(items), StartState(first, p, course)
 
 
 def _random_walk(rng: np.random.Generator, limits: MissionLimits, steep: bool) -> list[tuple[float, float, float]]:
@@ -96,20 +100,6 @@ def _random_walk(rng: np.random.Generator, limits: MissionLimits, steep: bool) -
         h = float(np.clip(h + slope_fraction * (climb if climbs else -sink), *limits.height))
         waypoints.append((n, e, -h))
     return waypoints
-
-
-def _start_before(
-    rng: np.random.Generator,
-    waypoint: tuple[float, ...],
-    next_waypoint: tuple[float, ...],
-    limits: MissionLimits,
-    seq: int,
-) -> StartState:
-    """Return a start state before the first waypoint, roughly in the direction of the second."""
-    course = wrap(atan2(next_waypoint[1] - waypoint[1], next_waypoint[0] - waypoint[0]) + rng.uniform(-0.6, 0.6))
-    distance = 10.0 * limits.cruise
-    p = [waypoint[0] - distance * cos(course), waypoint[1] - distance * sin(course), waypoint[2]]
-    return StartState(seq, np.array(p), course)
 
 
 _AMPLITUDES = {  # aileron, elevator, rudder, throttle, fractions of full travel

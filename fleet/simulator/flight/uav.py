@@ -188,7 +188,8 @@ class SimulatedUav:
                 self._ctl, self._par, self._legs, e.p, e.v, e.euler, e.Va, Va_dot, DT * _OUTER
             )
             if self._ctl[memory.LEG] >= len(self._legs) - 2:
-                self._extend_route()
+                self._legs, _ = self._route(int(self.leg[legs_of.SEQ]))  # the mission is endless
+                self._ctl[memory.LEG] = 0
         delta_a, delta_e, delta_r = laws.stabilise(
             self._ctl, self._par, self._phi_c, self._theta_c, e.euler, e.rates, e.Va, DT * _INNER
         )
@@ -198,11 +199,6 @@ class SimulatedUav:
             delta_a, delta_e, delta_r, delta_t = delta_a + a, delta_e + b, delta_r + r, delta_t + t
         self.pulses = servo_pulses(delta_a, delta_e, delta_r, delta_t)
         self.aircraft.set_controls(*servo_commands(self.pulses))
-
-    def _extend_route(self) -> None:
-        """Extend the legs of the endless mission without changing the controller state."""
-        self._legs, _ = self._route(int(self.leg[legs_of.SEQ]))
-        self._ctl[memory.LEG] = 0
 
     def _telemetry_state(self) -> TelemetryState:
         e, leg = self.estimate, self.leg
