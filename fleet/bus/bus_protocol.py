@@ -32,7 +32,7 @@ def uav_of_key(key_name: str) -> int | None:
 
 def select_latest(replies: list[tuple[M, Stamp | None]]) -> list[tuple[M, Stamp | None]]:
     """Select the reply of highest plausible epoch, then the newest, per UAV (and alert); keep all without a UAV."""
-    best: dict[tuple[int, str], tuple[M, Stamp | None]] = {}
+    pairs: dict[tuple[int, str], list[tuple[Any, Stamp | None]]] = {}
     without_uav = []
     for message, stamp in replies:
         uav = getattr(message, "uav", None)
@@ -42,14 +42,9 @@ def select_latest(replies: list[tuple[M, Stamp | None]]) -> list[tuple[M, Stamp 
         if stamp is not None and not is_plausible_epoch(stamp.epoch):
             continue
         identity = uav, str(getattr(message, "about", ""))
-        current = best.get(identity)
-        if current is None or _rank(message, stamp) > _rank(*current):
-            best[identity] = (message, stamp)
-    return [best[identity] for identity in sorted(best)] + without_uav
-
-
-def _rank(message: Any, stamp: Stamp | None) -> tuple[Stamp, float]:
-    return stamp or Stamp(0, 0), message.t
+        pairs.setdefault(identity, []).append((message, stamp))
+    best = [max(pairs[identity], key=lambda pair: (pair[1] or Stamp(0, 0), pair[0].t)) for identity in sorted(pairs)]
+    return best + without_uav
 
 
 def replies_about(uav: int | None, replies: Replies) -> Replies:

@@ -32,7 +32,9 @@ Callback = Callable[[Any, Stamp | None], None]
 RawCallback = Callable[[bytes, str, Stamp | None], None]
 BatchCallback = Callable[[list[RawMessage]], None]
 LivelinessCallback = Callable[[str, bool], None]
-_RELIABLE = {  # rare and essential: the sender blocks on congestion; all other messages are dropped
+_RELIABLE: dict[
+    type, dict[str, Any]
+] = {  # rare and essential: the sender blocks on congestion; all other messages are dropped
     Claim: {"congestion_control": zenoh.CongestionControl.BLOCK, "priority": zenoh.Priority.INTERACTIVE_HIGH}
 }
 _LIVE_PREFIX = f"{ROOT}/@live/"
@@ -72,7 +74,7 @@ class Bus(AbstractContextManager):
             with self._lock:
                 if (publisher := self._publishers.get((encoded.kind, encoded.uav))) is None:
                     name = key_of(encoded.kind, encoded.uav if encoded.kind in PER_UAV else f"{self.writer:016x}")
-                    options = {"encoding": encoding(encoded.kind)} | _RELIABLE.get(encoded.kind, {})
+                    options: dict[str, Any] = {"encoding": encoding(encoded.kind)} | _RELIABLE.get(encoded.kind, {})
                     publisher = self._session.declare_publisher(name, **options)
                     self._publishers[encoded.kind, encoded.uav] = publisher
         publisher.put(encoded.payload, attachment=pack_stamp(stamp) if stamp else None)
