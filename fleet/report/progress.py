@@ -53,7 +53,7 @@ def show_progress(
 
     def show(done: threading.Event) -> None:
         if console.is_terminal:
-            _draw_bars(sources, done, console, leave)
+            _draw_progress(sources, done, console, leave)
         else:
             _write_lines(sources, done, write_line)
 
@@ -84,7 +84,7 @@ def run_alongside(show: Callable[[threading.Event], None]) -> Iterator[None]:
         end()  # Ctrl-C may interrupt the first call; a remaining thread would block process exit
 
 
-def _draw_bars(sources: Sequence[ProgressSource], done: threading.Event, console: Console, leave: bool) -> None:
+def _draw_progress(sources: Sequence[ProgressSource], done: threading.Event, console: Console, leave: bool) -> None:
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[words]}"))
     with Progress(*columns, console=console, transient=not leave) as progress:
         task_ids = [progress.add_task(source.name, total=1.0, words="") for source in sources]
