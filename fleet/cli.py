@@ -9,10 +9,12 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
+from pathlib import Path
 
 from fleet import __version__, commands
+from fleet.process.children import run_until
 from fleet.process.interrupt import INTERRUPTED, PARENT, run_interruptible, set_exit_code
-from fleet.process.logs import configure_logging, report_failure
+from fleet.process.logs import configure_logging, report_failure, report_progress
 
 ORPHAN_GRACE_S = 30.0  # time for an orphan process to shut down in order [s]
 
@@ -54,16 +56,15 @@ def stop_on_signal() -> threading.Event:
     for number in (signal.SIGINT, signal.SIGTERM):
         # not stop.set(): a handler runs in the main thread, which may own that event's lock in wait(): a deadlock
         signal.signal(number, lambda number, _: signals.put(number))
-    threading.Thread(target=_forward_signal, args=(signals, stop), daemon=True).start()
+
+    def forward() -> None:
+        signals.get()
+        stop.set()
+
+    threading.Thread(target=forward, daemon=True).start()
     if parent := os.environ.get(PARENT):
         threading.Thread(target=_stop_with_parent, args=(int(parent), stop), daemon=True).start()
     return stop
-
-
-def _forward_signal(signals: queue.SimpleQueue[int], stop: threading.Event) -> None:
-    """Set the event after a signal."""
-    signals.get()
-    stop.set()
 
 
 def _stop_with_parent(parent: int, stop: threading.Event) -> None:
@@ -73,6 +74,44 @@ def _stop_with_parent(parent: int, stop: threading.Event) -> None:
             stop.set()
             threading.Event().wait(ORPHAN_GRACE_S)  # after this a process blocked in a foreign library is ended
             os._exit(1)
+
+
+def run_module(verb: str, lost: str, module: str, *options: str) -> int:
+    """Run `python -m module options…` for a verb and return its exit code, or 130 after Ctrl-C.
+
+    Args:
+        verb: name in messages
+        lost: what Ctrl-C loses, for the message
+        module, options: command line of the child process
+    """
+    stop = stop_on_signal()
+    code = run_until(stop, module, *options)
+    if not stop.is_set():
+        return code
+    report_progress(verb, f"stopped; {lost}")
+    return INTERRUPTED
+
+
+def check_parent(option: str, path: Path | str | None) -> None:
+    """Check that the folder of an output exists.
+
+    Raises:
+        ValueError: when it does not; the text names the option.
+    """
+    if path and not Path(path).absolute().parent.is_dir():
+        raise ValueError(f"{option}: found no folder {str(Path(path).parent)!r}, expected one; create it first")
+
+
+def host_and_port(option: str, text: str) -> tuple[str, int]:
+    """Parse HOST:PORT.
+
+    Raises:
+        ValueError: when it is malformed; the text names the option.
+    """
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65_536:
+        raise ValueError(f"{option}: found {text!r}, expected HOST:PORT such as 127.0.0.1:14550; correct {option}")
+    return host, int(port)
 
 
 def id_range(text: str) -> range:

@@ -44,10 +44,15 @@ _SIZES = {name: np.dtype(name).itemsize for name in DTYPES}
 MAX_ITEMS = 1_000  # mission items accepted from outside
 
 
+def about(text: str) -> Meta:
+    """Annotate a field with its meaning and unit."""
+    return Meta(description=text)
+
+
 class Array(msgspec.Struct, frozen=True, gc=False):  # numbers form no reference cycles
     """A numpy array on the wire: `numpy.frombuffer(data, dtype).reshape(shape)`."""
 
-    dtype: Annotated[str, Meta(description="numpy dtype string, little endian: " + " ".join(DTYPES))]
+    dtype: Annotated[str, about("numpy dtype string, little endian: " + " ".join(DTYPES))]
     shape: tuple[int, ...]
     data: bytes
 
@@ -75,8 +80,8 @@ class Array(msgspec.Struct, frozen=True, gc=False):  # numbers form no reference
 class Rows(msgspec.Struct, frozen=True, gc=False):
     """Measurements of one type, each row with its own time."""
 
-    t: Annotated[Array, Meta(description="fleet time of each row, (n,) <f8 [s since 1970]")]
-    x: Annotated[Array, Meta(description="values, (n, k); columns as in COLUMNS")]
+    t: Annotated[Array, about("fleet time of each row, (n,) <f8 [s since 1970]")]
+    x: Annotated[Array, about("values, (n, k); columns as in COLUMNS")]
 
 
 COLUMNS: dict[str, tuple[tuple[str, str], ...]] = {
@@ -111,8 +116,8 @@ class Message(msgspec.Struct, frozen=True, kw_only=True):
     topic: ClassVar[str] = ""
     version: ClassVar[int] = 1
 
-    uav: Annotated[int, Meta(description="UAV id: MAVLink system id + the link's offset")]
-    t: Annotated[float, Meta(description="fleet time of the newest content [s since 1970]")]
+    uav: Annotated[int, about("UAV id: MAVLink system id + the link's offset")]
+    t: Annotated[float, about("fleet time of the newest content [s since 1970]")]
 
 
 class Sample(Message, frozen=True, kw_only=True, gc=False):
@@ -128,11 +133,11 @@ class Sample(Message, frozen=True, kw_only=True, gc=False):
     servo: Rows | None = None
     command: Rows | None = None
     leg: Rows | None = None
-    wind: Annotated[Rows | None, Meta(description="estimated by the autopilot, the direction it blows to [m/s]")] = None
-    target: Annotated[Rows | None, Meta(description="guidance target reported by the autopilot")] = None
-    pressure: Annotated[Rows | None, Meta(description="raw barometer reading [Pa]")] = None
-    gnss: Annotated[Rows | None, Meta(description="raw reading of the satellite receiver")] = None
-    height: Annotated[Rows | None, Meta(description="above home, as reported by the autopilot [m]")] = None
+    wind: Annotated[Rows | None, about("estimated by the autopilot, the direction it blows to [m/s]")] = None
+    target: Annotated[Rows | None, about("guidance target reported by the autopilot")] = None
+    pressure: Annotated[Rows | None, about("raw barometer reading [Pa]")] = None
+    gnss: Annotated[Rows | None, about("raw reading of the satellite receiver")] = None
+    height: Annotated[Rows | None, about("above home, as reported by the autopilot [m]")] = None
 
 
 class Link(StrEnum):
@@ -148,51 +153,44 @@ class Status(Message, frozen=True, kw_only=True):
     topic: ClassVar[str] = "status"
 
     link: Link = Link.LIVE
-    mode: Annotated[str, Meta(description="flight mode as named by the autopilot, e.g. AUTO")] = ""
+    mode: Annotated[str, about("flight mode as named by the autopilot, e.g. AUTO")] = ""
     armed: bool = False
-    autopilot: Annotated[str, Meta(description="ardupilot, px4 or generic")] = "generic"
-    vehicle: Annotated[str, Meta(description="fixed_wing, quadplane, multirotor, helicopter or unknown")] = "unknown"
-    rates_hz: Annotated[dict[str, float], Meta(description="received rate of each message [Hz]")] = {}
-    received: Annotated[int, Meta(description="messages received")] = 0
-    missed: Annotated[int, Meta(description="messages lost, from gaps in the sequence number")] = 0
-    rejected: Annotated[int, Meta(description="messages or fields rejected (not finite, out of range, stale)")] = 0
-    clock_offset_s: Annotated[float, Meta(description="fleet time minus the aircraft's boot time [s]")] = 0.0
-    clock_jumps: Annotated[int, Meta(description="number of jumps of the aircraft's clock")] = 0
+    autopilot: Annotated[str, about("ardupilot, px4 or generic")] = "generic"
+    vehicle: Annotated[str, about("fixed_wing, quadplane, multirotor, helicopter or unknown")] = "unknown"
+    rates_hz: Annotated[dict[str, float], about("received rate of each message [Hz]")] = {}
+    received: Annotated[int, about("messages received")] = 0
+    missed: Annotated[int, about("messages lost, from gaps in the sequence number")] = 0
+    rejected: Annotated[int, about("messages or fields rejected (not finite, out of range, stale)")] = 0
+    clock_offset_s: Annotated[float, about("fleet time minus the aircraft's boot time [s]")] = 0.0
+    clock_jumps: Annotated[int, about("number of jumps of the aircraft's clock")] = 0
     clock_advance_s: Annotated[
-        float,
-        Meta(description="sum of the forward corrections of timestamps that lagged behind their arrival [s]"),
+        float, about("sum of the forward corrections of timestamps that lagged behind their arrival [s]")
     ] = 0.0
     clock_drift: Annotated[
-        float | None,
-        Meta(description="drift of the aircraft's clock behind the fleet clock [s/s]; null: not known yet"),
+        float | None, about("drift of the aircraft's clock behind the fleet clock [s/s]; null: not known yet")
     ] = None
-    latency_s: Annotated[
-        float, Meta(description="mean delay of messages relative to the fastest of the last 30 s [s]")
-    ] = 0.0
-    latency_worst_s: Annotated[float, Meta(description="the same, maximum since the previous status [s]")] = 0.0
-    round_trip_s: Annotated[
-        float | None, Meta(description="minimum recent round-trip time (TIMESYNC) [s]; null: no reply")
-    ] = None
+    latency_s: Annotated[float, about("mean delay of messages relative to the fastest of the last 30 s [s]")] = 0.0
+    latency_worst_s: Annotated[float, about("the same, maximum since the previous status [s]")] = 0.0
+    round_trip_s: Annotated[float | None, about("minimum recent round-trip time (TIMESYNC) [s]; null: no reply")] = None
     gps_offset_s: Annotated[
-        float | None,
-        Meta(description="fleet time minus satellite time of the same instant (SYSTEM_TIME) [s]; null: not reported"),
+        float | None, about("fleet time minus satellite time of the same instant (SYSTEM_TIME) [s]; null: not reported")
     ] = None
-    sentence: Annotated[str, Meta(description="note for the operator, or empty")] = ""
+    sentence: Annotated[str, about("note for the operator, or empty")] = ""
 
 
 class Item(msgspec.Struct, frozen=True, kw_only=True):
     """One mission item of MAVLink (MISSION_ITEM_INT)."""
 
     seq: int
-    command: Annotated[int, Meta(description="MAV_CMD")]
-    frame: Annotated[int, Meta(description="MAV_FRAME")] = 3
+    command: Annotated[int, about("MAV_CMD")]
+    frame: Annotated[int, about("MAV_FRAME")] = 3
     param1: float = 0.0
     param2: float = 0.0
     param3: float = 0.0
     param4: float = 0.0
-    lat_e7: Annotated[int, Meta(description="[1e-7 deg]")] = 0
-    lon_e7: Annotated[int, Meta(description="[1e-7 deg]")] = 0
-    alt_m: Annotated[float, Meta(description="altitude in the item's frame [m]")] = 0.0
+    lat_e7: Annotated[int, about("[1e-7 deg]")] = 0
+    lon_e7: Annotated[int, about("[1e-7 deg]")] = 0
+    alt_m: Annotated[float, about("altitude in the item's frame [m]")] = 0.0
 
 
 class Mission(Message, frozen=True, kw_only=True):
@@ -201,9 +199,9 @@ class Mission(Message, frozen=True, kw_only=True):
     topic: ClassVar[str] = "mission"
 
     items: tuple[Item, ...] = ()
-    seq: Annotated[int, Meta(description="current item when this was sent; -1 unknown")] = -1
-    complete: Annotated[bool, Meta(description="every item was received")] = False
-    sentence: Annotated[str, Meta(description="error in the mission, or empty")] = ""
+    seq: Annotated[int, about("current item when this was sent; -1 unknown")] = -1
+    complete: Annotated[bool, about("every item was received")] = False
+    sentence: Annotated[str, about("error in the mission, or empty")] = ""
 
 
 class Params(Message, frozen=True, kw_only=True):
@@ -221,7 +219,7 @@ class History(Message, frozen=True, kw_only=True):
 
     topic: ClassVar[str] = "history"
 
-    since: Annotated[float, Meta(description="fleet time from which on the history is complete [s since 1970]")] = 0.0
+    since: Annotated[float, about("fleet time from which on the history is complete [s since 1970]")] = 0.0
     samples: tuple[Sample, ...] = ()
     statuses: tuple[Status, ...] = ()
 
@@ -243,20 +241,17 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
 
     outcome: Outcome
     sentence: str
-    fit: Annotated[dict[str, float], Meta(description="100 (1 - nrmse) per state at `horizon_s` [%]")] = {}
-    fit_persistence: Annotated[
-        dict[str, float], Meta(description="the same for the persistence forecast (last value) [%]")
-    ] = {}
+    fit: Annotated[dict[str, float], about("100 (1 - nrmse) per state at `horizon_s` [%]")] = {}
+    fit_persistence: Annotated[dict[str, float], about("the same for the persistence forecast (last value) [%]")] = {}
     fit_by_length: Annotated[
-        dict[str, float], Meta(description="mean fit of both axes by free-run length in s, e.g. lon16, lat16 [%]")
+        dict[str, float], about("mean fit of both axes by free-run length in s, e.g. lon16, lat16 [%]")
     ] = {}
     whiteness: Annotated[
-        dict[str, float],
-        Meta(description="share of one-step residual autocorrelations within the bounds of white noise, 0..1"),
+        dict[str, float], about("share of one-step residual autocorrelations within the bounds of white noise, 0..1")
     ] = {}
-    horizon_s: Annotated[float, Meta(description="free-run length of the fit [s]")] = 0.0
-    threshold: Annotated[float, Meta(description="omega: minimum mean fit [%]")] = 0.0
-    attempts: Annotated[int, Meta(description="identification attempts for this verdict")] = 0
+    horizon_s: Annotated[float, about("free-run length of the fit [s]")] = 0.0
+    threshold: Annotated[float, about("omega: minimum mean fit [%]")] = 0.0
+    attempts: Annotated[int, about("identification attempts for this verdict")] = 0
 
 
 class LinearModel(msgspec.Struct, frozen=True, kw_only=True):
@@ -265,15 +260,15 @@ class LinearModel(msgspec.Struct, frozen=True, kw_only=True):
     Source: Huang 2021 eq. 2-4.
     """
 
-    states: Annotated[tuple[str, ...], Meta(description="state names: u w q theta | phi psi p r v")]
-    inputs: Annotated[tuple[str, ...], Meta(description="input names: delta_e delta_t | delta_a delta_r")]
+    states: Annotated[tuple[str, ...], about("state names: u w q theta | phi psi p r v")]
+    inputs: Annotated[tuple[str, ...], about("input names: delta_e delta_t | delta_a delta_r")]
     A: Array
     B: Array
     C: Array
     D: Array
-    x_trim: Annotated[Array, Meta(description="state at trim, u v w through the air, (n,) [m/s, rad, rad/s]")]
-    u_trim: Annotated[Array, Meta(description="input at trim, (m,) [-]")]
-    dt_s: Annotated[float, Meta(description="sample time [s]")]
+    x_trim: Annotated[Array, about("state at trim, u v w through the air, (n,) [m/s, rad, rad/s]")]
+    u_trim: Annotated[Array, about("input at trim, (m,) [-]")]
+    dt_s: Annotated[float, about("sample time [s]")]
 
 
 class Derivatives(msgspec.Struct, frozen=True, kw_only=True):
@@ -282,19 +277,17 @@ class Derivatives(msgspec.Struct, frozen=True, kw_only=True):
     Terms and letters: `fleet.physics.wrench`.
     """
 
-    names: Annotated[tuple[str, ...], Meta(description="X_0 X_u ... N_0 w_n w_e")]
-    value: Annotated[Array, Meta(description="(n,) <f8")]
-    covariance: Annotated[Array, Meta(description="(n, n) <f4")]
-    variance_reduction: Annotated[
-        Array, Meta(description="relative reduction of each prior variance by the data, (n,) 0..1")
-    ]
-    U0: Annotated[float, Meta(description="airspeed of the trim point of the derivatives [m/s]")]
-    W0: Annotated[float, Meta(description="velocity down the body at trim [m/s]")]
-    tau_s: Annotated[Array, Meta(description="lags of delta_a delta_e delta_r delta_t, (4,) [s]")]
-    prior: Annotated[str, Meta(description="airframe used as prior for what the data do not identify")] = ""
-    window_t0: Annotated[float, Meta(description="first instant of the identification window [s since 1970]")] = 0.0
-    window_s: Annotated[float, Meta(description="length of the identification window [s]")] = 0.0
-    sentence: Annotated[str, Meta(description="parameters identified from the data and those set by the prior")] = ""
+    names: Annotated[tuple[str, ...], about("X_0 X_u ... N_0 w_n w_e")]
+    value: Annotated[Array, about("(n,) <f8")]
+    covariance: Annotated[Array, about("(n, n) <f4")]
+    variance_reduction: Annotated[Array, about("relative reduction of each prior variance by the data, (n,) 0..1")]
+    U0: Annotated[float, about("airspeed of the trim point of the derivatives [m/s]")]
+    W0: Annotated[float, about("velocity down the body at trim [m/s]")]
+    tau_s: Annotated[Array, about("lags of delta_a delta_e delta_r delta_t, (4,) [s]")]
+    prior: Annotated[str, about("airframe used as prior for what the data do not identify")] = ""
+    window_t0: Annotated[float, about("first instant of the identification window [s since 1970]")] = 0.0
+    window_s: Annotated[float, about("length of the identification window [s]")] = 0.0
+    sentence: Annotated[str, about("parameters identified from the data and those set by the prior")] = ""
 
 
 class Model(Message, frozen=True, kw_only=True):
@@ -303,25 +296,22 @@ class Model(Message, frozen=True, kw_only=True):
     topic: ClassVar[str] = "model"
     version: ClassVar[int] = 2
 
-    method: Annotated[str, Meta(description="dynamics (coupled derivatives) or paper (two linear axes)")]
-    verdict: Annotated[Verdict, Meta(description="of the newest identification")]
-    active_verdict: Annotated[Verdict | None, Meta(description="of the model below; null before any was verified")] = (
-        None
-    )
+    method: Annotated[str, about("dynamics (coupled derivatives) or paper (two linear axes)")]
+    verdict: Annotated[Verdict, about("of the newest identification")]
+    active_verdict: Annotated[Verdict | None, about("of the model below; null before any was verified")] = None
     longitudinal: LinearModel | None = None
     lateral: LinearModel | None = None
-    derivatives: Annotated[Derivatives | None, Meta(description="of the coupled model; null for method paper")] = None
+    derivatives: Annotated[Derivatives | None, about("of the coupled model; null for method paper")] = None
     shrinkage_weights: Annotated[
-        dict[str, float],
-        Meta(description="weight of the model against persistence in a 10 s free run, from held-out data, 0..1"),
+        dict[str, float], about("weight of the model against persistence in a 10 s free run, from held-out data, 0..1")
     ] = {}
-    window_t0: Annotated[float, Meta(description="first instant of the identification window [s since 1970]")] = 0.0
-    window_s: Annotated[float, Meta(description="length of the identification window [s]")] = 0.0
-    interpolated: Annotated[float, Meta(description="share of the window that was interpolated, 0..1")] = 0.0
-    wind_n: Annotated[float, Meta(description="estimated wind, north, the direction it blows to [m/s]")] = 0.0
-    wind_e: Annotated[float, Meta(description="estimated wind, east [m/s]")] = 0.0
+    window_t0: Annotated[float, about("first instant of the identification window [s since 1970]")] = 0.0
+    window_s: Annotated[float, about("length of the identification window [s]")] = 0.0
+    interpolated: Annotated[float, about("share of the window that was interpolated, 0..1")] = 0.0
+    wind_n: Annotated[float, about("estimated wind, north, the direction it blows to [m/s]")] = 0.0
+    wind_e: Annotated[float, about("estimated wind, east [m/s]")] = 0.0
     active_effect: Annotated[
-        str, Meta(description="missing physics added to the active model, and since when; empty: as identified")
+        str, about("missing physics added to the active model, and since when; empty: as identified")
     ] = ""
 
 
@@ -342,11 +332,11 @@ class Controller(msgspec.Struct, frozen=True, kw_only=True):
     Names and units are the autopilot's.
     """
 
-    law: Annotated[str, Meta(description="e.g. arduplane: L1 + TECS")]
-    received: Annotated[dict[str, float], Meta(description="reported by the autopilot")] = {}
-    identified: Annotated[dict[str, float], Meta(description="not reported; identified from flight data")] = {}
-    default: Annotated[dict[str, float], Meta(description="neither; the autopilot's default is assumed")] = {}
-    overridden: Annotated[dict[str, float], Meta(description="what-if only: set by the request")] = {}
+    law: Annotated[str, about("e.g. arduplane: L1 + TECS")]
+    received: Annotated[dict[str, float], about("reported by the autopilot")] = {}
+    identified: Annotated[dict[str, float], about("not reported; identified from flight data")] = {}
+    default: Annotated[dict[str, float], about("neither; the autopilot's default is assumed")] = {}
+    overridden: Annotated[dict[str, float], about("what-if only: set by the request")] = {}
 
 
 class Event(StrEnum):
@@ -394,51 +384,47 @@ class Prediction(Message, frozen=True, kw_only=True):
     state: TwinState
     method: Annotated[
         str,
-        Meta(
-            description="dynamics (identified coupled model and controller twin in closed loop on the mission), "
+        about(
+            "dynamics (identified coupled model and controller twin in closed loop on the mission), "
             "paper (the same with two linear axes), "
             "copter (multirotor: the route at limited speed, acceleration and jerk behind a lag, or position hold), "
             "greybox (fixed wing without a model: L1 guidance and lags on the route) or imm (no route: turn rate only)"
         ),
     ]
-    law: Annotated[str, Meta(description="active controller twin, e.g. arduplane: L1 + TECS")] = ""
-    origin: Annotated[tuple[int, int, int], Meta(description="NED origin: lat, lon [1e-7 deg], alt [mm AMSL]")]
-    ahead: Annotated[Array, Meta(description="look-ahead from `t`, increasing, unequally spaced, (n,) <f4 [s]")]
-    path: Annotated[Array, Meta(description="mean position, NED from origin, (n, 3) <f4 [m]")]
+    law: Annotated[str, about("active controller twin, e.g. arduplane: L1 + TECS")] = ""
+    origin: Annotated[tuple[int, int, int], about("NED origin: lat, lon [1e-7 deg], alt [mm AMSL]")]
+    ahead: Annotated[Array, about("look-ahead from `t`, increasing, unequally spaced, (n,) <f4 [s]")]
+    path: Annotated[Array, about("mean position, NED from origin, (n, 3) <f4 [m]")]
     prediction_region_half_axes: Annotated[
-        Array,
-        Meta(description="half-axes of the simultaneous region: along, cross, vertical, (n, 3) <f4 [m]"),
+        Array, about("half-axes of the simultaneous region: along, cross, vertical, (n, 3) <f4 [m]")
     ]
-    quantile: Annotated[float, Meta(description="nominal coverage of the prediction region, 0..1")] = 0.9
-    axis_quantile: Annotated[
-        float,
-        Meta(description="nominal coverage of each half-axis alone; 0: as of independent axes"),
-    ] = 0.0
-    horizon_s: Annotated[
-        float, Meta(description="confidence horizon: `quantile` of similar predictions stay within 10 % [s]")
-    ] = 0.0
-    horizon_open: Annotated[bool, Meta(description="true: still below 10 % at the end of `ahead`")] = False
+    quantile: Annotated[float, about("nominal coverage of the prediction region, 0..1")] = 0.9
+    axis_quantile: Annotated[float, about("nominal coverage of each half-axis alone; 0: as of independent axes")] = 0.0
+    horizon_s: Annotated[float, about("confidence horizon: `quantile` of similar predictions stay within 10 % [s]")] = (
+        0.0
+    )
+    horizon_open: Annotated[bool, about("true: still below 10 % at the end of `ahead`")] = False
     coverage: Annotated[
-        float, Meta(description="empirical coverage of the prediction region, 0..1; nan before any evaluation")
+        float, about("empirical coverage of the prediction region, 0..1; nan before any evaluation")
     ] = float("nan")
-    coverage_n: Annotated[int, Meta(description="past predictions behind `coverage`")] = 0
+    coverage_n: Annotated[int, about("past predictions behind `coverage`")] = 0
     rollout_age_s: Annotated[
-        float, Meta(description="age of the rollout propagated from the newest position; 0: a new rollout [s]")
+        float, about("age of the rollout propagated from the newest position; 0: a new rollout [s]")
     ] = 0.0
     coverage_propagated: Annotated[
-        float | None, Meta(description="as `coverage`, propagated rollouts only, up to 60 s, 0..1; null before any")
+        float | None, about("as `coverage`, propagated rollouts only, up to 60 s, 0..1; null before any")
     ] = None
-    coverage_propagated_n: Annotated[int, Meta(description="past predictions behind `coverage_propagated`")] = 0
-    calibration: Annotated[str, Meta(description="calibration table of region and horizon, and its adaptation")] = ""
-    coast_s: Annotated[float, Meta(description="time predicted without telemetry since the last sample [s]")] = 0.0
-    seq: Annotated[int, Meta(description="mission item the prediction starts on; -1 none")] = -1
-    sentence: Annotated[str, Meta(description="limitation of this prediction, or empty")] = ""
-    event: Annotated[Event | None, Meta(description="last event that restarted it or made it coast")] = None
-    event_t: Annotated[float, Meta(description="time of that event; 0 never [s since 1970]")] = 0.0
-    event_text: Annotated[str, Meta(description="text of the event, with details")] = ""
+    coverage_propagated_n: Annotated[int, about("past predictions behind `coverage_propagated`")] = 0
+    calibration: Annotated[str, about("calibration table of region and horizon, and its adaptation")] = ""
+    coast_s: Annotated[float, about("time predicted without telemetry since the last sample [s]")] = 0.0
+    seq: Annotated[int, about("mission item the prediction starts on; -1 none")] = -1
+    sentence: Annotated[str, about("limitation of this prediction, or empty")] = ""
+    event: Annotated[Event | None, about("last event that restarted it or made it coast")] = None
+    event_t: Annotated[float, about("time of that event; 0 never [s since 1970]")] = 0.0
+    event_text: Annotated[str, about("text of the event, with details")] = ""
     controller: Annotated[
         Controller | None,
-        Meta(description="active law and parameters; null: unchanged. Sent on change, every 10 s and to queries"),
+        about("active law and parameters; null: unchanged. Sent on change, every 10 s and to queries"),
     ] = None
 
     def ned_origin(self) -> Origin:
@@ -449,26 +435,24 @@ class Prediction(Message, frozen=True, kw_only=True):
 class WhatIfStart(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Start of a what-if; heading and speed are unchanged where null."""
 
-    lat_e7: Annotated[int, Meta(description="[1e-7 deg]")]
-    lon_e7: Annotated[int, Meta(description="[1e-7 deg]")]
-    alt_mm: Annotated[int, Meta(description="[mm above mean sea level]")]
-    heading: Annotated[float | None, Meta(description="of the nose, clockwise from north [rad]")] = None
-    speed: Annotated[float | None, Meta(description="through the air; of a multirotor over ground [m/s]")] = None
+    lat_e7: Annotated[int, about("[1e-7 deg]")]
+    lon_e7: Annotated[int, about("[1e-7 deg]")]
+    alt_mm: Annotated[int, about("[mm above mean sea level]")]
+    heading: Annotated[float | None, about("of the nose, clockwise from north [rad]")] = None
+    speed: Annotated[float | None, about("through the air; of a multirotor over ground [m/s]")] = None
 
 
 class WhatIf(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Payload of a query on `parauav/{uav}/prediction`: hypothetical changes from now on. Affects no aircraft."""
 
     items: Annotated[
-        tuple[Item, ...] | None, Meta(description="another mission, numbered as by the autopilot, at most 1,000 items")
+        tuple[Item, ...] | None, about("another mission, numbered as by the autopilot, at most 1,000 items")
     ] = None
-    seq: Annotated[
-        int | None, Meta(description="item to fly to first; null: the first of `items`, or the current one")
-    ] = None
-    speed: Annotated[float | None, Meta(description="airspeed on the whole route, overrides the mission [m/s]")] = None
+    seq: Annotated[int | None, about("item to fly to first; null: the first of `items`, or the current one")] = None
+    speed: Annotated[float | None, about("airspeed on the whole route, overrides the mission [m/s]")] = None
     start: WhatIfStart | None = None
-    wind: Annotated[tuple[float, float] | None, Meta(description="north, east, the direction it blows to [m/s]")] = None
-    params: Annotated[dict[str, float], Meta(description="parameters, in the autopilot's names and units")] = {}
+    wind: Annotated[tuple[float, float] | None, about("north, east, the direction it blows to [m/s]")] = None
+    params: Annotated[dict[str, float], about("parameters, in the autopilot's names and units")] = {}
 
 
 class DiagnosisOutcome(StrEnum):
@@ -483,20 +467,17 @@ class DiagnosisOutcome(StrEnum):
 class Cause(msgspec.Struct, frozen=True, kw_only=True):
     """One effect that explains the flight, named or suspected."""
 
-    name: Annotated[str, Meta(description="effect, as listed by `fleet effects`; unknown: none of them")]
-    channel: Annotated[
-        str, Meta(description="where it acts, e.g. actuator, thrust, air, airspeed, or the name of a residual")
-    ] = ""
-    surface: Annotated[str, Meta(description="aileron, elevator, rudder, all surfaces; empty: no surface")] = ""
-    confusable_with: Annotated[
-        tuple[str, ...], Meta(description="effects that this flight cannot distinguish from it")
-    ] = ()
+    name: Annotated[str, about("effect, as listed by `fleet effects`; unknown: none of them")]
+    channel: Annotated[str, about("where it acts, e.g. actuator, thrust, air, airspeed, or the name of a residual")] = (
+        ""
+    )
+    surface: Annotated[str, about("aileron, elevator, rudder, all surfaces; empty: no surface")] = ""
+    confusable_with: Annotated[tuple[str, ...], about("effects that this flight cannot distinguish from it")] = ()
     segments: Annotated[
-        tuple[tuple[float, float], ...],
-        Meta(description="active intervals; the last ends at the newest [s since 1970]"),
+        tuple[tuple[float, float], ...], about("active intervals; the last ends at the newest [s since 1970]")
     ] = ()
-    parameters: Annotated[dict[str, float], Meta(description="estimated parameters, unit in the name")] = {}
-    sigma: Annotated[dict[str, float], Meta(description="their standard deviations, same names and units")] = {}
+    parameters: Annotated[dict[str, float], about("estimated parameters, unit in the name")] = {}
+    sigma: Annotated[dict[str, float], about("their standard deviations, same names and units")] = {}
 
 
 class Mismatch(Message, frozen=True, kw_only=True):
@@ -506,26 +487,20 @@ class Mismatch(Message, frozen=True, kw_only=True):
     version: ClassVar[int] = 2
 
     outcome: Annotated[
-        DiagnosisOutcome,
-        Meta(description="named: verified on held-out data; suspected: not; unknown: no effect explains it"),
+        DiagnosisOutcome, about("named: verified on held-out data; suspected: not; unknown: no effect explains it")
     ] = DiagnosisOutcome.NONE
-    causes: Annotated[tuple[Cause, ...], Meta(description="most significant first; empty for none")] = ()
+    causes: Annotated[tuple[Cause, ...], about("most significant first; empty for none")] = ()
     fit_before: Annotated[
-        float | None,
-        Meta(description="rms residual on held-out data [standard deviations of nominal flight]; null: not verified"),
+        float | None, about("rms residual on held-out data [standard deviations of nominal flight]; null: not verified")
     ] = None
-    fit_after: Annotated[
-        float | None, Meta(description="the same with the causes in the simulation [standard deviations]")
-    ] = None
-    force_before: Annotated[float | None, Meta(description="rms error of specific force, held-out data [m/s2]")] = None
-    force_after: Annotated[float | None, Meta(description="the same with the causes [m/s2]")] = None
-    attitude_error_before: Annotated[float | None, Meta(description="rms attitude error of free runs of 5 s [deg]")] = (
-        None
-    )
-    attitude_error_after: Annotated[float | None, Meta(description="the same with the causes [deg]")] = None
-    flight_t0: Annotated[float, Meta(description="first instant of the diagnosed flight [s since 1970]")] = 0.0
-    adapted: Annotated[bool, Meta(description="true: the prediction model includes the causes")] = False
-    sentence: Annotated[str, Meta(description="summary, and which model predicts")] = ""
+    fit_after: Annotated[float | None, about("the same with the causes in the simulation [standard deviations]")] = None
+    force_before: Annotated[float | None, about("rms error of specific force, held-out data [m/s2]")] = None
+    force_after: Annotated[float | None, about("the same with the causes [m/s2]")] = None
+    attitude_error_before: Annotated[float | None, about("rms attitude error of free runs of 5 s [deg]")] = None
+    attitude_error_after: Annotated[float | None, about("the same with the causes [deg]")] = None
+    flight_t0: Annotated[float, about("first instant of the diagnosed flight [s since 1970]")] = 0.0
+    adapted: Annotated[bool, about("true: the prediction model includes the causes")] = False
+    sentence: Annotated[str, about("summary, and which model predicts")] = ""
 
     @property
     def onset(self) -> float | None:
@@ -558,14 +533,12 @@ class Alert(Message, frozen=True, kw_only=True):
     kind: AlertKind
     active: bool = True
     sentence: str = ""
-    other: Annotated[int, Meta(description="the other UAV of a conflict, always the higher id; -1 none")] = -1
-    probability: Annotated[
-        float | None, Meta(description="probability of the event, 0..1; null: it is present now")
-    ] = None
-    predicted_t: Annotated[float | None, Meta(description="predicted time [s since 1970]; null: now")] = None
-    lat: Annotated[int | None, Meta(description="latitude of the event [1e-7 deg]; null: no single position")] = None
-    lon: Annotated[int | None, Meta(description="longitude of the event [1e-7 deg]")] = None
-    alt: Annotated[int | None, Meta(description="height of the event above mean sea level [mm]")] = None
+    other: Annotated[int, about("the other UAV of a conflict, always the higher id; -1 none")] = -1
+    probability: Annotated[float | None, about("probability of the event, 0..1; null: it is present now")] = None
+    predicted_t: Annotated[float | None, about("predicted time [s since 1970]; null: now")] = None
+    lat: Annotated[int | None, about("latitude of the event [1e-7 deg]; null: no single position")] = None
+    lon: Annotated[int | None, about("longitude of the event [1e-7 deg]")] = None
+    alt: Annotated[int | None, about("height of the event above mean sea level [mm]")] = None
 
     @property
     def about(self) -> AlertKey:
@@ -578,20 +551,20 @@ class FleetRow(msgspec.Struct, frozen=True, kw_only=True):
 
     uav: int
     state: TwinState
-    verdict: Annotated[str, Meta(description="sentence of the last verdict")]
-    fit: Annotated[dict[str, float], Meta(description="per state [%]")] = {}
-    horizon_s: Annotated[float, Meta(description="confidence horizon of the newest prediction [s]")] = 0.0
-    worker: Annotated[str, Meta(description="writer of the accepted results, 16 hex digits")] = ""
-    sample_age_s: Annotated[float | None, Meta(description="since the newest sample arrived [s]")] = None
-    prediction_age_s: Annotated[float | None, Meta(description="since the newest prediction [s]")] = None
+    verdict: Annotated[str, about("sentence of the last verdict")]
+    fit: Annotated[dict[str, float], about("per state [%]")] = {}
+    horizon_s: Annotated[float, about("confidence horizon of the newest prediction [s]")] = 0.0
+    worker: Annotated[str, about("writer of the accepted results, 16 hex digits")] = ""
+    sample_age_s: Annotated[float | None, about("since the newest sample arrived [s]")] = None
+    prediction_age_s: Annotated[float | None, about("since the newest prediction [s]")] = None
     t10_s: Annotated[
-        float | None, Meta(description="median time that past predictions stay within 10 % (M1) [s]; null before any")
+        float | None, about("median time that past predictions stay within 10 % (M1) [s]; null before any")
     ] = None
-    t10_censored: Annotated[float | None, Meta(description="share of them still within 10 % at their end, 0..1")] = None
-    t10_n: Annotated[int, Meta(description="past predictions behind `t10_s`")] = 0
-    epoch: Annotated[int, Meta(description="claim epoch of the writer")] = 0
-    alerts: Annotated[tuple[str, ...], Meta(description="texts of the active alerts")] = ()
-    mismatch: Annotated[str, Meta(description="outcome and causes, e.g. named thrust_loss; empty: none")] = ""
+    t10_censored: Annotated[float | None, about("share of them still within 10 % at their end, 0..1")] = None
+    t10_n: Annotated[int, about("past predictions behind `t10_s`")] = 0
+    epoch: Annotated[int, about("claim epoch of the writer")] = 0
+    alerts: Annotated[tuple[str, ...], about("texts of the active alerts")] = ()
+    mismatch: Annotated[str, about("outcome and causes, e.g. named thrust_loss; empty: none")] = ""
 
 
 class FleetState(msgspec.Struct, frozen=True, kw_only=True):
@@ -600,13 +573,11 @@ class FleetState(msgspec.Struct, frozen=True, kw_only=True):
     topic: ClassVar[str] = "@fleet/state"
     version: ClassVar[int] = 2
 
-    t: Annotated[float, Meta(description="fleet time of the rows [s since 1970]")]
+    t: Annotated[float, about("fleet time of the rows [s since 1970]")]
     rows: tuple[FleetRow, ...] = ()
-    sentence: Annotated[str, Meta(description="e.g. compiling the twin's physics, once")] = ""
-    tasks: Annotated[dict[str, int], Meta(description="tasks completed since start: predict, identify, ensemble")] = {}
-    dropped_messages: Annotated[
-        int, Meta(description="messages of its current aircraft dropped because a queue was full")
-    ] = 0
+    sentence: Annotated[str, about("e.g. compiling the twin's physics, once")] = ""
+    tasks: Annotated[dict[str, int], about("tasks completed since start: predict, identify, ensemble")] = {}
+    dropped_messages: Annotated[int, about("messages of its current aircraft dropped because a queue was full")] = 0
 
 
 class Predictions(msgspec.Struct, frozen=True, kw_only=True):
@@ -615,39 +586,33 @@ class Predictions(msgspec.Struct, frozen=True, kw_only=True):
     topic: ClassVar[str] = "@fleet/prediction"
     version: ClassVar[int] = 2
 
-    t: Annotated[float, Meta(description="fleet time of the answer [s since 1970]")]
-    predictions: Annotated[tuple[msgspec.Raw, ...], Meta(description="each a packed Prediction")] = ()
-    epochs: Annotated[
-        tuple[int, ...], Meta(description="claim epoch of each; readers accept the highest per aircraft")
-    ] = ()
+    t: Annotated[float, about("fleet time of the answer [s since 1970]")]
+    predictions: Annotated[tuple[msgspec.Raw, ...], about("each a packed Prediction")] = ()
+    epochs: Annotated[tuple[int, ...], about("claim epoch of each; readers accept the highest per aircraft")] = ()
 
 
 class LinkCounters(msgspec.Struct, frozen=True, kw_only=True):
     """Counters of one link since the gateway started; values in Hz and bytes/s are current rates."""
 
-    link: Annotated[str, Meta(description="the link as configured")]
+    link: Annotated[str, about("the link as configured")]
     datagrams: int = 0
     bytes_in: int = 0
     messages: int = 0
-    bad_bytes: Annotated[int, Meta(description="bytes that were no MAVLink frame")] = 0
-    bad_frames: Annotated[int, Meta(description="frames with a wrong checksum or an unknown message id")] = 0
-    dropped: Annotated[int, Meta(description="datagrams received and dropped because decoding fell behind")] = 0
-    overrun: Annotated[
-        int | None, Meta(description="datagrams dropped by the operating system; null: not reported")
-    ] = None
-    sent: Annotated[int, Meta(description="datagrams sent by the gateway itself")] = 0
+    bad_bytes: Annotated[int, about("bytes that were no MAVLink frame")] = 0
+    bad_frames: Annotated[int, about("frames with a wrong checksum or an unknown message id")] = 0
+    dropped: Annotated[int, about("datagrams received and dropped because decoding fell behind")] = 0
+    overrun: Annotated[int | None, about("datagrams dropped by the operating system; null: not reported")] = None
+    sent: Annotated[int, about("datagrams sent by the gateway itself")] = 0
     bytes_out: int = 0
-    unsent: Annotated[int, Meta(description="messages not sent or forwarded: no peer, or the queue was full")] = 0
-    bytes_s: Annotated[float, Meta(description="current receive rate [bytes/s]")] = 0.0
-    messages_hz: Annotated[float, Meta(description="current receive rate [Hz]")] = 0.0
-    recorded: Annotated[int, Meta(description="bytes of frames written to the .tlog, without timestamps")] = 0
-    noise: Annotated[int, Meta(description="bytes not recorded because they belong to no frame")] = 0
-    unrecorded: Annotated[int, Meta(description="bytes lost because the disk was full or too slow")] = 0
-    unwritten: Annotated[int, Meta(description="bytes waiting for the disk or for the rest of their frame")] = 0
-    rate_fraction: Annotated[
-        float, Meta(description="requested fraction of the desired message rates, by budget, 0..1")
-    ] = 1.0
-    sentence: Annotated[str, Meta(description="note for the operator, or empty")] = ""
+    unsent: Annotated[int, about("messages not sent or forwarded: no peer, or the queue was full")] = 0
+    bytes_s: Annotated[float, about("current receive rate [bytes/s]")] = 0.0
+    messages_hz: Annotated[float, about("current receive rate [Hz]")] = 0.0
+    recorded: Annotated[int, about("bytes of frames written to the .tlog, without timestamps")] = 0
+    noise: Annotated[int, about("bytes not recorded because they belong to no frame")] = 0
+    unrecorded: Annotated[int, about("bytes lost because the disk was full or too slow")] = 0
+    unwritten: Annotated[int, about("bytes waiting for the disk or for the rest of their frame")] = 0
+    rate_fraction: Annotated[float, about("requested fraction of the desired message rates, by budget, 0..1")] = 1.0
+    sentence: Annotated[str, about("note for the operator, or empty")] = ""
 
 
 class GatewayCounters(msgspec.Struct, frozen=True, kw_only=True):
@@ -656,28 +621,26 @@ class GatewayCounters(msgspec.Struct, frozen=True, kw_only=True):
     topic: ClassVar[str] = "@gateway"
     version: ClassVar[int] = 2
 
-    t: Annotated[float, Meta(description="fleet time of the count [s since 1970]")]
+    t: Annotated[float, about("fleet time of the count [s since 1970]")]
     links: tuple[str, ...] = ()
     uavs: tuple[int, ...] = ()
     datagrams: int = 0
     bytes_in: int = 0
     messages: int = 0
-    bad_bytes: Annotated[int, Meta(description="bytes that were no MAVLink frame")] = 0
-    bad_frames: Annotated[int, Meta(description="frames with a wrong checksum or an unknown message id")] = 0
-    refused: Annotated[dict[str, int], Meta(description="valid frames rejected, by reason")] = {}
-    published: Annotated[int, Meta(description="messages published while a router was connected")] = 0
+    bad_bytes: Annotated[int, about("bytes that were no MAVLink frame")] = 0
+    bad_frames: Annotated[int, about("frames with a wrong checksum or an unknown message id")] = 0
+    refused: Annotated[dict[str, int], about("valid frames rejected, by reason")] = {}
+    published: Annotated[int, about("messages published while a router was connected")] = 0
     sentence: str = ""
     per_link: tuple[LinkCounters, ...] = ()
-    router: Annotated[bool, Meta(description="a router is connected")] = True
-    unsent: Annotated[int, Meta(description="messages not published because no router was connected")] = 0
-    unconfirmed: Annotated[
-        int, Meta(description="published in the second before the loss of a router was detected")
-    ] = 0
-    removed: Annotated[int, Meta(description="recordings removed to stay within the budget")] = 0
-    history_bytes: Annotated[int, Meta(description="size of the history stored for late joiners")] = 0
-    wall_t: Annotated[float, Meta(description="send time by the gateway's own clock [s since 1970]")] = 0.0
-    machine: Annotated[str, Meta(description="name of the machine it runs on")] = ""
-    code: Annotated[str, Meta(description="hash of the sources it runs")] = ""
+    router: Annotated[bool, about("a router is connected")] = True
+    unsent: Annotated[int, about("messages not published because no router was connected")] = 0
+    unconfirmed: Annotated[int, about("published in the second before the loss of a router was detected")] = 0
+    removed: Annotated[int, about("recordings removed to stay within the budget")] = 0
+    history_bytes: Annotated[int, about("size of the history stored for late joiners")] = 0
+    wall_t: Annotated[float, about("send time by the gateway's own clock [s since 1970]")] = 0.0
+    machine: Annotated[str, about("name of the machine it runs on")] = ""
+    code: Annotated[str, about("hash of the sources it runs")] = ""
 
 
 class Claim(msgspec.Struct, frozen=True, kw_only=True):
@@ -690,18 +653,16 @@ class Claim(msgspec.Struct, frozen=True, kw_only=True):
     topic: ClassVar[str] = "@claim"
     version: ClassVar[int] = 2
 
-    t: Annotated[float, Meta(description="send time by the worker's clock [s since 1970]")]
-    worker: Annotated[str, Meta(description="writer, 16 hex digits")]
-    owned: Annotated[tuple[tuple[int, int], ...], Meta(description="UAV id and epoch of each owned aircraft")] = ()
-    without_history: Annotated[
-        tuple[int, ...], Meta(description="owned aircraft whose earlier telemetry is still missing")
-    ] = ()
-    leaving: Annotated[bool, Meta(description="true: it hands over all aircraft and stops")] = False
-    machine: Annotated[str, Meta(description="name of the machine it runs on")] = ""
-    code: Annotated[str, Meta(description="hash of the sources it runs")] = ""
+    t: Annotated[float, about("send time by the worker's clock [s since 1970]")]
+    worker: Annotated[str, about("writer, 16 hex digits")]
+    owned: Annotated[tuple[tuple[int, int], ...], about("UAV id and epoch of each owned aircraft")] = ()
+    without_history: Annotated[tuple[int, ...], about("owned aircraft whose earlier telemetry is still missing")] = ()
+    leaving: Annotated[bool, about("true: it hands over all aircraft and stops")] = False
+    machine: Annotated[str, about("name of the machine it runs on")] = ""
+    code: Annotated[str, about("hash of the sources it runs")] = ""
     highest_claims: Annotated[
         tuple[tuple[int, int, str], ...],
-        Meta(description="in query replies only: UAV id, epoch and writer of the highest known claim"),
+        about("in query replies only: UAV id, epoch and writer of the highest known claim"),
     ] = ()
 
 
@@ -711,17 +672,17 @@ class Handover(msgspec.Struct, frozen=True, kw_only=True):
     topic: ClassVar[str] = "@handover"
     version: ClassVar[int] = 2
 
-    t: Annotated[float, Meta(description="time of the copy by the worker's clock [s since 1970]")]
-    uav: Annotated[int, Meta(description="UAV id")]
-    epoch: Annotated[int, Meta(description="epoch of the old owner; the new owner's is higher")]
-    code: Annotated[str, Meta(description="hash of the sources that wrote `snapshot`; other versions must not read it")]
-    snapshot: Annotated[bytes, Meta(description="twin, unprocessed messages, open conflicts, mismatch")] = b""
+    t: Annotated[float, about("time of the copy by the worker's clock [s since 1970]")]
+    uav: Annotated[int, about("UAV id")]
+    epoch: Annotated[int, about("epoch of the old owner; the new owner's is higher")]
+    code: Annotated[str, about("hash of the sources that wrote `snapshot`; other versions must not read it")]
+    snapshot: Annotated[bytes, about("twin, unprocessed messages, open conflicts, mismatch")] = b""
 
 
 class HandoverRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Payload of a query on `parauav/@handover/{writer}`: ids of the requested aircraft."""
 
-    uavs: Annotated[tuple[int, ...], Meta(description="UAV ids")] = ()
+    uavs: Annotated[tuple[int, ...], about("UAV ids")] = ()
 
 
 PER_UAV: tuple[type[Message], ...] = (Sample, Status, Mission, Params, History, Model, Prediction, Mismatch, Alert)

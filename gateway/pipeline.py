@@ -8,8 +8,8 @@ from collections.abc import Hashable, Sequence
 
 import msgspec
 
-from fleet.bus.bus_protocol import Bus
 from fleet.bus.codec import EncodedMessage
+from fleet.bus.session import Bus
 from fleet.contract import Message
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
 from fleet.telemetry.mavlink.intake import MAX_UAVS, MavlinkReceiver

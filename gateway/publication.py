@@ -12,8 +12,9 @@ from typing import Any
 
 import msgspec
 
-from fleet.bus.bus_protocol import Bus, Replies
+from fleet.bus.bus_protocol import Replies
 from fleet.bus.codec import EncodedMessage, Stamp, encode
+from fleet.bus.session import Bus
 from fleet.contract import (
     PER_UAV,
     Alert,

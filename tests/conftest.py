@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import open_router
 from fleet.contract import Message
 from tests.support import flights, hover
+from tests.support.memory_bus import MemoryBus
 from twin_worker.confidence.tube_and_horizon import ConfidenceTracker
 from twin_worker.evaluation.replay import run_offline
 from twin_worker.prediction.method_selection import MethodSelector

@@ -23,13 +23,13 @@ from test_readme import MAINS, commands, understood
 
 from fleet.access.roles import ROLES, ROUTER_ROLE
 from fleet.bus.codec import decode, encode
-from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import connect
 from fleet.contract import FleetState, GatewayCounters, Prediction, Status
 from gateway import status as gateway
 from tests.bench.security.site import REAL, Site, make_papers, routed, zenohd
 from tests.bench.security.trying import until
 from tests.support.examples import EXAMPLES
+from tests.support.memory_bus import MemoryBus
 from twin_worker.service import work_rates as twin_worker
 
 DEPLOY = ROOT / "deploy"

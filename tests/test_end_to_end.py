@@ -18,8 +18,7 @@ from conftest import ROOT, unused_port
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from fleet import cli
-from fleet.bus.bus_protocol import Bus
-from fleet.bus.session import connect
+from fleet.bus.session import Bus, connect
 from fleet.commands.live.status import fleet_rows
 from fleet.contract import (
     FleetState,

@@ -20,10 +20,10 @@ from fleet import cli
 from fleet.access.entry import ROUTER
 from fleet.bus.bus_protocol import QueryHandler
 from fleet.bus.codec import Stamp
-from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import connect, open_router
 from fleet.contract import Array, Prediction, TwinState
 from gateway import __main__ as gateway
+from tests.support.memory_bus import MemoryBus
 from twin_worker import __main__ as twin_worker
 from twin_worker.service.queries import QueryHandlers
 from twin_worker.service.worker import Worker

@@ -5,7 +5,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from fleet.access.papers import CertificatePair, find_certificate, read_password
+from fleet.access.papers import find_certificate, read_password
 from fleet.access.roles import (
     LIVE,
     MAX_MESSAGE_BYTES,
@@ -23,12 +23,8 @@ CERTIFICATE, PASSWORD = "cert_common_names", "usernames"  # proof of a role, nam
 _STAMP_BYTES = 16  # attachment of a result [bytes]
 _PUBLISH = ("put", "reply", "declare_queryable")
 _ALL = (
-    *_PUBLISH,
-    "query",
-    "declare_subscriber",
-    "liveliness_token",
-    "liveliness_query",
-    "declare_liveliness_subscriber",
+    *(*_PUBLISH, "query", "declare_subscriber"),
+    *("liveliness_token", "liveliness_query", "declare_liveliness_subscriber"),
 )
 _UAV_KEYS = f"{ROOT}/**"
 _LIVE_KEYS = f"{ROOT}/{LIVE}/**"
@@ -48,21 +44,16 @@ def access_control(identified_by: str = CERTIFICATE) -> dict[str, Any]:
     role_rules = {role: ["subscribe", "watch liveliness", "receive"] for role in ROLES} | {ROUTER_ROLE: ["route"]}
     role_rules[WORKER].append("declare liveliness")
     for role in ROLES:
-        hidden = [
-            topic_keys(topic) for topic, topic_rule in TOPIC_RULES.items() if role in topic_rule.queriers != ROLES
-        ]
+        published = [topic_keys(topic) for topic, rule in TOPIC_RULES.items() if role in rule.publishers]
+        hidden = [topic_keys(topic) for topic, rule in TOPIC_RULES.items() if role in rule.queriers != ROLES]
         own = [
-            _rule(
-                f"{role} publishes",
-                _PUBLISH,
-                "ingress",
-                [topic_keys(topic) for topic, topic_rule in TOPIC_RULES.items() if role in topic_rule.publishers],
-            ),
+            _rule(f"{role} publishes", _PUBLISH, "ingress", published),
             _rule(f"{role} queries", ("query",), "ingress", hidden),
             _rule(f"{role} receives", _ALL, "egress", hidden),
         ]
-        rules += (own := [rule for rule in own if rule["key_exprs"]])
-        role_rules[role] += [rule["id"] for rule in own]
+        own = [allowed for allowed in own if allowed["key_exprs"]]
+        rules += own
+        role_rules[role] += [allowed["id"] for allowed in own]
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -90,13 +81,8 @@ def _rule(name: str, messages: tuple[str, ...], flow: str, key_exprs: list[str])
 
 def _size_filter(messages: tuple[str, ...], key_exprs: list[str], max_bytes: int) -> dict[str, Any]:
     name = f"{' and '.join(messages)} up to {max_bytes}"
-    return {
-        "id": name,
-        "flows": ["ingress"],
-        "messages": list(messages),
-        "key_exprs": key_exprs,
-        "size_limit": max_bytes,
-    }
+    limit = {"flows": ["ingress"], "messages": list(messages), "key_exprs": key_exprs, "size_limit": max_bytes}
+    return {"id": name} | limit
 
 
 ROUTER = "tcp/127.0.0.1:7447"
@@ -146,8 +132,7 @@ class BusConfig:
             presence = "without" if self.certificates is None else "with"
             raise ValueError(
                 f"--router: found {self.endpoint} {presence} certificates, expected tls/… and `certificates` "
-                "in the file of "
-                "--config, or neither; see deploy/README.md"
+                "in the file of --config, or neither; see deploy/README.md"
             )
 
     @property
@@ -155,8 +140,8 @@ class BusConfig:
         """Return whether a certificate identifies the role."""
         return self.certificates is not None and self.passwords is None
 
-    def certificate_pair(self) -> CertificatePair | None:
-        """Find the certificate of this role; None where the role uses a password or nothing.
+    def certificate_pair(self) -> tuple[Path, Path] | None:
+        """Find certificate and key of this role; None where the role uses a password or nothing.
 
         Raises:
             ValueError: when it is missing, expired, or readable by others.
@@ -171,15 +156,13 @@ class BusConfig:
             ValueError: when a file is missing, expired, or readable by others.
             OSError: when one cannot be read.
         """
-        out = _common_settings(
-            "peer" if retry else "client", connect=[self.endpoint], listen=[]
-        )  # a client would wait in `open`
+        mode = "peer" if retry else "client"  # a client would wait in `open`
+        out = _common_settings(mode, connect=[self.endpoint], listen=[])
         out |= {"connect/timeout_ms": -1 if retry else _CONNECT_TIMEOUT_MS, "connect/exit_on_failure": not retry}
         if self.certificates is not None:
             out[f"{_TLS}/root_ca_certificate"] = str(self.certificates / "ca.pem")
         if (pair := self.certificate_pair()) is not None:
-            out[f"{_TLS}/connect_certificate"] = str(pair.certificate)
-            out[f"{_TLS}/connect_private_key"] = str(pair.key)
+            out[f"{_TLS}/connect_certificate"], out[f"{_TLS}/connect_private_key"] = map(str, pair)
             out[f"{_TLS}/enable_mtls"] = True
         if self.passwords is not None:
             out |= {f"{_AUTH}/user": self.role, f"{_AUTH}/password": read_password(self.passwords, self.role)}
@@ -192,17 +175,17 @@ class BusConfig:
             listen: endpoints; None: `endpoint`
             peers: other routers of the site
         Raises:
-            ValueError: as `session`.
-            OSError: as `session`.
+            ValueError: as `session_settings`.
+            OSError: as `session_settings`.
         """
         out = _common_settings("router", connect=peers or [], listen=listen or [self.endpoint]) | message_limits()
         out |= {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
         if self.certificates is not None:
-            pair = find_certificate(self.certificates, ROUTER_ROLE)
+            certificate, key = find_certificate(self.certificates, ROUTER_ROLE)
             directions = ("listen", "connect") if peers and self.mutual_tls else ("listen",)
             for direction in directions:
-                out[f"{_TLS}/{direction}_certificate"] = str(pair.certificate)
-                out[f"{_TLS}/{direction}_private_key"] = str(pair.key)
+                out[f"{_TLS}/{direction}_certificate"] = str(certificate)
+                out[f"{_TLS}/{direction}_private_key"] = str(key)
             out[f"{_TLS}/root_ca_certificate"] = str(self.certificates / "ca.pem")
             out[f"{_TLS}/enable_mtls"] = self.mutual_tls
             out[f"{_TLS}/close_link_on_expiration"] = True

@@ -2,6 +2,7 @@
 
 import socket
 import ssl
+from contextlib import suppress
 from pathlib import Path
 
 from fleet.access.entry import BusConfig, parse_endpoint
@@ -40,24 +41,23 @@ def probe_router(bus_config: BusConfig) -> bool:
         return False
     try:
         with tcp, context.wrap_socket(tcp, server_hostname=host) as tls:
-            _check_rejection(tls)
+            tls.settimeout(_REJECTION_WAIT_S)
+            with suppress(TimeoutError):  # a router that accepts the client waits for its first message
+                if not tls.recv(1):
+                    raise ConnectionError("it closed the connection")
     except ssl.SSLCertVerificationError as error:
         raise ConnectionError(
-            f"router {bus_config.endpoint}: found its certificate not valid ({error.verify_message}), "
-            "expected one for this name, "
-            f"signed by the authority in ca.pem; {_remedy(error.verify_message)}"
+            f"router {bus_config.endpoint}: found its certificate not valid ({error.verify_message}), expected one "
+            f"for this name, signed by the authority in ca.pem; {_remedy(error.verify_message)}"
         ) from None
     except ssl.SSLError as error:
-        raise ConnectionError(
-            f"router {bus_config.endpoint}: found the certificate of {bus_config.role} rejected "
-            f"({_reason_text(error)}), expected one signed "
-            "by the router's authority; create it again with that authority"
-        ) from None
+        reason = f"found the certificate of {bus_config.role} rejected ({_reason_text(error)})"
+        remedy = "expected one signed by the router's authority; create it again with that authority"
+        raise ConnectionError(f"router {bus_config.endpoint}: {reason}, {remedy}") from None
     except OSError as error:
         raise ConnectionError(
-            f"router {bus_config.endpoint}: found no TLS there ({error.strerror or error}), expected a "
-            "handshake; check that it "
-            "is the tls endpoint of a router"
+            f"router {bus_config.endpoint}: found no TLS there ({error.strerror or error}), expected a handshake; "
+            "check that it is the tls endpoint of a router"
         ) from None
     return True
 
@@ -71,22 +71,11 @@ def _tls_context(bus_config: BusConfig, folder: Path) -> ssl.SSLContext:
     except ssl.SSLError as error:
         raise ValueError(
             f"certificates: found certificate and key in {folder} that do not match ({_reason_text(error)}), "
-            "expected a "
-            f"pair; create them again: certificates.sh role FOLDER {bus_config.role}"
+            f"expected a pair; create them again: certificates.sh role FOLDER {bus_config.role}"
         ) from None
     except OSError as error:
         raise ValueError(f"certificates: found no ca.pem in {folder} ({error.strerror}); copy the site's") from None
     return context
-
-
-def _check_rejection(tls: ssl.SSLSocket) -> None:
-    """Wait briefly for a rejection; a router that accepts the client waits for its first message."""
-    tls.settimeout(_REJECTION_WAIT_S)
-    try:
-        if not tls.recv(1):
-            raise ConnectionError("it closed the connection")
-    except TimeoutError:
-        return
 
 
 def _remedy(rejection: str) -> str:

@@ -4,7 +4,6 @@ import os
 import stat
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
 
 from cryptography import x509
 
@@ -14,37 +13,30 @@ CREATE_HINT = "create them with deploy/certificates.sh"
 MAX_PASSWORD_CHARS = 1024
 
 
-class CertificatePair(NamedTuple):
-    """A certificate and its key."""
-
-    certificate: Path
-    key: Path
-
-
-def find_certificate(folder: Path, role: str) -> CertificatePair:
+def find_certificate(folder: Path, role: str) -> tuple[Path, Path]:
     """Find the certificate of a role and its key.
 
     Raises:
         ValueError: when one is missing, has expired, or the key is readable by others.
         OSError: when one cannot be read.
     """
-    pair = CertificatePair(folder / f"{role}.pem", folder / f"{role}.key")
-    for path in (folder / "ca.pem", *pair):
+    certificate, key = folder / f"{role}.pem", folder / f"{role}.key"
+    for path in (folder / "ca.pem", certificate, key):
         if not path.is_file():
             raise ValueError(
                 f"certificates: found no {path}, expected it for the role {role}; {CREATE_HINT}, or copy it here"
             )
-    check_private(pair.key)
-    for path in (folder, folder / "ca.pem", pair.certificate):
+    check_private(key)
+    for path in (folder, folder / "ca.pem", certificate):
         _check_unwritable(path)
-    expiry, now = expiry_of(pair.certificate), datetime.now(UTC)
+    expiry, now = expiry_of(certificate), datetime.now(UTC)
     if expiry < now:
         names = "router FOLDER NAME..." if role == ROUTER_ROLE else f"role FOLDER {role}"
         raise ValueError(
-            f"certificates: found {pair.certificate} expired on {expiry:%Y-%m-%d %H:%M} UTC, the time here is "
+            f"certificates: found {certificate} expired on {expiry:%Y-%m-%d %H:%M} UTC, the time here is "
             f"{now:%Y-%m-%d %H:%M}; renew it: certificates.sh {names}, and copy it here"
         )
-    return pair
+    return certificate, key
 
 
 def expiry_of(certificate: Path) -> datetime:
@@ -83,12 +75,7 @@ def check_private(path: Path) -> None:
 
 
 def _check_unwritable(path: Path) -> None:
-    """Check that no other user may replace a certificate or its folder.
-
-    Raises:
-        ValueError: when another user may.
-        OSError: when its status cannot be read.
-    """
+    """Check that no other user may replace a certificate or its folder."""
     mode = stat.S_IMODE(path.stat().st_mode)
     if mode & 0o022 and not mode & stat.S_ISVTX:
         raise ValueError(

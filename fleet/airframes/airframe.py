@@ -8,15 +8,12 @@ import numba as nb
 import numpy as np
 
 _FUNCTION = {4: "delta_a", 19: "delta_e", 21: "delta_r", 70: "delta_t", 77: "delta_e+a", 78: "delta_e-a"}
+_INPUTS = ("delta_a", "delta_e", "delta_r", "delta_t")
 _MIXES = {  # contribution of each servo's deflection to each input
-    "delta_a": {"delta_a": 1.0},
-    "delta_e": {"delta_e": 1.0},
-    "delta_r": {"delta_r": 1.0},
-    "delta_t": {"delta_t": 1.0},
+    **{name: {name: 1.0} for name in _INPUTS},
     "delta_e+a": {"delta_e": 1.0, "delta_a": -1.0},  # left elevon
     "delta_e-a": {"delta_e": 1.0, "delta_a": 1.0},  # right elevon
 }
-_INPUTS = ("delta_a", "delta_e", "delta_r", "delta_t")
 _SERVOS = 8
 _PX4_MOTORS, _PX4_SURFACES = 101, 201  # PWM_MAIN_FUNCn of the first motor, of the first control surface
 _PX4_TYPES = {1: "delta_a", 2: "delta_a", 3: "delta_e", 4: "delta_r", 5: "delta_e+a", 6: "delta_e-a"}  # CA_SV_CSn_TYPE

@@ -59,15 +59,19 @@ def run_blind_test(config: BlindTestConfig, stop: Event, log: LogFunction) -> Bl
     """Run a blind test.
 
     Raises:
-        Ended: when a step fails or is stopped.
+        RunAborted: when a step fails or is stopped.
         ValueError: when the encrypted labels or the reports changed after their hash was committed.
     """
     with TemporaryDirectory(prefix="parauav-key-") as key_folder:
         key = Path(key_folder) / "key"
-        _conceal(config, key, stop)
+        settings: dict[str, object] = {"seed": config.seed, "flights": config.flights, "jobs": config.jobs}
+        settings |= {"out": config.folder, "sealed": config.sealed_labels, "key": key}
+        options = [f"--{name}={value}" for name, value in settings.items()]
+        _run_step(stop, "fleet.blind_test.concealer", *options)
         labels_hash, key_bytes = digest(config.sealed_labels), consume_key(key)
     log(f"labels encrypted, key only in this process: sha256 {labels_hash}")
-    report_paths = [_diagnose(config, folder, stop, log) for folder in _airframe_folders(config.folder)]
+    airframe_folders = sorted(path.parent for path in config.folder.glob("*/*.card.json"))
+    report_paths = [_diagnose(config, folder, stop, log) for folder in airframe_folders]
     reports_hash = digest(*report_paths)
     log(f"reports committed: sha256 {reports_hash}")
     labels: dict[str, Any] = json.loads(decrypt(config.sealed_labels, key_bytes, labels_hash))
@@ -84,17 +88,6 @@ def run_blind_test(config: BlindTestConfig, stop: Event, log: LogFunction) -> Bl
     return BlindTestResult(results, labels_hash, reports_hash)
 
 
-def _airframe_folders(folder: Path) -> list[Path]:
-    """Return the folders of the simulated airframes."""
-    return sorted(path.parent for path in folder.glob("*/*.card.json"))
-
-
-def _conceal(config: BlindTestConfig, key: Path, stop: Event) -> None:
-    settings = {"seed": config.seed, "flights": config.flights, "jobs": config.jobs, "out": config.folder}
-    options = [f"--{name}={value}" for name, value in (settings | {"sealed": config.sealed_labels, "key": key}).items()]
-    _run_step(stop, "fleet.blind_test.concealer", *options)
-
-
 def _diagnose(config: BlindTestConfig, folder: Path, stop: Event, log: LogFunction) -> Path:
     """Calibrate on the nominal flights of one airframe and diagnose the others; return the file of reports."""
     nominal, test_flights = (sorted(map(str, folder.glob(f"{prefix}_*.tlog"))) for prefix in ("cal", "rec"))
@@ -105,9 +98,8 @@ def _diagnose(config: BlindTestConfig, folder: Path, stop: Event, log: LogFuncti
     log(f"{folder.name}: diagnosing {len(test_flights)} flights without labels")
     page_options = [f"--report={folder / 'pages'}"] if config.write_pages else []
     options = [f"--model={model}", f"--json={reports}", f"--jobs={config.jobs}", *page_options]
-    _run_step(
-        stop, "twin_worker.diagnosis", *options, "--", *test_flights, accepted_codes=(0, 1)
-    )  # a rejected flight is graded as missed
+    accepted_codes = (0, 1)  # a rejected flight is graded as missed
+    _run_step(stop, "twin_worker.diagnosis", *options, "--", *test_flights, accepted_codes=accepted_codes)
     return reports
 
 

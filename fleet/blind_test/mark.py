@@ -1,28 +1,19 @@
 """Grade reports against their labels: names, location, onset, parameters and standard deviations; score of all."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import median
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 _ACTUATOR = ("actuator", "pitch", "roll", "yaw")
 _LOADS = ("lift", "drag", "force_x", "force_z")
 CHANNELS: Mapping[str, tuple[str, ...]] = {  # effect: correct channels
-    "wind_steady": ("air",),
-    "wind_shear": ("air",),
-    "turbulence": ("air",),
-    "gust_discrete": ("air",),
-    "updraft": ("air",),
+    **dict.fromkeys(("wind_steady", "wind_shear", "turbulence", "gust_discrete", "updraft"), ("air",)),
     "air_density": ("air", "dynamic_pressure"),
-    "actuator_lag": _ACTUATOR,
-    "actuator_delay": _ACTUATOR,
-    "actuator_rate_limit": _ACTUATOR,
-    "actuator_deadband": _ACTUATOR,
-    "actuator_saturation": _ACTUATOR,
-    "actuator_offset": _ACTUATOR,
-    "actuator_stuck": _ACTUATOR,
+    **dict.fromkeys(("actuator_lag", "actuator_delay", "actuator_rate_limit", "actuator_deadband"), _ACTUATOR),
+    **dict.fromkeys(("actuator_saturation", "actuator_offset", "actuator_stuck"), _ACTUATOR),
     "control_effectiveness_loss": _ACTUATOR,
     "prop_torque": ("roll",),
     "p_factor": ("yaw", "pitch"),
@@ -30,14 +21,10 @@ CHANNELS: Mapping[str, tuple[str, ...]] = {  # effect: correct channels
     "thrust_loss": ("thrust", "force_x"),
     "thrust_asymmetry": ("yaw", "thrust"),
     "drag_increase": ("drag", "force_x"),
-    "icing": _LOADS,
-    "flap_deployed": _LOADS,
-    "stall": _LOADS,
-    "ground_effect": _LOADS,
+    **dict.fromkeys(("icing", "flap_deployed", "stall", "ground_effect"), _LOADS),
     "mass_change": ("mass", "force_z", "lift"),
     "cg_shift": ("pitch", "mass", "roll"),
-    "airspeed_scale": ("airspeed",),
-    "airspeed_bias": ("airspeed",),
+    **dict.fromkeys(("airspeed_scale", "airspeed_bias"), ("airspeed",)),
     "gps_latency": ("gps",),
     "imu_misalignment": ("imu",),
     "gyro_bias": ("gyro", "imu"),
@@ -151,13 +138,9 @@ def grade(flight: str, label: Mapping[str, Any], report: Mapping[str, Any] | Non
             surfaces.append(location["surface"] == effect["surface"])
         if effect.get("t0") and location["segments"]:
             onset_errors.append((location["segments"][0][0] - effect["t0"], 5.0 + 0.2 * effect.get("ramp_s", 0.0)))
-        sizes += [
-            (
-                effect["name"],
-                ScoredParameter(name, truth, diagnosis["parameters"][i].get(name), diagnosis["sigma"][i].get(name)),
-            )
-            for name, truth in effect["params"].items()
-        ]
+        values, sigma = diagnosis["parameters"][i], diagnosis["sigma"][i]
+        for name, truth in effect["params"].items():
+            sizes.append((effect["name"], ScoredParameter(name, truth, values.get(name), sigma.get(name))))
     return GradedFlight(
         flight=flight,
         airframe=label["airframe"],
@@ -196,25 +179,12 @@ REQUIREMENTS = {  # score: bound and meaning
 """Bounds: a positive value is a minimum, a negative value the negative of a maximum."""
 
 
-class ScoreRow(NamedTuple):
-    """One score with its meaning and requirement, formatted."""
-
-    met: bool
-    meaning: str
-    required: str
-    achieved: str
-
-
-def score_rows(scores: Mapping[str, Any]) -> list[ScoreRow]:
-    """Format every score with its requirement."""
-    rows = []
+def score_rows(scores: Mapping[str, Any]) -> Iterator[tuple[bool, str, str, str]]:
+    """Format every score: whether it meets its requirement, meaning, requirement, value."""
     for name, (required, meaning) in REQUIREMENTS.items():
         value = scores[name]
         bound = f"at most {-required:.3g}" if required < 0 else f"at least {required:.3g}"
-        rows.append(
-            ScoreRow(meets_requirement(name, value), meaning, bound, "no data" if value is None else f"{value:.3g}")
-        )
-    return rows
+        yield meets_requirement(name, value), meaning, bound, "no data" if value is None else f"{value:.3g}"
 
 
 def meets_requirement(name: str, value: float | None) -> bool:
@@ -225,10 +195,8 @@ def meets_requirement(name: str, value: float | None) -> bool:
 
 def score(results: Sequence[GradedFlight]) -> dict[str, Any]:
     """Compute all scores; None where no flight contributes."""
-    by_role = {
-        kind: [result for result in results if result.role == kind]
-        for kind in ("control", "single", "compound", "unknown")
-    }
+    roles = ("control", "single", "compound", "unknown")
+    by_role = {role: [result for result in results if result.role == role] for role in roles}
     parameters = [parameter for one in results for _, parameter in one.sizes]
     errors = [size.error for size in parameters]
     onset_errors = [pair for one in results for pair in one.late]
@@ -239,7 +207,9 @@ def score(results: Sequence[GradedFlight]) -> dict[str, Any]:
     return {
         "top1_naming": _fraction(one.hit for one in by_role["single"]),
         "in_class": _fraction(one.in_class for one in by_role["single"]),
-        "spurious_extra_names": sum(_spurious(one) for one in by_role["single"]),
+        "spurious_extra_names": sum(
+            (one.concealed[0], extra) not in _NEAR_EQUIVALENT for one in by_role["single"] for extra in one.named[1:]
+        ),
         "channel_ok": _fraction(ok for one in results for ok in one.located),
         "surface_ok": _fraction(ok for one in results for ok in one.surfaces),
         "onset_ok": _fraction(abs(dt) <= tolerance for dt, tolerance in onset_errors),
@@ -259,10 +229,6 @@ def score(results: Sequence[GradedFlight]) -> dict[str, Any]:
         "n": {kind: len(flights) for kind, flights in by_role.items()}
         | {"sizes": len(parameters), "onsets": len(onset_errors)},
     }
-
-
-def _spurious(result: GradedFlight) -> int:
-    return sum((result.concealed[0], extra) not in _NEAR_EQUIVALENT for extra in result.named[1:])
 
 
 def _fraction(outcomes: Iterable[bool | None]) -> float | None:

@@ -37,9 +37,9 @@ def write(config: BlindTestConfig, outcome: BlindTestResult, scores: Mapping[str
 def _scores(scores: Mapping[str, Any]) -> str:
     """Show each score beside its requirement."""
     cards = []
-    for row in score_rows(scores):
-        chip = '<span class="chip none">met</span>' if row.met else '<span class="chip named">missed</span>'
-        cards.append(f'<div class="card"><b>{row.achieved} {chip}</b>{row.meaning}, {row.required}</div>')
+    for met, meaning, required, achieved in score_rows(scores):
+        chip = '<span class="chip none">met</span>' if met else '<span class="chip named">missed</span>'
+        cards.append(f'<div class="card"><b>{achieved} {chip}</b>{meaning}, {required}</div>')
     return f'<div class="cards">{"".join(cards)}</div>'
 
 
@@ -51,10 +51,10 @@ def _flights(results: Sequence[GradedFlight]) -> str:
 
 def _flight(result: GradedFlight) -> str:
     chip = '<span class="chip none">correct</span>' if result.hit else '<span class="chip named">miss</span>'
+    link = f'<a href="{result.airframe}/pages/{result.flight}.html">{escape_text(result.flight)}</a>'
     cells = (
         chip,
-        "<a "
-        f'href="{result.airframe}/pages/{result.flight}.html">{escape_text(result.flight)}</a><br>{escape_text(result.airframe)}',
+        f"{link}<br>{escape_text(result.airframe)}",
         ", ".join(map(escape_text, result.concealed)) or "nothing",
         ", ".join(map(escape_text, result.reported_names)),
         "<br>".join(map(escape_text, parameter_texts(result))),

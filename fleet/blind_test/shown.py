@@ -89,8 +89,6 @@ def _scores(scores: Mapping[str, Any]) -> Table:
     score_table = Table(box=None, pad_edge=False)
     for heading in ("", "score", "required", "achieved"):
         score_table.add_column(heading)
-    for row in score_rows(scores):
-        score_table.add_row(
-            Text("met", "green") if row.met else Text("missed", "red"), row.meaning, row.required, row.achieved
-        )
+    for met, *cells in score_rows(scores):
+        score_table.add_row(Text("met", "green") if met else Text("missed", "red"), *cells)
     return score_table

@@ -1,1 +1,1 @@
-"""The Zenoh bus: sessions, encoding, liveliness, fencing by epoch, and an in-memory bus for tests."""
+"""The Zenoh bus: sessions, encoding, liveliness, fencing by epoch."""

@@ -1,26 +1,20 @@
-"""Interface of a bus: keys, publish, subscribe, queries, presence, epoch fence, selection among replies."""
+"""Keys, liveliness tokens, selection among replies, and the fence that accepts one writer for each aircraft."""
 
 import re
 import time
-from collections.abc import Callable, Collection, Container, Iterable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from fleet.access.roles import ROOT
-from fleet.bus.codec import EncodedMessage, Stamp, is_plausible_epoch
+from fleet.bus.codec import Stamp, is_plausible_epoch
 from fleet.contract import PER_UAV
 
 M = TypeVar("M")
-Callback = Callable[[Any, Stamp | None], None]
-RawCallback = Callable[[bytes, str, Stamp | None], None]
 RawMessage = tuple[int | None, bytes, str, Stamp | None]
 """UAV id of the key, payload, encoding, stamp."""
-BatchCallback = Callable[[list[RawMessage]], None]
 Replies = Iterable[tuple[Any, Stamp | None]]
 QueryHandler = Callable[[int | None, dict[str, str], bytes], Replies]
-LivelinessCallback = Callable[[str, bool], None]
-Filter = Callable[[int], bool]
 
 
 def key_of(kind: type, target: int | str) -> str:
@@ -36,102 +30,9 @@ def uav_of_key(key_name: str) -> int | None:
     return int(chunk) if chunk.isdecimal() and len(chunk) <= 9 else None
 
 
-class Bus(AbstractContextManager, Protocol):
-    """Interface of the bus of one process."""
-
-    writer: int  # random id of this process on the bus
-    bad: int  # received messages that do not decode
-
-    def publish(self, message: Any, stamp: Stamp | None = None) -> None:
-        """Publish one message."""
-
-    def put(self, encoded: EncodedMessage, stamp: Stamp | None = None) -> None:
-        """Publish one encoded message."""
-
-    def remove_publishers(self, uavs: Collection[int]) -> None:
-        """Release what is kept per key for aircraft that this process no longer publishes."""
-
-    @property
-    def router(self) -> str:
-        """Return the id of the connected router; empty while none is connected (the bus keeps retrying)."""
-
-    def subscribe(self, kind: type, callback: Callback, accepts: Filter | None = None) -> None:
-        """Call `callback(message, stamp)` for every message of a class; undecodable messages are counted only.
-
-        Args:
-            kind: message class of the contract
-            callback: called on a thread of the bus
-            accepts: filter by UAV id, applied before decoding; None: all
-        """
-
-    def subscribe_raw(self, kind: type, callback: RawCallback) -> None:
-        """Call `callback(payload, encoding, stamp)` for every message of a class, without decoding it."""
-
-    def subscribe_buffered(self, kind: type, callback: BatchCallback) -> None:
-        """Buffer every message of a class until `dispatch`; needs no thread.
-
-        Args:
-            kind: message class of the contract
-            callback: called with all buffered messages in order of arrival, undecoded
-        """
-
-    def dispatch(self, latest_only: Container[type] = ()) -> None:
-        """Pass the buffered messages to their callbacks on this thread; a full buffer drops its oldest messages.
-
-        Args:
-            latest_only: classes of which only the newest message of each key is passed on
-        """
-
-    def declare_queryable(self, kind: type, handler: QueryHandler) -> None:
-        """Declare one wildcard queryable for a class: `handler(uav or None, parameters, payload)`."""
-
-    def get(self, kind: type[M], target: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
-        """Query all writers of a class for at most `timeout_s` [s]; return the reply of highest epoch per aircraft.
-
-        Raises:
-            ConnectionError: when the session is closed; join the router again.
-        """
-
-    def get_one(
-        self, kind: type[M], target: int, payload: bytes, timeout_s: float = 5.0
-    ) -> tuple[M, Stamp | None] | None:
-        """Query one aircraft with a payload; None without a reply.
-
-        Raises:
-            ValueError: when every reply is an error; with the text of the first.
-            ConnectionError: when the session is closed; join the router again.
-        """
-
-    def get_stream(self, kind: type[M], target: int | str, payload: bytes, timeout_s: float) -> Iterator[M]:
-        """Query with a payload and yield every reply on arrival, for at most `timeout_s` [s]; omits error replies.
-
-        Raises:
-            ConnectionError: when the session is closed; join the router again.
-        """
-
-    def get_payloads(self, kind: type, target: int | str, timeout_s: float) -> Iterator[bytes]:
-        """Query and yield the payload of every reply on arrival, for at most `timeout_s` [s]; skip other versions.
-
-        Raises:
-            ConnectionError: when the session is closed; join the router again.
-        """
-
-    def declare_liveliness(self, name: str) -> None:
-        """Declare the liveliness token `parauav/@live/{name}` for the lifetime of this process."""
-
-    def watch_liveliness(self, callback: LivelinessCallback) -> None:
-        """Call `callback(name, alive)` for every liveliness token now, and on every later change."""
-
-    def list_liveliness(self, callback: LivelinessCallback) -> None:
-        """Call `callback(name, True)` for every current liveliness token."""
-
-    def close(self) -> None:
-        """Close the connection to the bus."""
-
-
 def select_latest(replies: list[tuple[M, Stamp | None]]) -> list[tuple[M, Stamp | None]]:
     """Select the reply of highest plausible epoch, then the newest, per UAV (and alert); keep all without a UAV."""
-    best: dict[tuple[int, str], tuple[M, Stamp | None]] = {}
+    pairs: dict[tuple[int, str], list[tuple[Any, Stamp | None]]] = {}
     without_uav = []
     for message, stamp in replies:
         uav = getattr(message, "uav", None)
@@ -141,14 +42,9 @@ def select_latest(replies: list[tuple[M, Stamp | None]]) -> list[tuple[M, Stamp 
         if stamp is not None and not is_plausible_epoch(stamp.epoch):
             continue
         identity = uav, str(getattr(message, "about", ""))
-        current = best.get(identity)
-        if current is None or _rank(message, stamp) > _rank(*current):
-            best[identity] = (message, stamp)
-    return [best[identity] for identity in sorted(best)] + without_uav
-
-
-def _rank(message: Any, stamp: Stamp | None) -> tuple[Stamp, float]:
-    return stamp or Stamp(0, 0), message.t
+        pairs.setdefault(identity, []).append((message, stamp))
+    best = [max(pairs[identity], key=lambda pair: (pair[1] or Stamp(0, 0), pair[0].t)) for identity in sorted(pairs)]
+    return best + without_uav
 
 
 def replies_about(uav: int | None, replies: Replies) -> Replies:
@@ -187,14 +83,7 @@ def parse_token(token: str) -> WorkerToken | None:
     return WorkerToken(worker, range(int(low), int(high) + 1), int(started))
 
 
-WRITER_TIMEOUT_S = (
-    10.0  # a writer silent for this long loses its claim: a lower one (a restarted fleet) is accepted [s]
-)
-
-
-class _AcceptedWriter(NamedTuple):
-    rank: Stamp
-    received_t: float
+WRITER_TIMEOUT_S = 10.0  # a writer silent for this long loses its claim: a lower one is accepted [s]
 
 
 class EpochFence:
@@ -206,15 +95,15 @@ class EpochFence:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._by_uav: dict[int, _AcceptedWriter] = {}
+        self._by_uav: dict[int, tuple[Stamp, float]] = {}  # claim and time of its last result
 
     def accepts(self, uav: int, stamp: Stamp | None) -> bool:
         """Return whether a result is accepted: no writer with a higher plausible claim wrote recently."""
         rank, now = stamp or Stamp(0, 0), self._clock()
         if not is_plausible_epoch(rank.epoch):
             return False
-        current = self._by_uav.get(uav)
-        if current is not None and rank < current.rank and now - current.received_t < WRITER_TIMEOUT_S:
+        highest, received_t = self._by_uav.get(uav, (rank, now))
+        if rank < highest and now - received_t < WRITER_TIMEOUT_S:
             return False
-        self._by_uav[uav] = _AcceptedWriter(rank, now)
+        self._by_uav[uav] = rank, now
         return True

@@ -75,8 +75,8 @@ def decode(kind: type[M], payload: bytes, encoding_name: str = "") -> M:
     expected = encoding(kind)
     if encoding_name and encoding_name != expected:
         raise ValueError(
-            f"{kind.__name__}: found encoding {_shorten(repr(encoding_name))}, expected {expected!r}; upgrade "
-            "the older side"
+            f"{kind.__name__}: found encoding {_shorten(repr(encoding_name))}, expected {expected!r}; "
+            "upgrade the older side"
         )
     if len(payload) > (max_bytes := TOPIC_RULES[kind.topic].max_bytes):  # type: ignore[attr-defined]
         raise ValueError(f"{kind.__name__}: found {len(payload):,} bytes, expected at most {max_bytes:,}; send less")

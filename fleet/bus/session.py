@@ -22,32 +22,26 @@ import zenoh
 from fleet.access.entry import ROUTER, BusConfig, parse_endpoint
 from fleet.access.knock import probe_router
 from fleet.access.roles import ROOT
-from fleet.bus.bus_protocol import (
-    BatchCallback,
-    Callback,
-    Filter,
-    LivelinessCallback,
-    QueryHandler,
-    RawCallback,
-    RawMessage,
-    key_of,
-    replies_about,
-    select_latest,
-    uav_of_key,
-)
+from fleet.bus.bus_protocol import QueryHandler, RawMessage, key_of, replies_about, select_latest, uav_of_key
 from fleet.bus.codec import EncodedMessage, Stamp, decode_for_key, encode, encoding, pack_stamp, unpack_stamp
 from fleet.contract import PER_UAV, Claim
 
 M = TypeVar("M")
 _log = logging.getLogger(__name__)
-_RELIABLE = (Claim,)  # rare and essential: the sender blocks on congestion; all other messages are dropped
+Callback = Callable[[Any, Stamp | None], None]
+RawCallback = Callable[[bytes, str, Stamp | None], None]
+BatchCallback = Callable[[list[RawMessage]], None]
+LivelinessCallback = Callable[[str, bool], None]
+_RELIABLE: dict[
+    type, dict[str, Any]
+] = {  # rare and essential: the sender blocks on congestion; all other messages are dropped
+    Claim: {"congestion_control": zenoh.CongestionControl.BLOCK, "priority": zenoh.Priority.INTERACTIVE_HIGH}
+}
 _LIVE_PREFIX = f"{ROOT}/@live/"
 _BUFFER_SIZE = 20_000  # messages of a class buffered until `dispatch`
 _QUEUE_SIZE = 4096  # messages of a subscription, or queries of a queryable, waiting for Python; the oldest are dropped
 _REPLY_QUEUE_SIZE = 4096  # replies waiting to be read
-_SMALL_REPLIES = {
-    "priority": zenoh.Priority.DATA_HIGH
-}  # queries and replies of kilobytes: a queue separate from telemetry
+_SMALL_REPLIES = {"priority": zenoh.Priority.DATA_HIGH}  # kilobytes: a queue separate from telemetry
 _LARGE_REPLIES = {  # replies of megabytes: telemetry and predictions overtake them, a slow reader blocks no one else
     "priority": zenoh.Priority.DATA_LOW,
     "congestion_control": zenoh.CongestionControl.DROP,
@@ -55,12 +49,12 @@ _LARGE_REPLIES = {  # replies of megabytes: telemetry and predictions overtake t
 _TOKEN_QUEUE_SIZE = 4096  # tokens in one query; with the default channel more than 256 block for ever
 
 
-class ZenohBus(AbstractContextManager):
-    """Bus between processes. Use it in a `with` statement: an unclosed session can block at exit."""
+class Bus(AbstractContextManager):
+    """Bus of one process. Use it in a `with` statement: an unclosed session can block at exit."""
 
     def __init__(self, session: zenoh.Session) -> None:
-        self.writer = secrets.randbits(63)
-        self.bad = 0
+        self.writer = secrets.randbits(63)  # random id of this process on the bus
+        self.bad = 0  # received messages that do not decode
         self._session = session
         self._declared: list[Any] = []
         self._publishers: dict[tuple[type, int], Any] = {}
@@ -80,9 +74,8 @@ class ZenohBus(AbstractContextManager):
             with self._lock:
                 if (publisher := self._publishers.get((encoded.kind, encoded.uav))) is None:
                     name = key_of(encoded.kind, encoded.uav if encoded.kind in PER_UAV else f"{self.writer:016x}")
-                    publisher = self._session.declare_publisher(
-                        name, encoding=encoding(encoded.kind), **_qos(encoded.kind)
-                    )
+                    options: dict[str, Any] = {"encoding": encoding(encoded.kind)} | _RELIABLE.get(encoded.kind, {})
+                    publisher = self._session.declare_publisher(name, **options)
                     self._publishers[encoded.kind, encoded.uav] = publisher
         publisher.put(encoded.payload, attachment=pack_stamp(stamp) if stamp else None)
 
@@ -98,8 +91,14 @@ class ZenohBus(AbstractContextManager):
         """Return the id of the connected router, which changes with a restart; empty while none is connected."""
         return " ".join(map(str, self._session.info.routers_zid()))
 
-    def subscribe(self, kind: type, callback: Callback, accepts: Filter | None = None) -> None:
-        """Call `callback(message, stamp)` for every message of a class, on a thread of the session."""
+    def subscribe(self, kind: type, callback: Callback, accepts: Callable[[int], bool] | None = None) -> None:
+        """Call `callback(message, stamp)` for every message of a class; undecodable messages are counted only.
+
+        Args:
+            kind: message class of the contract
+            callback: called on a thread of the bus
+            accepts: filter by UAV id, applied before decoding; None: all
+        """
 
         def on_sample(sample: zenoh.Sample) -> None:
             if accepts is not None and ((uav := uav_of_key(str(sample.key_expr))) is None or not accepts(uav)):
@@ -142,13 +141,17 @@ class ZenohBus(AbstractContextManager):
         threading.Thread(target=run, name=f"bus {name}", daemon=True).start()
 
     def subscribe_buffered(self, kind: type, callback: BatchCallback) -> None:
-        """Buffer every message of a class until `dispatch`; a full buffer drops its oldest messages."""
+        """Buffer every message of a class, undecoded, until `dispatch`; a full buffer drops its oldest messages."""
         subscriber = self._session.declare_subscriber(key_of(kind, "*"), zenoh.handlers.RingChannel(_BUFFER_SIZE))
         self._declared.append(subscriber)
         self._buffered.append((kind, subscriber.handler, callback))
 
     def dispatch(self, latest_only: Container[type] = ()) -> None:
-        """Pass the buffered messages to their callbacks in order of arrival, or only the newest of each key."""
+        """Pass the buffered messages to their callbacks in order of arrival, on this thread.
+
+        Args:
+            latest_only: classes of which only the newest message of each key is passed on
+        """
         if not self._dispatching.acquire(blocking=False):
             return  # another thread is dispatching
         try:
@@ -162,26 +165,20 @@ class ZenohBus(AbstractContextManager):
             self._dispatching.release()
 
     def declare_queryable(self, kind: type, handler: QueryHandler) -> None:
-        """Declare one wildcard queryable for a class; the handler runs on a thread of the session."""
+        """Declare one wildcard queryable for a class: `handler(uav or None, parameters, payload)`, on a thread."""
 
         def on_query(query: zenoh.Query) -> None:
             with query:
-                uav, reply_encoding = (
-                    uav_of_key(str(query.key_expr)) if kind in PER_UAV else None,
-                    zenoh.Encoding(encoding(kind)),
-                )
+                uav = uav_of_key(str(query.key_expr)) if kind in PER_UAV else None
+                reply_encoding = zenoh.Encoding(encoding(kind))
                 payload = query.payload.to_bytes() if query.payload is not None else b""
                 try:
                     for message, stamp in replies_about(uav, handler(uav, _parameters(query), payload)):
                         name = key_of(kind, message.uav if kind in PER_UAV else f"{self.writer:016x}")
                         if not query.key_expr.intersects(name):
                             continue  # a key expression outside the contract, such as parauav/1$*/status
-                        query.reply(
-                            name,
-                            encode(message),
-                            encoding=reply_encoding,
-                            attachment=pack_stamp(stamp) if stamp else None,
-                        )
+                        attachment = pack_stamp(stamp) if stamp else None
+                        query.reply(name, encode(message), encoding=reply_encoding, attachment=attachment)
                 except ValueError as error:
                     query.reply_err(str(error).encode(), encoding="text/plain")
 
@@ -191,14 +188,22 @@ class ZenohBus(AbstractContextManager):
         self._consume(queryable.handler, on_query, name)
 
     def get(self, kind: type[M], target: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
-        """Query all writers of a class; return the reply of highest epoch per aircraft."""
-        return self._decode_replies(kind, self._all_replies(key_of(kind, target), timeout_s))
+        """Query all writers of a class for at most `timeout_s` [s]; return the reply of highest epoch per aircraft.
+
+        Raises:
+            ConnectionError: when the session is closed; join the router again. All queries raise it.
+        """
+        return self._decode_replies(kind, self._iter_replies(key_of(kind, target), timeout_s))
 
     def get_one(
         self, kind: type[M], target: int, payload: bytes, timeout_s: float = 5.0
     ) -> tuple[M, Stamp | None] | None:
-        """Query one aircraft with a payload; raise the error of an error reply where no other reply arrives."""
-        replies = self._all_replies(key_of(kind, target), timeout_s, payload)
+        """Query one aircraft with a payload; None without a reply.
+
+        Raises:
+            ValueError: when every reply is an error; with the text of the first.
+        """
+        replies = list(self._iter_replies(key_of(kind, target), timeout_s, payload))
         pairs = self._decode_replies(kind, replies)
         refusals = [reply.err.payload.to_bytes().decode(errors="replace") for reply in replies if reply.err is not None]
         if not pairs and refusals:
@@ -206,7 +211,7 @@ class ZenohBus(AbstractContextManager):
         return pairs[0] if pairs else None
 
     def get_stream(self, kind: type[M], target: int | str, payload: bytes, timeout_s: float) -> Iterator[M]:
-        """Query with a payload and yield every reply on arrival."""
+        """Query with a payload and yield every reply on arrival, for at most `timeout_s` [s]; omit error replies."""
         for reply in self._iter_replies(key_of(kind, target), timeout_s, payload, _LARGE_REPLIES):
             if (sample := reply.ok) is not None and (pair := self._decode_sample(kind, sample)) is not None:
                 yield pair[0]
@@ -216,9 +221,6 @@ class ZenohBus(AbstractContextManager):
         for reply in self._iter_replies(key_of(kind, target), timeout_s, qos=_LARGE_REPLIES):
             if (sample := reply.ok) is not None and str(sample.encoding) == encoding(kind):
                 yield sample.payload.to_bytes()
-
-    def _all_replies(self, name: str, timeout_s: float, payload: bytes | None = None) -> list[zenoh.Reply]:
-        return list(self._iter_replies(name, timeout_s, payload))
 
     def _iter_replies(
         self, name: str, timeout_s: float, payload: bytes | None = None, qos: dict[str, Any] = _SMALL_REPLIES
@@ -238,7 +240,7 @@ class ZenohBus(AbstractContextManager):
                 f"bus: the query on {name} failed ({error}), expected an open session; connect to the router again"
             ) from None
 
-    def _decode_replies(self, kind: type[M], replies: list[zenoh.Reply]) -> list[tuple[M, Stamp | None]]:
+    def _decode_replies(self, kind: type[M], replies: Iterable[zenoh.Reply]) -> list[tuple[M, Stamp | None]]:
         pairs = [self._decode_sample(kind, reply.ok) for reply in replies if reply.ok is not None]
         return select_latest([pair for pair in pairs if pair is not None])
 
@@ -280,13 +282,6 @@ class ZenohBus(AbstractContextManager):
         self.close()
 
 
-def _qos(kind: type) -> dict[str, Any]:
-    """Return the quality of service of a message class."""
-    if kind not in _RELIABLE:
-        return {}
-    return {"congestion_control": zenoh.CongestionControl.BLOCK, "priority": zenoh.Priority.INTERACTIVE_HIGH}
-
-
 def _stamp(sample: zenoh.Sample) -> Stamp | None:
     return unpack_stamp(sample.attachment.to_bytes() if sample.attachment is not None else None)
 
@@ -312,7 +307,7 @@ def _as_bus_config(router: str | BusConfig) -> BusConfig:
     return router if isinstance(router, BusConfig) else BusConfig(router)
 
 
-def connect(router: str | BusConfig = ROUTER, *, retry: bool = False) -> ZenohBus:
+def connect(router: str | BusConfig = ROUTER, *, retry: bool = False) -> Bus:
     """Connect to the bus through a router; with `retry` also without one, and join when it starts.
 
     Raises:
@@ -322,22 +317,17 @@ def connect(router: str | BusConfig = ROUTER, *, retry: bool = False) -> ZenohBu
     bus_config = _as_bus_config(router)
     if probe_router(bus_config):
         try:
-            return ZenohBus(zenoh.open(_config(bus_config.session_settings())))
+            return Bus(zenoh.open(_config(bus_config.session_settings())))
         except zenoh.ZError:
-            expected = (
-                f"it to accept the password of {bus_config.role}"
-                if bus_config.passwords
-                else "a Zenoh router without password"
-            )
-            raise ConnectionError(
-                f"router {bus_config.endpoint}: found the connection rejected, expected {expected}; check it "
-                "with `fleet doctor`"
-            ) from None
+            password = f"it to accept the password of {bus_config.role}"
+            expected = password if bus_config.passwords else "a Zenoh router without password"
+            reason = f"found the connection rejected, expected {expected}; check it with `fleet doctor`"
+            raise ConnectionError(f"router {bus_config.endpoint}: {reason}") from None
     if not retry:
         raise ConnectionError(
             f"router {bus_config.endpoint}: no response; start `zenohd` or `fleet up`, or name another --router"
         )
-    return ZenohBus(zenoh.open(_config(bus_config.session_settings(retry=True))))
+    return Bus(zenoh.open(_config(bus_config.session_settings(retry=True))))
 
 
 def open_router(router: str | BusConfig = ROUTER) -> zenoh.Session:

@@ -16,7 +16,8 @@ from fleet.access.entry import BusConfig, parse_endpoint
 from fleet.access.knock import probe_router
 from fleet.access.papers import check_private, expiry_of, find_certificate
 from fleet.access.roles import ROLES, ROUTER_ROLE
-from fleet.bus.bus_protocol import Bus, parse_token
+from fleet.bus.bus_protocol import parse_token
+from fleet.bus.session import Bus
 from fleet.contract import Claim, GatewayCounters, Status
 from fleet.health.machine import BAD, NOTE, OK, CheckResult, is_port_free
 from fleet.report.report_text import id_ranges
@@ -70,9 +71,9 @@ def check_fleet(bus: Bus) -> Iterator[CheckResult]:
     def on_token(name: str, is_live: bool) -> None:
         if (presence := parse_token(name)) is not None:
             with lock:
-                live_ranges.pop(presence.worker, None) if not is_live else live_ranges.update(
-                    {presence.worker: presence.ids}
-                )
+                live_ranges.pop(presence.worker, None)
+                if is_live:
+                    live_ranges[presence.worker] = presence.ids
 
     bus.watch_liveliness(on_token)
     first = FleetSnapshot(bus, live_ranges)
@@ -90,22 +91,18 @@ def _present(snapshot: FleetSnapshot) -> Iterator[CheckResult]:
     if not snapshot.accounts:
         yield CheckResult(NOTE, "gateways", "none found; start `gateway` with a --link to the aircraft")
     for account in snapshot.accounts:
-        account_text = f"{account.machine or 'one'}: {len(account.uavs)} aircraft on {len(account.links)} links"
-        sent = f", {account.unsent} messages unsent" if account.unsent else ""
-        yield CheckResult(OK, "gateways", account_text + sent)
+        unsent = f", {account.unsent} messages unsent" if account.unsent else ""
+        text = f"{account.machine or 'one'}: {len(account.uavs)} aircraft on {len(account.links)} links{unsent}"
+        yield CheckResult(OK, "gateways", text)
     publishers = Counter(uav for account in snapshot.accounts for uav in account.uavs)
     if duplicates := sorted(uav for uav, count in publishers.items() if count > 1):
-        yield CheckResult(
-            BAD,
-            "gateways",
-            f"two gateways publish uav {id_ranges(duplicates)}; change the offset of one (#offset=), or stop it",
-        )
+        remedy = "change the offset of one (#offset=), or stop it"
+        yield CheckResult(BAD, "gateways", f"two gateways publish uav {id_ranges(duplicates)}; {remedy}")
     if not snapshot.claims and not snapshot.live_ranges:
         yield CheckResult(NOTE, "workers", "none found; start `twin_worker` with a range of ids (--uavs)")
     for worker in sorted(set(snapshot.live_ranges) - set(snapshot.claims)):
-        yield CheckResult(
-            BAD, "workers", f"{worker} is live but does not answer: process or machine frozen; stop it (kill -9)"
-        )
+        problem = f"{worker} is live but does not answer: process or machine frozen; stop it (kill -9)"
+        yield CheckResult(BAD, "workers", problem)
 
 
 def _clocks(snapshot: FleetSnapshot) -> Iterator[CheckResult]:
@@ -120,15 +117,12 @@ def _clocks(snapshot: FleetSnapshot) -> Iterator[CheckResult]:
 
 
 def _sources(snapshot: FleetSnapshot) -> Iterator[CheckResult]:
-    processes: list[tuple[str, str, str]] = [
-        ("twin_worker", c.machine or w, c.code) for w, c in snapshot.claims.items()
-    ]
+    processes = [("twin_worker", claim.machine or worker, claim.code) for worker, claim in snapshot.claims.items()]
     processes += [("gateway", account.machine, account.code) for account in snapshot.accounts]
     differing = sorted({f"{role} on {machine or 'a machine'}" for role, machine, code in processes if code != SOURCES})
     if differing and len(differing) == len(processes) and len({code for *_, code in processes}) == 1:
-        yield CheckResult(
-            NOTE, "versions", f"all {len(processes)} processes have one release, this command another; install theirs"
-        )
+        text = f"all {len(processes)} processes have one release, this command another; install theirs"
+        yield CheckResult(NOTE, "versions", text)
     elif differing:
         remedy = "twins are not handed over between releases; install the same release everywhere and restart"
         yield CheckResult(NOTE, "versions", f"{', '.join(differing)}: other release than here; {remedy}")
@@ -146,11 +140,8 @@ def _owners(first: FleetSnapshot, snapshot: FleetSnapshot) -> Iterator[CheckResu
         if id_range is None:
             yield CheckResult(BAD, "owners", f"{worker}: claims without a liveliness token; restart it")
         if claim.without_history:
-            yield CheckResult(
-                NOTE,
-                "owners",
-                f"{worker}: uav {id_ranges(claim.without_history)} without past telemetry; check its gateway",
-            )
+            text = f"{worker}: uav {id_ranges(claim.without_history)} without past telemetry; check its gateway"
+            yield CheckResult(NOTE, "owners", text)
     for uav, workers in sorted(snapshot.contested().items()):
         if uav in first.contested():
             yield CheckResult(BAD, "owners", f"uav-{uav}: claimed by {' and '.join(sorted(workers))}; stop one of them")
@@ -158,19 +149,14 @@ def _owners(first: FleetSnapshot, snapshot: FleetSnapshot) -> Iterator[CheckResu
 
 
 def _unclaimed(unclaimed: Iterable[int], snapshot: FleetSnapshot) -> Iterator[CheckResult]:
-    out_of_range = sorted(
-        uav for uav in unclaimed if not any(uav in id_range for id_range in snapshot.live_ranges.values())
-    )
+    ranges = snapshot.live_ranges.values()
+    out_of_range = sorted(uav for uav in unclaimed if not any(uav in id_range for id_range in ranges))
     if out_of_range:
-        yield CheckResult(
-            BAD,
-            "orphans",
-            f"uav {id_ranges(out_of_range)}: in no worker range; start `twin_worker --uavs` with these ids",
-        )
+        text = f"uav {id_ranges(out_of_range)}: in no worker range; start `twin_worker --uavs` with these ids"
+        yield CheckResult(BAD, "orphans", text)
     if in_range := sorted(set(unclaimed) - set(out_of_range)):
-        yield CheckResult(
-            BAD, "orphans", f"uav {id_ranges(in_range)}: in a worker range but not claimed; restart that worker"
-        )
+        text = f"uav {id_ranges(in_range)}: in a worker range but not claimed; restart that worker"
+        yield CheckResult(BAD, "orphans", text)
     if not out_of_range and not in_range and snapshot.uavs:
         yield CheckResult(OK, "orphans", f"none of {len(snapshot.uavs)} aircraft")
 
@@ -180,31 +166,15 @@ LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
 def check_certificates(entry: BusConfig) -> Iterator[CheckResult]:
-    """Check every certificate in the folder: key present and private, not expired."""
+    """Check every certificate in the folder: key present and private, not expired; and the password file."""
     if entry.certificates is None:
         where = "on loopback" if parse_endpoint(entry.endpoint)[0] in LOOPBACK else "over the network"
         grade = OK if where == "on loopback" else NOTE
         access = "password authentication" if entry.passwords else "no authentication"
         remedy = "" if grade == OK else "; use --config with certificates to encrypt: deploy/README.md"
         yield CheckResult(grade, "certificates", f"not used: {where}, unencrypted, {access}{remedy}")
-        yield from _passwords(entry)
-        return
-    roles = [role for role in (*ROLES, ROUTER_ROLE) if (entry.certificates / f"{role}.pem").is_file()]
-    if entry.mutual_tls and entry.role not in roles:
-        roles.append(entry.role)
-    for role in roles:
-        try:
-            find_certificate(entry.certificates, role)
-            names = "router FOLDER NAME..." if role == ROUTER_ROLE else f"role FOLDER {role}"
-            yield _check_expiry(role, entry.certificates / f"{role}.pem", f"certificates.sh {names}, and copy it here")
-        except (ValueError, OSError) as error:
-            yield CheckResult(BAD, "certificates", str(error).removeprefix("certificates: "))
-    yield _authority(entry.certificates)
-    yield from _passwords(entry)
-
-
-def _passwords(entry: BusConfig) -> Iterator[CheckResult]:
-    """Check the password file."""
+    else:
+        yield from _certificates(entry, entry.certificates)
     if entry.passwords is not None:
         try:
             check_private(entry.passwords)
@@ -212,22 +182,27 @@ def _passwords(entry: BusConfig) -> Iterator[CheckResult]:
             yield CheckResult(BAD, "passwords", str(error).removeprefix("certificates: "))
 
 
-def _authority(folder: Path) -> CheckResult:
+def _certificates(entry: BusConfig, folder: Path) -> Iterator[CheckResult]:
+    roles = [role for role in (*ROLES, ROUTER_ROLE) if (folder / f"{role}.pem").is_file()]
+    if entry.mutual_tls and entry.role not in roles:
+        roles.append(entry.role)
+    for role in roles:
+        try:
+            find_certificate(folder, role)
+            names = "router FOLDER NAME..." if role == ROUTER_ROLE else f"role FOLDER {role}"
+            remedy = f"certificates.sh {names}, and copy it here"
+            yield _grade_expiry(role, expiry_of(folder / f"{role}.pem"), remedy)
+        except (ValueError, OSError) as error:
+            yield CheckResult(BAD, "certificates", str(error).removeprefix("certificates: "))
     try:
-        result = _check_expiry(
-            "authority", folder / "ca.pem", "certificates.sh next-ca FOLDER: Renewal in deploy/README.md"
-        )
+        remedy = "certificates.sh next-ca FOLDER: Renewal in deploy/README.md"
+        result = _grade_expiry("authority", expiry_of(folder / "ca.pem"), remedy)
     except (ValueError, OSError) as error:
-        return CheckResult(BAD, "certificates", str(error).removeprefix("certificates: "))
-    if result.grade == OK and (folder / "ca.key").exists():
-        return CheckResult(
-            NOTE, "certificates", f"{folder / 'ca.key'} can issue any role; store it offline, on one machine"
-        )
-    return result
-
-
-def _check_expiry(subject: str, path: Path, remedy: str) -> CheckResult:
-    return _grade_expiry(subject, expiry_of(path), remedy)
+        result = CheckResult(BAD, "certificates", str(error).removeprefix("certificates: "))
+    key = folder / "ca.key"
+    if result.grade == OK and key.exists():
+        result = CheckResult(NOTE, "certificates", f"{key} can issue any role; store it offline, on one machine")
+    yield result
 
 
 def _grade_expiry(subject: str, end: datetime, remedy: str) -> CheckResult:
@@ -235,9 +210,8 @@ def _grade_expiry(subject: str, end: datetime, remedy: str) -> CheckResult:
     if remaining < timedelta(0):
         return CheckResult(BAD, "certificates", f"{subject}: expired on {end:%Y-%m-%d %H:%M} UTC; renew it: {remedy}")
     if remaining < RENEWAL_PERIOD:
-        return CheckResult(
-            NOTE, "certificates", f"{subject}: expires on {end:%Y-%m-%d}, in {remaining.days} days; renew it: {remedy}"
-        )
+        text = f"{subject}: expires on {end:%Y-%m-%d}, in {remaining.days} days; renew it: {remedy}"
+        return CheckResult(NOTE, "certificates", text)
     return CheckResult(OK, "certificates", f"{subject}: valid until {end:%Y-%m-%d}")
 
 
@@ -257,11 +231,8 @@ def check_router(entry: BusConfig) -> Generator[CheckResult, None, bool]:
     if is_port_free(socket.SOCK_STREAM, host, port):
         yield CheckResult(OK, "router", f"{entry.endpoint} is free; `fleet up` will open a router there")
     else:
-        yield CheckResult(
-            BAD,
-            "router",
-            f"{entry.endpoint} is in use and does not answer; start `zenohd` there or choose another --router",
-        )
+        text = f"{entry.endpoint} is in use and does not answer; start `zenohd` there or choose another --router"
+        yield CheckResult(BAD, "router", text)
     return False
 
 

@@ -38,7 +38,7 @@ def check_machine() -> Iterator[CheckResult]:
 
 def python() -> CheckResult:
     """Report the Python version; one older than 3.11 cannot import this module."""
-    return CheckResult("ok", "python", ".".join(map(str, sys.version_info[:3])))
+    return CheckResult(OK, "python", ".".join(map(str, sys.version_info[:3])))
 
 
 def packages() -> Iterator[CheckResult]:
@@ -46,14 +46,14 @@ def packages() -> Iterator[CheckResult]:
     try:
         requirements = importlib.metadata.requires("parauav") or []
     except importlib.metadata.PackageNotFoundError:
-        yield CheckResult("note", "packages", "parauav is on the path but not installed; run make setup")
+        yield CheckResult(NOTE, "packages", "parauav is on the path but not installed; run make setup")
         return
     names = [line.split(";")[0].strip() for line in requirements if "extra ==" not in line]
     missing = [name for name in names if not _installed(name)]
     if missing:
-        yield CheckResult("BAD", "packages", f"missing {', '.join(missing)}; run make setup")
+        yield CheckResult(BAD, "packages", f"missing {', '.join(missing)}; run make setup")
     else:
-        yield CheckResult("ok", "packages", ", ".join(f"{name} {_installed(name)}" for name in names))
+        yield CheckResult(OK, "packages", ", ".join(f"{name} {_installed(name)}" for name in names))
 
 
 def _installed(name: str) -> str:
@@ -69,21 +69,19 @@ def compile_cache() -> CheckResult:
     try:
         problem, foreign_files = private_files.tampering_risk(folder), private_files.foreign_files(folder)
     except OSError as error:
-        return CheckResult("BAD", "compile cache", f"{error}; set another folder in PARAUAV_CACHE")
+        return CheckResult(BAD, "compile cache", f"{error}; set another folder in PARAUAV_CACHE")
     if problem:
-        return CheckResult("BAD", "compile cache", f"{folder}: found {problem}")
+        return CheckResult(BAD, "compile cache", f"{folder}: found {problem}")
     if foreign_files:
-        remedy = f"they could execute code as this user; rm -r {folder}"
-        return CheckResult(
-            "BAD", "compile cache", f"{folder}: found {len(foreign_files)} files of other users; {remedy}"
-        )
+        risk = f"they could execute code as this user; rm -r {folder}"
+        return CheckResult(BAD, "compile cache", f"{folder}: found {len(foreign_files)} files of other users; {risk}")
     if not os.access(folder, os.W_OK):
-        return CheckResult("BAD", "compile cache", f"{folder} is not writable; set another folder in PARAUAV_CACHE")
+        return CheckResult(BAD, "compile cache", f"{folder} is not writable; set another folder in PARAUAV_CACHE")
     if fleet.CACHE_NOTE:
-        return CheckResult("note", "compile cache", f"{folder}: {fleet.CACHE_NOTE}")
+        return CheckResult(NOTE, "compile cache", f"{folder}: {fleet.CACHE_NOTE}")
     count = sum(1 for _ in folder.rglob("*.nbc"))
     state = f"{count} functions compiled" if count else "empty, so the first start compiles (a minute)"
-    return CheckResult("ok", "compile cache", f"{folder}: {state}")
+    return CheckResult(OK, "compile cache", f"{folder}: {state}")
 
 
 def onboard_cache() -> Iterator[CheckResult]:
@@ -94,19 +92,19 @@ def onboard_cache() -> Iterator[CheckResult]:
     except (OSError, RuntimeError):
         return
     if problem:
-        yield CheckResult("BAD", "onboard cache", f"{folder}: found {problem}")
+        yield CheckResult(BAD, "onboard cache", f"{folder}: found {problem}")
     else:
-        yield CheckResult("ok", "onboard cache", f"{folder}: {sum(1 for _ in folder.glob('*.json'))} aircraft")
+        yield CheckResult(OK, "onboard cache", f"{folder}: {sum(1 for _ in folder.glob('*.json'))} aircraft")
 
 
 def mavlink_port(links: Collection[str] = ()) -> CheckResult:
     """Check that the default MAVLink UDP port is free; `links` are open links of local gateways."""
     if any(f":{MAVLINK_PORT}" in link for link in links):
-        return CheckResult("ok", "mavlink", f"udp port {MAVLINK_PORT} is used by the gateway")
+        return CheckResult(OK, "mavlink", f"udp port {MAVLINK_PORT} is used by the gateway")
     if is_port_free(socket.SOCK_DGRAM, "0.0.0.0", MAVLINK_PORT):
-        return CheckResult("ok", "mavlink", f"udp port {MAVLINK_PORT} is free")
+        return CheckResult(OK, "mavlink", f"udp port {MAVLINK_PORT} is free")
     remedy = "correct for a gateway container, else use another: --link udpin:0.0.0.0:14551"
-    return CheckResult("note", "mavlink", f"udp port {MAVLINK_PORT} is in use; {remedy}")
+    return CheckResult(NOTE, "mavlink", f"udp port {MAVLINK_PORT} is in use; {remedy}")
 
 
 def is_port_free(kind: socket.SocketKind, host: str, port: int) -> bool:
@@ -125,20 +123,16 @@ def chromium() -> CheckResult:
     """Check for a browser, needed by viewer tests and screenshots only."""
     path = os.environ.get("PARAUAV_CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
     if path is None:
-        return CheckResult(
-            "note",
-            "chromium",
-            "not found, no browser tests; apt-get install chromium, or set PARAUAV_CHROMIUM",
-        )
-    return CheckResult("ok", "chromium", path)
+        remedy = "apt-get install chromium, or set PARAUAV_CHROMIUM"
+        return CheckResult(NOTE, "chromium", f"not found, no browser tests; {remedy}")
+    return CheckResult(OK, "chromium", path)
 
 
 def recordings() -> CheckResult:
     """Check for recorded flights, needed by some tests only."""
     folder = os.environ.get("PARAUAV_RECORDINGS")
     if not folder or not Path(folder).is_dir():
-        return CheckResult(
-            "note", "recordings", f"PARAUAV_RECORDINGS is {folder or 'not set'}; tests on recordings are skipped"
-        )
+        text = f"PARAUAV_RECORDINGS is {folder or 'not set'}; tests on recordings are skipped"
+        return CheckResult(NOTE, "recordings", text)
     count = sum(1 for path in Path(folder).rglob("*") if path.is_file())
-    return CheckResult("ok", "recordings", f"{count} files in {folder}")
+    return CheckResult(OK, "recordings", f"{count} files in {folder}")

@@ -7,8 +7,7 @@ import numba as nb
 
 _FASTMATH = {"contract", "reassoc", "arcp", "afn", "nsz"}  # all of fastmath except nnan and ninf
 
-kernel = nb.njit(
-    cache=True, fastmath=_FASTMATH, error_model="numpy", nogil=True
-)  # identification and prediction run in parallel threads
+# nogil: identification and prediction run in parallel threads
+kernel = nb.njit(cache=True, fastmath=_FASTMATH, error_model="numpy", nogil=True)
 no_alloc_kernel = nb.njit(cache=True, fastmath=_FASTMATH, error_model="numpy", nogil=True, _nrt=False)  # type: ignore[call-overload]
 inlined_kernel = nb.njit(cache=True, fastmath=_FASTMATH, error_model="numpy", inline="always")

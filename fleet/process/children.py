@@ -97,11 +97,9 @@ class Children(AbstractContextManager):
             if code := child.poll():
                 self._readers[name].join(timeout=1.0)  # its last lines may still be in the pipe
                 lines = self._last_lines[name]
-                refused = code == 2 and lines
-                exit_text = f"{name}: found it ended with exit code {code}, expected it to run until stopped; "
-                results.append(
-                    (code, lines[-1] if refused else exit_text + f"last output: {' | '.join(lines) or 'none'}")
-                )
+                text = f"{name}: found it ended with exit code {code}, expected it to run until stopped; "
+                text += f"last output: {' | '.join(lines) or 'none'}"
+                results.append((code, lines[-1] if code == 2 and lines else text))
         return results
 
     def stop(self) -> None:

@@ -26,7 +26,7 @@ def log_arguments(parser: argparse.ArgumentParser) -> None:
 def configure_logging(process: str, *, as_json: bool = False) -> None:
     """Configure logging: warnings and above as text, or everything as JSON."""
     handler = logging.StreamHandler()
-    handler.setFormatter(JsonFormatter(process) if as_json else TextFormatter(process))
+    handler.setFormatter(LogFormatter(process, as_json=as_json))
     logging.basicConfig(level=logging.INFO if as_json else logging.WARNING, handlers=[handler])
 
 
@@ -70,28 +70,23 @@ def report_failure(process: str, sentence: str, *, logged: bool = True) -> None:
         print(add_time(line) if logged else line, file=sys.stderr)
 
 
-class TextFormatter(logging.Formatter):
-    """Format messages as text with time; escape control characters, because messages can contain untrusted text."""
+class LogFormatter(logging.Formatter):
+    """Format messages as text with time, or as JSON.
 
-    def __init__(self, process: str) -> None:
+    Text escapes control characters, because messages can contain untrusted text. JSON has t (RFC 3339), level,
+    process, from (module), message, and defect (traceback).
+    """
+
+    def __init__(self, process: str, *, as_json: bool) -> None:
         super().__init__()
-        self._process = process
+        self._process, self._as_json = process, as_json
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the message, followed by the traceback of an exception."""
-        text = add_time(f"{self._process}: {printable(record.getMessage())}", record.created)
-        return f"{text}\n{self.formatException(record.exc_info)}" if record.exc_info else text
-
-
-class JsonFormatter(logging.Formatter):
-    """Format messages as JSON: t (RFC 3339), level, process, from (module), message, and defect (traceback)."""
-
-    def __init__(self, process: str) -> None:
-        super().__init__()
-        self._process = process
-
-    def format(self, record: logging.LogRecord) -> str:
-        """Return one line of JSON."""
+        """Return the message with the traceback of an exception, if any."""
+        defect = self.formatException(record.exc_info) if record.exc_info else ""
+        if not self._as_json:
+            text = add_time(f"{self._process}: {printable(record.getMessage())}", record.created)
+            return f"{text}\n{defect}" if defect else text
         line = {
             "t": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
@@ -99,6 +94,4 @@ class JsonFormatter(logging.Formatter):
             "from": record.name,
             "message": record.getMessage(),
         }
-        if record.exc_info:
-            line["defect"] = self.formatException(record.exc_info)
-        return json.dumps(line)
+        return json.dumps(line | ({"defect": defect} if defect else {}))

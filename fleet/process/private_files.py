@@ -21,19 +21,16 @@ def tampering_risk(path: Path) -> str:
     if status.st_uid != os.geteuid():
         return f"owner {status.st_uid}, expected {os.geteuid()}, the current user; name a folder of your own"
     if status.st_mode & _WRITABLE:
-        return (
-            f"mode {stat.S_IMODE(status.st_mode):04o}, expected write permission for its owner only; chmod go-w {real}"
-        )
+        mode = stat.S_IMODE(status.st_mode)
+        return f"mode {mode:04o}, expected write permission for its owner only; chmod go-w {real}"
     for parent in real.parents:
         status = parent.stat()
         mode = stat.S_IMODE(status.st_mode)
         if status.st_uid not in (0, os.geteuid()):
             return f"parent {parent} with owner {status.st_uid}, expected root or {os.geteuid()}; name another folder"
         if mode & _WRITABLE and not mode & stat.S_ISVTX:
-            return (
-                f"parent {parent} with mode {mode:04o}, expected write permission for its owner only; chmod go-w "
-                f"{parent}"
-            )
+            remedy = f"chmod go-w {parent}"
+            return f"parent {parent} with mode {mode:04o}, expected write permission for its owner only; {remedy}"
     return ""
 
 

@@ -73,11 +73,8 @@ def document(title: str, body: str) -> str:
         f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
     )
-    return (
-        "<!DOCTYPE html>\n<html "
-        f'lang="en"><head>{head}<title>{escape_text(title)}</title>\n<style>{style}</style></head>\n'
-        f"<body><main>\n{body}\n</main></body></html>\n"
-    )
+    head += f"<title>{escape_text(title)}</title>\n<style>{style}</style>"
+    return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body><main>\n{body}\n</main></body></html>\n'
 
 
 def escape_text(text: str) -> str:

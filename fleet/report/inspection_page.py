@@ -86,15 +86,8 @@ def draw_page(page_data: ReportPage) -> Figure:
     figure = Figure(figsize=_A4, facecolor="white")
     colours = mode_colours(mode for _, mode in mode_spans(survey))
     texts = dict(summary_lines(findings))
-    figure.text(
-        0.06,
-        0.972,
-        printable(f"uav-{findings.uav}   {page_data.name}"),
-        size=14,
-        weight="bold",
-        va="top",
-        parse_math=False,
-    )
+    title = printable(f"uav-{findings.uav}   {page_data.name}")
+    figure.text(0.06, 0.972, title, size=14, weight="bold", va="top", parse_math=False)
     for row, heading in enumerate(("aircraft", "time")):
         text = printable(texts[heading]).removeprefix(f"uav-{findings.uav}, ")
         figure.text(0.06, 0.951 - 0.0125 * row, text, size=8, color=MUTED, va="top", parse_math=False)
@@ -137,9 +130,8 @@ def _facts(figure: Figure, findings: AircraftFindings, texts: dict[str, str]) ->
     facts = {heading: texts[heading] for heading in _HEADINGS}
     if any(not kind.rows for kind in findings.rows.values()):
         facts["no rows of"] = texts["no rows of"]
-    facts["problems"] = (
-        "; ".join(f"{e.t_s:.0f} s {e.text}" for e in findings.events if e.kind in _PROBLEM_KINDS) or "none reported"
-    )
+    problems = [f"{e.t_s:.0f} s {e.text}" for e in findings.events if e.kind in _PROBLEM_KINDS]
+    facts["problems"] = "; ".join(problems) or "none reported"
     for heading, text in facts.items():
         figure.text(_LEFT, y, heading, color=MUTED, weight="bold", **_SMALL)
         y = _draw_text(figure, y, _LEFT + 0.083, printable(text), _WIDTH - 16)

@@ -45,8 +45,7 @@ def altitude(ax: Any, survey: Survey) -> None:
         return _no_rows(ax, "altitude")
     in_flight = inside(t, airborne(survey))
     ax.set_ylim(*axis_limits((x[in_flight] if in_flight.any() else x)[:, 2] * 1e-3, min_range=10.0))
-    _label(ax, "altitude\n[m above MSL]", columns=0)
-    return None
+    return _label(ax, "altitude\n[m above MSL]", columns=0)
 
 
 def speeds(ax: Any, survey: Survey) -> None:
@@ -54,17 +53,12 @@ def speeds(ax: Any, survey: Survey) -> None:
     t, v = survey.rows["velocity"].rows()
     has_airspeed = _line(ax, survey, "air", 0, label="airspeed")
     if len(t):
-        ax.plot(
-            *_elapsed(survey, *downsample(t, np.hypot(v[:, 0], v[:, 1]), _max_interval(survey, "velocity"))),
-            color=LINES[1],
-            lw=0.9,
-            label="ground speed",
-        )
+        t, speed = downsample(t, np.hypot(v[:, 0], v[:, 1]), _max_interval(survey, "velocity"))
+        ax.plot(t - survey.start_t, speed, color=LINES[1], lw=0.9, label="ground speed")
     if not has_airspeed and not len(t):
         return _no_rows(ax, "speed")
     ax.set_ylim(bottom=0)
-    _label(ax, "speed\n[m/s]")
-    return None
+    return _label(ax, "speed\n[m/s]")
 
 
 def angles(ax: Any, survey: Survey) -> None:
@@ -74,8 +68,7 @@ def angles(ax: Any, survey: Survey) -> None:
     _line(ax, survey, "attitude", 1, scale=180 / np.pi, colour=LINES[1], label="pitch")
     _line(ax, survey, "command", 0, scale=180 / np.pi, colour=INK, label="roll commanded", ls=(0, (1, 1)), lw=0.7)
     ax.axhline(0, color=MUTED, lw=0.5)
-    _label(ax, "angle\n[deg]")
-    return None
+    return _label(ax, "angle\n[deg]")
 
 
 def servos(ax: Any, survey: Survey, findings: AircraftFindings) -> None:
@@ -102,9 +95,8 @@ def events_strip(ax: Any, survey: Survey, facts: LinkTexts, colours: dict[str, s
         start = span.start - survey.start_t
         ax.barh(2, span.seconds, left=start, height=0.8, color=colours[mode], lw=0)
         if span.seconds / length > 0.012 * len(mode) + 0.01:
-            ax.text(
-                start + span.seconds / 2, 2, mode, ha="center", va="center", color="white", size=7, parse_math=False
-            )
+            middle = start + span.seconds / 2
+            ax.text(middle, 2, mode, ha="center", va="center", color="white", size=7, parse_math=False)
     edge, shown = -np.inf, set()
     for event in merged_events(survey, facts):
         at = event.t - survey.start_t
@@ -162,18 +154,14 @@ def _line(
     """Draw one column over time; return False without rows."""
     t, x = survey.rows[name].rows()
     if len(t):
-        points = downsample(t, x[:, column] * scale, _max_interval(survey, name))
-        ax.plot(*_elapsed(survey, *points), color=colour, **({"lw": 0.9} | style))
+        times, y = downsample(t, x[:, column] * scale, _max_interval(survey, name))
+        ax.plot(times - survey.start_t, y, color=colour, **({"lw": 0.9} | style))
     return bool(len(t))
 
 
 def _max_interval(survey: Survey, name: str) -> float:
     rows = survey.rows[name]
     return max(rows.max_interval_s, 3 * rows.stride / rows.rate_hz) if rows.rate_hz else rows.max_interval_s
-
-
-def _elapsed(survey: Survey, t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return t - survey.start_t, y
 
 
 def _label(ax: Any, text: str, columns: int = 4) -> None:
@@ -183,9 +171,8 @@ def _label(ax: Any, text: str, columns: int = 4) -> None:
 
 
 def _no_rows(ax: Any, what: str) -> None:
-    ax.text(
-        0.5, 0.5, f"no {what} rows".replace("  ", " "), ha="center", va="center", transform=ax.transAxes, color=MUTED
-    )
+    text = f"no {what} rows".replace("  ", " ")
+    ax.text(0.5, 0.5, text, ha="center", va="center", transform=ax.transAxes, color=MUTED)
     ax.set(yticks=[])
 
 
@@ -201,9 +188,8 @@ def ground_track(ax: Any, survey: Survey, findings: AircraftFindings, colours: d
     t, x = survey.rows["position"].rows()
     origin = survey.origin()
     if origin is None:
-        ax.text(0.5, 0.5, "no position rows", ha="center", va="center", transform=ax.transAxes, color=MUTED)
-        ax.set(xticks=[], yticks=[])
-        return
+        ax.set(xticks=[])
+        return _no_rows(ax, "position")
     p = to_ned(origin, *x.T)
     in_flight = inside(t, airborne(survey))
     in_flight = in_flight if in_flight.any() else np.ones(len(t), bool)
@@ -211,15 +197,13 @@ def ground_track(ax: Any, survey: Survey, findings: AircraftFindings, colours: d
     legs = _legs(survey, origin)
     low, high = p[in_flight, :2].min(axis=0), p[in_flight, :2].max(axis=0)
     reach = _MAX_EXTENT * max(*(high - low), 50.0)
-    near = [
-        leg for leg in legs if (leg[P_N : P_E + 1] > low - reach).all() and (leg[P_N : P_E + 1] < high + reach).all()
-    ]
+    near = [leg for leg in legs if ((low - reach < leg[P_N : P_E + 1]) & (leg[P_N : P_E + 1] < high + reach)).all()]
     _route(ax, near, survey)
     if len(near) < len(legs):
         ax.text(0.02, 0.02, f"{len(legs) - len(near)} waypoints outside the map", transform=ax.transAxes, color=MUTED)
     _frame(ax, np.vstack([p[in_flight, :2], *[leg[None, P_N : P_E + 1] for leg in near]]))
     _ends(ax, p[in_flight])
-    _wind(ax, findings)
+    return _wind(ax, findings)
 
 
 def _draw_path(ax: Any, survey: Survey, t: np.ndarray, p: np.ndarray, colours: dict[str, str]) -> None:
@@ -256,16 +240,9 @@ def _route(ax: Any, legs: list[np.ndarray], survey: Survey) -> None:
         at = (round(leg[P_E] / 20), round(leg[P_N] / 20))
         offset = (4, 4) if at not in occupied else (4, -9)  # separate labels of items at one position
         occupied.add(at)
-        ax.annotate(
-            str(int(leg[SEQ])),
-            (leg[P_E], leg[P_N]),
-            xytext=offset,
-            textcoords="offset points",
-            color=ROUTE,
-            size=7,
-            zorder=5,
-            path_effects=_HALO,
-        )
+        style = {"color": ROUTE, "size": 7, "zorder": 5, "path_effects": _HALO}
+        text = str(int(leg[SEQ]))
+        ax.annotate(text, (leg[P_E], leg[P_N]), xytext=offset, textcoords="offset points", **style)
         if int(leg[KIND]) in _CIRCLES:
             radius = abs(leg[RADIUS]) or abs(survey.values.get("WP_LOITER_RAD", _USUAL_RADIUS))
             a = np.linspace(0, 2 * np.pi, 90)

@@ -50,8 +50,14 @@ def show_progress(
     if not sources:
         yield
         return
-    draw = _draw_progress if console.is_terminal else _write_lines
-    with run_alongside(lambda done: draw(sources, done, write_line, console, leave=leave)):
+
+    def show(done: threading.Event) -> None:
+        if console.is_terminal:
+            _draw_progress(sources, done, console, leave)
+        else:
+            _write_lines(sources, done, write_line)
+
+    with run_alongside(show):
         yield
 
 
@@ -78,9 +84,7 @@ def run_alongside(show: Callable[[threading.Event], None]) -> Iterator[None]:
         end()  # Ctrl-C may interrupt the first call; a remaining thread would block process exit
 
 
-def _draw_progress(
-    sources: Sequence[ProgressSource], done: threading.Event, _: Callable[[str], None], console: Console, *, leave: bool
-) -> None:
+def _draw_progress(sources: Sequence[ProgressSource], done: threading.Event, console: Console, leave: bool) -> None:
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[words]}"))
     with Progress(*columns, console=console, transient=not leave) as progress:
         task_ids = [progress.add_task(source.name, total=1.0, words="") for source in sources]
@@ -91,15 +95,7 @@ def _draw_progress(
                 progress.update(task_id, completed=source.share, words=source.progress_text())
 
 
-def _write_lines(
-    sources: Sequence[ProgressSource],
-    done: threading.Event,
-    write_line: Callable[[str], None],
-    _: Console,
-    *,
-    leave: bool,
-) -> None:
-    del leave
+def _write_lines(sources: Sequence[ProgressSource], done: threading.Event, write_line: Callable[[str], None]) -> None:
     due = time.monotonic() + PLAIN_S
     while not done.wait(max(due - time.monotonic(), 0.0)):
         due += PLAIN_S

@@ -13,17 +13,8 @@ from fleet.process.sanitise import printable
 from fleet.telemetry.inspection.findings import AircraftFindings, FileFindings, RowStatistics, mode_seconds
 
 _MAX_EVENTS = 14
-_EVENT_PRIORITY = (
-    "text",
-    "clock",
-    "link",
-    "gap",
-    "parameter",
-    "disarmed",
-    "armed",
-    "mission",
-    "mode",
-)  # most severe first; mission items are listed with the mission
+_EVENT_PRIORITY = ("text", "clock", "link", "gap", "parameter", "disarmed", "armed", "mission", "mode")
+"""Most severe first; mission items are listed with the mission."""
 _MAX_ITEMS = 12  # most mission items listed
 
 
@@ -40,19 +31,20 @@ def table(file: FileFindings) -> RenderableType:
 
 def summary_lines(findings: AircraftFindings) -> list[tuple[str, str]]:
     """Return the summary without events and abilities: (heading, text)."""
+    vehicle, firmware = findings.vehicle.replace("_", " "), findings.firmware or "firmware unknown"
+    jumps = f"{findings.clock_jumps} clock jumps" if findings.clock_jumps else "no clock jump"
+    rows = findings.rows.items()
+    modes = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in mode_seconds(findings).items())
     return [
-        ("aircraft", _aircraft_text(findings)),
+        ("aircraft", f"uav-{findings.uav}, {vehicle}, {findings.autopilot}, {firmware}"),
         ("time", _time(findings)),
-        ("link", _link(findings)),
         (
-            "modes",
-            ", ".join(f"{name} {seconds:.0f} s" for name, seconds in mode_seconds(findings).items()) or "none reported",
+            "link",
+            f"{findings.received:,} messages, {findings.missed:,} missed, {findings.rejected:,} rejected, {jumps}",
         ),
-        ("rows", ", ".join(f"{name} {kind.rate_hz:.1f} Hz" for name, kind in findings.rows.items() if kind.rows)),
-        (
-            "no rows of",
-            ", ".join(name for name, kind in findings.rows.items() if not kind.rows) or "none missing",
-        ),
+        ("modes", modes or "none reported"),
+        ("rows", ", ".join(f"{name} {kind.rate_hz:.1f} Hz" for name, kind in rows if kind.rows)),
+        ("no rows of", ", ".join(name for name, kind in rows if not kind.rows) or "none missing"),
         ("gaps", _gaps(findings.rows)),
         ("mission", _mission(findings)),
         ("parameters", f"{findings.params:,}" + (", complete" if findings.params_complete else ", incomplete")),
@@ -73,10 +65,8 @@ def _aircraft(findings: AircraftFindings, twin: str) -> Table:
         out.add_row("  events" if number == 0 else "", Text(f"{when:>8} {printable(text)}"))
     for number, ability in enumerate(findings.abilities):
         mark, style = ("yes", "green") if ability.can else ("no ", "yellow")
-        out.add_row(
-            "  twin can" if number == 0 else "",
-            Text.assemble((mark, style), f" {ability.name}: {printable(ability.why)}"),
-        )
+        verdict = Text.assemble((mark, style), f" {ability.name}: {printable(ability.why)}")
+        out.add_row("  twin can" if number == 0 else "", verdict)
     if twin:
         out.add_row("  twin result", Text(printable(twin)))
     return out
@@ -84,15 +74,10 @@ def _aircraft(findings: AircraftFindings, twin: str) -> Table:
 
 def events(findings: AircraftFindings, limit: int) -> list[tuple[str, str]]:
     """Return the most severe events in time order and the number of others: (time, text)."""
-    selected = sorted(
-        (event for event in findings.events if event.kind != "item"),
-        key=lambda event: (_EVENT_PRIORITY.index(event.kind), event.t_s),
-    )[:limit]
-    rows = [
-        (f"{e.t_s:.1f} s", e.text if e.kind == e.text else f"{e.kind}: {e.text}")
-        for e in findings.events
-        if e in selected
-    ]
+    candidates = [event for event in findings.events if event.kind != "item"]
+    selected = sorted(candidates, key=lambda event: (_EVENT_PRIORITY.index(event.kind), event.t_s))[:limit]
+    shown = [event for event in findings.events if event in selected]
+    rows = [(f"{e.t_s:.1f} s", e.text if e.kind == e.text else f"{e.kind}: {e.text}") for e in shown]
     remaining = Counter(event.kind for event in findings.events if event not in selected)
     if remaining or findings.events_lost:
         more = ", ".join(f"{n} {kind}" for kind, n in remaining.items())
@@ -100,27 +85,16 @@ def events(findings: AircraftFindings, limit: int) -> list[tuple[str, str]]:
     return rows or [("", "none")]
 
 
-def _aircraft_text(findings: AircraftFindings) -> str:
-    kind = findings.vehicle.replace("_", " ")
-    return f"uav-{findings.uav}, {kind}, {findings.autopilot}, {findings.firmware or 'firmware unknown'}"
-
-
 def _time(findings: AircraftFindings) -> str:
     begun = datetime.fromtimestamp(min(max(findings.begun, 0.0), 4e9), UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-    height = (
-        f", {findings.altitude_m[0]:.0f} to {findings.altitude_m[1]:.0f} m above MSL" if findings.altitude_m else ""
-    )
-    airborne_text = (
-        f"{findings.airborne_s:.0f} s in the air, {findings.distance_m / 1e3:.1f} km"
-        if findings.airborne_s
-        else "never in the air"
-    )
-    return f"{findings.seconds:.0f} s from {begun}; {airborne_text}{height}"
-
-
-def _link(findings: AircraftFindings) -> str:
-    jumps = f"{findings.clock_jumps} clock jumps" if findings.clock_jumps else "no clock jump"
-    return f"{findings.received:,} messages, {findings.missed:,} missed, {findings.rejected:,} rejected, {jumps}"
+    text = f"{findings.seconds:.0f} s from {begun}; "
+    if findings.airborne_s:
+        text += f"{findings.airborne_s:.0f} s in the air, {findings.distance_m / 1e3:.1f} km"
+    else:
+        text += "never in the air"
+    if findings.altitude_m:
+        text += f", {findings.altitude_m[0]:.0f} to {findings.altitude_m[1]:.0f} m above MSL"
+    return text
 
 
 def _gaps(rows: dict[str, RowStatistics]) -> str:
@@ -133,18 +107,12 @@ def _gaps(rows: dict[str, RowStatistics]) -> str:
 
 
 def _mission(findings: AircraftFindings) -> str:
-    sequence_items = findings.mission.flown
-    shown = " ".join(map(str, sequence_items[:_MAX_ITEMS])) + (
-        f" … {sequence_items[-1]}" if len(sequence_items) > _MAX_ITEMS else ""
-    )
-    sequence = f"active {shown}" if sequence_items else "no active item reported"
-    count_text = (
-        f"{findings.mission.items} items" + ("" if findings.mission.complete else ", incomplete")
-        if findings.mission.items
-        else ""
-    )
-    upload_text = f"{findings.mission.uploads} uploads" if findings.mission.uploads > 1 else ""
-    return "; ".join(filter(None, (count_text, findings.mission.sentence, upload_text, sequence)))
+    mission, active = findings.mission, findings.mission.flown
+    last = f" … {active[-1]}" if len(active) > _MAX_ITEMS else ""
+    sequence = f"active {' '.join(map(str, active[:_MAX_ITEMS]))}{last}" if active else "no active item reported"
+    count = f"{mission.items} items" + ("" if mission.complete else ", incomplete") if mission.items else ""
+    uploads = f"{mission.uploads} uploads" if mission.uploads > 1 else ""
+    return "; ".join(filter(None, (count, mission.sentence, uploads, sequence)))
 
 
 def _servos(findings: AircraftFindings) -> str:
@@ -171,10 +139,8 @@ def _airspeed(findings: AircraftFindings) -> str:
 def _wind(findings: AircraftFindings) -> str:
     if findings.wind is None:
         return "not reported by the autopilot"
-    wind = findings.wind
-    return (
-        f"autopilot estimate {wind.speed:.1f} m/s from {wind.from_deg:.0f} deg, {wind.low:.1f} to {wind.high:.1f} m/s"
-    )
+    speed, low, high = findings.wind.speed, findings.wind.low, findings.wind.high
+    return f"autopilot estimate {speed:.1f} m/s from {findings.wind.from_deg:.0f} deg, {low:.1f} to {high:.1f} m/s"
 
 
 def _twin_text(answer: dict[str, Any] | None, uav: int) -> str:
@@ -186,18 +152,12 @@ def _twin_text(answer: dict[str, Any] | None, uav: int) -> str:
     predictions = ", ".join(f"{n} by {name}" for name, n in methods.items()) if isinstance(methods, dict) else ""
     first = result.get("first_verified_s")
     verified = f"verified after {first:.0f} s" if isinstance(first, int | float) else "never verified"
-    return "; ".join(
-        filter(
-            None, (f"predictions: {predictions or 'none'}", verified, *_within(result), str(result.get("sentence", "")))
-        )
-    )
-
-
-def _within(result: dict[str, Any]) -> list[str]:
     within = result.get("within")
     shares = {at: x for at, x in within.items() if isinstance(x, int | float)} if isinstance(within, dict) else {}
     shares_text = ", ".join(f"{share:.0%} at {at} s" for at, share in shares.items())
-    return [f"within 10 %: {shares_text}"] if shares_text else []
+    accuracy = f"within 10 %: {shares_text}" if shares_text else ""
+    texts = (f"predictions: {predictions or 'none'}", verified, accuracy, str(result.get("sentence", "")))
+    return "; ".join(filter(None, texts))
 
 
 def id_ranges(uavs: Iterable[int]) -> str:

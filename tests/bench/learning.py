@@ -19,9 +19,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Message
 from fleet.telemetry.recording.recordings import replay_messages
+from tests.support.memory_bus import MemoryBus
 from twin_worker.evaluation.replay import run_offline
 from twin_worker.service.warm_up import warm_up
 from twin_worker.service.worker import OwnedTwin, Worker

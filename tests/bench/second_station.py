@@ -18,8 +18,7 @@ import threading
 import time
 from pathlib import Path
 
-from fleet.bus.bus_protocol import Bus
-from fleet.bus.session import connect, open_router
+from fleet.bus.session import Bus, connect, open_router
 from fleet.contract import GatewayCounters, Item, Mission, Params
 from fleet.process.children import Children
 

@@ -16,13 +16,13 @@ from conftest import ROOT, unused_port
 
 from fleet.access.entry import parse_endpoint
 from fleet.access.knock import accepts_connections
-from fleet.bus.bus_protocol import Bus, key_of, select_latest, uav_of_key
+from fleet.bus.bus_protocol import key_of, select_latest, uav_of_key
 from fleet.bus.codec import Stamp, encode, encoding
-from fleet.bus.memory_bus import MemoryBus
-from fleet.bus.session import connect, open_router
+from fleet.bus.session import Bus, connect, open_router
 from fleet.contract import Alert, AlertKind, FleetState, GatewayCounters, Handover, Prediction, Sample, Status
 from tests.bench.referee.forwarder import Forwarder
 from tests.support.examples import EXAMPLES
+from tests.support.memory_bus import MemoryBus
 
 PATIENCE_S = 10.0
 STAMP = Stamp(epoch=5, writer=99)

@@ -17,7 +17,6 @@ from rich.console import Console
 from fleet import SOURCES, cli
 from fleet.access.entry import BusConfig
 from fleet.access.knock import _remedy
-from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import open_router
 from fleet.commands.live.status import machines, processes
 from fleet.contract import Claim, FleetRow, FleetState, GatewayCounters, LinkCounters, Status, TwinState
@@ -27,6 +26,7 @@ from fleet.health.machine import BAD, NOTE, OK
 from fleet.report.report_text import id_ranges
 from tests.bench.security.bombs import ESCAPES
 from tests.bench.security.site import expired, make_papers, make_passwords
+from tests.support.memory_bus import MemoryBus
 
 ONE, TWO = "0" * 15 + "1", "0" * 15 + "2"
 

@@ -4,9 +4,9 @@ import argparse
 
 import pytest
 
-from fleet.bus.memory_bus import MemoryBus
 from fleet.commands.live import whatif as command
 from fleet.contract import MAX_ITEMS, Prediction
+from tests.support.memory_bus import MemoryBus
 
 WPL = """QGC WPL 110
 0\t1\t0\t16\t0\t0\t0\t0\t47.4\t8.5\t450\t1

@@ -12,7 +12,6 @@ from prometheus_client.parser import text_string_to_metric_families
 from rich.console import Console
 from test_gateway import PATIENCE_S, Ear
 
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import GatewayCounters, Status
 from fleet.metrics import serve, with_unit
 from gateway import status as status_table
@@ -23,6 +22,7 @@ from gateway.record.recorder import LinkRecorder
 from gateway.record.tape import DiskBudget
 from gateway.status import counters, format_line, overruns, render, status_display
 from tests.support.examples import EXAMPLES
+from tests.support.memory_bus import MemoryBus
 from tests.support.talker import T0, Talker
 
 ACCOUNT, STATUS = EXAMPLES[GatewayCounters], EXAMPLES[Status]

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from conftest import ROOT, unused_port
 
-from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import connect
 from fleet.contract import GatewayCounters, Mission, Params, Sample, Status
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
@@ -23,6 +22,7 @@ from gateway.links.receive import Udp
 from gateway.links.recorded import ReplayLink
 from gateway.pipeline import Pipeline
 from tests.support.fake_link import FakeLink, beside_compiling, untimed
+from tests.support.memory_bus import MemoryBus
 from tests.support.talker import ITEMS, T0, Aircraft, Talker
 
 PATIENCE_S = 30.0  # an upper bound; every wait ends with its condition

@@ -8,10 +8,10 @@ import pytest
 
 from fleet.bus.bus_protocol import key_of
 from fleet.bus.codec import EncodedMessage, encode
-from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import connect
 from fleet.contract import Array, History, Rows, Sample, Status
 from gateway.publication import HistoryStore, Publisher
+from tests.support.memory_bus import MemoryBus
 from tests.support.talker import T0
 
 

@@ -13,7 +13,6 @@ import pytest
 from conftest import ROOT
 
 from fleet.bus.codec import Stamp, encode, encoding
-from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import connect
 from fleet.commands.live import record
 from fleet.commands.live.record import BusRecorder
@@ -27,6 +26,7 @@ from gateway.pipeline import Pipeline
 from gateway.publication import Publisher
 from tests.support.examples import EXAMPLES, MESSAGES
 from tests.support.fake_link import untimed
+from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import STAMP, PretendFleet, T
 from viewer.store.store import FleetStore
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fleet.bus.codec import EncodedMessage
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Alert, AlertKind, Message, Prediction, Sample, Status
 from fleet.simulator.flight.uav import SimulatedUav
 from fleet.telemetry.mavlink.intake import MavlinkReceiver, unpacked
+from tests.support.memory_bus import MemoryBus
 from twin_worker.service.worker import Worker
 
 T0 = 1_700_000_000.0  # arrival of the first datagram [s since 1970]

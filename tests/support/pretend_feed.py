@@ -13,10 +13,8 @@ import numpy as np
 
 from fleet.access.entry import ROUTER
 from fleet.access.knock import accepts_connections
-from fleet.bus.bus_protocol import Bus
 from fleet.bus.codec import Stamp
-from fleet.bus.memory_bus import MemoryBus
-from fleet.bus.session import connect, open_router
+from fleet.bus.session import Bus, connect, open_router
 from fleet.cli import stop_on_signal
 from fleet.contract import (
     Alert,
@@ -42,6 +40,7 @@ from fleet.contract import (
     Verdict,
 )
 from fleet.frames import Origin, to_geodetic
+from tests.support.memory_bus import MemoryBus
 from viewer.store.store import FleetStore
 
 HOME = Origin(473977420, 85455940, 488_000)

@@ -5,10 +5,10 @@ import copy
 import numpy as np
 import pytest
 
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import DiagnosisOutcome, Message, Mismatch, Prediction, Sample
 from tests.bench.mismatch.flown import Inline, errors
 from tests.bench.mismatch.world import FAULT, ONSET_S, baseline, messages
+from tests.support.memory_bus import MemoryBus
 from twin_worker.mismatch.coordinator import ALL_UAVS, Coordinator
 from twin_worker.service.worker import OwnedTwin, Worker
 from viewer.panels.detail import status_html

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import (
     Alert,
     AlertKind,
@@ -22,6 +21,7 @@ from fleet.contract import (
     Verdict,
 )
 from fleet.frames import Origin, body_to_ned, to_geodetic
+from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import HOME, HOSTILE, STAMP, Clock, PretendUav, T, feed_of, fields
 from viewer.panels.charts import axis_range, band
 from viewer.panels.detail import figures_html, law_html, limitations, status_html

@@ -20,8 +20,8 @@ from websockets.http11 import Request
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
-from fleet.bus.memory_bus import MemoryBus
 from tests.support.fake_link import PATIENCE_S, until
+from tests.support.memory_bus import MemoryBus
 from viewer.browser.http_server import POLICY, REFUSED, VIOLATION, request_filter, serve, without_stdout
 from viewer.server.app import App
 

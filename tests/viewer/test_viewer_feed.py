@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from fleet.bus.codec import Stamp
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Alert, AlertKind, Array, FleetRow, FleetState, Mission, Prediction, Rows, Sample, TwinState
 from fleet.frames import Origin
+from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import HOME, STAMP, Clock, PretendFleet, PretendUav, T, feed_of, fields
 from viewer.panels.detail import limitations
 from viewer.store.place import UNIT_M

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from fleet.bus.codec import encode, encoding
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Array, Mission, Rows, Sample, Status
 from fleet.frames import Origin
+from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import STAMP, Clock, PretendUav, T, feed_of
 from viewer.scene.fleet_arrays import LARGE_FLEET, LOST, MISMATCH, READ_PARTS, TRAIL_AGES_S, FleetArrays, display_status
 from viewer.scene.labels import MAX_LABELS, CameraView, Tag, visible_labels

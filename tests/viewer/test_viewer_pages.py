@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from conftest import unused_port
 
-from fleet.bus.memory_bus import MemoryBus
 from tests.bench.viewing.watcher import Watcher
+from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import PretendFleet
 from viewer.browser.http_server import Browser, serve, without_stdout
 from viewer.panels.panels import NO_UAV

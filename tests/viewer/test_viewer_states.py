@@ -7,12 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import GatewayCounters, LinkCounters, Status
 from gateway.link_spec import read_spec
 from gateway.links.recorded import ReplayLink
 from gateway.pipeline import Pipeline
 from tests.gateway.test_gateway import flight
+from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import HOSTILE, STAMP, Clock, PretendUav, T, feed_of
 from viewer.panels.detail import status_html
 from viewer.scene.camera import set_initial_view

@@ -22,8 +22,9 @@ from typing import Any, Protocol
 import msgspec
 
 from fleet import SOURCES
-from fleet.bus.bus_protocol import Bus, WorkerToken, parse_token
+from fleet.bus.bus_protocol import WorkerToken, parse_token
 from fleet.bus.codec import MAX_EPOCH_AHEAD_MS, Stamp, is_plausible_epoch
+from fleet.bus.session import Bus
 from fleet.contract import Claim, Handover, HandoverRequest
 from twin_worker.ownership.protocol_state import FencingToken, OwnershipState
 

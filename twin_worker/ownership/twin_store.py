@@ -13,8 +13,9 @@ from typing import Protocol
 import msgspec
 
 import fleet
-from fleet.bus.bus_protocol import Bus, EpochFence
+from fleet.bus.bus_protocol import EpochFence
 from fleet.bus.codec import EncodedMessage, Stamp
+from fleet.bus.session import Bus
 from fleet.contract import (
     Handover,
     History,

@@ -6,8 +6,9 @@ import time
 from collections.abc import Callable, Iterator
 
 from fleet.airframes import GENERIC, Airframe, load
-from fleet.bus.bus_protocol import Bus, RawMessage
+from fleet.bus.bus_protocol import RawMessage
 from fleet.bus.codec import Stamp, decode_for_key
+from fleet.bus.session import Bus
 from fleet.contract import (
     Alert,
     FleetState,

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 import viser
 
-from fleet.bus.bus_protocol import Bus
+from fleet.bus.session import Bus
 from fleet.contract import History
 from viewer.browser.http_server import Browser
 from viewer.scene.camera import IN_VIEW_M, set_initial_view, within_reach

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from fleet.bus.bus_protocol import WRITER_TIMEOUT_S, Bus, EpochFence, RawMessage, key_of
+from fleet.bus.bus_protocol import WRITER_TIMEOUT_S, EpochFence, RawMessage, key_of
 from fleet.bus.codec import Stamp, decode_for_key, encoding
+from fleet.bus.session import Bus
 from fleet.contract import (
     Alert,
     FleetState,

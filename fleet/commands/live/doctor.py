@@ -15,7 +15,6 @@ from fleet.bus.session import connect
 from fleet.config import bus_config_from, router_arguments
 from fleet.contract import GatewayCounters
 from fleet.health import claims, machine
-from fleet.health import claims as door
 from fleet.health.machine import BAD, CheckResult
 from fleet.process.sanitise import printable
 
@@ -48,8 +47,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _checks(bus_config: BusConfig) -> Iterator[CheckResult]:
     yield from machine.check_machine()
-    yield from door.check_certificates(bus_config)
-    reachable = yield from door.check_router(bus_config)
+    yield from claims.check_certificates(bus_config)
+    reachable = yield from claims.check_router(bus_config)
     if not reachable:
         yield machine.mavlink_port()
         return

@@ -1,17 +1,14 @@
 """Fly simulated aircraft: fixed-wing UAVs on JSBSim that send MAVLink 2 over UDP, or into a recording."""
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
-from threading import Event
 from typing import TYPE_CHECKING
 
-from fleet.cli import id_range, stop_on_signal
+from fleet.cli import host_and_port, id_range, stop_on_signal
 from fleet.process.logs import report_status
 
 if TYPE_CHECKING:
     from fleet.simulator.faults.physics import Fault
-    from fleet.simulator.flight.uav import SimulatedUav
 
 EXAMPLES = """
   fleet fly --uavs 0-7
@@ -20,10 +17,8 @@ EXAMPLES = """
   fleet fly --uavs 0-3 --fault drag_increase,dCD=0.03,at=120 --fault actuator_lag:elevator,tau_s=0.3 --fault-uav 2
   fleet fly --uavs 0 --seed 3 --for 300 --tlog flight.tlog     as fast as possible, no network
 """
-AUTOPILOTS, AIRCRAFT = (
-    ("ardupilot", "px4"),
-    ("small", "c172p"),
-)  # as in `fleet.simulator.flight.tuning`, which loads slowly
+AUTOPILOTS = ("ardupilot", "px4")  # both as in `fleet.simulator.flight.tuning`, which loads slowly
+AIRCRAFT = ("small", "c172p")
 _DEFAULT_TLOG_S = 300.0  # length of a recording when --for is not given [s]
 
 
@@ -74,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     _check(args)
     stop = stop_on_signal()
     level = turbulence_level(args.turbulence)
-    host, port = _address(args.to)
+    host, port = host_and_port("--to", args.to)
     options = {"autopilot": args.autopilot, "aircraft": args.aircraft}
     faulty = faults_of(args, args.uavs)
     uavs = [
@@ -84,7 +79,10 @@ def run(args: argparse.Namespace) -> int:
     report_status("fly", "compiling the autopilot, first start only")
     SimulatedUav(args.uavs[0], args.seed).step(0.2)
     if args.tlog is not None:
-        _record(uavs, args, stop)
+        seconds = args.seconds or _DEFAULT_TLOG_S
+        title = f"flying into {args.tlog.name}"
+        frames = drive.to_tlog(args.tlog, uavs, seconds=seconds, loss=args.loss, seed=args.seed, title=title, stop=stop)
+        report_status("fly", f"{frames} frames of {len(uavs)} aircraft in {args.tlog}")
         return 0
     report_status("fly", f"{len(uavs)} aircraft in the air, sending to {host}:{port}")
     max_delay = drive.to_udp(uavs, (host, port), seconds=args.seconds, loss=args.loss, seed=args.seed, stop=stop)
@@ -98,7 +96,7 @@ def faults_of(args: argparse.Namespace, uavs: range) -> "dict[int, tuple[Fault, 
     Raises:
         ValueError: when a fault is not applicable to the aircraft type, or the id is not simulated.
     """
-    from fleet.simulator.faults.oddities import parse_fault
+    from fleet.simulator.faults.kinds import parse_fault
 
     uav = uavs[0] if args.fault_uav is None else args.fault_uav
     if args.fault_uav is not None and not args.fault:
@@ -118,36 +116,3 @@ def _check(args: argparse.Namespace) -> None:
         raise ValueError(f"--seed: found {args.seed}, expected an integer from 0; change --seed")
     if args.seconds is not None and not args.seconds > 0:
         raise ValueError(f"--for: found {args.seconds} s, expected more than 0; change --for")
-
-
-def _address(text: str) -> tuple[str, int]:
-    """Parse HOST:PORT.
-
-    Raises:
-        ValueError: when it is malformed.
-    """
-    host, colon, port = text.rpartition(":")
-    if not colon or not host or not port.isdecimal() or not 0 < int(port) < 65_536:
-        raise ValueError(f"--to: found {text!r}, expected HOST:PORT such as 127.0.0.1:14550; correct --to")
-    return host, int(port)
-
-
-def _record(uavs: "Sequence[SimulatedUav]", args: argparse.Namespace, stop: Event) -> None:
-    """Write the recording and show a progress bar."""
-    from rich.progress import Progress
-
-    from fleet.simulator.flight import drive
-
-    seconds = args.seconds or _DEFAULT_TLOG_S
-    with Progress(transient=True) as bar:
-        task = bar.add_task(f"flying into {args.tlog.name}", total=seconds)
-        frames = drive.to_tlog(
-            args.tlog,
-            uavs,
-            seconds=seconds,
-            loss=args.loss,
-            seed=args.seed,
-            progress=lambda t: bar.update(task, completed=t),
-            stop=stop,
-        )
-    report_status("fly", f"{frames} frames of {len(uavs)} aircraft in {args.tlog}")

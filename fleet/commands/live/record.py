@@ -13,9 +13,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from fleet.bus.bus_protocol import Bus
 from fleet.bus.codec import Stamp, encode, encoding
-from fleet.bus.session import connect
+from fleet.bus.session import Bus, connect
 from fleet.cli import stop_on_signal
 from fleet.config import bus_config_from, router_arguments
 from fleet.contract import TOPICS, Sample
@@ -56,11 +55,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Validate the options before anything is opened.
-
-    Raises:
-        ValueError: when an option is invalid; the text names it.
-    """
+    """Validate the options before anything is opened."""
     if not 0 <= args.seconds < math.inf:
         raise ValueError(f"--for: found {args.seconds} s, expected 0 (until Ctrl-C) or more; change it")
     if args.file.suffix != SUFFIX:

@@ -9,9 +9,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from fleet.bus.bus_protocol import Bus
 from fleet.bus.codec import is_plausible_epoch
-from fleet.bus.session import connect
+from fleet.bus.session import Bus, connect
 from fleet.config import bus_config_from, router_arguments
 from fleet.contract import Claim, FleetRow, FleetState, GatewayCounters, Status, TwinState
 from fleet.process.sanitise import printable

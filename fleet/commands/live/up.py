@@ -13,9 +13,8 @@ from rich.live import Live
 from rich.text import Text
 
 from fleet.access.knock import probe_router
-from fleet.bus.bus_protocol import Bus
-from fleet.bus.session import connect, open_router
-from fleet.cli import stop_on_signal
+from fleet.bus.session import Bus, connect, open_router
+from fleet.cli import check_parent, host_and_port, stop_on_signal
 from fleet.commands.live.fly import AIRCRAFT, AUTOPILOTS, fault_arguments, faults_of
 from fleet.commands.live.replay import check_arguments as check_playing
 from fleet.commands.live.replay import replay_link
@@ -92,11 +91,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Validate the options before anything is started.
-
-    Raises:
-        ValueError: when an option is invalid; the text names it.
-    """
+    """Validate the options before anything is started."""
     if not 1 <= args.uavs <= 250:
         raise ValueError(f"--uavs: found {args.uavs}, expected 1 to 250 aircraft; start several fleets for more")
     if not 0 <= args.seconds < float("inf"):
@@ -110,19 +105,16 @@ def _check(args: argparse.Namespace) -> None:
     for name in args.replay:
         if not Path(name).is_file():
             raise ValueError(f"--replay: found no recording {name!r}, expected a file; check the path")
-    if args.summary and not args.summary.absolute().parent.is_dir():
-        raise ValueError(f"--summary: found no folder {str(args.summary.parent)!r}, expected one; create it first")
+    check_parent("--summary", args.summary)
     if not (args.link or args.replay):
         _check_free(args.mavlink)
 
 
 def _check_free(mavlink: str) -> None:
-    host, _, port = mavlink.rpartition(":")
-    if not host or not port.isdecimal() or not 0 < int(port) < 65_536:
-        raise ValueError(f"--mavlink: found {mavlink!r}, expected HOST:PORT such as {_MAVLINK}; correct it")
+    address = host_and_port("--mavlink", mavlink)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
         try:
-            trial.bind((host, int(port)))
+            trial.bind(address)
         except OSError as error:
             reason = f"UDP {mavlink} not free ({error.strerror or error}), expected a port for the simulated aircraft"
             raise ValueError(f"--mavlink: found {reason}; stop the other fleet, or name another port") from None
@@ -134,9 +126,8 @@ def _start(children: Children, args: argparse.Namespace) -> None:
         ids = "0-999999" if args.replay else "0-249"
         baselines = [f"--baseline={text}" for text in args.baseline]
         children.start("twin worker", "twin_worker", "--uavs", ids, *baselines, *router)
-    gateway_options = (
-        [f"--forward={text}" for text in args.forward] + ([f"--keys={args.keys}"] if args.keys else []) + router
-    )
+    gateway_options = [f"--forward={text}" for text in args.forward] + router
+    gateway_options += [f"--keys={args.keys}"] if args.keys else []
     links = [f"--link={text}" for text in args.link]
     links += [f"--link={replay_link(file, args)}" for file in args.replay]
     if links:
@@ -156,12 +147,12 @@ def _start(children: Children, args: argparse.Namespace) -> None:
 def _watch(bus: Bus, children: Children, args: argparse.Namespace, stop: threading.Event) -> int:
     """Show the fleet once a second until stopped, a process fails or the duration has elapsed."""
     worker_texts: list[str] = [""]  # texts of the worker, the newest last; none is lost between two polls
-    bus.subscribe(
-        FleetState,
-        lambda state, _: (
-            worker_texts.append(printable(state.sentence)) if printable(state.sentence) != worker_texts[-1] else None
-        ),
-    )
+
+    def on_state(state: FleetState, _: object) -> None:
+        if (text := printable(state.sentence)) != worker_texts[-1]:
+            worker_texts.append(text)
+
+    bus.subscribe(FleetState, on_state)
     rows: list[FleetRow] = []
     first_sample_t = None
     display = _Display(Console(stderr=True))

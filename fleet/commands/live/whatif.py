@@ -9,8 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from fleet.bus.bus_protocol import Bus
-from fleet.bus.session import connect
+from fleet.bus.session import Bus, connect
 from fleet.config import bus_config_from, router_arguments
 from fleet.contract import Prediction, WhatIf, WhatIfStart
 from fleet.frames import to_geodetic, to_ned
@@ -54,10 +53,8 @@ def run(args: argparse.Namespace) -> int:
     """
     request = build_request(args)
     with connect(bus_config_from(args)) as bus:
-        what_if, reference = (
-            send_request(bus, args.uav, request),
-            next((p for p, _ in bus.get(Prediction, args.uav)), None),
-        )
+        what_if = send_request(bus, args.uav, request)
+        reference = next((p for p, _ in bus.get(Prediction, args.uav)), None)
     if what_if is None:
         print(f"uav {args.uav}: found no worker that replies, expected one; see `fleet status`", file=sys.stderr)
         return 1
@@ -143,8 +140,8 @@ def format_text(prediction: Prediction, reference: Prediction | None) -> str:
     lines = [
         printable(prediction.sentence),
         f"{printable(prediction.method)} · {printable(prediction.law)} · horizon {prediction.horizon_s:.0f} s",
+        "   in s    latitude   longitude  alt m  length m  tube m   deviation m",
     ]
-    lines.append("   in s    latitude   longitude  alt m  length m  tube m   deviation m")
     for lead_s in (s for s in _SHOWN_S if s <= ahead[-1]):
         k = int(np.argmin(np.abs(ahead - lead_s)))
         lat, lon, alt = positions[k] * [1e-7, 1e-7, 1e-3]

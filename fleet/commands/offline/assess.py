@@ -3,10 +3,7 @@
 import argparse
 from pathlib import Path
 
-from fleet.cli import stop_on_signal
-from fleet.process.children import run_until
-from fleet.process.interrupt import INTERRUPTED
-from fleet.process.logs import report_progress
+from fleet.cli import check_parent, run_module
 
 EXAMPLES = """
   fleet assess flight.tlog
@@ -57,8 +54,7 @@ def check_arguments(args: argparse.Namespace) -> None:
     for path in args.file:
         if not path.is_file():
             raise ValueError(f"FILE: found no recording {str(path)!r}, expected a file; check the path")
-    if args.json and not args.json.absolute().parent.is_dir():
-        raise ValueError(f"--json: found no folder {str(args.json.parent)!r}, expected one; create it first")
+    check_parent("--json", args.json)
     if args.json and any(args.json.exists() and path.samefile(args.json) for path in args.file):
         raise ValueError(f"--json: found the recording {str(args.json)!r} itself, expected another file; rename it")
     if args.out and args.out.exists() and not args.out.is_dir():
@@ -73,12 +69,8 @@ def baseline_methods(methods: str) -> tuple[str, ...]:
 def run(args: argparse.Namespace) -> int:
     """Start the assessment and return its exit code."""
     check_arguments(args)
-    stop = stop_on_signal()
     options = [f"--{name}={getattr(args, name)}" for name in ("every", "method", "methods", "jobs", "offset")]
     options += [f"--{name}={value}" for name, value in (("out", args.out), ("json", args.json)) if value]
     options += ["--without-params"] if args.without_params else []
-    code = run_until(stop, "twin_worker.evaluation", *options, "--", *map(str, args.file))
-    if stop.is_set():
-        report_progress("assess", "stopped; unfinished results are not written")
-        return INTERRUPTED
-    return code
+    lost = "unfinished results are not written"
+    return run_module("assess", lost, "twin_worker.evaluation", *options, "--", *map(str, args.file))

@@ -3,10 +3,7 @@
 import argparse
 from pathlib import Path
 
-from fleet.cli import stop_on_signal
-from fleet.process.children import run_until
-from fleet.process.interrupt import INTERRUPTED
-from fleet.process.logs import report_progress
+from fleet.cli import run_module
 
 EXAMPLES = """
   fleet calibrate monday/*.tlog --airframe skywalker --out skywalker.json
@@ -31,12 +28,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Start the calibration and return its exit code."""
-    stop = stop_on_signal()
-    options = [
-        f"--{name}={getattr(args, name)}" for name in ("airframe", "until", "out", "json") if getattr(args, name)
-    ]
-    code = run_until(stop, "twin_worker.diagnosis.learn", *options, "--", *map(str, args.file))
-    if stop.is_set():
-        report_progress("calibrate", "stopped; no model was written")
-        return INTERRUPTED
-    return code
+    values = {name: getattr(args, name) for name in ("airframe", "until", "out", "json")}
+    options = [f"--{name}={value}" for name, value in values.items() if value]
+    lost = "no model was written"
+    return run_module("calibrate", lost, "twin_worker.diagnosis.learn", *options, "--", *map(str, args.file))

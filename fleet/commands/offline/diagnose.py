@@ -3,10 +3,7 @@
 import argparse
 from pathlib import Path
 
-from fleet.cli import stop_on_signal
-from fleet.process.children import run_until
-from fleet.process.interrupt import INTERRUPTED
-from fleet.process.logs import report_progress
+from fleet.cli import check_parent, run_module
 
 _MAX_PAST_S = 1e6
 
@@ -61,23 +58,16 @@ def check_arguments(args: argparse.Namespace) -> None:
         )
     if args.against_own_past is not None and not 0 < args.against_own_past < _MAX_PAST_S:
         raise ValueError(f"--against-own-past: found {args.against_own_past:g} s, expected more than 0; change it")
-    for option, path in (("--json", args.json), ("--report", args.report)):
-        if path and not path.absolute().parent.is_dir():
-            raise ValueError(f"{option}: found no folder {str(path.parent)!r}, expected one; create it first")
+    check_parent("--json", args.json)
+    check_parent("--report", args.report)
 
 
 def run(args: argparse.Namespace) -> int:
     """Start the diagnosis and return its exit code."""
     check_arguments(args)
-    stop = stop_on_signal()
-    values = {
-        name: getattr(args, name)
-        for name in ("model", "airframe", "json", "report", "jobs", "against_own_past", "conceal")
-    }
+    names = ("model", "airframe", "json", "report", "jobs", "against_own_past", "conceal")
+    values = {name: getattr(args, name) for name in names}
     options = [f"--{name.replace('_', '-')}={value}" for name, value in values.items() if value]
     simulated = ["--against", *map(str, args.against)] if args.against else []
-    code = run_until(stop, "twin_worker.diagnosis", *options, *simulated, "--", *map(str, args.file))
-    if stop.is_set():
-        report_progress("diagnose", "stopped; unfinished results are not written")
-        return INTERRUPTED
-    return code
+    lost = "unfinished results are not written"
+    return run_module("diagnose", lost, "twin_worker.diagnosis", *options, *simulated, "--", *map(str, args.file))

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from fleet.effects import FOLDERS_ENV, Body, Effect, Parameter, catalogue
+from fleet.effects import FOLDERS_ENV, Body, Effect, catalogue
 
 EXAMPLES = """
   fleet effects                       table of all effects
@@ -86,17 +86,15 @@ def as_text(effect: Effect) -> str:
     }
     lines = [*_wrapped(f"{effect.name}   ", summary(effect)), ""]
     lines += [row for name, fact in facts.items() for row in _wrapped(f"  {name:12} ", fact)]
-    lines += ["", "  parameters, all zero without the effect:", *map(_parameter, effect.parameters)]
+    lines += ["", "  parameters, all zero without the effect:"]
+    for p in effect.parameters:
+        lines.append(f"    {p.name:20} {'[' + p.unit + ']':8} {p.low:>6g} to {p.high:<6g} {p.meaning}")
     if effect.confusable_with:
         lines += ["", "  confusable with, and distinguished by:"]
     lines += [
         row for other, difference in effect.confusable_with.items() for row in _wrapped(f"    {other:27} ", difference)
     ]
     return "\n".join(lines)
-
-
-def _parameter(p: Parameter) -> str:
-    return f"    {p.name:20} {'[' + p.unit + ']':8} {p.low:>6g} to {p.high:<6g} {p.meaning}"
 
 
 def _wrapped(head: str, text: str) -> list[str]:

@@ -6,12 +6,14 @@ import json
 import sys
 import tempfile
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 from rich.console import Console
 
+from fleet.cli import check_parent
 from fleet.commands.offline.schema import fields_of, parts_of, summary
 from fleet.process.children import run_to_end
 from fleet.process.interrupt import interrupt_deferred
@@ -30,14 +32,6 @@ EXAMPLES = """
   fleet inspect --keys                                 meaning of the keys of the JSON
 """
 PLOTS = (".png", ".svg", ".pdf")
-
-
-class InspectedFile(NamedTuple):
-    """Result of reading one recording."""
-
-    file: FileFindings
-    surveys: dict[int, Survey]
-    facts: dict[int, LinkTexts]
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -60,17 +54,15 @@ def run(args: argparse.Namespace) -> int:
     pages: list[tuple[Survey, AircraftFindings, LinkTexts, str]] = []
     console = Console()
     for path in args.file:
-        inspected = inspect_file(path, args.offset)
-        file = msgspec.structs.replace(inspected.file, twin=_run_twin(path)) if args.twin else inspected.file
+        file, surveys, facts = inspect_file(path, args.offset)
+        if args.twin:
+            file = msgspec.structs.replace(file, twin=_run_twin(path))
         files.append(file)
         if args.json != "-":
             console.print(table(file))
         if args.plot:
-            surveys = inspected.surveys.values()
-            pages += [
-                (k, t, inspected.facts.get(k.uav, LinkTexts()), path.name)
-                for k, t in zip(surveys, file.aircraft, strict=True)
-            ]
+            pairs = zip(surveys.values(), file.aircraft, strict=True)
+            pages += [(survey, findings, facts.get(survey.uav, LinkTexts()), path.name) for survey, findings in pairs]
     if args.json:
         _write_json(files, args.json)
     if args.plot and pages:
@@ -89,14 +81,15 @@ def describe_keys() -> str:
     return "\n".join(lines)
 
 
-def inspect_file(path: Path, offset: int = 0) -> InspectedFile:
-    """Read one recording; report every error in it as a text."""
+def inspect_file(path: Path, offset: int = 0) -> tuple[FileFindings, dict[int, Survey], dict[int, LinkTexts]]:
+    """Read one recording; return its findings, with every error as a text, and survey and texts by UAV id."""
     surveys: dict[int, Survey] = {}
     facts: dict[int, LinkTexts] = {}
     sentences: list[str] = []
     try:
         recording = Recording(path, offset)
-        with show_progress([recording], _report, Console(stderr=True), leave=False):
+        report = partial(report_progress, "fleet inspect")
+        with show_progress([recording], report, Console(stderr=True), leave=False):
             surveys = survey_recording((news for _, step in recording.steps() for news in step), recording.kind)
         facts = {uav: LinkTexts(link.firmware, tuple(link.texts)) for uav, link in recording.aircraft.items()}
         sentences += recording.skipped
@@ -106,13 +99,8 @@ def inspect_file(path: Path, offset: int = 0) -> InspectedFile:
         sentences.append(f"{path.name}: found no aircraft, expected at least one heartbeat of one; check the file")
     aircraft = tuple(compute_findings(known, facts.get(uav, LinkTexts())) for uav, known in surveys.items())
     sentences = [sentence.removeprefix(f"{path.name}: ") for sentence in dict.fromkeys(sentences)]
-    return InspectedFile(
-        FileFindings(file=str(path), bytes=_size(path), sentences=tuple(sentences), aircraft=aircraft), surveys, facts
-    )
-
-
-def _report(line: str) -> None:
-    report_progress("fleet inspect", line)
+    file = FileFindings(file=str(path), bytes=_size(path), sentences=tuple(sentences), aircraft=aircraft)
+    return file, surveys, facts
 
 
 def _size(path: Path) -> int:
@@ -123,11 +111,7 @@ def _size(path: Path) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Validate the options before anything is read.
-
-    Raises:
-        ValueError: when an option is invalid; the text names it.
-    """
+    """Validate the options before anything is read."""
     if not args.file:
         raise ValueError("FILE: found none, expected at least one recording; name one")
     for path in args.file:
@@ -136,8 +120,7 @@ def _check(args: argparse.Namespace) -> None:
     if args.plot and args.plot.suffix not in PLOTS:
         raise ValueError(f"--plot: found {args.plot.name!r}, expected a name in {' '.join(PLOTS)}; change the suffix")
     for option, name in (("--plot", args.plot), ("--json", args.json)):
-        if name and not Path(name).absolute().parent.is_dir():
-            raise ValueError(f"{option}: found no folder {str(Path(name).parent)!r}, expected one; create it first")
+        check_parent(option, name)
         if name and any(path.exists() and Path(name).exists() and path.samefile(name) for path in args.file):
             raise ValueError(f"{option}: found the recording {str(name)!r} itself, expected another file; rename it")
 

@@ -77,26 +77,14 @@ def _recordings(args: argparse.Namespace, stop: Event) -> Iterator[list[Path]]:
 
 
 def _fly(args: argparse.Namespace, path: Path, stop: Event) -> None:
-    """Fly as fast as possible into a recording and show a progress bar."""
-    from rich.progress import Progress
-
     from fleet.simulator.flight import drive  # loads JSBSim and the compiler: not for --help
     from fleet.simulator.flight.uav import SimulatedUav
     from fleet.simulator.vehicle.weather import turbulence_level
 
     level = turbulence_level(args.turbulence)
     uavs = [SimulatedUav(i, args.seed, wind=args.wind, turbulence=level) for i in args.uavs]
-    with Progress(transient=True) as bar:
-        task = bar.add_task(f"flying {len(uavs)} aircraft", total=args.seconds)
-        drive.to_tlog(
-            path,
-            uavs,
-            seconds=args.seconds,
-            loss=_LOSS,
-            seed=args.seed,
-            progress=lambda t: bar.update(task, completed=t),
-            stop=stop,
-        )
+    title = f"flying {len(uavs)} aircraft"
+    drive.to_tlog(path, uavs, seconds=args.seconds, loss=_LOSS, seed=args.seed, title=title, stop=stop)
 
 
 def _evaluate(args: argparse.Namespace, files: list[Path], stop: Event) -> int:
@@ -105,12 +93,8 @@ def _evaluate(args: argparse.Namespace, files: list[Path], stop: Event) -> int:
     if args.experiment == "identify":
         command = ["twin_worker.paper_experiments", args.experiment, f"--first={args.first}"]
     else:
-        command = [
-            "twin_worker.evaluation",
-            f"--methods={_COMPARED_METHODS}",
-            f"--every={_EVERY_S}",
-            f"--jobs={args.jobs}",
-        ]
+        command = ["twin_worker.evaluation", f"--methods={_COMPARED_METHODS}", f"--every={_EVERY_S}"]
+        command.append(f"--jobs={args.jobs}")
     code = run_until(stop, *command, *options, *map(str, files))
     if stop.is_set():
         report_progress("paper", "stopped; unfinished results are not written")

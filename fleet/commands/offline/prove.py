@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from fleet.cli import stop_on_signal
+from fleet.cli import check_parent, stop_on_signal
 from fleet.process.logs import report_progress
 
 EXAMPLES = """
@@ -70,8 +70,7 @@ def _check(args: argparse.Namespace) -> None:
         raise ValueError(f"--seed: found {args.seed}, expected an integer from 0; change it")
     if not 1 <= args.jobs <= 64:
         raise ValueError(f"--jobs: found {args.jobs}, expected 1..64; change it")
-    for option, path in (("--json", args.json), ("--report", args.report)):
-        if path and not path.absolute().parent.is_dir():
-            raise ValueError(f"{option}: found no folder {str(path.parent)!r}, expected one; create it first")
+    check_parent("--json", args.json)
+    check_parent("--report", args.report)
     if args.report and args.report.exists() and any(args.report.iterdir()):
         raise ValueError(f"--report: found files in {str(args.report)!r}, expected an empty folder; name another")

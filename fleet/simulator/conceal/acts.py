@@ -9,7 +9,6 @@ import numpy as np
 from fleet.simulator.conceal.paths import PlannedFlight
 from fleet.simulator.conceal.record import ExamFlightLog, fly
 from fleet.simulator.faults.carried import FaultSet
-from fleet.simulator.faults.oddities import UNCATALOGUED
 from fleet.simulator.faults.physics import PHYSICS_FAULTS, WIND_FAULTS, Fault
 from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.jsbsim import DT
@@ -36,6 +35,7 @@ _FLIGHT_NOISE: dict[str, float] = {  # columns of `ExamFlightLog.channels`
     **{name: _NOISE[name] for name in ("aileron", "elevator", "throttle", "rudder")},
 }
 _SLOW_EFFECTS = ("turbulence", "flap_deployed", "thrust_loss", "_surging_engine")  # not observable in a single sample
+_EVIDENCE_CHANNELS = [x for x in _FLIGHT_NOISE if x not in ("p_n", "p_e", "v_n", "v_e", "satellites")]
 _SCATTER_CHANNELS = ("p", "q", "r", "a_y", "a_z", "Va")
 MIN_OVER_NOISE = 2.0  # rms over the noise
 
@@ -77,14 +77,7 @@ def _compare_flights(affected: np.ndarray, reference: np.ndarray, scatter_only: 
     if scatter_only:
         magnitude = np.sqrt(np.maximum(affected.var(axis=0) - reference.var(axis=0), 0.0))
     rms = dict(zip(names, magnitude / np.array(list(_FLIGHT_NOISE.values())), strict=True))
-    channels = (
-        _SCATTER_CHANNELS if scatter_only else [x for x in names if x not in ("p_n", "p_e", "v_n", "v_e", "satellites")]
-    )
-    return _strongest(rms, channels)
-
-
-def _strongest(rms: dict[str, float], channels: object) -> tuple[float, str]:
-    strongest = max(channels, key=lambda name: rms[name])  # type: ignore[call-overload]
+    strongest = max(_SCATTER_CHANNELS if scatter_only else _EVIDENCE_CHANNELS, key=rms.__getitem__)
     return float(rms[strongest]), strongest
 
 
@@ -93,7 +86,8 @@ def _compare_instants(planned: PlannedFlight, fault: Fault, active: np.ndarray) 
     rows: list[np.ndarray] = []
     fly(planned, planned.hidden_faults, observe=lambda uav: rows.append(_instant_changes(uav, fault)))
     magnitude = np.sqrt(np.mean(np.array(rows)[active] ** 2, axis=0)) / np.array(list(_NOISE.values()))
-    return _strongest(dict(zip(_NOISE, magnitude, strict=True)), list(_NOISE))
+    i = int(np.argmax(magnitude))
+    return float(magnitude[i]), list(_NOISE)[i]
 
 
 def _instant_changes(uav: SimulatedUav, fault: Fault) -> np.ndarray:
@@ -101,7 +95,7 @@ def _instant_changes(uav: SimulatedUav, fault: Fault) -> np.ndarray:
     t, fault_set = uav.tick * DT, uav.fault_set
     assert fault_set is not None
     reactions, wind = np.zeros(6), np.zeros(3)
-    if fault.name in PHYSICS_FAULTS or fault.name in UNCATALOGUED:
+    if fault.name in PHYSICS_FAULTS or fault.name.startswith("_"):
         reactions = _reaction_changes(uav, fault_set, fault, t)
     if fault.name in WIND_FAULTS:
         wind = fault.intensity(t) * WIND_FAULTS[fault.name](fault.values, -float(uav.estimate.p[2]))

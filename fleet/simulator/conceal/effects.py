@@ -1,7 +1,6 @@
 """Table of hidden effects: airframe, channel, time profile and magnitude.
 
-Magnitudes are those of realistic defects. `reported` lists the values that a report should contain, in its units, where
-they are known beforehand. Names that begin with _ are not in the catalogue.
+Magnitudes are those of realistic defects. Names that begin with _ are not in the catalogue.
 """
 
 from collections.abc import Callable, Mapping
@@ -27,7 +26,6 @@ class HiddenEffect(NamedTuple):
     profiles: tuple[str, ...] = ("always", "step")  # time profiles, equally probable
     airframes: tuple[str, ...] = BOTH
     parts: tuple[str, ...] = ("",)
-    reported: tuple[str, ...] | None = ()  # values that a report should contain; None: all
 
 
 def _random_sign(rng: np.random.Generator, low: float, high: float) -> float:
@@ -76,51 +74,37 @@ def _both(low: float, high: float) -> tuple[tuple[float, float], tuple[float, fl
 
 _ALWAYS, _STEPS = ("always",), ("step",)
 HIDDEN: dict[str, HiddenEffect] = {
-    "wind_steady": HiddenEffect("air", _wind("speed_mps", (4.0, 9.0), (2.5, 5.0)), reported=None),
-    "wind_shear": HiddenEffect("air", _wind("mps_per_100m", *_both(2.5, 5.0)), _ALWAYS, CESSNA, reported=None),
-    "gust_discrete": HiddenEffect("air", _wind("speed_mps", (5.0, 9.0), (3.0, 6.0)), ("pass",), reported=None),
-    "updraft": HiddenEffect("air", _uniform_signed("speed_mps", (2.5, 5.0), (1.5, 3.0)), ("pass",), reported=None),
+    "wind_steady": HiddenEffect("air", _wind("speed_mps", (4.0, 9.0), (2.5, 5.0))),
+    "wind_shear": HiddenEffect("air", _wind("mps_per_100m", *_both(2.5, 5.0)), _ALWAYS, CESSNA),
+    "gust_discrete": HiddenEffect("air", _wind("speed_mps", (5.0, 9.0), (3.0, 6.0)), ("pass",)),
+    "updraft": HiddenEffect("air", _uniform_signed("speed_mps", (2.5, 5.0), (1.5, 3.0)), ("pass",)),
     "turbulence": HiddenEffect("air", _uniform("w20_mps", *_both(6.0, 11.0))),
     "air_density": HiddenEffect("air", _density, _ALWAYS),
-    "actuator_lag": HiddenEffect("servo", _uniform("tau_s", (0.15, 0.4), (0.12, 0.3)), parts=SURFACES, reported=None),
-    "actuator_delay": HiddenEffect(
-        "servo", _uniform("delay_s", (0.12, 0.3), (0.08, 0.2)), parts=SURFACES, reported=None
-    ),
-    "actuator_rate_limit": HiddenEffect(
-        "servo", _uniform("rate_per_s", (0.08, 0.25), (0.2, 0.6)), parts=SURFACES, reported=None
-    ),
-    "actuator_deadband": HiddenEffect(
-        "servo", _uniform("half_width", (0.04, 0.1), (0.04, 0.1)), parts=SURFACES, reported=None
-    ),
-    "actuator_offset": HiddenEffect(
-        "servo", _uniform_signed("offset", (0.08, 0.2), (0.08, 0.2)), parts=SURFACES, reported=None
-    ),
+    "actuator_lag": HiddenEffect("servo", _uniform("tau_s", (0.15, 0.4), (0.12, 0.3)), parts=SURFACES),
+    "actuator_delay": HiddenEffect("servo", _uniform("delay_s", (0.12, 0.3), (0.08, 0.2)), parts=SURFACES),
+    "actuator_rate_limit": HiddenEffect("servo", _uniform("rate_per_s", (0.08, 0.25), (0.2, 0.6)), parts=SURFACES),
+    "actuator_deadband": HiddenEffect("servo", _uniform("half_width", (0.04, 0.1), (0.04, 0.1)), parts=SURFACES),
+    "actuator_offset": HiddenEffect("servo", _uniform_signed("offset", (0.08, 0.2), (0.08, 0.2)), parts=SURFACES),
     "actuator_stuck": HiddenEffect("servo", _uniform_signed("position", (0.05, 0.25), (0.04, 0.15)), parts=("rudder",)),
-    "control_effectiveness_loss": HiddenEffect(
-        "servo", _uniform("loss", *_both(0.3, 0.6)), parts=SURFACES, reported=None
-    ),
+    "control_effectiveness_loss": HiddenEffect("servo", _uniform("loss", *_both(0.3, 0.6)), parts=SURFACES),
     "prop_torque": HiddenEffect("roll", _fixed(sense=1.0), _ALWAYS, CESSNA),
     "p_factor": HiddenEffect("yaw", _uniform("inches_per_rad", *_both(60.0, 140.0)), _ALWAYS, CESSNA),
     "slipstream_tail": HiddenEffect("pitch", _fixed(share=1.0), _ALWAYS, CESSNA),
     "thrust_loss": HiddenEffect("force", _uniform("fraction", (0.15, 0.3), (0.15, 0.35))),
-    "drag_increase": HiddenEffect("force", _uniform("dCD", (0.015, 0.04), (0.02, 0.05)), reported=None),
-    "icing": HiddenEffect("force", _icing, ("ramp",), reported=None),
+    "drag_increase": HiddenEffect("force", _uniform("dCD", (0.015, 0.04), (0.02, 0.05))),
+    "icing": HiddenEffect("force", _icing, ("ramp",)),
     "flap_deployed": HiddenEffect("force", lambda rng, _: {"flap_deg": float(rng.choice([10, 20]))}, airframes=CESSNA),
-    "mass_change": HiddenEffect("force", _uniform_signed("dmass_kg", (55.0, 110.0), (0.9, 1.8)), reported=None),
-    "cg_shift": HiddenEffect("pitch", _uniform_signed("dx_m", (0.04, 0.1), (0.008, 0.02)), reported=None),
-    "airspeed_scale": HiddenEffect("airspeed", _airspeed_scale, reported=None),
-    "airspeed_bias": HiddenEffect("airspeed", _uniform_signed("bias_mps", (2.5, 5.0), (1.5, 3.0)), reported=None),
-    "gps_latency": HiddenEffect("gps", _uniform("latency_s", *_both(0.2, 0.5)), reported=None),
-    "imu_misalignment": HiddenEffect("imu", _misalignment, reported=None),
-    "gyro_bias": HiddenEffect(
-        "imu", _uniform_signed("bias_dps", *_both(0.7, 2.0)), parts=("p", "q", "r"), reported=None
-    ),
-    "accel_bias": HiddenEffect(
-        "imu", _uniform_signed("bias_mps2", *_both(0.3, 0.8)), parts=("x", "y", "z"), reported=None
-    ),
-    "heading_bias": HiddenEffect("heading", _uniform_signed("bias_deg", *_both(6.0, 15.0)), reported=None),
+    "mass_change": HiddenEffect("force", _uniform_signed("dmass_kg", (55.0, 110.0), (0.9, 1.8))),
+    "cg_shift": HiddenEffect("pitch", _uniform_signed("dx_m", (0.04, 0.1), (0.008, 0.02))),
+    "airspeed_scale": HiddenEffect("airspeed", _airspeed_scale),
+    "airspeed_bias": HiddenEffect("airspeed", _uniform_signed("bias_mps", (2.5, 5.0), (1.5, 3.0))),
+    "gps_latency": HiddenEffect("gps", _uniform("latency_s", *_both(0.2, 0.5))),
+    "imu_misalignment": HiddenEffect("imu", _misalignment),
+    "gyro_bias": HiddenEffect("imu", _uniform_signed("bias_dps", *_both(0.7, 2.0)), parts=("p", "q", "r")),
+    "accel_bias": HiddenEffect("imu", _uniform_signed("bias_mps2", *_both(0.3, 0.8)), parts=("x", "y", "z")),
+    "heading_bias": HiddenEffect("heading", _uniform_signed("bias_deg", *_both(6.0, 15.0))),
     # a constant bias is equivalent to a different sea level pressure
-    "baro_bias": HiddenEffect("baro", _uniform_signed("bias_m", (10.0, 25.0), (8.0, 20.0)), _STEPS, reported=None),
+    "baro_bias": HiddenEffect("baro", _uniform_signed("bias_m", (10.0, 25.0), (8.0, 20.0)), _STEPS),
 }
 UNKNOWN: dict[str, HiddenEffect] = {
     "_crossed_linkage": HiddenEffect("", _uniform_signed("gain", *_both(0.7, 1.2)), _STEPS),
@@ -137,6 +121,10 @@ UNKNOWN: dict[str, HiddenEffect] = {
     "_gyro_scale": HiddenEffect("", _uniform_signed("scale", *_both(0.15, 0.3)), _STEPS),
     "_pitot_lag": HiddenEffect("", _uniform("tau_s", *_both(3.0, 6.0)), _STEPS),
 }
+_UNREPORTED = (  # values that a report contains in other terms
+    *("turbulence", "air_density", "actuator_stuck", "thrust_loss", "flap_deployed"),
+    *("prop_torque", "p_factor", "slipstream_tail"),
+)
 
 
 def reported_values(name: str, airframe: str, values: Mapping[str, float]) -> Values:
@@ -145,5 +133,4 @@ def reported_values(name: str, airframe: str, values: Mapping[str, float]) -> Va
         return dict(values)
     if name == "actuator_lag":
         return {"tau_s": values["tau_s"] + SERVO_LAG_S[airframe]}
-    reported_keys = (HIDDEN | UNKNOWN)[name].reported
-    return dict(values) if reported_keys is None else {key: values[key] for key in reported_keys}
+    return dict(values) if name in HIDDEN and name not in _UNREPORTED else {}

@@ -23,21 +23,21 @@ from fleet.simulator.conceal.paths import (
     draw_flight,
 )
 from fleet.simulator.conceal.record import ExamFlightLog, fly, rejection_reason
-from fleet.simulator.faults.physics import Fault, FaultyPhysics
+from fleet.simulator.faults.carried import FaultSet
+from fleet.simulator.faults.physics import Fault
 from fleet.simulator.vehicle.altered import instrumented_type
 from fleet.simulator.vehicle.jsbsim import DT, KG_TO_LB, Aircraft
 from fleet.simulator.vehicle.sensors import pressure_at
 from fleet.simulator.vehicle.weather import FT
 
+Label = dict[str, Any]
 _R = 287.05  # of dry air [J/(kg K)]
 _SEA_LEVEL_K, _LAPSE_K = 288.15, 0.0065  # standard atmosphere [K, K/m]
 _SPEEDS, _THROTTLES = (44.0, 48.0, 52.0), (0.6, 0.75, 0.9)  # operating range of the Cessna [m/s, -]
 _SPOOL_S = 6.0  # time for the propeller to reach steady speed
 
 
-def describe_effect(
-    planned: PlannedFlight, fault: Fault, log: ExamFlightLog, first_attitude_s: float
-) -> dict[str, object]:
+def describe_effect(planned: PlannedFlight, fault: Fault, log: ExamFlightLog, first_attitude_s: float) -> Label:
     """Describe one hidden effect.
 
     Args:
@@ -48,8 +48,13 @@ def describe_effect(
     Returns:
         name, of, surface, params in the units of a report, times since that ATTITUDE [s]
     """
-    params = reported_values(fault.name, planned.job.airframe, fault.values) | _measured(planned, fault, log)
-    label: dict[str, object] = {"name": fault.name, "params": {key: round(x, 6) for key, x in params.items()}}
+    airframe = planned.job.airframe
+    params = reported_values(fault.name, airframe, fault.values)
+    if fault.name == "air_density":
+        params["density_ratio"] = density_ratio(log)
+    if fault.name == "thrust_loss" and airframe == "c172p":
+        params["fraction"] = thrust_lost(planned, fault)
+    label: Label = {"name": fault.name, "params": {key: round(x, 6) for key, x in params.items()}}
     if fault.part:
         label["surface" if fault.name.startswith(("actuator", "control")) else "of"] = fault.part
     if fault.t0 > 0:
@@ -59,14 +64,6 @@ def describe_effect(
     elif fault.ramp_s > 0:
         label["ramp_s"] = round(fault.ramp_s, 3)
     return label
-
-
-def _measured(planned: PlannedFlight, fault: Fault, log: ExamFlightLog) -> dict[str, float]:
-    if fault.name == "air_density":
-        return {"density_ratio": density_ratio(log)}
-    if fault.name == "thrust_loss" and planned.job.airframe == "c172p":
-        return {"fraction": thrust_lost(planned, fault)}
-    return {}
 
 
 def density_ratio(log: ExamFlightLog) -> float:
@@ -89,7 +86,7 @@ def _thrust(aircraft: Aircraft, Va: float, delta_t: float, fault: Fault | None) 
     nominal = aircraft[thrust_property]
     aircraft.start(np.array([0.0, 0.0, -200.0]), 0.0, Va, (0.0, 0.0))
     if fault is not None:
-        FaultyPhysics([fault._replace(t0=0.0)], aircraft).apply(0.0)
+        FaultSet([fault._replace(t0=0.0)], aircraft).apply_to_physics(0.0)
     for _ in range(round(_SPOOL_S / DT)):
         aircraft.set_controls(0.0, 0.0, 0.0, delta_t)
         aircraft.step()
@@ -129,8 +126,9 @@ def card(airframe: str) -> dict[str, object]:
 
 AIRFRAMES = ("c172p", "small")
 _ATTEMPTS = 25
-Label = dict[str, Any]
 Labels = dict[str, Label]
+EffectNames = tuple[str, ...]
+"""Names of the hidden effects of one flight."""
 
 
 def simulate_exam(
@@ -164,7 +162,7 @@ def simulate_exam(
 def draw_jobs(seed: int, flights: int) -> list[FlightJob]:
     """Draw the effects of all flights; order and names are independent of them."""
     rng = np.random.default_rng((seed, 22))
-    requests: list[tuple[str, str, tuple[str, ...]]] = []
+    requests: list[tuple[str, str, EffectNames]] = []
     for k, (role, count) in enumerate(counts(flights).items()):
         for i, airframe in enumerate(AIRFRAMES):
             n_flights = (count + (i + k) % 2) // 2
@@ -183,9 +181,17 @@ def draw_jobs(seed: int, flights: int) -> list[FlightJob]:
     return nominal + jobs
 
 
-def _names(rng: np.random.Generator, role: str, airframe: str, count: int) -> list[tuple[str, ...]]:
-    draws = {"single": singles, "compound": compounds, "unknown": unknowns}
-    return draws[role](rng, airframe, count) if role in draws else [()] * count
+def _names(rng: np.random.Generator, role: str, airframe: str, count: int) -> list[EffectNames]:
+    """Draw the effects of `count` flights of one role; a single effect is repeated only when all were drawn."""
+    if role == "compound":
+        return compounds(rng, airframe, count)
+    if role not in ("single", "unknown"):
+        return [()] * count
+    names = [x for x, h in (HIDDEN if role == "single" else UNKNOWN).items() if airframe in h.airframes]
+    drawn: list[EffectNames] = []
+    while len(drawn) < count:
+        drawn += [(names[i],) for i in rng.permutation(len(names))]
+    return drawn[:count]
 
 
 def _fly_all(tasks: list[tuple[FlightJob, int, Path]], processes: int) -> Iterator[tuple[str, Label]]:
@@ -232,10 +238,9 @@ def _try_flight(planned: PlannedFlight, path: Path, rejections: list[str]) -> La
     strengths: list[Label] = []
     for fault in planned.hidden_faults if not reason else ():
         strengths.append(effect_strength(planned, fault, log))
-        if strengths[-1]["over_noise"] < MIN_OVER_NOISE:
-            reason = (
-                f"{fault.name} {fault.part} has strength {strengths[-1]['over_noise']} in {strengths[-1]['channel']}"
-            )
+        strength, channel = strengths[-1]["over_noise"], strengths[-1]["channel"]
+        if strength < MIN_OVER_NOISE:
+            reason = f"{fault.name} {fault.part} has strength {strength} in {channel}"
     if reason:
         rejections.append(reason)
         path.unlink()
@@ -261,8 +266,6 @@ _OVERLAPPING = (  # pairs of channels that are not separable
     {"gps", "baro"},
 )
 _GLOBAL_EFFECTS = {"air_density", "turbulence"}  # affect all channels: never combined
-EffectNames = tuple[str, ...]
-"""Names of the hidden effects of one flight."""
 
 
 def counts(flights: int) -> dict[str, int]:
@@ -277,16 +280,6 @@ def counts(flights: int) -> dict[str, int]:
     unknown = max(round(flights * _UNKNOWN), 1)
     control = flights - single - compound - unknown
     return {"control": control, "single": single, "compound": compound, "unknown": unknown}
-
-
-def singles(rng: np.random.Generator, airframe: str, n: int) -> list[EffectNames]:
-    """Draw `n` effects without repetition until all are used."""
-    return [(name,) for name in _draw_cycling(rng, [x for x, h in HIDDEN.items() if airframe in h.airframes], n)]
-
-
-def unknowns(rng: np.random.Generator, airframe: str, n: int) -> list[EffectNames]:
-    """Draw `n` uncatalogued effects."""
-    return [(name,) for name in _draw_cycling(rng, [x for x, h in UNKNOWN.items() if airframe in h.airframes], n)]
 
 
 def compounds(rng: np.random.Generator, airframe: str, n: int) -> list[EffectNames]:
@@ -312,10 +305,3 @@ def are_separable(a: str, b: str) -> bool:
     if len(channels) == 1 or channels in _OVERLAPPING:
         return False
     return not ("servo" in channels and channels & {"roll", "pitch", "yaw"})
-
-
-def _draw_cycling(rng: np.random.Generator, names: list[str], n: int) -> list[str]:
-    out: list[str] = []
-    while len(out) < n:
-        out += [names[i] for i in rng.permutation(len(names))]
-    return out[:n]

@@ -64,11 +64,8 @@ def draw_exam_mission(
     for k, waypoint in enumerate(waypoints):
         if k % 2 == 0:
             speed = float(rng.choice([x for x in _SPEEDS if abs(x - speed) > 0.04]))
-            items.append(
-                mission_item(
-                    len(items), DO_CHANGE_SPEED, EXAM_HOME, params=(0.0, round(speed * limits.cruise, 1), -1.0)
-                )
-            )
+            params = (0.0, round(speed * limits.cruise, 1), -1.0)
+            items.append(mission_item(len(items), DO_CHANGE_SPEED, EXAM_HOME, params=params))
         if k == circle_at:
             radius = float(rng.choice([-1, 1])) * limits.circle
             items.append(mission_item(len(items), LOITER_TURNS, EXAM_HOME, waypoint, params=(1.0, 0.0, radius)))
@@ -76,7 +73,11 @@ def draw_exam_mission(
             items.append(mission_item(len(items), WAYPOINT, EXAM_HOME, waypoint))
     first = next(i.seq for i in items[1:] if i.command == WAYPOINT)
     items.append(mission_item(len(items), DO_JUMP, EXAM_HOME, params=(1.0, -1.0)))
-    return tuple(items), _start_before(rng, waypoints[0], waypoints[1], limits, first)
+    (n, e, d), (next_n, next_e, _) = waypoints[:2]
+    course = wrap(atan2(next_e - e, next_n - n) + rng.uniform(-0.6, 0.6))  # roughly towards the second waypoint
+    distance = 10.0 * limits.cruise
+    p = np.array([n - distance * cos(course), e - distance * sin(course), d])
+    return tuple(items), StartState(first, p, course)
 
 
 def _random_walk(rng: np.random.Generator, limits: MissionLimits, steep: bool) -> list[tuple[float, float, float]]:
@@ -99,21 +100,6 @@ def _random_walk(rng: np.random.Generator, limits: MissionLimits, steep: bool) -
         h = float(np.clip(h + slope_fraction * (climb if climbs else -sink), *limits.height))
         waypoints.append((n, e, -h))
     return waypoints
-
-
-def _start_before(
-    rng: np.random.Generator,
-    waypoint: tuple[float, ...],
-    next_waypoint: tuple[float, ...],
-    limits: MissionLimits,
-    seq: int,
-) -> StartState:
-    """Return a start state before the first waypoint, roughly in the direction of the second."""
-    course = wrap(atan2(next_waypoint[1] - waypoint[1], next_waypoint[0] - waypoint[0]) + rng.uniform(-0.6, 0.6))
-    distance = 10.0 * limits.cruise
-    return StartState(
-        seq, np.array([waypoint[0] - distance * cos(course), waypoint[1] - distance * sin(course), waypoint[2]]), course
-    )
 
 
 _AMPLITUDES = {  # aileron, elevator, rudder, throttle, fractions of full travel
@@ -146,10 +132,7 @@ SETTLE_S = 20.0  # simulated before the recording starts
 NOMINAL_S, EXAMINED_S = 210.0, 200.0
 NOMINAL_EXCITATION = (1.0, 0.8, 0.4, 0.0, 0.0)  # amplitude of the test pilot inputs on the nominal flights
 _ONSET_S, _TRANSIENT_START_S = (50.0, 110.0), (45.0, 140.0)
-_BASELINE_SETTINGS = {
-    "propulsion/engine/propeller-sense": 0.0,
-    "conceal/slipstream": 0.0,
-}  # zero except as a hidden effect
+_BASELINE_SETTINGS = {"propulsion/engine/propeller-sense": 0.0, "conceal/slipstream": 0.0}  # but as a hidden effect
 _EXTRA_PARAMS = {"c172p": {"KFF_RDDRMIX": 0.3}, "small": {}}  # otherwise its rudder hardly moves
 _W20_MPS = 1.5  # light turbulence
 _STEEP_SHARE = 0.35  # fraction of flights over the full height range
@@ -161,7 +144,7 @@ class FlightJob(NamedTuple):
     name: str  # file name without suffix
     airframe: str
     role: str
-    effects: tuple[str, ...]  # effects
+    effects: tuple[str, ...]  # names in `effects`
     number: int  # index in the blind test
     excitation: float = 0.0
 
@@ -174,7 +157,6 @@ class PlannedFlight(NamedTuple):
     flight_seed: int  # draws everything else
     hidden_faults: tuple[Fault, ...]
     steep: bool
-    w20_mps: float
     seconds: float
 
     def build_uav(self, faults: tuple[Fault, ...]) -> SimulatedUav:
@@ -195,7 +177,7 @@ class PlannedFlight(NamedTuple):
         """Draw the wind; none for the Cessna, where it has little effect."""
         mean, towards = rng.uniform(1.0, 5.0), rng.uniform(-pi, pi)
         mean = 0.0 if self.job.airframe == "c172p" else float(mean)
-        return Weather(mean, float(towards), exponent=0.0, drift=0.5, w20_mps=self.w20_mps)
+        return Weather(mean, float(towards), exponent=0.0, drift=0.5, w20_mps=_W20_MPS)
 
 
 def baseline_type(airframe: str) -> AircraftType:
@@ -211,7 +193,7 @@ def draw_flight(job: FlightJob, seed: int, attempt: int) -> PlannedFlight:
     hidden_faults = tuple(_draw_fault(rng, name, job.airframe) for name in job.effects)
     steep = "wind_shear" in job.effects or bool(rng.random() < _STEEP_SHARE)
     seconds = NOMINAL_S if job.role == "nominal" else EXAMINED_S
-    return PlannedFlight(job, seed, flight_seed, hidden_faults, steep, _W20_MPS, seconds)
+    return PlannedFlight(job, seed, flight_seed, hidden_faults, steep, seconds)
 
 
 def _draw_fault(rng: np.random.Generator, name: str, airframe: str) -> Fault:

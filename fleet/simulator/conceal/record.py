@@ -18,13 +18,8 @@ LOG_S = 0.1
 LOSS, FADES_S = 0.02, 45.0  # fraction of frames lost; mean time between two fades [s]
 _ATTITUDE = bytes((30, 0, 0))  # MAVLink message id
 _MAX_ALPHA = {"c172p": 0.20, "small": 0.21}  # maximum angle of attack with attached flow [rad]
-_MIN_HEIGHT_M, _MAX_BANK, _MAX_SIDESLIP, _SPEED_RANGE = (
-    30.0,
-    np.radians(75),
-    np.radians(16),
-    (0.72, 1.4),
-)  # speeds relative to cruise
-
+_MIN_HEIGHT_M, _MAX_BANK, _MAX_SIDESLIP = 30.0, np.radians(75), np.radians(16)
+_SPEED_RANGE = (0.72, 1.4)  # relative to cruise
 
 _LogRow = tuple[float, Truth, Estimate, tuple[int, ...]]
 

@@ -2,14 +2,13 @@
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from math import radians
+from math import exp, radians
 
 import numpy as np
 
-from fleet.simulator.faults.oddities import UNCATALOGUED
-from fleet.simulator.faults.physics import PHYSICS_FAULTS, WIND_FAULTS, Fault, FaultyPhysics
-from fleet.simulator.faults.servos import SERVO_FAULTS, SURFACES, Commands, ServoFault
-from fleet.simulator.vehicle.jsbsim import Aircraft
+from fleet.simulator.faults.physics import PHYSICS_FAULTS, TIMED_FAULTS, WIND_FAULTS, Fault
+from fleet.simulator.faults.servos import COMMAND_FAULTS, SERVO_FAULTS, SURFACES, CommandFault, Commands
+from fleet.simulator.vehicle.jsbsim import DT, Aircraft
 from fleet.simulator.vehicle.sensors import Estimate, pressure_at, pressure_height
 
 _BUFFER_S = 3.0  # length of the buffer of fixes
@@ -86,6 +85,22 @@ def _baro_bias(fault: Fault, dt: float) -> SensorFault:
     return apply
 
 
+def _gyro_scale(fault: Fault, dt: float) -> SensorFault:
+    return lambda e, share: e._replace(rates=e.rates * (1 + share * fault.values["scale"]))
+
+
+def _pitot_lag(fault: Fault, dt: float) -> SensorFault:
+    """Apply a first-order lag to the airspeed, as from water in the pitot line."""
+    state: list[float] = []
+
+    def apply(e: Estimate, intensity: float) -> Estimate:
+        previous, tau = state[0] if state else e.Va, intensity * fault.values["tau_s"]
+        state[:] = [e.Va + (previous - e.Va) * exp(-dt / tau) if tau > 0 else e.Va]
+        return e._replace(Va=state[0])
+
+    return apply
+
+
 SENSOR_FAULTS: dict[str, Callable[[Fault, float], SensorFault]] = {
     "airspeed_scale": _airspeed_scale,
     "airspeed_bias": _airspeed_bias,
@@ -95,14 +110,18 @@ SENSOR_FAULTS: dict[str, Callable[[Fault, float], SensorFault]] = {
     "accel_bias": _accel_bias,
     "heading_bias": _heading_bias,
     "baro_bias": _baro_bias,
+    "_gyro_scale": _gyro_scale,
+    "_pitot_lag": _pitot_lag,
 }
 
 
 class FaultSet:
     """Faults of one aircraft."""
 
-    def __init__(self, faults: Sequence[Fault], aircraft: Aircraft, tick_s: float, estimate_s: float):
-        """Assign each fault to physics, wind, estimate or commands.
+    def __init__(
+        self, faults: Sequence[Fault], aircraft: Aircraft, tick_s: float = DT, estimate_s: float = 2 * DT
+    ) -> None:
+        """Assign each fault to physics, wind, estimate or commands, and store the nominal properties.
 
         Args:
             faults: faults of the aircraft
@@ -110,47 +129,45 @@ class FaultSet:
             tick_s: time between two calls of `apply_to_commands` [s]
             estimate_s: time between two calls of `apply_to_estimate` [s]
         """
-        self.faults = faults
-        uncatalogued = [
-            (fault, UNCATALOGUED[fault.name](fault.values, aircraft)) for fault in faults if fault.name in UNCATALOGUED
-        ]
-        self._physics_functions = [(fault, oddity.apply_to_physics) for fault, oddity in uncatalogued]
-        self._servo_functions = [
-            (f, _on_one_surface(f, SERVO_FAULTS[f.name](f.values, tick_s))) for f in faults if f.name in SERVO_FAULTS
-        ]
-        self._servo_functions += [(fault, oddity.apply_to_commands) for fault, oddity in uncatalogued]
-        self._sensor_functions = [
-            (fault, SENSOR_FAULTS[fault.name](fault, estimate_s)) for fault in faults if fault.name in SENSOR_FAULTS
-        ]
-        self._sensor_functions += [(fault, oddity.apply_to_estimate) for fault, oddity in uncatalogued]
-        self._physics = FaultyPhysics(
-            [fault for fault in faults if fault.name in PHYSICS_FAULTS or fault.name in WIND_FAULTS], aircraft
-        )
+        self._aircraft = aircraft
+        self._winds = [fault for fault in faults if fault.name in WIND_FAULTS]
+        self._increments = [(f, PHYSICS_FAULTS[f.name](aircraft, f.values)) for f in faults if f.name in PHYSICS_FAULTS]
+        self._nominal = {name: aircraft[name] for _, increments in self._increments for name in increments}
+        self._timed = [(f, TIMED_FAULTS[f.name](aircraft, f.values)) for f in faults if f.name in TIMED_FAULTS]
+        self._commands = [(f, _on_one_surface(f, tick_s)) for f in faults if f.name in SERVO_FAULTS]
+        self._commands += [(f, COMMAND_FAULTS[f.name](f.values)) for f in faults if f.name in COMMAND_FAULTS]
+        self._sensors = [(f, SENSOR_FAULTS[f.name](f, estimate_s)) for f in faults if f.name in SENSOR_FAULTS]
         self.command_changes = {fault: np.zeros(4) for fault in faults}  # last change of the commands by each fault
-        self.estimate_changes = {
-            fault: np.zeros(14) for fault in faults
-        }  # last change of the estimate, see `estimate_vector`
+        self.estimate_changes = {fault: np.zeros(14) for fault in faults}  # of the estimate, see `estimate_vector`
 
     def apply_to_physics(self, t: float, excluding: Fault | None = None) -> None:
-        """Apply the physics faults, all or all but one."""
-        self._physics.apply(t, excluding)
-        for fault, apply in self._physics_functions:
+        """Set the JSBSim properties for `t` [s], optionally excluding one fault."""
+        values = dict(self._nominal)
+        for fault, increments in self._increments:
+            intensity = 0.0 if fault is excluding else fault.intensity(t)
+            for name, increment in increments.items():
+                values[name] += intensity * increment
+        for name, value in values.items():
+            if self._aircraft[name] != value:
+                self._aircraft[name] = value
+        for fault, apply in self._timed:
             apply(t, 0.0 if fault is excluding else fault.intensity(t))
 
     def wind(self, t: float, height: float) -> np.ndarray:
-        """Return the wind added, NED, (3,) [m/s]."""
-        return self._physics.wind(t, height)
+        """Return the wind added at `t` [s] and `height` above home [m], NED, (3,) [m/s]."""
+        winds = [fault.intensity(t) * WIND_FAULTS[fault.name](fault.values, height) for fault in self._winds]
+        return np.sum([np.zeros(3), *winds], axis=0)
 
     def apply_to_estimate(self, t: float, e: Estimate) -> Estimate:
         """Return the estimate with sensor faults."""
-        for fault, apply in self._sensor_functions:
+        for fault, apply in self._sensors:
             original, e = e, apply(e, fault.intensity(t))
             self.estimate_changes[fault] = estimate_vector(e) - estimate_vector(original)
         return e
 
     def apply_to_commands(self, t: float, commands: Commands) -> Commands:
         """Return surface and motor positions with servo faults."""
-        for fault, apply in self._servo_functions:
+        for fault, apply in self._commands:
             original, commands = commands, apply(t, fault.intensity(t), commands)
             self.command_changes[fault] = np.subtract(commands, original)
         return commands
@@ -161,9 +178,9 @@ def estimate_vector(e: Estimate) -> np.ndarray:
     return np.concatenate([e.rates, e.force, e.euler, e.v, [e.Va, -e.p[2]]])
 
 
-def _on_one_surface(fault: Fault, servo_fault: ServoFault) -> Callable[[float, float, Commands], Commands]:
+def _on_one_surface(fault: Fault, dt: float) -> CommandFault:
     """Apply a servo fault to its surface only."""
-    i = SURFACES.index(fault.part)
+    i, servo_fault = SURFACES.index(fault.part), SERVO_FAULTS[fault.name](fault.values, dt)
 
     def apply(t: float, intensity: float, commands: Commands) -> Commands:
         deltas = list(commands)

@@ -1,15 +1,16 @@
 """A fault in time, and faults of the physics: increments of JSBSim properties and of the wind.
 
-`vehicle.altered` defines the properties conceal/*.
+`vehicle.altered` defines the properties conceal/*. Faults whose name begins with _ are not in the catalogue: only a
+blind test uses them, and a diagnosis must report them as unknown.
 """
 
 from collections.abc import Callable, Mapping
-from math import cbrt, cos, inf, pi, radians, sin
+from math import cbrt, cos, exp, inf, pi, radians, sin
 from typing import NamedTuple
 
 import numpy as np
 
-from fleet.simulator.vehicle.jsbsim import KG_TO_LB, Aircraft
+from fleet.simulator.vehicle.jsbsim import DT, KG_TO_LB, Aircraft
 from fleet.simulator.vehicle.weather import FT, REFERENCE_M
 
 
@@ -120,30 +121,54 @@ WIND_FAULTS: dict[str, Callable[[Mapping[str, float], float], np.ndarray]] = {
 }
 """(values, height above home [m]) to wind added, NED, (3,) [m/s]."""
 
+TimedFault = Callable[[float, float], None]
+"""Change the aircraft at a time [s] with an intensity of the fault; may have state."""
 
-class FaultyPhysics:
-    """Physics faults of one aircraft."""
 
-    def __init__(self, faults: list[Fault], aircraft: Aircraft):
-        """Store the nominal properties; the aircraft is started already."""
-        self._aircraft = aircraft
-        self._winds = [fault for fault in faults if fault.name in WIND_FAULTS]
-        physics_faults = [fault for fault in faults if fault.name in PHYSICS_FAULTS]
-        self._changes = [(fault, PHYSICS_FAULTS[fault.name](aircraft, fault.values)) for fault in physics_faults]
-        self._nominal = {name: aircraft[name] for _, change in self._changes for name in change}
+def _surging_engine(aircraft: Aircraft, values: Mapping[str, float]) -> TimedFault:
+    """Modulate the thrust with a sine."""
+    name = aircraft.kind.thrust_property
+    nominal = aircraft[name]
 
-    def apply(self, t: float, excluding: Fault | None = None) -> None:
-        """Set the JSBSim properties for `t` [s], optionally excluding one fault."""
-        values = dict(self._nominal)
-        for fault, change in self._changes:
-            intensity = 0.0 if fault is excluding else fault.intensity(t)
-            for name, full_change in change.items():
-                values[name] += intensity * full_change
-        for name, value in values.items():
-            if self._aircraft[name] != value:
-                self._aircraft[name] = value
+    def apply(t: float, intensity: float) -> None:
+        modulation = intensity * values["fraction"] * sin(2 * pi * values["hertz"] * t)
+        aircraft[name] = nominal * (1 + modulation)
 
-    def wind(self, t: float, height: float) -> np.ndarray:
-        """Return the wind added at `t` [s] and `height` above home [m], NED, (3,) [m/s]."""
-        winds = [fault.intensity(t) * WIND_FAULTS[fault.name](fault.values, height) for fault in self._winds]
-        return np.sum([np.zeros(3), *winds], axis=0)
+    return apply
+
+
+def _scaled_derivatives(aircraft: Aircraft, values: Mapping[str, float]) -> TimedFault:
+    """Scale derivatives of the airframe."""
+    prefix = "conceal" if aircraft.kind.from_jsbsim else "vary"
+    nominal = {f"{prefix}/{name}": (aircraft[f"{prefix}/{name}"], factor) for name, factor in values.items()}
+
+    def apply(t: float, intensity: float) -> None:
+        for name, (value, factor) in nominal.items():
+            aircraft[name] = value * (1 + intensity * (factor - 1))
+
+    return apply
+
+
+def _sloshing_tank(aircraft: Aircraft, values: Mapping[str, float]) -> TimedFault:
+    """Move a loose payload aft when the aircraft pitches up or accelerates, with a first-order lag."""
+    location = f"inertia/pointmass-location-X-inches{aircraft.kind.sliding_index}"
+    nominal, x = aircraft[location], 0.0  # [in]; displacement aft [m]
+
+    def apply(t: float, intensity: float) -> None:
+        nonlocal x
+        acceleration = aircraft["accelerations/a-pilot-x-ft_sec2"] * FT
+        limit, gain = values["most_m"], values["m_per_mps2"]
+        equilibrium = min(max(gain * acceleration, -limit), limit)
+        x = equilibrium + (x - equilibrium) * exp(-DT / values["tau_s"])
+        aircraft[location] = nominal + intensity * x / _INCH
+
+    return apply
+
+
+TIMED_FAULTS: dict[str, Callable[[Aircraft, Mapping[str, float]], TimedFault]] = {
+    "_torn_fin": _scaled_derivatives,
+    "_roll_damping": _scaled_derivatives,
+    "_pitch_damping": _scaled_derivatives,
+    "_surging_engine": _surging_engine,
+    "_sloshing_tank": _sloshing_tank,
+}

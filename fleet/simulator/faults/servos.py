@@ -5,7 +5,7 @@ Commands and surfaces are fractions of full travel, -1..1, + rolls right, pitche
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from math import exp
+from math import exp, pi, sin
 
 SURFACES = ("aileron", "elevator", "rudder")
 _BUFFER_S = 2.0  # length of the buffer of commands
@@ -99,3 +99,32 @@ SERVO_FAULTS: dict[str, Callable[[Mapping[str, float], float], ServoFault]] = {
 
 Commands = tuple[float, float, float, float]
 """delta_a, delta_e, delta_r, delta_t."""
+CommandFault = Callable[[float, float, Commands], Commands]
+"""(time [s], intensity of the fault, commands) to surfaces and motor."""
+
+
+def _crossed_linkage(values: Mapping[str, float]) -> CommandFault:
+    """Couple the rudder to the aileron."""
+
+    def apply(t: float, intensity: float, commands: Commands) -> Commands:
+        a, e, r, thrust = commands
+        return a, e, min(max(r + intensity * values["gain"] * a, -1.0), 1.0), thrust
+
+    return apply
+
+
+def _loose_hinge(values: Mapping[str, float]) -> CommandFault:
+    """Add an elevator oscillation independent of the command."""
+
+    def apply(t: float, intensity: float, commands: Commands) -> Commands:
+        a, e, r, thrust = commands
+        return a, e + intensity * values["half_width"] * sin(2 * pi * values["hertz"] * t), r, thrust
+
+    return apply
+
+
+COMMAND_FAULTS: dict[str, Callable[[Mapping[str, float]], CommandFault]] = {
+    "_crossed_linkage": _crossed_linkage,
+    "_loose_hinge": _loose_hinge,
+}
+"""Faults that are no property of one servo."""

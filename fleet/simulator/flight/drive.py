@@ -10,6 +10,7 @@ from threading import Event
 from typing import BinaryIO
 
 import numpy as np
+from rich.progress import Progress
 
 from fleet.simulator.flight.uav import SimulatedUav
 
@@ -72,7 +73,7 @@ def to_tlog(
     seconds: float,
     loss: float,
     seed: int,
-    progress: Callable[[float], None] = lambda _: None,
+    title: str = "",
     stop: Event | None = None,
 ) -> int:
     """Simulate as fast as possible into a .tlog: records of 8 bytes microseconds since 1970, big endian, and one frame.
@@ -85,21 +86,22 @@ def to_tlog(
         seconds: duration [s]
         loss: fraction of frames lost
         seed: seed of losses and delays
-        progress: called with the simulated time [s]
+        title: of the progress bar; empty: none
         stop: stops the simulation early
     Returns:
         number of frames written
     """
     links = [RadioLink(np.random.default_rng((seed, 6, uav.uav_id)), loss) for uav in uavs]
     written = 0
-    with path.open("wb") as file:
+    with path.open("wb") as file, Progress(transient=True, disable=not title) as bar:
+        task = bar.add_task(title, total=seconds)
         written += write(file, [(0.0, frame) for uav in uavs for frame in uav.initial_frames()])
         for k in range(1, int(seconds) + 1):
             received: list[tuple[float, bytes]] = []
             for uav, link in zip(uavs, links, strict=True):
                 received += _fly_until(uav, link, float(k))
             written += write(file, received)
-            progress(float(k))
+            bar.update(task, completed=k)
             if stop is not None and stop.is_set():
                 break
     return written
@@ -178,9 +180,7 @@ class _SimulationClock:
     def __init__(self, start: float, log: Callable[[str], None]) -> None:
         self.t = 0.0  # simulated time [s]
         self._start, self._log = start, log
-        self._slow_since: tuple[float, float] | None = (
-            None  # simulated and real time at the start of slow operation [s]
-        )
+        self._slow_since: tuple[float, float] | None = None  # simulated and real time at its start [s]
         self._reported = False
 
     def due(self, now: float) -> float:

@@ -88,46 +88,31 @@ class MavlinkEndpoint:
         return param_value_message(name, self._params[name], (len(self._names), index_field), self._dialect)
 
     def _param_list(self, message: Any, t: float) -> list[Any]:
-        del message, t
         self._pending_params = deque(range(len(self._names)))
         return []
 
     def _param_read(self, message: Any, t: float) -> list[Any]:
-        del t
         if message.param_index >= 0:
             return [self._param(message.param_index)] if message.param_index < len(self._names) else []
         name = message.param_id
         return [self._param(self._names.index(name), by_name=True)] if name in self._params else []
 
     def _mission_list(self, message: Any, t: float) -> list[Any]:
-        del t
         count = len(self._items) if message.mission_type == 0 else 0  # neither geofence nor rally points
         return [mav.MAVLink_mission_count_message(*_sender(message), count, message.mission_type)]
 
     def _mission_item(self, message: Any, t: float) -> list[Any]:
-        del t
         if message.mission_type != 0 or message.seq >= len(self._items):
             result = mav.MAV_MISSION_INVALID_SEQUENCE
             return [mav.MAVLink_mission_ack_message(*_sender(message), result, message.mission_type)]
         item = self._items[message.seq]
-        head = (
-            *_sender(message),
-            item.seq,
-            item.frame,
-            item.command,
-            0,
-            1,
-            item.param1,
-            item.param2,
-            item.param3,
-            item.param4,
-        )
+        params = (item.param1, item.param2, item.param3, item.param4)
+        head = (*_sender(message), item.seq, item.frame, item.command, 0, 1, *params)
         if message.get_type() == "MISSION_REQUEST_INT":
             return [mav.MAVLink_mission_item_int_message(*head, item.lat_e7, item.lon_e7, item.alt_m)]
         return [mav.MAVLink_mission_item_message(*head, item.lat_e7 * 1e-7, item.lon_e7 * 1e-7, item.alt_m)]
 
     def _command(self, message: Any, t: float) -> list[Any]:
-        del t
         version_id = mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION
         is_version_request = message.command == mav.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES or (
             message.command == mav.MAV_CMD_REQUEST_MESSAGE and message.param1 == version_id  # may be nan
@@ -135,14 +120,14 @@ class MavlinkEndpoint:
         accepted = is_version_request or message.command == mav.MAV_CMD_SET_MESSAGE_INTERVAL  # rates are fixed
         result = mav.MAV_RESULT_ACCEPTED if accepted else mav.MAV_RESULT_UNSUPPORTED
         ack = mav.MAVLink_command_ack_message(message.command, result, 0, 0, *_sender(message))
-        return [ack, self._version()] if is_version_request else [ack]
-
-    def _version(self) -> Any:
-        zeros = [0] * 8
-        uid = self._out.srcSystem
-        return mav.MAVLink_autopilot_version_message(
-            _CAPABILITIES, self._dialect.version, 0, 0, 0, zeros, zeros, zeros, 0, 0, uid
-        )
+        if not is_version_request:
+            return [ack]
+        zeros, uid = [0] * 8, self._out.srcSystem
+        version = self._dialect.version
+        return [
+            ack,
+            mav.MAVLink_autopilot_version_message(_CAPABILITIES, version, 0, 0, 0, zeros, zeros, zeros, 0, 0, uid),
+        ]
 
     def _timesync(self, message: Any, t: float) -> list[Any]:
         return [mav.MAVLink_timesync_message(round(t * 1e9), message.ts1)] if message.tc1 == 0 else []
@@ -163,21 +148,15 @@ _HANDLERS: dict[str, Callable[[MavlinkEndpoint, Any, float], list[Any]]] = {
 }
 
 
-class MavlinkGroundStation:
-    """Requests at the start of a recording, so that it contains mission and parameters."""
-
-    def __init__(self, system: int):
-        """Create a ground station that addresses `system`."""
-        self._mav = mav.MAVLink(None, srcSystem=255, srcComponent=mav.MAV_COMP_ID_MISSIONPLANNER)
-        self._target = (system, COMPONENT)
-
-    def requests(self, items: int) -> list[bytes]:
-        """Return requests for the version, every mission item and the parameter list, in this order."""
-        version = (mav.MAV_CMD_REQUEST_MESSAGE, 0, mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION, 0, 0, 0, 0, 0, 0)
-        messages = [
-            mav.MAVLink_command_long_message(*self._target, *version),
-            mav.MAVLink_mission_request_list_message(*self._target),
-            *(mav.MAVLink_mission_request_int_message(*self._target, seq) for seq in range(items)),
-            mav.MAVLink_param_request_list_message(*self._target),
-        ]
-        return [bytes(message.pack(self._mav)) for message in messages]
+def ground_requests(system: int, items: int) -> list[bytes]:
+    """Return a ground station's requests to `system`: version, every mission item, parameter list, in this order."""
+    ground = mav.MAVLink(None, srcSystem=255, srcComponent=mav.MAV_COMP_ID_MISSIONPLANNER)
+    target = (system, COMPONENT)
+    version = (mav.MAV_CMD_REQUEST_MESSAGE, 0, mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION, 0, 0, 0, 0, 0, 0)
+    messages = [
+        mav.MAVLink_command_long_message(*target, *version),
+        mav.MAVLink_mission_request_list_message(*target),
+        *(mav.MAVLink_mission_request_int_message(*target, seq) for seq in range(items)),
+        mav.MAVLink_param_request_list_message(*target),
+    ]
+    return [bytes(message.pack(ground)) for message in messages]

@@ -92,7 +92,6 @@ def _mission_current(f: TelemetryState) -> Any:
 
 
 def _heartbeat(f: TelemetryState) -> Any:
-    del f
     return mav.MAVLink_heartbeat_message(
         mav.MAV_TYPE_FIXED_WING, mav.MAV_AUTOPILOT_ARDUPILOTMEGA, _ARMED, AUTO, mav.MAV_STATE_ACTIVE, 3
     )
@@ -107,7 +106,6 @@ def _sys_status(f: TelemetryState) -> Any:
 
 
 def _heartbeat_px4(f: TelemetryState) -> Any:
-    del f
     mode = _ARMED | mav.MAV_MODE_FLAG_AUTO_ENABLED
     return mav.MAVLink_heartbeat_message(
         mav.MAV_TYPE_FIXED_WING, mav.MAV_AUTOPILOT_PX4, mode, MISSION, mav.MAV_STATE_ACTIVE, 3
@@ -151,21 +149,10 @@ def _pressure(f: TelemetryState) -> Any:
 
 def _gps_raw(f: TelemetryState) -> Any:
     height = f.home[2] + round(f.estimate.gps_height * 1e3)
-    ground_speed, course = (
-        hypot(f.estimate.v[0], f.estimate.v[1]),
-        round(degrees(atan2(f.estimate.v[1], f.estimate.v[0])) * 100) % 36_000,
-    )
-    return mav.MAVLink_gps_raw_int_message(
-        round(f.t * 1e6),
-        mav.GPS_FIX_TYPE_3D_FIX,
-        *f.position[:2],
-        height,
-        80,
-        120,
-        round(ground_speed * 100),
-        course,
-        14,
-    )
+    ground_speed = round(hypot(f.estimate.v[0], f.estimate.v[1]) * 100)
+    course = round(degrees(atan2(f.estimate.v[1], f.estimate.v[0])) * 100) % 36_000
+    fix = (mav.GPS_FIX_TYPE_3D_FIX, *f.position[:2], height)
+    return mav.MAVLink_gps_raw_int_message(round(f.t * 1e6), *fix, 80, 120, ground_speed, course, 14)
 
 
 MessageSchedule = tuple[tuple[float, int, Callable[[TelemetryState], Any]], ...]
@@ -207,12 +194,7 @@ TELEMETRY_ONBOARD: MessageSchedule = (  # onboard log, without the bandwidth lim
     (1, 11, _mission_current),
     (1, 23, _heartbeat),
 )
-_INTEGER_PARAMS = (
-    "PWM_MAIN_",
-    "CA_SV_CS",
-    "FW_ARSP_SCALE_EN",
-    "NPFG_LB_PERIOD",
-)  # prefixes of integer parameters of PX4
+_INTEGER_PARAMS = ("PWM_MAIN_", "CA_SV_CS", "FW_ARSP_SCALE_EN", "NPFG_LB_PERIOD")  # PX4, name prefixes
 
 
 class MavlinkDialect(NamedTuple):
@@ -227,8 +209,6 @@ DIALECTS = {
     "ardupilot": MavlinkDialect(TELEMETRY, 0x040600FF, ()),  # 4.6.0, official release
     "px4": MavlinkDialect(TELEMETRY_PX4, 0x011000FF, _INTEGER_PARAMS),  # 1.16.0
 }
-
-
 ONBOARD_DIALECT = MavlinkDialect(TELEMETRY_ONBOARD, 0x040600FF, ())
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fleet.autopilots import arduplane, px4_fixedwing
-from fleet.simulator.vehicle.sensors import Servos
+from fleet.simulator.vehicle.sensors import MOTOR_FULL, MOTOR_IDLE, SERVO_HIGH, SERVO_LOW, SERVO_TRIM
 from fleet.simulator.vehicle.types import CRUISE
 
 
@@ -197,9 +197,9 @@ def _outputs_arduplane() -> dict[str, float]:
     for output, function in _FUNCTIONS.items():
         motor = function == 70
         values[f"SERVO{output}_FUNCTION"] = float(function)
-        values[f"SERVO{output}_MIN"] = float(Servos.IDLE if motor else Servos.LOW)
-        values[f"SERVO{output}_MAX"] = float(Servos.FULL if motor else Servos.HIGH)
-        values[f"SERVO{output}_TRIM"] = float(Servos.IDLE if motor else Servos.TRIM)
+        values[f"SERVO{output}_MIN"] = float(MOTOR_IDLE if motor else SERVO_LOW)
+        values[f"SERVO{output}_MAX"] = float(MOTOR_FULL if motor else SERVO_HIGH)
+        values[f"SERVO{output}_TRIM"] = float(MOTOR_IDLE if motor else SERVO_TRIM)
         values[f"SERVO{output}_REVERSED"] = 0.0
     return values
 
@@ -209,6 +209,6 @@ def _outputs_px4() -> dict[str, float]:
     for output, (function, _) in _PX4_OUTPUTS.items():
         motor = function == 101
         values[f"PWM_MAIN_FUNC{output}"] = float(function)
-        values[f"PWM_MAIN_MIN{output}"] = float(Servos.IDLE if motor else Servos.LOW)
-        values[f"PWM_MAIN_MAX{output}"] = float(Servos.FULL if motor else Servos.HIGH)
+        values[f"PWM_MAIN_MIN{output}"] = float(MOTOR_IDLE if motor else SERVO_LOW)
+        values[f"PWM_MAIN_MAX{output}"] = float(MOTOR_FULL if motor else SERVO_HIGH)
     return values | {f"CA_SV_CS{function - 201}_TYPE": float(kind) for function, kind in _PX4_OUTPUTS.values() if kind}

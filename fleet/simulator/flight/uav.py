@@ -14,20 +14,22 @@ from fleet.contract import Item
 from fleet.frames import G, Origin, to_geodetic
 from fleet.simulator.faults.carried import FaultSet
 from fleet.simulator.faults.physics import Fault
-from fleet.simulator.flight.mavlink import MAX_AIRCRAFT, TICK_HZ, MavlinkEndpoint, MavlinkGroundStation
+from fleet.simulator.flight.mavlink import MAX_AIRCRAFT, TICK_HZ, MavlinkEndpoint, ground_requests
 from fleet.simulator.flight.mavlink_messages import DIALECTS, ONBOARD_DIALECT, TelemetryState
 from fleet.simulator.flight.tuning import tuned_parameters
 from fleet.simulator.vehicle.altered import instrumented_type
-from fleet.simulator.vehicle.jsbsim import Aircraft, Gusts
+from fleet.simulator.vehicle.jsbsim import Aircraft
 from fleet.simulator.vehicle.missions import HOME, StartState, draw_mission
-from fleet.simulator.vehicle.sensors import AltitudeSensors, Estimate, Sensors, Servos, WindEstimator
+from fleet.simulator.vehicle.sensors import Estimate, Sensors, servo_commands, servo_pulses
 from fleet.simulator.vehicle.types import TYPES, FlightSetup, Weather
+from fleet.simulator.vehicle.weather import GaussMarkov
 
 DT = 1 / TICK_HZ
 _INNER, _OUTER = 2, 10  # attitude loop at 50 Hz, guidance at 10 Hz [ticks]
 _LEGS_AHEAD = 200
 _LAWS = {"ardupilot": "arduplane", "px4": "px4"}
 JITTER_S = 0.001  # jitter of onboard time stamps [s]
+_WIND_STD, _WIND_S = np.full(2, 0.4), np.full(2, 60.0)  # error of the wind estimate, north and east [m/s, s]
 _MIN_HEIGHT_M = 3.0  # height above home below which the flight ends
 
 
@@ -85,24 +87,25 @@ class SimulatedUav:
         self.tick = 0
         self.crashed = False  # reached the ground
         self._wind = setup.weather.wind(rng, DT * _OUTER)
-        is_exam = setup.is_exam
-        self._sensors = Sensors(rng, DT * _INNER, np.random.default_rng((aircraft_seed, 9)) if is_exam else None)
-        self._wind_estimator = WindEstimator(np.random.default_rng((setup.flight_seed, 8)), DT * _OUTER)
-        self._altitude_sensors = (
-            AltitudeSensors(np.random.default_rng((setup.flight_seed, 10)), DT * _INNER) if is_exam else None
-        )
-        self._jitter = np.random.default_rng((setup.flight_seed, 11)) if is_exam else None
-        self._endpoint = MavlinkEndpoint(
-            uav_id + 1, self.items, self.params, ONBOARD_DIALECT if is_exam else DIALECTS[autopilot]
-        )
-        gusts = Gusts(setup.flight_seed, setup.weather.w20_fps)
+        scale_rng = altitude_rng = self._jitter = None
+        dialect = DIALECTS[autopilot]
+        if setup.is_exam:
+            scale_rng = np.random.default_rng((aircraft_seed, 9))
+            altitude_rng = np.random.default_rng((setup.flight_seed, 10))
+            self._jitter = np.random.default_rng((setup.flight_seed, 11))
+            dialect = ONBOARD_DIALECT
+        self._sensors = Sensors(rng, DT * _INNER, scale_rng, altitude_rng)
+        wind_rng = np.random.default_rng((setup.flight_seed, 8))
+        self._wind_error = GaussMarkov(wind_rng, _WIND_STD, _WIND_S, DT * _OUTER)
+        self._endpoint = MavlinkEndpoint(uav_id + 1, self.items, self.params, dialect)
+        gusts = (setup.flight_seed, setup.weather.w20_fps)
         self.aircraft = Aircraft(origin, aircraft_seed, setup.weather.severity, setup.kind, gusts)
         mean_wind = self._wind.step(-start.p[2])
-        self._wind_estimate = self._wind_estimator.measure(mean_wind)
+        self._wind_estimate = self._estimate_wind(mean_wind)
         self._phi_c = 0.0
         self._theta_c, delta_e, self._delta_t = self.aircraft.start(start.p, start.psi, setup.kind.cruise, mean_wind)
         self.fault_set = FaultSet(faults, self.aircraft, DT, DT * _INNER) if faults else None
-        self.pulses = Servos.pulses(0.0, delta_e, 0.0, self._delta_t)
+        self.pulses = servo_pulses(0.0, delta_e, 0.0, self._delta_t)
         self.estimate: Estimate = self._measure()
         self._engage(start.seq)
 
@@ -133,7 +136,7 @@ class SimulatedUav:
 
     def initial_frames(self) -> list[bytes]:
         """Return the frames for the start of a recording: version, mission, parameters."""
-        requests = MavlinkGroundStation(self.uav_id + 1).requests(len(self.items))
+        requests = ground_requests(self.uav_id + 1, len(self.items))
         replies = [frame for request in requests for frame in self.receive(request)]
         return replies + self._endpoint.stream_parameters(len(self.params))
 
@@ -149,7 +152,7 @@ class SimulatedUav:
             self._control()
         if self.fault_set is not None:
             self.fault_set.apply_to_physics(self.tick * DT)
-            self.aircraft.set_controls(*self.fault_set.apply_to_commands(self.tick * DT, Servos.commands(self.pulses)))
+            self.aircraft.set_controls(*self.fault_set.apply_to_commands(self.tick * DT, servo_commands(self.pulses)))
         frames = self._endpoint.telemetry(self.tick, self._telemetry_state)
         self.aircraft.step()
         self.tick += 1
@@ -162,15 +165,16 @@ class SimulatedUav:
         if self.fault_set is not None:
             w_n, w_e, w_d = wind + self.fault_set.wind(self.tick * DT, height)
             wind = float(w_n), float(w_e), float(w_d)
-        self._wind_estimate = self._wind_estimator.measure(wind[:2])
+        self._wind_estimate = self._estimate_wind(wind[:2])
         self.aircraft.set_wind(*wind)
+
+    def _estimate_wind(self, wind: tuple[float, float]) -> tuple[float, float]:
+        error = self._wind_error.step()
+        return wind[0] + float(error[0]), wind[1] + float(error[1])
 
     def _measure(self) -> Estimate:
         """Return the state estimate including faults."""
-        truth = self.aircraft.truth()
-        e = self._sensors.measure(truth)
-        if self._altitude_sensors is not None:
-            e = self._altitude_sensors.measure(e, truth)
+        e = self._sensors.measure(self.aircraft.truth())
         return e if self.fault_set is None else self.fault_set.apply_to_estimate(self.tick * DT, e)
 
     def _control(self) -> None:
@@ -184,26 +188,17 @@ class SimulatedUav:
                 self._ctl, self._par, self._legs, e.p, e.v, e.euler, e.Va, Va_dot, DT * _OUTER
             )
             if self._ctl[memory.LEG] >= len(self._legs) - 2:
-                self._extend_route()
+                self._legs, _ = self._route(int(self.leg[legs_of.SEQ]))  # the mission is endless
+                self._ctl[memory.LEG] = 0
         delta_a, delta_e, delta_r = laws.stabilise(
             self._ctl, self._par, self._phi_c, self._theta_c, e.euler, e.rates, e.Va, DT * _INNER
         )
-        commands = (delta_a, delta_e, delta_r, self._delta_t)
+        delta_t = self._delta_t
         if self.setup.pilot is not None:
-            pilot_deltas = self.setup.pilot(self.tick * DT)
-            commands = (
-                delta_a + pilot_deltas[0],
-                delta_e + pilot_deltas[1],
-                delta_r + pilot_deltas[2],
-                self._delta_t + pilot_deltas[3],
-            )
-        self.pulses = Servos.pulses(*commands)
-        self.aircraft.set_controls(*Servos.commands(self.pulses))
-
-    def _extend_route(self) -> None:
-        """Extend the legs of the endless mission without changing the controller state."""
-        self._legs, _ = self._route(int(self.leg[legs_of.SEQ]))
-        self._ctl[memory.LEG] = 0
+            a, b, r, t = self.setup.pilot(self.tick * DT)
+            delta_a, delta_e, delta_r, delta_t = delta_a + a, delta_e + b, delta_r + r, delta_t + t
+        self.pulses = servo_pulses(delta_a, delta_e, delta_r, delta_t)
+        self.aircraft.set_controls(*servo_commands(self.pulses))
 
     def _telemetry_state(self) -> TelemetryState:
         e, leg = self.estimate, self.leg

@@ -12,7 +12,7 @@ import jsbsim
 import numpy as np
 
 from fleet.frames import Origin, to_ned
-from fleet.simulator.vehicle.types import CRUISE, TYPES, AircraftType
+from fleet.simulator.vehicle.types import TYPES, AircraftType
 from fleet.simulator.vehicle.weather import FT, wind_at_20ft
 
 DT = 0.01  # physics step [s]
@@ -30,7 +30,6 @@ _READ_PROPERTIES = (
 _SURFACES = ("fcs/aileron-cmd-norm", "fcs/elevator-cmd-norm", "fcs/rudder-cmd-norm")
 _MIXTURE = 0.87  # mixture of a piston engine at these heights [-]
 _HERE = Path(__file__).parent
-__all__ = ["CRUISE", "DT", "Aircraft", "Truth"]
 
 
 class Truth(NamedTuple):
@@ -49,13 +48,6 @@ class Truth(NamedTuple):
     T: float  # of the air outside [K]
 
 
-class Gusts(NamedTuple):
-    """Turbulence of one flight."""
-
-    seed: int  # random seed
-    w20_fps: float  # wind at 20 ft, sets the intensity below 1000 ft
-
-
 class Aircraft:
     """One JSBSim aircraft with random variations of its parameters."""
 
@@ -65,7 +57,7 @@ class Aircraft:
         seed: int,
         turbulence: int = 0,
         kind: AircraftType = TYPES["small"],
-        gusts: Gusts | None = None,
+        gusts: tuple[int, float] | None = None,
     ):
         """Load the model and draw its variations.
 
@@ -74,7 +66,7 @@ class Aircraft:
             seed: seed of mass, coefficients and turbulence
             turbulence: MIL-F-8785C severity, 0..7
             kind: aircraft type
-            gusts: seed and intensity of turbulence, instead of those of the severity
+            gusts: seed of turbulence, and wind at 20 ft that sets it below 1000 ft [ft/s]; None: from the severity
         Raises:
             RuntimeError: when JSBSim cannot load its aircraft file; reinstall the package.
         """
@@ -92,7 +84,7 @@ class Aircraft:
             self._fdm[name] = value
         self._draw_variations(np.random.default_rng((seed, 1)))
         self._turbulence = turbulence
-        self._gusts = gusts or Gusts(seed, wind_at_20ft(turbulence))
+        self._gust_seed, self._w20_fps = gusts or (seed, wind_at_20ft(turbulence))
 
     def _draw_variations(self, rng: np.random.Generator) -> None:
         self.payload_kg = rng.uniform(*self.kind.payload_kg)
@@ -114,7 +106,7 @@ class Aircraft:
             theta [rad], delta_e, delta_t at trim
         """
         fdm = self._fdm
-        fdm["simulation/randomseed"] = self._gusts.seed % 2**31
+        fdm["simulation/randomseed"] = self._gust_seed % 2**31
         fdm["ic/terrain-elevation-ft"] = self._origin.alt_mm * 1e-3 / FT
         fdm["ic/lat-geod-deg"] = self._origin.lat_e7 * 1e-7 + degrees(p[0] / self._per_rad[0])
         fdm["ic/long-gc-deg"] = self._origin.lon_e7 * 1e-7 + degrees(p[1] / self._per_rad[1])
@@ -128,7 +120,7 @@ class Aircraft:
         fdm["ic/ve-fps"] = (Va * sin(psi) + wind[1]) / FT
         fdm["ic/vd-fps"] = 0.0
         fdm["atmosphere/turb-type"] = 3 if self._turbulence else 0
-        fdm["atmosphere/turbulence/milspec/windspeed_at_20ft_AGL-fps"] = self._gusts.w20_fps
+        fdm["atmosphere/turbulence/milspec/windspeed_at_20ft_AGL-fps"] = self._w20_fps
         fdm["atmosphere/turbulence/milspec/severity"] = float(self._turbulence)
         fdm.run_ic()
         fdm.set_trim_status(False)
@@ -146,11 +138,8 @@ class Aircraft:
         fdm.run_ic()
         fdm["propulsion/set-running"] = -1
         fdm["simulation/do_simple_trim"] = 0  # longitudinal
-        theta, delta_e, delta_t = (
-            fdm["attitude/theta-rad"],
-            -fdm["fcs/pitch-trim-cmd-norm"],
-            fdm[self.kind.throttle_property],
-        )
+        theta, delta_e = fdm["attitude/theta-rad"], -fdm["fcs/pitch-trim-cmd-norm"]
+        delta_t = fdm[self.kind.throttle_property]
         fdm["fcs/pitch-trim-cmd-norm"] = 0.0
         fdm["ic/alpha-rad"] = fdm["ic/theta-rad"] = theta
         self.set_controls(0.0, delta_e, 0.0, delta_t)
@@ -212,15 +201,8 @@ class Aircraft:
                 origin.alt_mm * 1e-3 - x[2] * FT,
             ]
         )
-        air_data = (
-            float(x[15] * FT),
-            float(x[16]),
-            float(x[17]),
-            float(x[18] * _SLUG_FT3),
-            float(x[19] * _PSF),
-            float(x[20] / 1.8),
-        )
-        return Truth(p, x[3:6] * FT, x[6:9], x[9:12], x[12:15] * FT, *air_data)
+        air_data = (x[15] * FT, x[16], x[17], x[18] * _SLUG_FT3, x[19] * _PSF, x[20] / 1.8)
+        return Truth(p, x[3:6] * FT, x[6:9], x[9:12], x[12:15] * FT, *map(float, air_data))
 
     def __getitem__(self, name: str) -> float:
         """Return a JSBSim property by its name, in its unit."""
@@ -237,24 +219,19 @@ def model_file(kind: AircraftType) -> Path:
     return root / "aircraft" / kind.model / f"{kind.model}.xml"
 
 
-def _load(fdm: Any, kind: AircraftType) -> bool:
-    """Load a model; JSBSim reads files only, so a changed one goes through a temporary file."""
-    if kind.xml is None:
-        return bool(fdm.load_model(kind.model))
-    with TemporaryDirectory(prefix="parauav-") as folder:
-        xml_path = Path(folder, kind.model, f"{kind.model}.xml")
-        xml_path.parent.mkdir()
-        xml_path.write_text(kind.xml)
-        fdm.set_aircraft_path(folder)
-        return bool(fdm.load_model(kind.model))
-
-
 def _create_executive(kind: AircraftType) -> Any:
     """Create a JSBSim executive without log output and load an aircraft."""
     jsbsim.set_logger(jsbsim.DefaultLogger(jsbsim.LogLevel.ERROR))
     fdm = jsbsim.FGFDMExec(None if kind.from_jsbsim else str(_HERE))
     fdm.set_debug_level(0)
-    if not _load(fdm, kind):
+    with TemporaryDirectory(prefix="parauav-") as folder:
+        if kind.xml is not None:  # JSBSim reads files only
+            xml_path = Path(folder, kind.model, f"{kind.model}.xml")
+            xml_path.parent.mkdir()
+            xml_path.write_text(kind.xml)
+            fdm.set_aircraft_path(folder)
+        loaded = fdm.load_model(kind.model)
+    if not loaded:
         location = "in the jsbsim package" if kind.from_jsbsim else "beside this file"
         raise RuntimeError(f"jsbsim: found no loadable {kind.model!r}, expected it {location}; reinstall the package")
     fdm.set_dt(DT)

@@ -57,18 +57,15 @@ class _WaypointWalk:
 
     def advance(self, turn: float, length: float, climb: float) -> None:
         """Turn by `turn` [rad], fly `length` [m], climb by `climb` [m]; beyond the maximum distance turn home."""
-        if (
-            hypot(self.n + length * cos(self.course + turn), self.e + length * sin(self.course + turn))
-            > MAX_RANGE_M * self._geometry.scale
-        ):
+        n, e = self.n + length * cos(self.course + turn), self.e + length * sin(self.course + turn)
+        if hypot(n, e) > MAX_RANGE_M * self._geometry.scale:
             home_turn = wrap(atan2(-self.e, -self.n) - self.course)
             turn = float(np.clip(home_turn, -2.4, 2.4)) + self._rng.uniform(-0.3, 0.3)
         self.course = wrap(self.course + turn)
         self.n += length * cos(self.course)
         self.e += length * sin(self.course)
-        self.h = float(
-            np.clip(self.h + climb, MIN_HEIGHT_M * self._geometry.height, MAX_HEIGHT_M * self._geometry.height)
-        )
+        low, high = MIN_HEIGHT_M * self._geometry.height, MAX_HEIGHT_M * self._geometry.height
+        self.h = float(np.clip(self.h + climb, low, high))
 
     def position(self) -> tuple[float, float, float]:
         """Return the current position, NED from home [m]."""
@@ -152,15 +149,5 @@ def mission_item(
     lat, lon, alt_mm = to_geodetic(origin, np.array(ned)) if ned is not None else (0, 0, 0)
     alt = 0.0 if ned is None else alt_mm * 1e-3 - (origin.alt_mm * 1e-3 if frame == RELATIVE_ALT else 0.0)
     p = (*params, 0.0, 0.0, 0.0, 0.0)
-    return Item(
-        seq=seq,
-        command=command,
-        frame=frame,
-        param1=p[0],
-        param2=p[1],
-        param3=p[2],
-        param4=p[3],
-        lat_e7=int(lat),
-        lon_e7=int(lon),
-        alt_m=round(float(alt), 2),
-    )
+    item = Item(seq=seq, command=command, frame=frame, param1=p[0], param2=p[1], param3=p[2], param4=p[3])
+    return msgspec.structs.replace(item, lat_e7=int(lat), lon_e7=int(lon), alt_m=round(float(alt), 2))

@@ -31,11 +31,13 @@ AIRSPEED_SCALE = 0.02  # standard deviation of the pitot tube's scale error [-]
 SEA_LEVEL_RHO = 1.225  # [kg/m3]
 _SEA_LEVEL_PA, _LAPSE, _POWER = 101_325.0, 2.25577e-5, 5.25588  # ICAO standard atmosphere [Pa, 1/m, -]
 BOARD_K = 14.0  # excess of board temperature over outside air [K]
-_ALTITUDE_ERRORS = {  # standard deviation, correlation time [s]
-    "pressure": (2.0, 0.0),  # [Pa]
-    "pressure_wander": (3.0, 60.0),  # [Pa]
-    "satellites": (1.5, 100.0),  # [m]
-}
+_ALTITUDE_ERRORS = (
+    ("pressure", 2.0, 0.0, 1),  # [Pa]
+    ("pressure_wander", 3.0, 60.0, 1),  # [Pa]
+    ("satellites", 1.5, 100.0, 1),  # [m]
+)
+SERVO_LOW, SERVO_TRIM, SERVO_HIGH = 1100, 1500, 1900  # SERVOn_MIN, _TRIM, _MAX of surfaces [us]
+MOTOR_IDLE, MOTOR_FULL = 1000, 2000  # SERVO3_MIN, SERVO3_MAX [us]
 
 
 class Estimate(NamedTuple):
@@ -55,17 +57,29 @@ class Estimate(NamedTuple):
 class Sensors:
     """Sensors and estimator of one aircraft."""
 
-    def __init__(self, rng: np.random.Generator, dt: float, scale_rng: np.random.Generator | None = None):
-        """Draw biases, and the airspeed scale from `scale_rng` if given; `dt`: time between `measure` calls [s]."""
-        sigma = np.concatenate([np.full(n, s) for _, s, _, n in _ERRORS])
-        tau = np.concatenate([np.full(n, t) for _, _, t, n in _ERRORS])
-        self._noise = GaussMarkov(rng, sigma, tau, dt)
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        dt: float,
+        scale_rng: np.random.Generator | None = None,
+        altitude_rng: np.random.Generator | None = None,
+    ):
+        """Draw the first errors.
+
+        Args:
+            rng: draws the errors
+            dt: time between two calls of `measure` [s]
+            scale_rng: draws the airspeed scale instead of `rng`
+            altitude_rng: draws the errors of barometer and satellite height; None: without these sensors
+        """
+        self._noise = _noise(rng, _ERRORS, dt)
+        self._altitude_noise = None if altitude_rng is None else _noise(altitude_rng, _ALTITUDE_ERRORS, dt)
         self.airspeed_scale = 1 + AIRSPEED_SCALE * float(np.clip((scale_rng or rng).standard_normal(), -2, 2))
 
     def measure(self, truth: Truth) -> Estimate:
         """Return the true state plus errors."""
         e = self._noise.step()
-        return Estimate(
+        estimate = Estimate(
             truth.p + e[0:3],
             truth.v + e[3:6] + e[6:9],
             truth.euler + e[9:12] + e[12:15],
@@ -73,24 +87,20 @@ class Sensors:
             truth.force + e[21:24] + e[24:27],
             float(truth.Va * sqrt(truth.rho / SEA_LEVEL_RHO) * self.airspeed_scale + e[27]),
         )
-
-
-class AltitudeSensors:
-    """Barometer and satellite height with independent errors."""
-
-    def __init__(self, rng: np.random.Generator, dt: float):
-        """Draw the first errors; `dt` is the time between two calls of `measure` [s]."""
-        sigma, tau = zip(*_ALTITUDE_ERRORS.values(), strict=True)
-        self._noise = GaussMarkov(rng, np.array(sigma), np.array(tau), dt)
-
-    def measure(self, e: Estimate, truth: Truth) -> Estimate:
-        """Return an estimate with the readings of both sensors."""
-        white, wander, gps_error = map(float, self._noise.step())
-        return e._replace(
+        if self._altitude_noise is None:
+            return estimate
+        white, wander, gps_error = map(float, self._altitude_noise.step())
+        return estimate._replace(
             pressure=truth.P + white + wander,
             board_temperature=truth.T + BOARD_K,
             gps_height=gps_error - float(truth.p[2]),
         )
+
+
+def _noise(rng: np.random.Generator, errors: tuple[tuple[str, float, float, int], ...], dt: float) -> GaussMarkov:
+    sigma = np.concatenate([np.full(n, s) for _, s, _, n in errors])
+    tau = np.concatenate([np.full(n, t) for _, _, t, n in errors])
+    return GaussMarkov(rng, sigma, tau, dt)
 
 
 def pressure_height(pressure: float) -> float:
@@ -103,41 +113,15 @@ def pressure_at(height: float) -> float:
     return float(_SEA_LEVEL_PA * (1 - _LAPSE * height) ** _POWER)
 
 
-class WindEstimator:
-    """Wind estimate of the autopilot: mean wind plus an error of 0.4 m/s with a correlation time of 60 s."""
-
-    def __init__(self, rng: np.random.Generator, dt: float):
-        """Draw the first error; `dt` is the time between two calls of `measure` [s]."""
-        self._error = GaussMarkov(rng, np.full(2, 0.4), np.full(2, 60.0), dt)
-
-    def measure(self, wind: tuple[float, float]) -> tuple[float, float]:
-        """Return the mean wind plus the error, NED [m/s]."""
-        error = self._error.step()
-        return wind[0] + float(error[0]), wind[1] + float(error[1])
+def servo_pulses(delta_a: float, delta_e: float, delta_r: float, delta_t: float) -> tuple[int, int, int, int]:
+    """Convert commands to whole pulse widths in output order: aileron, elevator, throttle, rudder [us]."""
+    half = SERVO_HIGH - SERVO_TRIM
+    a, e, r = (SERVO_TRIM + round(half * min(max(x, -1.0), 1.0)) for x in (delta_a, delta_e, delta_r))
+    return a, e, MOTOR_IDLE + round((MOTOR_FULL - MOTOR_IDLE) * min(max(delta_t, 0.0), 1.0)), r
 
 
-class Servos:
-    """Pulse widths between autopilot and servos, in whole microseconds."""
-
-    LOW, TRIM, HIGH = 1100, 1500, 1900  # SERVOn_MIN, _TRIM, _MAX of surfaces [us]
-    IDLE = 1000  # SERVO3_MIN [us]
-    FULL = 2000  # SERVO3_MAX [us]
-
-    @classmethod
-    def pulses(cls, delta_a: float, delta_e: float, delta_r: float, delta_t: float) -> tuple[int, int, int, int]:
-        """Convert commands to pulses in output order: aileron, elevator, throttle, rudder [us]."""
-        half = cls.HIGH - cls.TRIM
-        a, e, r = (cls.TRIM + round(half * min(max(x, -1.0), 1.0)) for x in (delta_a, delta_e, delta_r))
-        return a, e, cls.IDLE + round((cls.FULL - cls.IDLE) * min(max(delta_t, 0.0), 1.0)), r
-
-    @classmethod
-    def commands(cls, pulses: tuple[int, int, int, int]) -> tuple[float, float, float, float]:
-        """Convert pulses to delta_a, delta_e, delta_r, delta_t."""
-        a, e, t, r = pulses
-        half = cls.HIGH - cls.TRIM
-        return (
-            (a - cls.TRIM) / half,
-            (e - cls.TRIM) / half,
-            (r - cls.TRIM) / half,
-            (t - cls.IDLE) / (cls.FULL - cls.IDLE),
-        )
+def servo_commands(pulses: tuple[int, int, int, int]) -> tuple[float, float, float, float]:
+    """Convert pulse widths [us] to delta_a, delta_e, delta_r, delta_t."""
+    a, e, t, r = pulses
+    delta_a, delta_e, delta_r = ((x - SERVO_TRIM) / (SERVO_HIGH - SERVO_TRIM) for x in (a, e, r))
+    return delta_a, delta_e, delta_r, (t - MOTOR_IDLE) / (MOTOR_FULL - MOTOR_IDLE)

@@ -26,8 +26,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from fleet.bus.bus_protocol import Bus
-from fleet.bus.session import ZenohBus, connect
+from fleet.bus.session import Bus, connect
 from fleet.cli import make_parser, run_command
 from fleet.contract import Prediction, Predictions
 from tests.bench.referee.site import Site
@@ -49,7 +48,7 @@ def once(bus: Bus, kind: type, wanted: int, timeout_s: float = 5.0) -> float | N
     return last if came >= wanted else None
 
 
-def beside(bus: ZenohBus, wanted: dict[str, int], times: int) -> dict[str, dict[str, Any]]:
+def beside(bus: Bus, wanted: dict[str, int], times: int) -> dict[str, dict[str, Any]]:
     """Measure Zenoh alone."""
     return {name: _summary([plain.once(bus, name, wanted[name]) for _ in range(times)]) for name in KINDS}
 

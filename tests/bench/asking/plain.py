@@ -5,13 +5,13 @@ import time
 
 import zenoh
 
-from fleet.bus.session import ZenohBus, connect
+from fleet.bus.session import Bus, connect
 from fleet.cli import stop_on_signal
 
 KEYS = {"wildcard": "plain/one/*", "batch": "plain/all/*"}
 
 
-def once(bus: ZenohBus, name: str, wanted: int) -> float | None:
+def once(bus: Bus, name: str, wanted: int) -> float | None:
     """Ask once; give how long the last of so many answers took [s]; None where fewer came."""
     begun, came = time.perf_counter(), 0
     replies = bus._session.get(

@@ -17,7 +17,7 @@ from fleet.simulator.flight.uav import DT as TICK_S
 from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.jsbsim import Aircraft, Truth
 from fleet.simulator.vehicle.missions import HOME
-from fleet.simulator.vehicle.sensors import Servos
+from fleet.simulator.vehicle.sensors import servo_commands
 from fleet.simulator.vehicle.weather import FT
 from fleet.window import STATES
 
@@ -51,7 +51,7 @@ def _case(seed: int, k: int) -> Case:
         dt=_ROW * TICK_S,
         t=_ROW * TICK_S * np.arange(n),
         x=np.hstack([ned_to_body(*x[:, 3:6].T, x[:, :3]), x[:, 6:9], unwrapped(x[:, 3:6])]),
-        u=np.array([Servos.commands(tuple(pulses)) for pulses in kept["pulses"]]),
+        u=np.array([servo_commands(tuple(pulses)) for pulses in kept["pulses"]]),
         Va=true_airspeed(x[:, 9], HOME.alt_mm * 1e-3 - kept["p"][:, 2]),
         ok=np.ones(n, bool),
         b=_SPAN,

@@ -7,7 +7,7 @@ from fleet.contract import Message
 from fleet.simulator.conceal.exam import card
 from fleet.simulator.conceal.paths import NOMINAL_EXCITATION, FlightJob, draw_flight
 from fleet.simulator.conceal.record import fly
-from fleet.simulator.faults.oddities import parse_fault
+from fleet.simulator.faults.kinds import parse_fault
 from fleet.simulator.flight.drive import to_tlog
 from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.weather import FT, wind_at_20ft

@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.bus.bus_protocol import Bus, EpochFence
+from fleet.bus.bus_protocol import EpochFence
 from fleet.bus.codec import Stamp
+from fleet.bus.session import Bus
 from fleet.contract import Claim, FleetState, Model, Prediction
 
 

@@ -4,8 +4,8 @@ import time
 
 from fleet.bus.bus_protocol import EpochFence, select_latest
 from fleet.bus.codec import Stamp, is_plausible_epoch
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Claim, Handover, Status
+from tests.support.memory_bus import MemoryBus
 from twin_worker.ownership.protocol import OwnershipProtocol
 
 FORGED = (2**62 - 1, 2**63 - 1, 2**64 - 1)

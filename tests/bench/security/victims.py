@@ -8,9 +8,8 @@ from typing import Any
 import msgspec
 from rich.console import Console
 
-from fleet.bus.bus_protocol import Bus
 from fleet.bus.codec import encode
-from fleet.bus.session import connect
+from fleet.bus.session import Bus, connect
 from fleet.commands.live.record import BusRecorder
 from fleet.commands.live.status import as_objects, fleet_rows, fleet_table
 from fleet.commands.live.whatif import as_object, format_text, send_request

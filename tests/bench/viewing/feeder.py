@@ -14,9 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from fleet.bus.bus_protocol import Bus
 from fleet.bus.codec import Stamp
-from fleet.bus.session import connect, open_router
+from fleet.bus.session import Bus, connect, open_router
 from fleet.contract import (
     Alert,
     AlertKind,

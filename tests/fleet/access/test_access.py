@@ -119,9 +119,9 @@ def test_every_command_on_the_bus_takes_the_same_two_options(monkeypatch: pytest
 
 
 def test_papers_are_found_private_and_in_time(papers: Path, tmp_path: Path) -> None:
-    found = find_certificate(papers, "worker")
-    assert found.certificate == papers / "worker.pem"
-    assert timedelta(days=89) < expiry_of(found.certificate) - datetime.now(UTC) < timedelta(days=91)
+    certificate, key = find_certificate(papers, "worker")
+    assert (certificate, key) == (papers / "worker.pem", papers / "worker.key")
+    assert timedelta(days=89) < expiry_of(certificate) - datetime.now(UTC) < timedelta(days=91)
     with pytest.raises(ValueError, match=r"found no .*pilot\.pem, expected it for the role pilot"):
         find_certificate(papers, "pilot")
     mine = Path(shutil.copytree(papers, tmp_path / "mine"))

@@ -13,13 +13,11 @@ import pytest
 from conftest import ROOT, unused_port
 from prometheus_client.parser import text_string_to_metric_families
 
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import FleetRow, FleetState, TwinState
 from fleet.metrics import serve
 from fleet.process.children import Children
 from fleet.process.logs import (
-    JsonFormatter,
-    TextFormatter,
+    LogFormatter,
     add_time,
     report_failure,
     report_progress,
@@ -27,6 +25,7 @@ from fleet.process.logs import (
     strip_time,
 )
 from tests.bench.security.bombs import ESCAPES
+from tests.support.memory_bus import MemoryBus
 from twin_worker.service.work_rates import counters
 
 PATIENCE_S = 10.0
@@ -43,17 +42,22 @@ def record(message: str, *, defect: bool = False) -> logging.LogRecord:
 
 
 def test_people_read_a_sentence_that_steers_no_terminal() -> None:
-    assert strip_time(TextFormatter("gateway").format(record("the router is away"))) == "gateway: the router is away"
-    said = strip_time(TextFormatter("gateway").format(record(f"uav-7 says {ESCAPES}")))
+    assert (
+        strip_time(LogFormatter("gateway", as_json=False).format(record("the router is away")))
+        == "gateway: the router is away"
+    )
+    said = strip_time(LogFormatter("gateway", as_json=False).format(record(f"uav-7 says {ESCAPES}")))
     assert said.isprintable() and said.startswith("gateway: uav-7 says ?]0;owned??[2J")
-    assert "ZeroDivisionError: by a stranger" in TextFormatter("gateway").format(record("x", defect=True))
+    assert "ZeroDivisionError: by a stranger" in LogFormatter("gateway", as_json=False).format(record("x", defect=True))
 
 
 def test_every_line_of_a_log_begins_with_its_time(capsys) -> None:
     assert add_time("gateway: there", 0.0625) == "1970-01-01T00:00:00.062Z gateway: there"
     later = record("the router is away")
     later.created = 86_400.0
-    assert TextFormatter("gateway").format(later) == "1970-01-02T00:00:00.000Z gateway: the router is away"
+    assert (
+        LogFormatter("gateway", as_json=False).format(later) == "1970-01-02T00:00:00.000Z gateway: the router is away"
+    )
     begun = time.time() - 0.001
     for one in (report_status, report_progress, report_failure):
         one("gateway", "a\x1b sentence")
@@ -84,7 +88,7 @@ def test_what_a_child_says_again_has_one_time() -> None:
 
 
 def test_machines_read_one_line_of_json() -> None:
-    line = JsonFormatter("gateway").format(record(f"uav-7 says {ESCAPES}", defect=True))
+    line = LogFormatter("gateway", as_json=True).format(record(f"uav-7 says {ESCAPES}", defect=True))
     assert line.isprintable()
     told = json.loads(line)
     assert told["message"] == f"uav-7 says {ESCAPES}" and "by a stranger" in told["defect"]

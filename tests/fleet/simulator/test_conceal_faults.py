@@ -9,9 +9,9 @@ import pytest
 from fleet.cli import main
 from fleet.simulator.conceal.effects import SERVO_LAG_S, reported_values
 from fleet.simulator.conceal.paths import EXAM_HOME, baseline_type
-from fleet.simulator.faults.carried import SENSOR_FAULTS
-from fleet.simulator.faults.oddities import KINDS, parse_fault
-from fleet.simulator.faults.physics import Fault, FaultyPhysics
+from fleet.simulator.faults.carried import SENSOR_FAULTS, FaultSet
+from fleet.simulator.faults.kinds import KINDS, parse_fault
+from fleet.simulator.faults.physics import Fault
 from fleet.simulator.faults.servos import SERVO_FAULTS
 from fleet.simulator.vehicle.altered import instrumented_type
 from fleet.simulator.vehicle.jsbsim import DT, KG_TO_LB, Aircraft
@@ -35,7 +35,7 @@ def flying(airframe: str, still: bool = True) -> Aircraft:
 def pressed(aircraft: Aircraft, name: str, **values: float) -> np.ndarray:
     """What a whole fault changes at once: moments over inertia [rad/s2], specific force [m/s2]."""
     before = aircraft.evaluate_accelerations()
-    FaultyPhysics([Fault(name, "", values)], aircraft).apply(1.0)
+    FaultSet([Fault(name, "", values)], aircraft).apply_to_physics(1.0)
     return np.asarray(aircraft.evaluate_accelerations() - before)
 
 
@@ -224,7 +224,7 @@ def test_the_propeller_rolls_left_yaws_left_and_wets_the_tail() -> None:
     ],
 )
 def test_winds_blow_from_where_they_say(text: str, height: float, wind: tuple[float, float, float]) -> None:
-    world = FaultyPhysics([parse_fault(text, "c172p")], flying("c172p"))
+    world = FaultSet([parse_fault(text, "c172p")], flying("c172p"))
     assert world.wind(10.0, height) == pytest.approx(wind)
 
 

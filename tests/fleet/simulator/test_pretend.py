@@ -10,9 +10,10 @@ from fleet.cli import main
 from fleet.contract import Item
 from fleet.frames import to_geodetic, to_ned
 from fleet.simulator.flight.uav import SimulatedUav
-from fleet.simulator.vehicle.jsbsim import CRUISE, DT, Aircraft
+from fleet.simulator.vehicle.jsbsim import DT, Aircraft
 from fleet.simulator.vehicle.missions import DO_CHANGE_SPEED, DO_JUMP, HOME, LOITER_TURNS, WAYPOINT, draw_mission
 from fleet.simulator.vehicle.sensors import Sensors
+from fleet.simulator.vehicle.types import CRUISE
 from fleet.simulator.vehicle.weather import GaussMarkov, MeanWind, turbulence_level
 
 ALOFT = np.array([100.0, -200.0, -120.0])

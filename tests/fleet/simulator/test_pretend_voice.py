@@ -19,7 +19,7 @@ from fleet.simulator.flight.mavlink_messages import AUTO, TELEMETRY
 from fleet.simulator.flight.tuning import tuned_parameters
 from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.jsbsim import DT
-from fleet.simulator.vehicle.sensors import Servos
+from fleet.simulator.vehicle.sensors import servo_commands, servo_pulses
 
 
 def heard(frames: list[bytes]) -> list:
@@ -129,8 +129,8 @@ def test_parameters_are_streamed_while_it_flies() -> None:
 def test_servo_parameters_say_what_is_wired_where() -> None:
     params = tuned_parameters(0)
     assert [params[f"SERVO{i}_FUNCTION"] for i in (1, 2, 3, 4)] == [4, 19, 70, 21]
-    assert Servos.pulses(-1.0, 0.5, 2.0, 0.25) == (1100, 1700, 1250, 1900)
-    assert Servos.commands((1100, 1700, 1250, 1900)) == (-1.0, 0.5, 1.0, 0.25)
+    assert servo_pulses(-1.0, 0.5, 2.0, 0.25) == (1100, 1700, 1250, 1900)
+    assert servo_commands((1100, 1700, 1250, 1900)) == (-1.0, 0.5, 1.0, 0.25)
     assert tuned_parameters(0) == params
     assert tuned_parameters(1) != params
 

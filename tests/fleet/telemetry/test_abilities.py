@@ -104,7 +104,7 @@ def test_the_remedy_for_a_missing_mission_list_fits_the_recording(kind, words):
 def test_a_ulog_is_surveyed_as_one(tmp_path):
     path = tmp_path / "flight.ulg"
     path.write_bytes(ulog(flight_of((1, 14))))
-    (one,) = inspect.inspect_file(path).surveys.values()
+    (one,) = inspect.inspect_file(path)[1].values()
     assert one.kind == "ULog"
 
 

@@ -16,7 +16,6 @@ from conftest import ROOT
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from fleet.bus.codec import decode, encode
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import COLUMNS, Array, GatewayCounters, Item, Mission, Params, Rows, Sample, Status
 from fleet.frames import Origin, to_geodetic, to_ned
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
@@ -35,6 +34,7 @@ from gateway.link_spec import read_spec
 from gateway.links.recorded import ReplayLink
 from gateway.pipeline import Pipeline
 from tests.support.examples import EXAMPLES
+from tests.support.memory_bus import MemoryBus
 from tests.support.talker import T0, Talker, of
 
 HOME = Origin(470_000_000, 80_000_000, 500_000)

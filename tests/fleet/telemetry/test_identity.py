@@ -13,7 +13,6 @@ import pytest
 from conftest import unused_port
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Alert, AlertKind, GatewayCounters, Status
 from fleet.telemetry.mavlink.heartbeat import CLEAR_AFTER_S
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
@@ -22,6 +21,7 @@ from gateway.link_spec import read_spec
 from gateway.links.opening import open_link
 from gateway.pipeline import Pipeline
 from tests.support.fake_link import PATIENCE_S, until
+from tests.support.memory_bus import MemoryBus
 from tests.support.oracle import framed, ours, raw
 from tests.support.talker import ARDU, PLANE, T0, Talker, of
 

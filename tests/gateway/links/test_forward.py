@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Alert, Mission, Params
 from fleet.telemetry.mavlink.parsing.decode import IDS
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
@@ -14,6 +13,7 @@ from gateway.forwarding import DUPLICATE_SENDER, MAX_DATAGRAM, NO_TARGET, target
 from gateway.links.link import Batch
 from gateway.pipeline import Pipeline
 from tests.support.fake_link import FakeLink
+from tests.support.memory_bus import MemoryBus
 from tests.support.oracle import framed, ours
 from tests.support.talker import ITEMS, Aircraft, Ears, Talker
 

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from conftest import unused_port
 
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import GatewayCounters
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
 from fleet.telemetry.recording.ids import IdAllocator
@@ -25,6 +24,7 @@ from gateway.links.stream import MAX_BYTES, SendQueue
 from gateway.onboard import RequestSender
 from gateway.pipeline import Pipeline
 from tests.support.fake_link import PATIENCE_S, pieces, until
+from tests.support.memory_bus import MemoryBus
 from tests.support.talker import Talker
 
 DROPPED = "dropped: decoding fell behind"

@@ -12,12 +12,12 @@ from conftest import ROOT, unused_port
 from pymavlink import mavutil
 
 from fleet.bus.codec import EncodedMessage, encode
-from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import connect, open_router
 from fleet.contract import GatewayCounters, Mission, Status
 from gateway.publication import LEASE_S, Publisher, RouterSession
 from tests.gateway.test_gateway import PATIENCE_S, Ear, udp_port
 from tests.support.fake_link import beside_compiling, untimed
+from tests.support.memory_bus import MemoryBus
 from tests.support.talker import T0, Talker
 
 STATUS = EncodedMessage(Status, 7, encode(Status(uav=7, t=T0)))

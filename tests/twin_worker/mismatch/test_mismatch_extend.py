@@ -12,7 +12,7 @@ from fleet.effects import catalogue
 from fleet.frames import to_ned
 from fleet.physics import point_mass as H
 from fleet.physics.wrench import NAMES, WIND
-from fleet.simulator.faults.oddities import parse_fault
+from fleet.simulator.faults.kinds import parse_fault
 from fleet.simulator.flight.drive import to_tlog
 from fleet.simulator.flight.uav import SimulatedUav
 from fleet.telemetry.recording.recordings import replay_messages

@@ -12,9 +12,9 @@ import pytest
 import fleet
 from fleet.bus.bus_protocol import WorkerToken
 from fleet.bus.codec import encode
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Claim, Handover, HandoverRequest, History, Message, Sample, Status
 from tests.support import flights as f
+from tests.support.memory_bus import MemoryBus
 from twin_worker.ownership.protocol import OwnershipProtocol
 from twin_worker.ownership.twin_store import INBOX_SIZE, query_history
 from twin_worker.service.worker import Worker

@@ -16,10 +16,8 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from fleet.bus.bus_protocol import Bus
 from fleet.bus.codec import Stamp, encode
-from fleet.bus.memory_bus import MemoryBus
-from fleet.bus.session import connect
+from fleet.bus.session import Bus, connect
 from fleet.contract import (
     Claim,
     Handover,
@@ -35,6 +33,7 @@ from fleet.contract import (
 from gateway.publication import Publisher
 from tests.bench.asking.answerer import prediction
 from tests.support import flights as f
+from tests.support.memory_bus import MemoryBus
 from twin_worker.ownership.history_decoder import decode_history
 from twin_worker.ownership.protocol import OwnershipProtocol
 from twin_worker.service.worker import Worker

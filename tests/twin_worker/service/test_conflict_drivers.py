@@ -9,11 +9,11 @@ import pytest
 from rich.console import Console
 
 from fleet.bus.codec import Stamp
-from fleet.bus.memory_bus import MemoryBus
 from fleet.commands.live.status import fleet_rows, fleet_table
 from fleet.contract import Alert, AlertKind, FleetRow, FleetState, Message, Prediction, TwinState
 from fleet.frames import to_geodetic
 from tests.support import flights as f
+from tests.support.memory_bus import MemoryBus
 from tests.support.predicted import T, straight
 from twin_worker.__main__ import main
 from twin_worker.alerts.conflict_probability import Separation

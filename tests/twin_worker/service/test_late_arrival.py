@@ -4,13 +4,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Alert, AlertKind, Event, Link, Sample, Status, TwinState
 from fleet.simulator.flight import drive as simulator
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
 from tests.support import flights as f
 from tests.support.flights import predictions, published
 from tests.support.late_arrival import ARRIVALS, Datagram, flight, lived, relayed
+from tests.support.memory_bus import MemoryBus
 from tests.support.talker import T0, Talker
 from twin_worker.evaluation.replay import run_offline
 from twin_worker.service import worker as live

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Alert, Event, Message, Model, Prediction, Sample
 from fleet.telemetry.recording.recordings import replay_messages
 from tests.support import hover
+from tests.support.memory_bus import MemoryBus
 from twin_worker.evaluation.replay import run_offline
 from twin_worker.service import worker as live
 from twin_worker.service.worker import Worker

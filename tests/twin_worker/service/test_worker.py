@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from fleet.bus.codec import Stamp, decode, encode
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import (
     Array,
     FleetState,
@@ -21,6 +20,7 @@ from fleet.contract import (
 )
 from tests.support import flights as f
 from tests.support.flights import item
+from tests.support.memory_bus import MemoryBus
 from twin_worker.ownership.twin_store import INBOX_SIZE
 from twin_worker.service import worker as live
 from twin_worker.service.queries import latest_prediction as told_of

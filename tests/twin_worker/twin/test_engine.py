@@ -10,9 +10,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Prediction, Sample
 from tests.support import flights as f
+from tests.support.memory_bus import MemoryBus
 from twin_worker.__main__ import NICE_INCREMENT, _prepare
 from twin_worker.confidence.tube_and_horizon import AHEAD
 from twin_worker.service.busy_fallback import is_superseded, publish_fallbacks

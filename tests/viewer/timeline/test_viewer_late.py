@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import History, Sample
+from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import Clock, PretendUav, T
 from viewer.scene.labels import CameraView, Tag, visible_labels
 from viewer.scene.strokes import smooth_curve

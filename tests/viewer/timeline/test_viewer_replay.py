@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Alert, AlertKind, GatewayCounters, Status, TwinState
 from fleet.telemetry.onboard_logs.onboard_news import DEFAULT_EPOCH_S
 from fleet.telemetry.recording.recordings import Recording
+from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import STAMP, Clock, PretendUav, T, feed_of
 from viewer.panels.detail import figures_html, status_html
 from viewer.scene.selection.pins import MAX_LABELS, MINOR_KINDS, event_text, labelled_events

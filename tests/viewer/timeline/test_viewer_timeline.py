@@ -5,8 +5,8 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Alert, AlertKind, GatewayCounters, Status, TwinState
+from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import HOSTILE, Clock, PretendFleet, PretendUav, T, feed_of
 from viewer.panels.detail import figures_html, status_html
 from viewer.scene.fleet_arrays import FleetArrays

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from fleet.bus.codec import EncodedMessage
-from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Link, Params, Sample, Status
 from fleet.telemetry.mavlink import intake as module
 from fleet.telemetry.mavlink.intake import (
@@ -27,6 +26,7 @@ from gateway.links.receive import MAX_DATAGRAMS, BatchReceiver
 from gateway.pipeline import FLUSH_BYTES, Pipeline
 from gateway.publication import Publisher
 from tests.support.fake_link import FakeLink
+from tests.support.memory_bus import MemoryBus
 from tests.support.talker import ITEMS, T0, Talker, of
 
 

@@ -1,24 +1,16 @@
-"""In-memory bus within one process, for tests and for uses without a router."""
+"""Bus within one process, without a router: the methods of `fleet.bus.session.Bus`."""
 
 import secrets
-from collections.abc import Collection, Container, Iterator
+from collections.abc import Callable, Collection, Container, Iterator
 from contextlib import AbstractContextManager, suppress
 from functools import partial
 from typing import Any, TypeVar
 
 import msgspec
 
-from fleet.bus.bus_protocol import (
-    BatchCallback,
-    Callback,
-    Filter,
-    LivelinessCallback,
-    QueryHandler,
-    RawCallback,
-    replies_about,
-    select_latest,
-)
+from fleet.bus.bus_protocol import QueryHandler, replies_about, select_latest
 from fleet.bus.codec import EncodedMessage, Stamp, decode, encode, encoding
+from fleet.bus.session import BatchCallback, Callback, LivelinessCallback, RawCallback
 
 M = TypeVar("M")
 
@@ -60,7 +52,7 @@ class MemoryBus(AbstractContextManager):
                 continue
             callback(message, stamp)
 
-    def subscribe(self, kind: type, callback: Callback, accepts: Filter | None = None) -> None:
+    def subscribe(self, kind: type, callback: Callback, accepts: Callable[[int], bool] | None = None) -> None:
         """Call `callback(message, stamp)` for every message of a class that `accepts` admits."""
         if accepts is not None:
             callback = partial(_call_if_accepted, callback, accepts)
@@ -157,6 +149,6 @@ def _uav_of_payload(payload: bytes) -> int | None:
         return None
 
 
-def _call_if_accepted(callback: Callback, accepts: Filter, message: Any, stamp: Stamp | None) -> None:
+def _call_if_accepted(callback: Callback, accepts: Callable[[int], bool], message: Any, stamp: Stamp | None) -> None:
     if accepts(message.uav):
         callback(message, stamp)
