@@ -1,6 +1,6 @@
 """Replay recordings through the twins as if live, with forecasts of every method at the same instants."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -69,13 +69,14 @@ class RecordingDriver:
     Attributes:
         name: name of the recording
         plan: settings
-        is_selected: whether to evaluate an aircraft, by its order of appearance
+        share: aircraft before this recording, remainder and divisor: evaluate the aircraft whose number, in order of
+            appearance over all recordings, has this remainder
         uavs: aircraft by UAV id; None: not selected
     """
 
     name: str
     plan: EvaluationPlan
-    is_selected: Callable[[int], bool] = lambda _: True
+    share: tuple[int, int, int] = (0, 0, 1)
     uavs: dict[int, EvaluatedUav | None] = field(default_factory=dict)
 
     def run(self, messages: Iterable[Message]) -> Iterator[EvaluationCase]:
@@ -101,9 +102,10 @@ class RecordingDriver:
 
     def _evaluated(self, uav: int) -> EvaluatedUav | None:
         if uav not in self.uavs:
+            before, remainder, divisor = self.share
             paper_twin = Twin.of(uav, method=PAPER) if PAPER in self.plan.methods else None
             evaluated = EvaluatedUav(f"{self.name}:uav-{uav}", Twin.of(uav, method=self.plan.method), paper_twin)
-            self.uavs[uav] = evaluated if self.is_selected(len(self.uavs)) else None
+            self.uavs[uav] = evaluated if (before + len(self.uavs)) % divisor == remainder else None
         return self.uavs[uav]
 
 
@@ -156,16 +158,14 @@ def _record_start(evaluated: EvaluatedUav, prediction: Prediction, plan: Evaluat
     inputs = BaselineInput(twin, track, ahead + (prediction.t - track.t[-1]))
     forecasts = {OURS: _resampled_forecast(prediction, ahead, prediction.t)}
     for name in plan.methods:
-        path = (
-            _paper_forecast(evaluated, prediction, ahead)
-            if name == PAPER
-            else _baseline_forecast(name, inputs, forecasts[OURS])
-        )
-        if path is None:
-            fallback = BASELINES[FALLBACK](inputs)
-            path = None if fallback is None else MethodForecast(fallback, FALLBACK)
-        if path is not None:
-            forecasts[name] = path
+        if name == PAPER:
+            forecast = _paper_forecast(evaluated, prediction, ahead)
+        else:
+            forecast = _baseline_forecast(name, inputs, forecasts[OURS])
+        if forecast is None and (path := BASELINES[FALLBACK](inputs)) is not None:
+            forecast = MethodForecast(path, FALLBACK)
+        if forecast is not None:
+            forecasts[name] = forecast
     group, spread = _group_and_spread(twin, prediction, ahead)
     evaluated.starts.append(
         EvaluationStart(
@@ -196,11 +196,12 @@ def _baseline_forecast(name: str, inputs: BaselineInput, ours: MethodForecast) -
 def _resampled_forecast(prediction: Prediction, ahead: np.ndarray, t: float) -> MethodForecast:
     """Resample a prediction to look-aheads from `t`, which is within one step of its own time."""
     prediction_t = prediction.t + prediction.ahead.numpy().astype(float)
+
+    def resampled(rows: np.ndarray) -> np.ndarray:
+        return np.column_stack([np.interp(t + ahead, prediction_t, column, right=np.nan) for column in rows.T])
+
     path, tube = (
-        np.column_stack(
-            [np.interp(t + ahead, prediction_t, column, right=np.nan) for column in rows.numpy().astype(float).T]
-        )
-        for rows in (prediction.path, prediction.prediction_region_half_axes)
+        resampled(rows.numpy().astype(float)) for rows in (prediction.path, prediction.prediction_region_half_axes)
     )
     return MethodForecast(path, prediction.method, tube, prediction.horizon_s)
 

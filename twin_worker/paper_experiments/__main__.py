@@ -114,10 +114,7 @@ def _run(args: argparse.Namespace) -> int:
         result["first_step"][first] = table = summary(results)
         print(format_summary(first, table), flush=True)
         if args.out:
-            print(
-                f"  figures: {', '.join(path.name for path in draw(args.out, first, results, STATE_NAMES))} "
-                f"in {args.out}"
-            )
+            print(f"  figures: {', '.join(path.name for path in draw(args.out, first, results))} in {args.out}")
     if args.json:
         args.json.write_text(json.dumps(result, indent=1) + "\n")
     return 0

@@ -112,14 +112,13 @@ class DriftMode:
     floor: float
 
 
-def drift_modes(nuisances: Sequence[Nuisance], vane: bool) -> tuple[DriftMode, ...]:
+def drift_modes(vane: bool) -> tuple[DriftMode, ...]:
     """List the drift modes of all drifting nuisances; none without a fast accelerometer, where noise covers them."""
     return tuple(
         DriftMode(f"{n.name}~{half_waves}", k, half_waves, _DRIFT_FLOORS[n.effect.name] * n.floor)
-        for k, n in enumerate(nuisances)
+        for k, n in enumerate(list_nuisances(vane) if vane else ())
         if n.effect.name in _DRIFT_FLOORS
         for half_waves in range(1, DRIFT_HARMONICS + 1)
-        if vane
     )
 
 
