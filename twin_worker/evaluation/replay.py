@@ -83,22 +83,18 @@ def replay(messages: Iterable[Message], progress: str = "") -> dict[str, dict[st
             report_progress(progress, f"{reported_s:.0f} s of flight, {len(first_t)} UAVs")
         uav_summary = summaries.setdefault(message.uav, ReplaySummary())
         for result in run_offline((message,), twins, traffic):
-            _add_result(uav_summary, result, start)
+            if isinstance(result, Prediction):
+                uav_summary.methods[result.method] += 1
+                uav_summary.sentence = result.sentence
+            elif isinstance(result, Model):
+                uav_summary.verdict = result.verdict.sentence
+                if result.verdict.outcome is Outcome.VERIFIED and uav_summary.verified_s is None:
+                    uav_summary.verified_s = result.t - start
         _collect_passages(uav_summary, twins[message.uav])
     for uav, twin in twins.items():
         twin.confidence.tracker.censor_open()  # the recording is over: open predictions are censored
         _collect_passages(summaries[uav], twin)
     return {str(uav): _row(twins[uav], summaries[uav], first_t[uav]) for uav in sorted(twins)}
-
-
-def _add_result(summary: ReplaySummary, result: Message, start: float) -> None:
-    if isinstance(result, Prediction):
-        summary.methods[result.method] += 1
-        summary.sentence = result.sentence
-    elif isinstance(result, Model):
-        summary.verdict = result.verdict.sentence
-        if result.verdict.outcome is Outcome.VERIFIED and summary.verified_s is None:
-            summary.verified_s = result.t - start
 
 
 def _collect_passages(summary: ReplaySummary, twin: Twin) -> None:

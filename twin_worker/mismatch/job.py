@@ -177,14 +177,14 @@ def mismatch_message(uav: int, report: Report, begin: float, end: float) -> Mism
 
 def shift_times(report: Report, shift: float) -> Report:
     """Return the report with the times in its sentence shifted by `shift` [s]."""
-    shifted = [
-        replace(finding, hypothesis=replace(finding.hypothesis, onset=finding.hypothesis.onset.shifted(shift)))
-        for finding in report.findings
-    ]
+    findings = []
+    for finding in report.findings:
+        onset = finding.hypothesis.onset.shifted(shift)
+        findings.append(replace(finding, hypothesis=replace(finding.hypothesis, onset=onset)))
     channel, segments = report.where
-    shifted_where = channel, tuple((a + shift, b + shift) for a, b in segments)
-    text = with_sentence(replace(report, findings=tuple(shifted), where=shifted_where)).sentence
-    return replace(report, sentence=text)
+    where = channel, tuple((a + shift, b + shift) for a, b in segments)
+    shifted = with_sentence(replace(report, findings=tuple(findings), where=where))
+    return replace(report, sentence=shifted.sentence)
 
 
 def mark_unconfirmed(mismatch: Mismatch) -> Mismatch:
