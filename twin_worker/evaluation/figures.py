@@ -17,7 +17,7 @@ from twin_worker.numerics.plot_style import style_axes
 from twin_worker.telemetry.flight_phase import PHASES
 
 _COLOURS = dict(zip((OURS, "paper", "dynamics", "route_wind", "route", "imm", "ct", "cv"), LINES, strict=True))
-_STYLE = {  # of all figures
+_STYLE: Any = {  # of all figures
     "figure.constrained_layout.use": True,
     "axes.labelsize": 9,
     "axes.labelcolor": INK,

@@ -145,7 +145,8 @@ def _with_noise(
         ]
     nuisances = list_nuisances(base.vane)
     slopes = [_slopes(modelled, g, x) for modelled, g, x in zip(modelled_flights, weathers, residual_rows, strict=True)]
-    floors = np.array([n.floor for n in (*nuisances, *drift_modes(base.vane))])
+    modes = drift_modes(base.vane)
+    floors = np.array([*(n.floor for n in nuisances), *(mode.floor for mode in modes)])
     noise = _noise(residual_rows, modelled_flights)
     for _ in range(2):
         spread, means = _spreads(noise, floors, modelled_flights, residual_rows, slopes)
@@ -153,7 +154,7 @@ def _with_noise(
     for k, n in enumerate(nuisances):
         if n.effect.name == "wind_steady":
             spread[k] = max(spread[k], np.sqrt(np.mean([w[n.index] ** 2 for w in winds])))
-    names = [n.name for n in (*nuisances, *drift_modes(base.vane))]
+    names = [*(n.name for n in nuisances), *(mode.name for mode in modes)]
     spread_by_name = dict(zip(names, spread.tolist(), strict=True))
     return replace(base, noise=Noise(noise.ar, noise.sigma * _NOISE_MARGIN), spread=spread_by_name)
 

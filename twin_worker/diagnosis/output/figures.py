@@ -33,7 +33,7 @@ _MAX_STEM = 50  # letters of a flight name in a file name, which is limited to 2
 _MAX_TITLE = 40  # letters of a flight name in a title
 _MAX_CANDIDATES = 12  # candidates in the figure
 _MIN_CANDIDATES = 4  # least number of rows, so that a single bar stays thin
-_STYLE = {  # of all figures
+_STYLE: Any = {  # of all figures
     "figure.constrained_layout.use": True,
     "axes.labelsize": 9,
     "axes.labelcolor": INK,
