@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from twin_worker.mismatch.job import (
     telemetry_rows,
     with_adaptation,
 )
+from twin_worker.mismatch.process import DiagnosisProcess
 from twin_worker.twin.state.state import ROUTE_MODES, Twin
 
 BASELINE_S = 105.0  # own past used as the comparison model [s]
@@ -188,31 +189,21 @@ ALL_UAVS = -1  # in place of a UAV id
 LockedTwin = tuple[Twin, AbstractContextManager]  # a twin and its lock
 
 
-class Executor(Protocol):
-    """Executes diagnosis jobs, one at a time."""
-
-    @property
-    def free(self) -> bool:
-        """Return whether a job can be submitted now."""
-
-    def submit(self, job: DiagnosisJob) -> None:
-        """Start a job."""
-
-    def poll(self) -> DiagnosisResult | None:
-        """Return a finished result; None if there is none."""
-
-
 class Coordinator:
     """Mismatch diagnosis of the aircraft that a worker owns.
 
     Args:
-        executor: executes the diagnoses
+        executor: executes the diagnoses, one at a time
         baselines: comparison models by UAV id, `ALL_UAVS` for all others; by default each UAV's own past
         adapt: adapt the prediction models to diagnosed effects
     """
 
     def __init__(
-        self, executor: Executor, baselines: Mapping[int, Baseline] = MappingProxyType({}), *, adapt: bool = True
+        self,
+        executor: DiagnosisProcess,
+        baselines: Mapping[int, Baseline] = MappingProxyType({}),
+        *,
+        adapt: bool = True,
     ) -> None:
         self._executor, self._baselines, self._adapt = executor, baselines, adapt
         self.states: dict[int, DiagnosisState] = {}
