@@ -179,10 +179,10 @@ def resample_flight(name: str, history: TelemetryHistory, params: dict[str, floa
     return flight
 
 
-def _check_length(name: str, seconds: float, found: str, expected: str) -> None:
+def _check_length(name: str, seconds: float, span: str, requirement: str) -> None:
     if seconds < _MIN_FLIGHT_S:
-        least = f"{_MIN_FLIGHT_S:.0f} {expected}"
-        raise ValueError(f"{name}: found {format_below(seconds, _MIN_FLIGHT_S)} {found}, expected {least}")
+        least = f"{_MIN_FLIGHT_S:.0f} {requirement}"
+        raise ValueError(f"{name}: found {format_below(seconds, _MIN_FLIGHT_S)} {span}, expected {least}")
 
 
 def _interpolated(t: np.ndarray, samples: tuple[np.ndarray, np.ndarray], t_start: float) -> np.ndarray:
