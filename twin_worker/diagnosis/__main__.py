@@ -6,21 +6,23 @@ from pathlib import Path
 
 from fleet.cli import make_parser, run_command
 from fleet.commands.offline.diagnose import EXAMPLES, arguments, check_arguments
-from twin_worker.diagnosis.baseline import own_past as hidden
-from twin_worker.diagnosis.baseline.own_past import OwnPast
+from twin_worker.diagnosis.baseline.own_past import OwnPast, check
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.learn import calibrate_recordings, card_or_unknown, log_progress
 from twin_worker.diagnosis.model.baseline import Baseline
 from twin_worker.diagnosis.output import keep
-from twin_worker.diagnosis.output import keep as written
 from twin_worker.diagnosis.share import Reference, diagnose_all
 
 
 def _run(args: argparse.Namespace) -> int:
     check_arguments(args)
     args.conceal = tuple(filter(None, args.conceal.split(",")))
-    hidden.check(args.conceal)
-    reference = _reference_of(args)
+    check(args.conceal)
+    if args.model:
+        reference: Reference = keep.load(args.model)[0]
+    else:  # a calibration, or the past of each flight
+        card = card_or_unknown(args.airframe)
+        reference = calibrate_recordings(args.against, card) if args.against else OwnPast(args.against_own_past, card)
     reports: list[Report] = []
     n_refused = 0
     for file_reports, refusal in diagnose_all(args.file, reference, args.jobs, log_progress, args.conceal):
@@ -31,18 +33,10 @@ def _run(args: argparse.Namespace) -> int:
             n_refused += 1
             log_progress(refusal)
     if args.json:
-        written.write(reports, args.json)
+        keep.write(reports, args.json)
     if args.report:
         _page(reports, reference, args.report)
     return 2 if n_refused and not reports else 1 if n_refused else 0
-
-
-def _reference_of(args: argparse.Namespace) -> Reference:
-    """Return the reference of the diagnosis: a model, a calibration, or the past of each flight."""
-    if args.model:
-        return keep.load(args.model)[0]
-    card = card_or_unknown(args.airframe)
-    return calibrate_recordings(args.against, card) if args.against else OwnPast(args.against_own_past, card)
 
 
 def _page(reports: list[Report], reference: Reference, folder: Path) -> None:

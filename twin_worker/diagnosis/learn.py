@@ -31,23 +31,17 @@ def card_or_unknown(path: Path | None) -> AircraftCard:
     return UNKNOWN
 
 
-def read_all_flights(files: Sequence[Path], card: AircraftCard) -> list[FlightData]:
-    """Read the flights of all recordings.
+def calibrate_recordings(files: Sequence[Path], card: AircraftCard, until: float | None = None) -> Baseline:
+    """Calibrate on recordings, or on the part of each before `until` [s, on its own clock].
 
     Raises:
         ValueError: if a recording has no usable flight.
         OSError: if a file cannot be read.
     """
-    flights = []
+    flights: list[FlightData] = []
     for path in files:
         log_progress(f"reading {path.name}")
         flights += read_flights(path, card)
-    return flights
-
-
-def calibrate_recordings(files: Sequence[Path], card: AircraftCard, until: float | None = None) -> Baseline:
-    """Calibrate on recordings, or on the part of each before `until` [s, on its own clock]."""
-    flights = read_all_flights(files, card)
     if until is None:
         base = calibrate(flights, card, log_progress)
     elif len(flights) == 1:

@@ -3,6 +3,7 @@
 import multiprocessing
 import signal
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 from twin_worker.diagnosis.baseline.own_past import OwnPast, conceal_channels, exclude_concealed
@@ -32,30 +33,20 @@ def diagnose_all(
         progress: callback for progress messages, used with one process only
         conceal: channels to conceal, of `hidden.NAMES`
     """
+    diagnose_task = partial(_diagnose_task, reference=reference, conceal=conceal)
     if jobs == 1:
-        yield from (_diagnose_task(task, reference, progress, conceal) for task in tasks)
+        yield from (diagnose_task(task, progress=progress) for task in tasks)
         return
-    with multiprocessing.get_context("spawn").Pool(jobs, _init_worker, (reference, conceal)) as pool:
-        yield from pool.imap(_task, tasks)
-
-
-_reference: Reference
-_conceal: Sequence[str]
-
-
-def _init_worker(reference: Reference, conceal: Sequence[str]) -> None:
-    """Initialise a pool process; only the parent handles Ctrl-C."""
-    global _reference, _conceal
-    _reference, _conceal = reference, conceal
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _task(task: Path | FlightData) -> TaskResult:
-    return _diagnose_task(task, _reference, lambda message: None, _conceal)
+    # only the parent handles Ctrl-C
+    with multiprocessing.get_context("spawn").Pool(jobs, signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
+        yield from pool.imap(diagnose_task, tasks)
 
 
 def _diagnose_task(
-    task: Path | FlightData, reference: Reference, progress: ReportProgress, conceal: Sequence[str]
+    task: Path | FlightData,
+    reference: Reference,
+    conceal: Sequence[str],
+    progress: ReportProgress = lambda message: None,
 ) -> TaskResult:
     reports: list[Report] = []
     try:
@@ -64,9 +55,8 @@ def _diagnose_task(
             if isinstance(reference, OwnPast):
                 reports.append(reference.diagnose(flight, progress, conceal))
             else:
-                reports.append(
-                    diagnose(conceal_channels(flight, conceal, flight), exclude_concealed(reference, conceal), progress)
-                )
+                visible = conceal_channels(flight, conceal, flight)
+                reports.append(diagnose(visible, exclude_concealed(reference, conceal), progress))
     except (ValueError, OSError) as error:
         return reports, str(error)
     return reports, ""

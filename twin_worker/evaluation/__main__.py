@@ -4,7 +4,6 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -14,7 +13,7 @@ from fleet.process.logs import report_progress
 from twin_worker.evaluation.drive import EvaluationPlan
 from twin_worker.evaluation.scoring.log import EvaluationCase
 from twin_worker.evaluation.scoring.summary import summarise
-from twin_worker.evaluation.share import Evaluation, assess_recordings
+from twin_worker.evaluation.share import assess_recordings
 from twin_worker.evaluation.table import table
 
 _PLAIN_WIDTH = 150  # columns of the table where the output is not a terminal
@@ -32,7 +31,17 @@ def _run(args: argparse.Namespace) -> int:
     warm_up()
     plan = EvaluationPlan(args.every, args.method, baseline_methods(args.methods), args.without_params)
     evaluation = assess_recordings(args.file, plan, jobs=args.jobs, offset=args.offset, report=_report)
-    results = summarise(evaluation.cases) | {"run": _run_summary(args, plan, evaluation)}
+    results = summarise(evaluation.cases)
+    results["run"] = {
+        "files": [str(path) for path in args.file],
+        "every_s": plan.every_s,
+        "method": args.method,
+        "methods": list(plan.methods),
+        "without_params": plan.without_params,
+        "counted": sum(not case.exclusion for case in evaluation.cases),
+        "apart": sum(bool(case.exclusion) for case in evaluation.cases),
+        "silent": evaluation.missed,
+    }
     console = Console()
     console.width = console.width if console.is_terminal else _PLAIN_WIDTH
     console.print(table(results))
@@ -45,27 +54,14 @@ def _run(args: argparse.Namespace) -> int:
     return 0 if any(not case.exclusion for case in evaluation.cases) else 1
 
 
-def _run_summary(args: argparse.Namespace, plan: EvaluationPlan, evaluation: Evaluation) -> dict[str, Any]:
-    return {
-        "files": [str(path) for path in args.file],
-        "every_s": plan.every_s,
-        "method": args.method,
-        "methods": list(plan.methods),
-        "without_params": plan.without_params,
-        "counted": sum(not case.exclusion for case in evaluation.cases),
-        "apart": sum(bool(case.exclusion) for case in evaluation.cases),
-        "silent": evaluation.missed,
-    }
-
-
 def _write_outputs(folder: Path, cases: list[EvaluationCase]) -> None:
     from twin_worker.evaluation.figures import draw
     from twin_worker.evaluation.table import write_predictions
 
     folder.mkdir(parents=True, exist_ok=True)
-    counted = [case for case in cases if not case.exclusion]
+    counted, excluded = ([case for case in cases if bool(case.exclusion) is apart] for apart in (False, True))
     written = draw(folder, counted)
-    for name, selected in (("predictions", counted), ("predictions_apart", [case for case in cases if case.exclusion])):
+    for name, selected in (("predictions", counted), ("predictions_apart", excluded)):
         if selected:
             write_predictions(folder / f"{name}.npz", selected)
             written.append(folder / f"{name}.npz")

@@ -69,7 +69,10 @@ def route_line(route: Route, inputs: LineInputs) -> np.ndarray:
     """Return the route from the point abeam the aircraft on, points every few metres, (n, 4)."""
     parts, remaining = [], inputs.length
     start = route.start if np.isfinite(route.start).all() else inputs.on_item[0]
-    start = _nearest_point(start, route.legs[0, P_N : P_D + 1], inputs.position)
+    # begin at the point of the first leg, as a straight one, horizontally nearest to the aircraft
+    leg_vector = route.legs[0, P_N : P_D + 1] - start
+    share = (inputs.position[:2] - start[:2]) @ leg_vector[:2] / max(float(leg_vector[:2] @ leg_vector[:2]), 1e-6)
+    start = start + np.clip(share, 0.0, 1.0) * leg_vector
     for k, leg in enumerate(route.legs):
         next_target = route.legs[k + 1, P_N : P_N + 2] if k + 1 < len(route.legs) else None
         for part in _leg_points(leg, start, next_target, inputs, first=k == 0):
@@ -79,13 +82,6 @@ def route_line(route: Route, inputs: LineInputs) -> np.ndarray:
         if remaining < 0:
             break
     return np.vstack(parts)
-
-
-def _nearest_point(start: np.ndarray, end: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Return the point of a straight leg horizontally nearest to the aircraft, (3,) [m]."""
-    vector = end - start
-    share = (position[:2] - start[:2]) @ vector[:2] / max(float(vector[:2] @ vector[:2]), 1e-6)
-    return start + np.clip(share, 0.0, 1.0) * vector
 
 
 def _leg_points(
@@ -211,8 +207,9 @@ def route_at_ground_speed(inputs: BaselineInput) -> np.ndarray | None:
 
 def route_in_wind(inputs: BaselineInput) -> np.ndarray | None:
     """Predict along the mission at the commanded airspeed in the estimated wind, (k, 3) [m]; None without a mission."""
-    if inputs.twin.vehicle_class.is_rotorcraft:
-        return _follow_route(inputs, lambda points: _multirotor_speed(inputs, points))
+    if inputs.twin.vehicle_class.is_rotorcraft:  # as commanded, else the present speed
+        speed = np.hypot(*inputs.velocity[:2])
+        return _follow_route(inputs, lambda points: np.where(points[1:, 3] > 0, points[1:, 3], speed))
     wind = inputs.twin.environment.wind.wind if np.isfinite(inputs.twin.environment.wind.t) else None
     wind_ne, airspeed = wind_and_airspeed(inputs.track, wind)
     params = inputs.twin.onboard.params.values if inputs.twin.onboard.params else {}
@@ -231,11 +228,6 @@ def route_in_wind(inputs: BaselineInput) -> np.ndarray | None:
         return np.sqrt(np.maximum(Va**2 - cross_wind**2, 1.0)) + direction @ wind_ne
 
     return _follow_route(inputs, ground_speed)
-
-
-def _multirotor_speed(inputs: BaselineInput, points: np.ndarray) -> np.ndarray:
-    """Return the speed of a multirotor: as commanded, else the present speed."""
-    return np.where(points[1:, 3] > 0, points[1:, 3], np.hypot(*inputs.velocity[:2]))
 
 
 def _follow_route(inputs: BaselineInput, ground_speed: Callable[[np.ndarray], np.ndarray]) -> np.ndarray | None:
@@ -271,10 +263,8 @@ def _route_points(inputs: BaselineInput) -> np.ndarray | None:
     if not np.isfinite(seq[-1]):
         return None
     params = twin.onboard.params.values if twin.onboard.params else {}
-    first = twin.first_item
-    remaining = unroll_route(
-        twin.onboard.mission.items, seq=int(seq[-1]), origin=twin.telemetry.origin, params=params, first=first
-    )
+    items, origin = twin.onboard.mission.items, twin.telemetry.origin
+    remaining = unroll_route(items, seq=int(seq[-1]), origin=origin, params=params, first=twin.first_item)
     if not len(remaining.legs):
         return None
     other_item = np.flatnonzero(seq != seq[-1])
@@ -287,16 +277,11 @@ def _route_points(inputs: BaselineInput) -> np.ndarray | None:
 def closed_loop_dynamics(inputs: BaselineInput) -> np.ndarray | None:
     """Predict with the identified derivatives model in closed loop, (k, 3) [m]; None without model or route."""
     twin = inputs.twin
-    window = twin.window(_HISTORY_S)
-    if (
-        not isinstance(twin.models.active_model, DerivativesModel)
-        or window is None
-        or not window.ok[-1]
-        or twin.no_route_reason()
-    ):
+    window, model = twin.window(_HISTORY_S), twin.models.active_model
+    if not isinstance(model, DerivativesModel) or window is None or not window.ok[-1] or twin.no_route_reason():
         return None
     ahead = inputs.ahead + (inputs.track.t[-1] - window.t[-1])
-    return fly_ahead(twin.situation(window), twin.models.active_model, np.maximum(ahead, 0.0)).path
+    return fly_ahead(twin.situation(window), model, np.maximum(ahead, 0.0)).path
 
 
 BASELINES: dict[str, Callable[[BaselineInput], np.ndarray | None]] = {

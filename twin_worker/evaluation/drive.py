@@ -1,6 +1,6 @@
 """Replay recordings through the twins as if live, with forecasts of every method at the same instants."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -69,13 +69,14 @@ class RecordingDriver:
     Attributes:
         name: name of the recording
         plan: settings
-        is_selected: whether to evaluate an aircraft, by its order of appearance
+        share: aircraft before this recording, remainder and divisor: evaluate the aircraft whose number, in order of
+            appearance over all recordings, has this remainder
         uavs: aircraft by UAV id; None: not selected
     """
 
     name: str
     plan: EvaluationPlan
-    is_selected: Callable[[int], bool] = lambda _: True
+    share: tuple[int, int, int] = (0, 0, 1)
     uavs: dict[int, EvaluatedUav | None] = field(default_factory=dict)
 
     def run(self, messages: Iterable[Message]) -> Iterator[EvaluationCase]:
@@ -84,9 +85,12 @@ class RecordingDriver:
             evaluated = self._evaluated(message.uav)
             if evaluated is None:
                 continue
-            if _clock_jumps(evaluated, message):
-                yield from _resolve_starts(evaluated)
-                evaluated.reference, evaluated.slot = ReferenceFlight(), -1
+            before = evaluated.twin.onboard.status
+            if isinstance(message, Status) and before is not None:
+                now, earlier = ((status.clock_jumps, status.clock_advance_s) for status in (message, before))
+                if now != earlier:
+                    yield from _resolve_starts(evaluated)
+                    evaluated.reference, evaluated.slot = ReferenceFlight(), -1
             evaluated.reference.add(message)
             if not (self.plan.without_params and isinstance(message, Params)):
                 _advance(evaluated, message, self.plan)
@@ -101,18 +105,11 @@ class RecordingDriver:
 
     def _evaluated(self, uav: int) -> EvaluatedUav | None:
         if uav not in self.uavs:
+            before, remainder, divisor = self.share
             paper_twin = Twin.of(uav, method=PAPER) if PAPER in self.plan.methods else None
             evaluated = EvaluatedUav(f"{self.name}:uav-{uav}", Twin.of(uav, method=self.plan.method), paper_twin)
-            self.uavs[uav] = evaluated if self.is_selected(len(self.uavs)) else None
+            self.uavs[uav] = evaluated if (before + len(self.uavs)) % divisor == remainder else None
         return self.uavs[uav]
-
-
-def _clock_jumps(evaluated: EvaluatedUav, message: Message) -> bool:
-    before = evaluated.twin.onboard.status
-    if not isinstance(message, Status) or before is None:
-        return False
-    now, earlier = ((status.clock_jumps, status.clock_advance_s) for status in (message, before))
-    return now != earlier
 
 
 def _resolve_starts(evaluated: EvaluatedUav) -> Iterator[EvaluationCase]:
@@ -152,28 +149,25 @@ def _record_start(evaluated: EvaluatedUav, prediction: Prediction, plan: Evaluat
     if track is None or twin.telemetry.origin is None:
         return
     track = track.unbroken_tail()
-    ahead = AHEAD
-    inputs = BaselineInput(twin, track, ahead + (prediction.t - track.t[-1]))
-    forecasts = {OURS: _resampled_forecast(prediction, ahead, prediction.t)}
+    inputs = BaselineInput(twin, track, AHEAD + (prediction.t - track.t[-1]))
+    forecasts = {OURS: _resampled_forecast(prediction, prediction.t)}
     for name in plan.methods:
-        path = (
-            _paper_forecast(evaluated, prediction, ahead)
-            if name == PAPER
-            else _baseline_forecast(name, inputs, forecasts[OURS])
-        )
-        if path is None:
-            fallback = BASELINES[FALLBACK](inputs)
-            path = None if fallback is None else MethodForecast(fallback, FALLBACK)
-        if path is not None:
-            forecasts[name] = path
-    group, spread = _group_and_spread(twin, prediction, ahead)
+        if name == PAPER:
+            forecast = _paper_forecast(evaluated, prediction)
+        else:
+            forecast = _baseline_forecast(name, inputs, forecasts[OURS])
+        if forecast is None and (path := BASELINES[FALLBACK](inputs)) is not None:
+            forecast = MethodForecast(path, FALLBACK)
+        if forecast is not None:
+            forecasts[name] = forecast
+    group, spread = _group_and_spread(twin, prediction)
     evaluated.starts.append(
         EvaluationStart(
             flight=evaluated.flight,
             uav=twin.config.uav,
             t=prediction.t,
             first_s=prediction.t - evaluated.reference.first_t,
-            ahead=ahead,
+            ahead=AHEAD,
             origin=twin.telemetry.origin,
             speed=float(np.linalg.norm(track.v[-1])),
             no_route_reason=twin.no_route_reason(),
@@ -193,30 +187,31 @@ def _baseline_forecast(name: str, inputs: BaselineInput, ours: MethodForecast) -
     return None if path is None or not np.isfinite(path[required]).all() else MethodForecast(path, name)
 
 
-def _resampled_forecast(prediction: Prediction, ahead: np.ndarray, t: float) -> MethodForecast:
+def _resampled_forecast(prediction: Prediction, t: float) -> MethodForecast:
     """Resample a prediction to look-aheads from `t`, which is within one step of its own time."""
     prediction_t = prediction.t + prediction.ahead.numpy().astype(float)
+
+    def resampled(rows: np.ndarray) -> np.ndarray:
+        return np.column_stack([np.interp(t + AHEAD, prediction_t, column, right=np.nan) for column in rows.T])
+
     path, tube = (
-        np.column_stack(
-            [np.interp(t + ahead, prediction_t, column, right=np.nan) for column in rows.numpy().astype(float).T]
-        )
-        for rows in (prediction.path, prediction.prediction_region_half_axes)
+        resampled(rows.numpy().astype(float)) for rows in (prediction.path, prediction.prediction_region_half_axes)
     )
     return MethodForecast(path, prediction.method, tube, prediction.horizon_s)
 
 
-def _paper_forecast(evaluated: EvaluatedUav, prediction: Prediction, ahead: np.ndarray) -> MethodForecast | None:
+def _paper_forecast(evaluated: EvaluatedUav, prediction: Prediction) -> MethodForecast | None:
     """Step the paper's twin once and return its forecast by the paper's method; None without one."""
     assert evaluated.paper_twin is not None
     results = advance(evaluated.paper_twin, (), evaluated.twin.telemetry.last_step_t)
     predictions = [result for result in results if isinstance(result, Prediction) and result.method == PAPER]
-    return _resampled_forecast(predictions[-1], ahead, prediction.t) if predictions else None
+    return _resampled_forecast(predictions[-1], prediction.t) if predictions else None
 
 
-def _group_and_spread(twin: Twin, prediction: Prediction, ahead: np.ndarray) -> tuple[str, np.ndarray]:
+def _group_and_spread(twin: Twin, prediction: Prediction) -> tuple[str, np.ndarray]:
     """Return the calibration group of a prediction and its ensemble spread, (k, 3) [m] or nan."""
     latest = twin.confidence.tracker.latest
-    spread = np.full((len(ahead), 3), np.nan)
+    spread = np.full((len(AHEAD), 3), np.nan)
     if latest is None or abs(latest[0].t + latest[0].ahead[0] - prediction.t) > _TIME_TOLERANCE_S:
         return prediction.method, spread
     if latest[0].spread is not None:

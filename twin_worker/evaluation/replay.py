@@ -56,6 +56,7 @@ EXAMPLES = """
 class ReplaySummary:
     """Summary of one UAV over a recording."""
 
+    first_t: float  # of its messages [s since 1970]
     methods: Counter[str] = field(default_factory=Counter)
     verified_s: float | None = None  # since its first message
     verdict: str = ""
@@ -74,31 +75,26 @@ def replay(messages: Iterable[Message], progress: str = "") -> dict[str, dict[st
     twins: dict[int, Twin] = {}
     traffic = TrafficMonitor()
     summaries: dict[int, ReplaySummary] = {}
-    first_t: dict[int, float] = {}
     reported_s = 0.0
     for message in messages:
-        start = first_t.setdefault(message.uav, message.t)
+        uav_summary = summaries.setdefault(message.uav, ReplaySummary(message.t))
+        start = uav_summary.first_t
         if progress and message.t - start >= reported_s + _REPORT_EVERY_S:
             reported_s = message.t - start
-            report_progress(progress, f"{reported_s:.0f} s of flight, {len(first_t)} UAVs")
-        uav_summary = summaries.setdefault(message.uav, ReplaySummary())
+            report_progress(progress, f"{reported_s:.0f} s of flight, {len(summaries)} UAVs")
         for result in run_offline((message,), twins, traffic):
-            _add_result(uav_summary, result, start)
+            if isinstance(result, Prediction):
+                uav_summary.methods[result.method] += 1
+                uav_summary.sentence = result.sentence
+            elif isinstance(result, Model):
+                uav_summary.verdict = result.verdict.sentence
+                if result.verdict.outcome is Outcome.VERIFIED and uav_summary.verified_s is None:
+                    uav_summary.verified_s = result.t - start
         _collect_passages(uav_summary, twins[message.uav])
     for uav, twin in twins.items():
         twin.confidence.tracker.censor_open()  # the recording is over: open predictions are censored
         _collect_passages(summaries[uav], twin)
-    return {str(uav): _row(twins[uav], summaries[uav], first_t[uav]) for uav in sorted(twins)}
-
-
-def _add_result(summary: ReplaySummary, result: Message, start: float) -> None:
-    if isinstance(result, Prediction):
-        summary.methods[result.method] += 1
-        summary.sentence = result.sentence
-    elif isinstance(result, Model):
-        summary.verdict = result.verdict.sentence
-        if result.verdict.outcome is Outcome.VERIFIED and summary.verified_s is None:
-            summary.verified_s = result.t - start
+    return {str(uav): _row(twins[uav], summaries[uav]) for uav in sorted(twins)}
 
 
 def _collect_passages(summary: ReplaySummary, twin: Twin) -> None:
@@ -111,10 +107,10 @@ def _collect_passages(summary: ReplaySummary, twin: Twin) -> None:
             summary.scored[method] = n
 
 
-def _row(twin: Twin, summary: ReplaySummary, start: float) -> dict[str, Any]:
+def _row(twin: Twin, summary: ReplaySummary) -> dict[str, Any]:
     return {
         "vehicle": twin.vehicle,
-        "seconds": round(float(max(twin.telemetry.history.newest - start, 0.0)), 1),
+        "seconds": round(float(max(twin.telemetry.history.newest - summary.first_t, 0.0)), 1),
         "methods": dict(summary.methods),
         "first_verified_s": None if summary.verified_s is None else round(summary.verified_s, 1),
         "scored": {method: len(passages) for method, passages in summary.passages.items()},

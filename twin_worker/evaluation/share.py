@@ -4,8 +4,7 @@ import multiprocessing
 import signal
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +15,8 @@ from fleet.telemetry.recording.recordings import Recording
 from twin_worker.evaluation.drive import EvaluationPlan, RecordingDriver
 from twin_worker.evaluation.scoring.log import EvaluationCase
 
-Task = tuple[
-    Sequence[Path], EvaluationPlan, int, tuple[int, int]
-]  # files, plan, offset, number of this process of how many
+# files, plan, offset, number of this process of how many
+Task = tuple[Sequence[Path], EvaluationPlan, int, tuple[int, int]]
 
 
 @dataclass
@@ -26,8 +24,8 @@ class Progress:
     """Progress of one recording."""
 
     name: str
-    shares: Any  # progress of each process, 0..1
-    processes: slice = field(default_factory=lambda: slice(None))
+    shares: Any  # progress of each process on each recording, 0..1
+    processes: slice
 
     @property
     def share(self) -> float:
@@ -100,23 +98,18 @@ def _task(task: Task) -> Evaluation:
 
 def _evaluate_share(task: Task, shares: Any) -> Evaluation:
     """Evaluate this process's share of the aircraft, numbered in order of appearance."""
-    files, plan, offset, share = task
-    k, jobs = share
+    files, plan, offset, (k, jobs) = task
     cases: list[EvaluationCase] = []
     missed, sentences, uav_count = 0, [], 0
     for number, (path, name) in enumerate(zip(files, recording_names(files), strict=True)):
         recording = Recording(path, offset)
-        drive = RecordingDriver(name, plan, partial(_is_in_share, uav_count, share))
+        drive = RecordingDriver(name, plan, (uav_count, k, jobs))
         cases += drive.run(_messages(recording, shares, number * jobs + k))
         shares[number * jobs + k] = 1.0
         uav_count += len(drive.uavs)
         missed += drive.missed
         sentences += recording.skipped
     return Evaluation(cases, missed, sentences)
-
-
-def _is_in_share(before: int, share: tuple[int, int], number: int) -> bool:
-    return (before + number) % share[1] == share[0]
 
 
 def recording_names(files: Sequence[Path]) -> list[str]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from rich.console import Group, RenderableType
@@ -27,6 +27,7 @@ _LABELS = {
     OURS: "ours",
 }
 _ERRORS = ("5", "16", "30", "60")
+_ERROR_COLUMNS = [f"p50 {s} s [m]" for s in _ERRORS]
 _STYLES = {BEATEN: "green", WORSE: "red"}
 _NO_STARTS = f"no prediction, and no mission flown after the first {MIN_FIRST_S:.0f} s"
 _OTHER_KEYS = ("compare", "apart", "run")
@@ -34,8 +35,8 @@ _OTHER_KEYS = ("compare", "apart", "run")
 
 def table(results: dict[str, Any]) -> RenderableType:
     """Format methods, tubes, phases, comparison and excluded starts."""
-    names = [name for name in (*_LABELS, *results) if name in results and name not in _OTHER_KEYS]
-    names = list(dict.fromkeys(names))
+    ordered = dict.fromkeys((*_LABELS, *results))
+    names = [name for name in ordered if name in results and name not in _OTHER_KEYS]
     parts: list[RenderableType] = []
     if names:
         parts += [_methods(results, names), Text(""), _region_table(results, names), Text("")]
@@ -47,21 +48,24 @@ def table(results: dict[str, Any]) -> RenderableType:
 
 def _methods(results: dict[str, Any], names: list[str]) -> Table:
     first_row = results[names[0]]
-    title = (
-        f"{first_row['starts']} starts of {first_row['flights']} flights; t10: time within 10 % of the path flown (M1)"
+    counts = f"{first_row['starts']} starts of {first_row['flights']} flights"
+    columns = (
+        "method",
+        "t10 quartile / median [s]",
+        "t5 [s]",
+        "within 60 s",
+        "M2 [s]",
+        *_ERROR_COLUMNS,
+        "p90 60 s [m]",
     )
-    out = _table(title, "method", "t10 quartile / median [s]", "t5 [s]", "within 60 s", "M2 [s]")
-    for s in _ERRORS:
-        _column(out, f"p50 {s} s [m]")
-    _column(out, "p90 60 s [m]")
+    out = _table(f"{counts}; t10: time within 10 % of the path flown (M1)", *columns)
     for name in names:
         row = results[name]
-        survival = "–" if row["survive_60"] is None else f"{row['survive_60']:.0%}"
         out.add_row(
             _LABELS.get(name, name),
             f"{_time(row, 'm1_t10_lq_s')} / {_time(row, 'm1_t10_median_s')}",
             _time(row, "m1_t5_lq_s"),
-            survival,
+            _share(row["survive_60"]),
             _time(row, "m2_t10_lq_s"),
             *(_number(row["p50_m"].get(s)) for s in _ERRORS),
             _number(row["p90_m"].get("60")),
@@ -71,16 +75,15 @@ def _methods(results: dict[str, Any], names: list[str]) -> Table:
 
 
 def _region_table(results: dict[str, Any], names: list[str]) -> Table:
-    look_aheads = list(results[names[0]]["coverage"])
-    out = _table("tube: share inside (worst flight), half-axes along / cross / vertical [m]", "look-ahead")
     with_region = [name for name in names if any(value is not None for value in results[name]["coverage"].values())]
-    for name in with_region:
-        _column(out, _LABELS.get(name, name))
-    for s in look_aheads:
-        out.add_row(f"{s} s", *(_inside(results[name], s) for name in with_region))
-    out.add_row("horizon hit rate", *(_share(results[name]["horizon_hit_rate"]) for name in with_region))
-    out.add_row("horizon rank correlation", *(_number(results[name]["horizon_rank_corr"], 2) for name in with_region))
-    out.add_row("horizon median [s]", *(_number(results[name]["horizon_median_s"]) for name in with_region))
+    rows = [results[name] for name in with_region]
+    title = "tube: share inside (worst flight), half-axes along / cross / vertical [m]"
+    out = _table(title, "look-ahead", *(_LABELS.get(name, name) for name in with_region))
+    for s in results[names[0]]["coverage"]:
+        out.add_row(f"{s} s", *(_inside(row, s) for row in rows))
+    out.add_row("horizon hit rate", *(_share(row["horizon_hit_rate"]) for row in rows))
+    out.add_row("horizon rank correlation", *(_number(row["horizon_rank_corr"], 2) for row in rows))
+    out.add_row("horizon median [s]", *(_number(row["horizon_median_s"]) for row in rows))
     return out
 
 
@@ -90,9 +93,8 @@ def _inside(row: dict[str, Any], s: str) -> str:
 
 
 def _phases(phases: dict[str, Any]) -> Table:
-    out = _table("ours by flight phase after the start", "phase", "starts", "t10 quartile [s]", "within 60 s")
-    for s in _ERRORS:
-        _column(out, f"p50 {s} s [m]")
+    columns = ("phase", "starts", "t10 quartile [s]", "within 60 s", *_ERROR_COLUMNS)
+    out = _table("ours by flight phase after the start", *columns)
     for name, row in phases.items():
         errors = (_number(row["p50_m"].get(s)) for s in _ERRORS)
         out.add_row(name, str(row["starts"]), _time(row, "m1_t10_lq_s"), _share(row["survive_60"]), *errors)
@@ -120,15 +122,11 @@ def notes(results: dict[str, Any], names: list[str]) -> list[str]:
     lines = [] if names else [_no_start_reason(results)]
     for name in names:
         counts = results[name]["made_by"]
-        others = {source: n for source, n in counts.items() if source != name}
-        if others:
-            counts_text = ", ".join(f"{n} by {by}" for by, n in others.items())
-            lines.append(f"{_LABELS.get(name, name)}: of {results[name]['starts']} predictions {counts_text}")
+        if others := ", ".join(f"{n} by {source}" for source, n in counts.items() if source != name):
+            lines.append(f"{_LABELS.get(name, name)}: of {results[name]['starts']} predictions {others}")
     for reason, row in results["apart"].items():
-        lines.append(
-            f"excluded: {row['starts']} starts, {reason}; ours within 10 % for {_number(row['m1_t10_lq_s'])} "
-            "s (quartile)"
-        )
+        time = _number(row["m1_t10_lq_s"])
+        lines.append(f"excluded: {row['starts']} starts, {reason}; ours within 10 % for {time} s (quartile)")
     return lines
 
 
@@ -145,14 +143,9 @@ def _no_start_reason(results: dict[str, Any]) -> str:
 
 def _table(title: str, *columns: str) -> Table:
     out = Table(title=Text(title), title_justify="left", box=None, pad_edge=False, padding=(0, 1), header_style="cyan")
-    for number, column in enumerate(columns):
-        _column(out, column, "right" if number else "left")
+    for number, column in enumerate(columns):  # `Text` keeps brackets of units from being parsed as markup
+        out.add_column(Text(column), justify="right" if number else "left", no_wrap=number == 0)
     return out
-
-
-def _column(out: Table, heading: str, justify: Literal["left", "right"] = "right") -> None:
-    """Add a column; `Text` keeps brackets of units from being parsed as markup."""
-    out.add_column(Text(heading), justify=justify, no_wrap=justify == "left")
 
 
 def _number(value: float | None, digits: int = 1) -> str:

@@ -45,9 +45,9 @@ _INPUT_LETTERS = {0: "da", 1: "de", 2: "dr", 3: "dt"}  # derivatives of each inp
 class AdaptationResult:
     """Result of an adaptation: whether the adapted model is used, and the mean position errors compared [m]."""
 
-    used: bool
-    present_error: float
-    adapted_error: float
+    used: bool = False
+    present_error: float = np.nan
+    adapted_error: float = np.nan
 
     @property
     def message(self) -> str:
@@ -68,19 +68,14 @@ def adapt_models(twin: Twin, outputs: EffectOutputs, names: str) -> AdaptationRe
     """
     checkpoint = latest_before(twin.models.checkpoints, outputs.onset - _CHECKPOINT_MARGIN_S)
     if checkpoint is None:
-        return AdaptationResult(False, np.nan, np.nan)
+        return AdaptationResult()
     adapted = _adapted_copy(twin, outputs, checkpoint)
-    errors = np.array(
-        [
-            (_hindcast_error(twin, s), _hindcast_error(adapted, s))
-            for s in _HINDCAST_S
-            if twin.telemetry.history.newest - s > outputs.onset
-        ]
-    )
-    errors = errors[np.isfinite(errors).all(axis=1)] if len(errors) else np.full((1, 2), np.nan)
-    if not len(errors):
-        return AdaptationResult(False, np.nan, np.nan)
-    present_error, adapted_error = errors.mean(axis=0).tolist()
+    spans = [s for s in _HINDCAST_S if twin.telemetry.history.newest - s > outputs.onset]
+    pairs = [(_hindcast_error(twin, s), _hindcast_error(adapted, s)) for s in spans]
+    pairs = [pair for pair in pairs if np.isfinite(pair).all()]
+    if not pairs:
+        return AdaptationResult()
+    present_error, adapted_error = np.mean(pairs, axis=0).tolist()
     if not adapted_error < _MAX_ERROR_RATIO * present_error:
         return AdaptationResult(False, present_error, adapted_error)
     twin.environment.set_wind(adapted.environment.wind, adapted.environment.wind_t)

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from twin_worker.mismatch.job import (
     telemetry_rows,
     with_adaptation,
 )
+from twin_worker.mismatch.process import DiagnosisProcess
 from twin_worker.twin.state.state import ROUTE_MODES, Twin
 
 BASELINE_S = 105.0  # own past used as the comparison model [s]
@@ -37,6 +38,7 @@ _RETRY_S = 30.0  # after a refusal [s]
 _SUSPEND_S, _MAX_SUSPEND_S = 60.0, 3600.0  # after an internal error, doubled each time; upper limit [s]
 _SAME_ONSET_S = 20.0  # findings of one effect with onsets further apart count as different [s]
 _CLEAR_COUNT = 2  # consecutive diagnoses without a finding that clear a mismatch
+_CONFIRMED = (DiagnosisOutcome.NAMED, DiagnosisOutcome.UNKNOWN)
 _VALID_OUTCOMES = (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST, Outcome.INSUFFICIENT_DATA)
 
 
@@ -107,16 +109,13 @@ class DiagnosisState:
             newest - self.diagnosed_t >= DIAGNOSIS_PERIOD_S or not self._model_valid(twin) or self._needs_confirmation
         )
         rows = telemetry_rows(twin.telemetry.history, newest - FLIGHT_S, self.past)
-        return DiagnosisJob(
-            twin.config.uav, rows, dict(twin.received_params), self.card, self.baseline, self.past_t, full
-        )
+        params = dict(twin.received_params)
+        return DiagnosisJob(twin.config.uav, rows, params, self.card, self.baseline, self.past_t, full)
 
     @property
     def _needs_confirmation(self) -> bool:
-        return self.published is not None and self.published.outcome in (
-            DiagnosisOutcome.SUSPECTED,
-            DiagnosisOutcome.UNKNOWN,
-        )
+        unsettled = (DiagnosisOutcome.SUSPECTED, DiagnosisOutcome.UNKNOWN)
+        return self.published is not None and self.published.outcome in unsettled
 
     def handle_result(self, result: DiagnosisResult) -> Mismatch | None:
         """Handle a result; return the mismatch to publish, None if nothing changed."""
@@ -131,22 +130,14 @@ class DiagnosisState:
             return None
         self.diagnosed_t = result.end
         report = result.report
-        mismatch = mismatch_message(
-            result.uav, shift_times(report, result.begin - self.first_t), result.begin, result.end
-        )
-        if mismatch.outcome in (DiagnosisOutcome.NAMED, DiagnosisOutcome.UNKNOWN) and not self._is_confirmed(
-            report, result.begin
-        ):
+        shifted = shift_times(report, result.begin - self.first_t)
+        mismatch = mismatch_message(result.uav, shifted, result.begin, result.end)
+        if mismatch.outcome in _CONFIRMED and not self._is_confirmed(report, result.begin):
             self.next_t = result.end + _CONFIRM_AFTER_S
             mismatch = mark_unconfirmed(mismatch)
         self.last_report, self.last_begin = report, result.begin
-        confirmed_before = self.published is not None and self.published.outcome in (
-            DiagnosisOutcome.NAMED,
-            DiagnosisOutcome.UNKNOWN,
-        )
-        self.clear_count = (
-            self.clear_count + 1 if mismatch.outcome in (DiagnosisOutcome.NONE, DiagnosisOutcome.SUSPECTED) else 0
-        )
+        confirmed_before = self.published is not None and self.published.outcome in _CONFIRMED
+        self.clear_count = 0 if mismatch.outcome in _CONFIRMED else self.clear_count + 1
         if confirmed_before and 0 < self.clear_count < _CLEAR_COUNT:
             return None  # a single diagnosis without the finding does not clear it
         self.published = mismatch
@@ -185,14 +176,10 @@ class DiagnosisState:
         """Return the uninterrupted flight time on the mission [s]."""
         if twin.onboard.status is None or twin.onboard.status.mode not in ROUTE_MODES:
             return 0.0
-        t = twin.telemetry.history.rows(
-            "attitude",
-            max(
-                twin.onboard.plan_changed_t,
-                twin.telemetry.link_restored_t,
-                twin.telemetry.history.newest - BASELINE_S - 5.0,
-            ),
-        )[0]
+        telemetry = twin.telemetry
+        earliest = telemetry.history.newest - BASELINE_S - 5.0
+        start = max(twin.onboard.plan_changed_t, telemetry.link_restored_t, earliest)
+        t, _ = telemetry.history.rows("attitude", start)
         return float(t[-1] - t[0]) if len(t) else 0.0
 
 
@@ -202,31 +189,21 @@ ALL_UAVS = -1  # in place of a UAV id
 LockedTwin = tuple[Twin, AbstractContextManager]  # a twin and its lock
 
 
-class Executor(Protocol):
-    """Executes diagnosis jobs, one at a time."""
-
-    @property
-    def free(self) -> bool:
-        """Return whether a job can be submitted now."""
-
-    def submit(self, job: DiagnosisJob) -> None:
-        """Start a job."""
-
-    def poll(self) -> DiagnosisResult | None:
-        """Return a finished result; None if there is none."""
-
-
 class Coordinator:
     """Mismatch diagnosis of the aircraft that a worker owns.
 
     Args:
-        executor: executes the diagnoses
+        executor: executes the diagnoses, one at a time
         baselines: comparison models by UAV id, `ALL_UAVS` for all others; by default each UAV's own past
         adapt: adapt the prediction models to diagnosed effects
     """
 
     def __init__(
-        self, executor: Executor, baselines: Mapping[int, Baseline] = MappingProxyType({}), *, adapt: bool = True
+        self,
+        executor: DiagnosisProcess,
+        baselines: Mapping[int, Baseline] = MappingProxyType({}),
+        *,
+        adapt: bool = True,
     ) -> None:
         self._executor, self._baselines, self._adapt = executor, baselines, adapt
         self.states: dict[int, DiagnosisState] = {}
@@ -246,7 +223,8 @@ class Coordinator:
         """
         twins = {twin.config.uav: (twin, lock) for twin, lock in owned}
         if (result := self._deferred or self._executor.poll()) is not None:
-            self._deferred = result if _locked(twins.get(result.uav)) else None
+            _, lock = twins.get(result.uav, (None, None))
+            self._deferred = result if isinstance(lock, LockType) and lock.locked() else None
             if self._deferred is not None:  # identification holds the lock; do not block the telemetry of the others
                 return
             uav, t = result.uav, result.end
@@ -255,22 +233,20 @@ class Coordinator:
             return
         due = []
         for twin, _ in owned:
-            urgency = self._run_isolated(twin.config.uav, twin.telemetry.history.newest, partial(self._urgency, twin))
+            uav, newest = twin.config.uav, twin.telemetry.history.newest
+            urgency = self._run_isolated(uav, newest, partial(self.state(uav).urgency, twin))
             if urgency is not None:
                 due.append((urgency, twin))
         if due:
             twin = max(due, key=lambda entry: entry[0])[1]
             uav, newest = twin.config.uav, twin.telemetry.history.newest
-            job = self._run_isolated(uav, newest, lambda: self.state(uav).create_job(twin))
+            job = self._run_isolated(uav, newest, partial(self.state(uav).create_job, twin))
             if job is not None:
                 self._executor.submit(job)
 
     def defects(self, uavs: Iterable[int]) -> list[str]:
         """Return the newest internal errors in the diagnoses of these aircraft."""
         return [self.states[uav].defect for uav in uavs if uav in self.states and self.states[uav].defect]
-
-    def _urgency(self, twin: Twin) -> float | None:
-        return self.state(twin.config.uav).urgency(twin)
 
     def _run_isolated(self, uav: int, t: float, action: Callable[[], T]) -> T | None:
         """Run an action for one aircraft at data time `t`; return None after an internal error."""
@@ -294,10 +270,6 @@ class Coordinator:
             with lock:
                 mismatch = state.published = _adapt_twin(twin, mismatch, result)
         return [mismatch]
-
-
-def _locked(locked_twin: LockedTwin | None) -> bool:
-    return locked_twin is not None and isinstance(locked_twin[1], LockType) and locked_twin[1].locked()
 
 
 def _adapt_twin(twin: Twin, mismatch: Mismatch, result: DiagnosisResult) -> Mismatch:

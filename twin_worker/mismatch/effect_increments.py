@@ -47,7 +47,11 @@ def effect_outputs(flight: FlightData, baseline: Baseline, report: Report) -> Ef
         return None
     last = float(flight.t[-1])
     rows = np.flatnonzero(flight.ok & (flight.t > last - _MAX_SPAN_S))[:: round(_ROW_PERIOD_S / DT)]
-    active = [_constant_at(hypothesis, last) for hypothesis in hypotheses]
+    # with their parameters at the end, held constant
+    active = [
+        hypothesis.with_parameters(hypothesis.parameters_at(np.array([last]))[:, 0], ALWAYS)
+        for hypothesis in hypotheses
+    ]
     active = [hypothesis for hypothesis in active if any(hypothesis.par)]
     if not active or len(rows) < 2:
         return None
@@ -69,12 +73,6 @@ def effect_outputs(flight: FlightData, baseline: Baseline, report: Report) -> Ef
     )
 
 
-def _constant_at(hypothesis: FaultHypothesis, t: float) -> FaultHypothesis:
-    """Return the effect with its parameters at time t, held constant."""
-    gate = float(hypothesis.onset.gate(np.array([t]))[0])
-    return hypothesis.with_parameters(gate * np.array(hypothesis.par), ALWAYS)
-
-
 def _accelerations(
     baseline: Baseline, ground: float, hypotheses: list[FaultHypothesis], inputs: tuple[np.ndarray, np.ndarray]
 ) -> np.ndarray:
@@ -82,8 +80,7 @@ def _accelerations(
     x, command = inputs
     n = x.shape[1]
     simulation = Simulation(baseline, [hypotheses] * n, np.zeros(n), ground)
-    angles = np.stack([*(baseline.card.angles(i)(command[i]) for i in range(3)), command[3]])
-    rates, force, *_ = simulation.derivatives(x, angles, np.zeros(n), np.zeros(n))
+    rates, force, *_ = simulation.derivatives(x, baseline.card.deflections(command), np.zeros(n), np.zeros(n))
     return np.concatenate([force, rates[3:6]])
 
 
@@ -93,17 +90,14 @@ def actual_deflections(hypotheses: list[FaultHypothesis], command: np.ndarray) -
     for hypothesis in hypotheses:
         if hypothesis.effect.stage is not Stage.DELTA or hypothesis.effect.takes_lag:
             continue
+        par = np.repeat(np.asarray(hypothesis.par, float)[:, None], _SETTLING_STEPS, axis=1)
         for column, name in enumerate(SURFACES):
             if hypothesis.target in (name, ALL_SURFACES):
-                out[:, column] = [_final_deflection(hypothesis, u) for u in out[:, column]]
+                for row in range(len(out)):
+                    u = np.full(_SETTLING_STEPS, out[row, column])
+                    hypothesis.effect.act(u, np.full(MEMORY, u[0]), DT, par)
+                    out[row, column] = u[-1]
     return out
-
-
-def _final_deflection(hypothesis: FaultHypothesis, u: float) -> float:
-    series = np.full(_SETTLING_STEPS, u)
-    par = np.repeat(np.asarray(hypothesis.par, float)[:, None], _SETTLING_STEPS, axis=1)
-    hypothesis.effect.act(series, np.full(MEMORY, u), DT, par)
-    return float(series[-1])
 
 
 def _wind(hypotheses: list[FaultHypothesis], flight: FlightData) -> np.ndarray:

@@ -177,14 +177,14 @@ def mismatch_message(uav: int, report: Report, begin: float, end: float) -> Mism
 
 def shift_times(report: Report, shift: float) -> Report:
     """Return the report with the times in its sentence shifted by `shift` [s]."""
-    shifted = [
-        replace(finding, hypothesis=replace(finding.hypothesis, onset=finding.hypothesis.onset.shifted(shift)))
-        for finding in report.findings
-    ]
+    findings = []
+    for finding in report.findings:
+        onset = finding.hypothesis.onset.shifted(shift)
+        findings.append(replace(finding, hypothesis=replace(finding.hypothesis, onset=onset)))
     channel, segments = report.where
-    shifted_where = channel, tuple((a + shift, b + shift) for a, b in segments)
-    text = with_sentence(replace(report, findings=tuple(shifted), where=shifted_where)).sentence
-    return replace(report, sentence=text)
+    where = channel, tuple((a + shift, b + shift) for a, b in segments)
+    shifted = with_sentence(replace(report, findings=tuple(findings), where=where))
+    return replace(report, sentence=shifted.sentence)
 
 
 def mark_unconfirmed(mismatch: Mismatch) -> Mismatch:
@@ -198,7 +198,11 @@ def summary(mismatch: Mismatch | None) -> str:
     """Return a short summary for the fleet table; empty if there is no mismatch."""
     if mismatch is None or mismatch.outcome is DiagnosisOutcome.NONE:
         return ""
-    names = " and ".join(_cause_name(cause) for cause in mismatch.causes if cause.name != "unknown")
+    names = " and ".join(
+        f"{cause.name} of the {cause.surface}" if cause.surface else cause.name
+        for cause in mismatch.causes
+        if cause.name != "unknown"
+    )
     if mismatch.outcome is DiagnosisOutcome.UNKNOWN:
         return f"unknown, in {mismatch.causes[0].channel}" if mismatch.causes else "unknown"
     return f"{mismatch.outcome.value} {names}".rstrip()
@@ -207,10 +211,6 @@ def summary(mismatch: Mismatch | None) -> str:
 def with_adaptation(mismatch: Mismatch, text: str, *, used: bool) -> Mismatch:
     """Add to a mismatch whether predictions use the adapted model."""
     return msgspec.structs.replace(mismatch, adapted=used, sentence=f"{mismatch.sentence}; {text}")
-
-
-def _cause_name(cause: Cause) -> str:
-    return f"{cause.name} of the {cause.surface}" if cause.surface else cause.name
 
 
 def _cause(finding: DiagnosisFinding, begin: float) -> Cause:

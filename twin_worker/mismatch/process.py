@@ -98,8 +98,7 @@ class DiagnosisProcess:
         finally:
             guard.cancel()
         if reason:
-            cpu_s = min(time.monotonic() - started, self._limit_cpu_s)
-            result = failed_result(job, reason, cpu_s=cpu_s)
+            result = failed_result(job, reason, cpu_s=min(time.monotonic() - started, self._limit_cpu_s))
         self._result = result
 
     def _open_pipe(self) -> Connection:
@@ -123,8 +122,7 @@ class DiagnosisProcess:
     def _kill_on_timeout(self) -> None:
         """Kill a process that exceeds the wall time; the reader then sees the end of its pipe."""
         self._timed_out = True
-        process = self._process
-        if process is not None:
+        if (process := self._process) is not None:
             process.kill()
 
     def _stop_process(self) -> int | None:

@@ -48,8 +48,7 @@ def summary(results: list[Experiment]) -> dict[str, dict[str, Any]]:
     """
     table = {}
     for mode in PHASES:
-        mode_results = [result for result in results if result.mode == mode]
-        if mode_results:
+        if mode_results := [result for result in results if result.mode == mode]:
             table[mode] = _row(mode_results, [result.fit_seen for result in results if result.mode_seen == mode])
     return table
 
@@ -89,9 +88,8 @@ def format_summary(first: str, table: dict[str, dict[str, Any]]) -> str:
             f"paired {row['paired_gain']:+5.1f}, better in {row['share_better']:.0%} (p {row['p']:.1g})"
         )
         if seen := row["fit_seen"]:
-            lines.append(
-                f"           over identification data: first {seen['first']:.1f}, refined {seen['refined']:.1f}"
-            )
+            values = f"first {seen['first']:.1f}, refined {seen['refined']:.1f}"
+            lines.append(f"           over identification data: {values}")
         verdict_text = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in sorted(row["verdicts"].items()))
         lines.append(f"           {verdict_text}; e.g. {row['sentence']}")
     return "\n".join(lines)
@@ -114,10 +112,7 @@ def _run(args: argparse.Namespace) -> int:
         result["first_step"][first] = table = summary(results)
         print(format_summary(first, table), flush=True)
         if args.out:
-            print(
-                f"  figures: {', '.join(path.name for path in draw(args.out, first, results, STATE_NAMES))} "
-                f"in {args.out}"
-            )
+            print(f"  figures: {', '.join(path.name for path in draw(args.out, first, results))} in {args.out}")
     if args.json:
         args.json.write_text(json.dumps(result, indent=1) + "\n")
     return 0
@@ -148,15 +143,10 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--first", choices=(*FIRST_STEPS, "both"), default="both", help="first step: projection (paper), PBSID, or both"
     )
-    for name, help_text in (
-        ("seen", "identification window"),
-        ("unseen", "free run"),
-        ("every", "interval of experiments"),
-    ):
+    durations = {"seen": "identification window", "unseen": "free run", "every": "interval of experiments"}
+    for name, text in durations.items():
         default = getattr(ExperimentPlan(), f"{name}_s")
-        parser.add_argument(
-            f"--{name}", type=_seconds, default=default, metavar="S", help=f"{help_text} ({default:.0f} s)"
-        )
+        parser.add_argument(f"--{name}", type=_seconds, default=default, metavar="S", help=f"{text} ({default:.0f} s)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="draw the figures into DIR")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the numbers to FILE")
     return run_command("twin_worker.paper_experiments", _run, parser.parse_args(argv))

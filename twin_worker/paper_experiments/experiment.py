@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fleet.airframes.airframe import ServoMap, servo_map
+from fleet.airframes.airframe import servo_map
 from fleet.contract import Outcome, Params, Sample
 from fleet.frames import Origin, ned_to_body
 from fleet.telemetry.recording.recordings import replay_messages
@@ -77,17 +77,14 @@ def read_flights(path: Path, offset: int = 0) -> Iterator[RecordedFlight]:
         elif isinstance(message, Params):
             params.setdefault(message.uav, {}).update(message.values)
     for uav, history in sorted(histories.items()):
-        recording = _resampled(history, servo_map(params.get(uav, {})))
+        t, lla = history.rows("position")
+        if len(t) < 2:
+            continue
+        origin, servos = Origin(*(int(k) for k in lla[0])), servo_map(params.get(uav, {}))
+        end, length = float(t[-1]), float(t[-1] - t[0])
+        recording = preprocess(history, origin, servos, np.zeros(3), until=end, seconds=length)
         if recording is not None:
             yield RecordedFlight(uav, recording, _wind(history, recording))
-
-
-def _resampled(history: TelemetryHistory, servos: ServoMap) -> Window | None:
-    t, lla = history.rows("position")
-    if len(t) < 2:
-        return None
-    origin, calm = Origin(*(int(k) for k in lla[0])), np.zeros(3)
-    return preprocess(history, origin, servos, calm, until=float(t[-1]), seconds=float(t[-1] - t[0]))
 
 
 def _wind(history: TelemetryHistory, recording: Window) -> np.ndarray:

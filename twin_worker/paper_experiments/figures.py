@@ -2,55 +2,47 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from fleet.report.ink import BAD, INK, LINES, MUTED, axis_limits
 from twin_worker.numerics.plot_style import style_axes
+from twin_worker.paper_experiments.experiment import STATE_NAMES, Experiment
 from twin_worker.telemetry.flight_phase import PHASES
-
-if TYPE_CHECKING:
-    from twin_worker.paper_experiments.experiment import Experiment
 
 _STEPS = (("first", LINES[0], "first step"), ("refined", BAD, "refined"))
 _UNITS = {"u": "m/s", "v": "m/s", "w": "m/s", "p": "rad/s", "q": "rad/s", "r": "rad/s"}
 
 
-def draw(folder: Path, first: str, results: "Sequence[Experiment]", names: Sequence[str]) -> list[Path]:
+def draw(folder: Path, first: str, results: Sequence[Experiment]) -> list[Path]:
     """Draw figure 7 for every mode and figure 8, over unseen and seen data, into a folder; return the files.
 
     Args:
         folder: created if missing
         first: name of the first step
         results: experiments
-        names: state names of the columns
     """
     folder.mkdir(parents=True, exist_ok=True)
     by_mode = {mode: group for mode in PHASES if (group := [result for result in results if result.mode == mode])}
     fits = {mode: np.array([result.fit for result in group]) for mode, group in by_mode.items()}
     seen_by_mode = {mode: [result.fit_seen for result in results if result.mode_seen == mode] for mode in PHASES}
     seen = {mode: np.array(group) for mode, group in seen_by_mode.items() if group}
-    figures = {
-        f"fig7_{first}_{mode}.png": _runs(_median_experiment(group), names, first) for mode, group in by_mode.items()
-    }
-    figures[f"fig8_{first}.png"] = _boxes(fits, names, f"{first} and refined, over unseen data")
-    figures[f"fig8_{first}_seen.png"] = _boxes(seen, names, f"{first} and refined, over identification data")
+    figures = {}
+    for mode, group in by_mode.items():
+        ranked = sorted(group, key=lambda result: float(result.fit[1].mean()))
+        figures[f"fig7_{first}_{mode}.png"] = _runs(ranked[len(ranked) // 2], first)  # the median fit of the refined
+    figures[f"fig8_{first}.png"] = _boxes(fits, f"{first} and refined, over unseen data")
+    figures[f"fig8_{first}_seen.png"] = _boxes(seen, f"{first} and refined, over identification data")
     for name, figure in figures.items():
         figure.savefig(folder / name, dpi=130)
     return [folder / name for name in figures]
 
 
-def _median_experiment(group: "list[Experiment]") -> "Experiment":
-    """Return the experiment with the median fit of the refined model."""
-    return sorted(group, key=lambda result: float(result.fit[1].mean()))[len(group) // 2]
-
-
-def _runs(result: "Experiment", names: Sequence[str], first: str) -> Figure:
+def _runs(result: Experiment, first: str) -> Figure:
     """Draw every state of one experiment: measured, first step, refined."""
     figure = Figure(figsize=(11, 7), layout="constrained")
-    for k, (ax, name) in enumerate(zip(figure.subplots(3, 3, sharex=True).flat, names, strict=True)):
+    for k, (ax, name) in enumerate(zip(figure.subplots(3, 3, sharex=True).flat, STATE_NAMES, strict=True)):
         ax.plot(result.seconds, result.actual[:, k], color=INK, lw=1.6, label="measured")
         for step, colour, label in _STEPS:
             run = getattr(result, step)[:, k]
@@ -66,11 +58,11 @@ def _runs(result: "Experiment", names: Sequence[str], first: str) -> Figure:
     return figure
 
 
-def _boxes(fits: dict[str, np.ndarray], names: Sequence[str], title: str) -> Figure:
+def _boxes(fits: dict[str, np.ndarray], title: str) -> Figure:
     """Draw box plots of the fit per state, one panel per mode: fits (N, 2, 9) [%]."""
     figure = Figure(figsize=(11, 7.5), layout="constrained")
     panels = figure.subplots(2, 2, sharey=True, squeeze=False).flat
-    places = np.arange(len(names))
+    places = np.arange(len(STATE_NAMES))
     for ax, (mode, fit) in zip(panels, fits.items(), strict=False):
         for i, (_, colour, label) in enumerate(_STEPS):
             boxes = ax.boxplot(
@@ -82,7 +74,7 @@ def _boxes(fits: dict[str, np.ndarray], names: Sequence[str], title: str) -> Fig
                 line.set(color=colour)
             ax.plot([], [], color=colour, lw=5, alpha=0.5, label=label)
         ax.axhline(0, color=MUTED, lw=0.6)
-        ax.set_xticks(places, names)
+        ax.set_xticks(places, STATE_NAMES)
         style_axes(ax, f"{mode}, n {len(fit)}")
     for ax in list(panels):
         ax.set_visible(False)

@@ -46,8 +46,8 @@ def with_added(sight: Any, channel: str, x: np.ndarray) -> Any:
 def test_a_hum_is_heard_in_its_channel_and_noise_is_none(hertz: float) -> None:
     hum = 1.6 * np.sin(2 * np.pi * hertz * T + 1.0) * (T > ONSET_S)
     heard = {one.channel: one for one in find_tones(with_added(quiet(1), "pitch", hum))}
-    assert heard["pitch"].power_ratio > RULES["tone"].min_gain and abs(heard["pitch"].t0 - ONSET_S) < 20.0
-    assert max(one.power_ratio for name, one in heard.items() if name != "pitch") < 0.4 * RULES["tone"].min_gain
+    assert heard["pitch"].net_gain > RULES["tone"].min_gain and abs(heard["pitch"].t0 - ONSET_S) < 20.0
+    assert max(one.net_gain for name, one in heard.items() if name != "pitch") < 0.4 * RULES["tone"].min_gain
 
 
 def test_a_constant_term_does_not_drown_the_others() -> None:

@@ -47,7 +47,7 @@ def test_an_engine_loss_is_located_by_the_flights_own_first_90_s(alfa: FlightDat
 
 def test_the_engine_loss_shows_however_much_of_the_past_is_trusted(alfa: FlightData) -> None:
     found = [find_tracking_loss(alfa, until) for until in (70.0, 90.0, 110.0)]
-    assert all(one is not None and one.signal == ENERGY and abs(one.since - 116.1) <= 5.0 for one in found), found
+    assert all(one is not None and one[0] == ENERGY and abs(one[1] - 116.1) <= 5.0 for one in found), found
 
 
 @pytest.fixture(scope="module")

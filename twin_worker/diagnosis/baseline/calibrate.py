@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from twin_worker.diagnosis.baseline.fit import drag_uncertainty, fit, fit_timing
+from twin_worker.diagnosis.baseline.fit import drag_uncertainty, fit, fit_timing, terms_in_wind
 from twin_worker.diagnosis.data.card import AircraftCard, FaultHypothesis
 from twin_worker.diagnosis.data.flight import FlightData
 from twin_worker.diagnosis.inference.isolation.nuisance import (
@@ -54,16 +54,14 @@ def calibrate(
     progress("fitting without each flight in turn")
     parts = list(flights) if len(flights) > 1 else halves(flights[0])
     partial_fits = [fit([f for f in parts if f is not part], card, timing, vane)[0] for part in parts]
-    modelled_flights = [ModelledFlight(part, partial) for part, partial in zip(parts, partial_fits, strict=True)]
-    others = tuple({name: b.coef[name] - x for name, x in base.coef.items()} for b in partial_fits)
-    base = replace(
-        base, others=(*others, drag_uncertainty([ModelledFlight(flight, base) for flight in flights], winds))
-    )
+    modelled_flights = list(map(ModelledFlight, parts, partial_fits))
+    others = [{name: b.coef[name] - x for name, x in base.coef.items()} for b in partial_fits]
+    drag = drag_uncertainty(terms_in_wind([ModelledFlight(flight, base) for flight in flights], winds))
+    base = replace(base, others=(*others, drag))
     _check_plausible(base)
-    _check_consistent(modelled_flights)
-    return with_statistics(
-        base, modelled_flights, [fit_wind(modelled, np.zeros(4)) for modelled in modelled_flights], progress
-    )
+    winds = [fit_wind(modelled, np.zeros(4)) for modelled in modelled_flights]
+    _check_consistent(modelled_flights, winds)
+    return with_statistics(base, modelled_flights, winds, progress)
 
 
 def with_statistics(
@@ -87,9 +85,9 @@ def with_statistics(
     chance: dict[str, float] = {}
     usual = []
     for modelled, w in zip(modelled_flights, winds, strict=True):
-        whitened = WhitenedResiduals(
-            with_noise_of(modelled, base), weather_hypotheses(w) if wind_is_nominal(base) else ()
-        )
+        own = replace(modelled.base, noise=base.noise, spread=base.spread, usual=base.usual, others=base.others)
+        with_noise = ModelledFlight(modelled.flight, own, template=modelled)
+        whitened = WhitenedResiduals(with_noise, weather_hypotheses(w) if wind_is_nominal(base) else ())
         usual.append(whitened.mean_square())
         for scored in best_hypotheses(whitened, ()):
             chance[scored.kind] = max(chance.get(scored.kind, 0.0), scored.gain)
@@ -114,22 +112,18 @@ def _check_plausible(base: Baseline) -> None:
         )
 
 
-def _check_consistent(modelled_flights: list[ModelledFlight]) -> None:
+def _check_consistent(modelled_flights: list[ModelledFlight], winds: list[np.ndarray]) -> None:
     """Reject nominal flights if one deviates from the others."""
-    residual_rows = [
-        modelled.residuals(weather_hypotheses(fit_wind(modelled, np.zeros(4))))[modelled.ok]
-        for modelled in modelled_flights
-    ]
-    rms = np.array([np.sqrt((x**2).mean(axis=0)) for x in residual_rows])
+    pairs = zip(modelled_flights, winds, strict=True)
+    residual_rows = [modelled.residuals(weather_hypotheses(w))[modelled.ok] for modelled, w in pairs]
+    rms = np.array([np.sqrt((x**2).mean(axis=0)) for x in residual_rows])[:, :_N_MODEL_CHANNELS]
     for k, modelled in enumerate(modelled_flights):
         ratio = rms[k] / np.maximum(np.median(np.delete(rms, k, axis=0), axis=0), 1e-6)
-        ratio = np.where(np.arange(len(CHANNELS)) < _N_MODEL_CHANNELS, ratio, 0.0)
         worst = int(np.argmax(ratio))
         if ratio[worst] > _MAX_RMS_RATIO:
             raise ValueError(
-                f"{modelled.flight.name}: found {CHANNELS[worst]} {ratio[worst]:.0f} times as far from the "
-                "simulation as "
-                "on the other flights, expected nominal flights; leave it out, and diagnose it"
+                f"{modelled.flight.name}: found {CHANNELS[worst]} {ratio[worst]:.0f} times as far from the simulation "
+                "as on the other flights, expected nominal flights; leave it out, and diagnose it"
             )
 
 
@@ -137,14 +131,6 @@ def halves(flight: FlightData) -> list[FlightData]:
     """Split a flight into halves with disjoint valid rows."""
     middle = np.median(flight.t[flight.ok])
     return [replace(flight, ok=flight.ok & side) for side in (flight.t < middle, flight.t >= middle)]
-
-
-def with_noise_of(modelled: ModelledFlight, base: Baseline) -> ModelledFlight:
-    """Return the flight under its coefficients with the noise and spreads of another baseline."""
-    own = replace(
-        modelled.base, noise=base.noise, spread=base.spread, usual=base.usual, chance=base.chance, others=base.others
-    )
-    return ModelledFlight(modelled.flight, own, template=modelled)
 
 
 def _with_noise(
@@ -159,14 +145,16 @@ def _with_noise(
         ]
     nuisances = list_nuisances(base.vane)
     slopes = [_slopes(modelled, g, x) for modelled, g, x in zip(modelled_flights, weathers, residual_rows, strict=True)]
+    modes = drift_modes(base.vane)
+    floors = np.array([*(n.floor for n in nuisances), *(mode.floor for mode in modes)])
     noise = _noise(residual_rows, modelled_flights)
     for _ in range(2):
-        spread, means = _spreads(noise, modelled_flights, residual_rows, slopes)
+        spread, means = _spreads(noise, floors, modelled_flights, residual_rows, slopes)
         noise = _noise([x + J @ m for x, J, m in zip(residual_rows, slopes, means, strict=True)], modelled_flights)
     for k, n in enumerate(nuisances):
         if n.effect.name == "wind_steady":
             spread[k] = max(spread[k], np.sqrt(np.mean([w[n.index] ** 2 for w in winds])))
-    names = [*(n.name for n in nuisances), *(mode.name for mode in drift_modes(nuisances, base.vane))]
+    names = [*(n.name for n in nuisances), *(mode.name for mode in modes)]
     spread_by_name = dict(zip(names, spread.tolist(), strict=True))
     return replace(base, noise=Noise(noise.ar, noise.sigma * _NOISE_MARGIN), spread=spread_by_name)
 
@@ -177,20 +165,20 @@ def _slopes(modelled: ModelledFlight, weather: tuple[FaultHypothesis, ...], resi
     own = np.stack(
         [(modelled.residuals((*weather, n.hypothesis(n.step))) - residual_rows) / n.step for n in nuisances], axis=2
     )
-    return np.concatenate([own, drift_slopes(own, drift_modes(nuisances, modelled.base.vane), modelled.t)], axis=2)
+    return np.concatenate([own, drift_slopes(own, drift_modes(modelled.base.vane), modelled.t)], axis=2)
 
 
 def _spreads(
-    noise: Noise, modelled_flights: Sequence[ModelledFlight], residual_rows: list[np.ndarray], slopes: list[np.ndarray]
+    noise: Noise,
+    floors: np.ndarray,
+    modelled_flights: Sequence[ModelledFlight],
+    residual_rows: list[np.ndarray],
+    slopes: list[np.ndarray],
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Estimate the spreads of the nuisances by expectation-maximisation; return them and the values of each flight.
 
     A nuisance that is not observable on a flight does not change its spread.  Source: Dempster, Laird & Rubin 1977.
     """
-    nuisances = list_nuisances(modelled_flights[0].base.vane)
-    floors = np.array(
-        [*(n.floor for n in nuisances), *(mode.floor for mode in drift_modes(nuisances, modelled_flights[0].base.vane))]
-    )
     parts = []
     for modelled, x, J in zip(modelled_flights, residual_rows, slopes, strict=True):
         white = noise.whiten(J)[modelled.ok]

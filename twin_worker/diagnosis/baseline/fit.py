@@ -41,50 +41,37 @@ def fit(
     modelled_flights = [ModelledFlight(flight, base) for flight in flights]
     for _ in range(_ROUNDS):
         winds = [fit_wind(modelled, w) for modelled, w in zip(modelled_flights, winds, strict=True)]
-        all_terms = [
-            modelled.equation_terms(weather_hypotheses(w)) for modelled, w in zip(modelled_flights, winds, strict=True)
-        ]
-        base = replace(base, airspeed=_refit_airspeed_scale(modelled_flights, all_terms))
-        alpha = _solve(RegressionData(modelled_flights, all_terms, "alpha", ridge_share), 0)[0]
-        base = replace(
-            base,
-            coef={
-                "alpha": alpha,
-                "beta": _fit_sideslip(
-                    RegressionData(modelled_flights, all_terms, "beta", ridge_share), all_terms, vane
-                ),
-            },
-        )
+        all_terms = terms_in_wind(modelled_flights, winds)
+        airspeed = _refit_airspeed_scale(all_terms)
+        alpha = _solve(RegressionData(all_terms, "alpha", ridge_share), 0)[0]
+        beta = _fit_sideslip(RegressionData(all_terms, "beta", ridge_share), all_terms, vane)
+        base = replace(base, airspeed=airspeed, coef={"alpha": alpha, "beta": beta})
         modelled_flights = _with_baseline(modelled_flights, base)
-        base = _fit_forces_and_moments(
-            modelled_flights,
-            [
-                modelled.equation_terms(weather_hypotheses(w))
-                for modelled, w in zip(modelled_flights, winds, strict=True)
-            ],
-            base,
-            ridge_share,
-        )
+        base = _fit_forces_and_moments(terms_in_wind(modelled_flights, winds), base, ridge_share)
         modelled_flights = _with_baseline(modelled_flights, base)
     return base, winds
+
+
+def terms_in_wind(modelled_flights: Sequence[ModelledFlight], winds: Sequence[np.ndarray]) -> list[EquationTerms]:
+    """Compute the equation terms of each flight in its own weather, (4,)."""
+    pairs = zip(modelled_flights, winds, strict=True)
+    return [modelled.equation_terms(weather_hypotheses(w)) for modelled, w in pairs]
 
 
 def _with_baseline(modelled_flights: list[ModelledFlight], base: Baseline) -> list[ModelledFlight]:
     return [ModelledFlight(modelled.flight, base, template=modelled) for modelled in modelled_flights]
 
 
-def _fit_forces_and_moments(
-    modelled_flights: list[ModelledFlight], all_terms: list[EquationTerms], base: Baseline, ridge_share: float
-) -> Baseline:
+def _fit_forces_and_moments(all_terms: list[EquationTerms], base: Baseline, ridge_share: float) -> Baseline:
     """Fit forces and moments for known flow angles."""
     coef, r2 = dict(base.coef), {}
-    coef_x_t, r2["X"] = _solve(axial_regression(modelled_flights, all_terms, ridge_share), 0)
+    coef_x_t, r2["X"] = _solve(axial_regression(all_terms, ridge_share), 0)
     coef["X"], coef["T"] = coef_x_t[: len(eq.X)], coef_x_t[len(eq.X) :]
-    coef["M"], r2["M"] = _solve(pitch_regression(modelled_flights, all_terms, coef, ridge_share))
+    coef["M"], r2["M"] = _solve(pitch_regression(all_terms, coef, ridge_share))
     for name in ("L", "N"):
-        coef[name], r2[name] = _solve(RegressionData(modelled_flights, all_terms, name, ridge_share))
+        coef[name], r2[name] = _solve(RegressionData(all_terms, name, ridge_share))
     for name in ("alpha", "beta"):
-        data = RegressionData(modelled_flights, all_terms, name)
+        data = RegressionData(all_terms, name)
         r2[name] = _r2(data.A[data.ok] @ coef[name], data.y[data.ok])
     return replace(base, coef=coef, r2=r2)
 
@@ -109,7 +96,6 @@ class RegressionData:
 
     def __init__(
         self,
-        modelled_flights: list[ModelledFlight],
         all_terms: list[EquationTerms],
         name: str,
         ridge_share: float = RIDGE,
@@ -117,21 +103,22 @@ class RegressionData:
     ) -> None:
         self.ridge_share = ridge_share
         A, y, ok, lagged_ok = [], [], [], []
-        for modelled, m in zip(modelled_flights, all_terms, strict=True):
+        for m in all_terms:
             regressors = m.regressors[name] * m.scale.get(name, 1.0)
             A.append((regressors if extra_terms is None else np.concatenate([regressors, extra_terms(m)])).T)
             y.append(m.measured[name])
-            ok.append(modelled.ok)
-            good = modelled.ok.copy()
+            ok.append(m.modelled.ok)
+            good = m.modelled.ok.copy()
             for k in range(1, _ORDER + 1):
-                good[k:] &= modelled.ok[:-k]
+                good[k:] &= m.modelled.ok[:-k]
             good[:_ORDER] = False
             lagged_ok.append(good)
         self.A, self.y = np.concatenate(A), np.concatenate(y)
-        self.vane = modelled_flights[0].base.vane
-        known = modelled_flights[0].base.card.known and self.vane
+        base = all_terms[0].modelled.base
+        self.vane = base.vane
+        unlimited = [np.inf] * self.A.shape[1]
         self.prior_std = np.array(
-            eq.COEF_PRIOR_STD[name] if known and name in eq.COEF_PRIOR_STD else [np.inf] * self.A.shape[1]
+            eq.COEF_PRIOR_STD.get(name, unlimited) if base.card.known and base.vane else unlimited
         )
         self.ok, self.lagged_ok = np.concatenate(ok), np.concatenate(lagged_ok)
 
@@ -183,33 +170,37 @@ def _regularised_fit(A: np.ndarray, y: np.ndarray, data: RegressionData, rows_pe
     return solve_ridge(A, y, np.maximum(data.ridge_share, noise / (data.prior_std * length)))
 
 
-def drag_uncertainty(modelled_flights: list[ModelledFlight], winds: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+def drag_uncertainty(all_terms: list[EquationTerms]) -> dict[str, np.ndarray]:
     """Return the joint uncertainty of the drag coefficients that flight data do not separate: one standard deviation.
 
     The elevator coefficient, limited by its prior, changes by its standard deviation; correlated coefficients follow.
     """
-    coef = modelled_flights[0].base.coef
-    data = axial_regression(
-        modelled_flights,
-        [modelled.equation_terms(weather_hypotheses(w)) for modelled, w in zip(modelled_flights, winds, strict=True)],
-    )
+    coef = all_terms[0].modelled.base.coef
+    data = axial_regression(all_terms)
     A, k = data.A[data.ok], eq.X.index("delta_e")
-    noise = RAW_ROWS_PER_SAMPLE * np.mean(data.residuals(np.concatenate([coef["X"], coef["T"]])) ** 2)
+    noise = RAW_ROWS_PER_SAMPLE * np.mean(data.residuals(stacked_coef(coef, "X")) ** 2)
     ridge_weight = data.ridge_share * np.linalg.norm(A, axis=0)
     covariance = np.linalg.inv((A.T @ A + np.diag(ridge_weight**2)) / noise + np.diag(data.prior_std**-2.0))
-    change = covariance[:, k] / np.sqrt(covariance[k, k])
-    unchanged = {name: np.zeros_like(x) for name, x in coef.items()}
-    return {**unchanged, "X": change[: len(eq.X)], "T": change[len(eq.X) :]}
+    return coef_change(coef, "X", covariance[:, k] / np.sqrt(covariance[k, k]))
 
 
-def _refit_airspeed_scale(modelled_flights: list[ModelledFlight], all_terms: list[EquationTerms]) -> float:
+def stacked_coef(coef: dict[str, np.ndarray], name: str) -> np.ndarray:
+    """Return the coefficients of a separately fitted equation; `X` includes those of thrust."""
+    return np.concatenate([coef["X"], coef["T"]]) if name == "X" else coef[name]
+
+
+def coef_change(coef: dict[str, np.ndarray], name: str, change: np.ndarray) -> dict[str, np.ndarray]:
+    """Return a change of one equation's `stacked_coef` as a change of all coefficients."""
+    out = {equation: np.zeros_like(x) for equation, x in coef.items()}
+    return out | ({"X": change[: len(eq.X)], "T": change[len(eq.X) :]} if name == "X" else {name: change})
+
+
+def _refit_airspeed_scale(all_terms: list[EquationTerms]) -> float:
     """Fit the ratio of reported to indicated airspeed."""
-    if any("Va" not in modelled.flight.readings for modelled in modelled_flights):
+    if any("Va" not in m.modelled.flight.readings for m in all_terms):
         return 1.0
-    pairs = zip(modelled_flights, all_terms, strict=True)
-    x, y = np.concatenate(
-        [np.stack([m.flow.Va * np.sqrt(m.flow.rho / RHO_0), m.measured["airspeed"]])[:, c.ok] for c, m in pairs], axis=1
-    )
+    pairs = [np.stack([m.flow.Va * np.sqrt(m.flow.rho / RHO_0), m.measured["airspeed"]]) for m in all_terms]
+    x, y = np.concatenate([pair[:, m.modelled.ok] for pair, m in zip(pairs, all_terms, strict=True)], axis=1)
     return float((x @ y) / (x @ x))
 
 
@@ -226,13 +217,13 @@ def fit_timing(flights: Sequence[FlightData], card: AircraftCard, vane: bool) ->
     def unexplained(timing: ActuatorTiming) -> dict[str, float]:
         """Return the log innovation variance of pitch and yaw (servo) and of axial force (engine)."""
         timed = _with_baseline(modelled_flights, replace(base, timing=timing))
-        all_terms = [modelled.equation_terms(weather_hypotheses(w)) for modelled, w in zip(timed, winds, strict=True)]
-        axial_data = axial_regression(timed, all_terms)
-        coef = {"T": _solve(axial_data, 0)[0][len(eq.X) :]}
-        yaw = RegressionData(timed, all_terms, "N")
+        all_terms = terms_in_wind(timed, winds)
+        axial = axial_regression(all_terms)
+        pitch = pitch_regression(all_terms, {"T": _solve(axial, 0)[0][len(eq.X) :]})
+        yaw = RegressionData(all_terms, "N")
         return {
-            "servo": _log_innovation_variance(pitch_regression(timed, all_terms, coef)) + _log_innovation_variance(yaw),
-            "engine": _log_innovation_variance(axial_data),
+            "servo": _log_innovation_variance(pitch) + _log_innovation_variance(yaw),
+            "engine": _log_innovation_variance(axial),
         }
 
     # lag and delay are strongly correlated: a search in turn would miss the best pair
@@ -243,19 +234,12 @@ def fit_timing(flights: Sequence[FlightData], card: AircraftCard, vane: bool) ->
 
 
 def pitch_regression(
-    modelled_flights: list[ModelledFlight],
-    all_terms: list[EquationTerms],
-    coef: dict[str, np.ndarray],
-    ridge_share: float = RIDGE,
+    all_terms: list[EquationTerms], coef: dict[str, np.ndarray], ridge_share: float = RIDGE
 ) -> RegressionData:
     """Return the regression data of the pitching moment, with the moment of thrust as a term."""
-    return RegressionData(
-        modelled_flights, all_terms, "M", ridge_share, extra_terms=lambda m: (coef["T"] @ m.regressors["T"])[None]
-    )
+    return RegressionData(all_terms, "M", ridge_share, lambda m: (coef["T"] @ m.regressors["T"])[None])
 
 
-def axial_regression(
-    modelled_flights: list[ModelledFlight], all_terms: list[EquationTerms], ridge_share: float = RIDGE
-) -> RegressionData:
+def axial_regression(all_terms: list[EquationTerms], ridge_share: float = RIDGE) -> RegressionData:
     """Return the regression data of axial force, drag terms before thrust terms."""
-    return RegressionData(modelled_flights, all_terms, "X", ridge_share, extra_terms=lambda m: m.regressors["T"])
+    return RegressionData(all_terms, "X", ridge_share, lambda m: m.regressors["T"])

@@ -23,22 +23,11 @@ _RANGE_PERCENTILES = 5.0, 95.0  # percentiles of the past range
 _MIN_MARGIN = {ENERGY: 4.0, TURN: np.radians(4.0), PITCH: np.radians(6.0)}  # least excess [m, rad/s, rad]
 
 
-@dataclass(frozen=True)
-class TrackingLoss:
-    """Loss of tracking: signal, onset [s], largest excess in units of the margin."""
-
-    signal: str
-    since: float
-    range_ratio: float
-
-
-def find_tracking_loss(flight: FlightData, until: float) -> TrackingLoss | None:
-    """Return the first signal that permanently left its range before `until` [s, on the flight's clock]."""
-    t = flight.t
-    losses = [
-        loss for name, x in _signals(flight).items() if (loss := _detect_loss(name, t, x, flight.ok, until)) is not None
-    ]
-    return min(losses, key=lambda loss: loss.since, default=None)
+def find_tracking_loss(flight: FlightData, until: float) -> tuple[str, float] | None:
+    """Return the first signal that permanently left its range before `until` [s, on the flight's clock], and when."""
+    onsets = {name: _loss_onset(name, x, flight, until) for name, x in _signals(flight).items()}
+    lost = [(name, onset) for name, onset in onsets.items() if onset is not None]
+    return min(lost, key=lambda loss: loss[1], default=None)
 
 
 def _signals(flight: FlightData) -> dict[str, np.ndarray]:
@@ -56,7 +45,9 @@ def _signals(flight: FlightData) -> dict[str, np.ndarray]:
     }
 
 
-def _detect_loss(name: str, t: np.ndarray, x: np.ndarray, ok: np.ndarray, until: float) -> TrackingLoss | None:
+def _loss_onset(name: str, x: np.ndarray, flight: FlightData, until: float) -> float | None:
+    """Return when a signal, (n,), permanently left its range [s]; None if it did not."""
+    t, ok = flight.t, flight.ok
     past, later = ok & (t < until), t >= until
     low, middle, high = np.percentile(x[past], [_RANGE_PERCENTILES[0], 50.0, _RANGE_PERCENTILES[1]])
     margin = max(_MARGIN_SHARE * (high - low), _MIN_MARGIN[name])
@@ -71,8 +62,7 @@ def _detect_loss(name: str, t: np.ndarray, x: np.ndarray, ok: np.ndarray, until:
         return None
     side = np.sign(x[first] - middle)
     before = np.flatnonzero(side * (x[:first] - middle) <= 0.0)
-    since = float(t[before[-1]]) if len(before) else float(t[first])
-    return TrackingLoss(name, since, float(excess.max()))
+    return float(t[before[-1]]) if len(before) else float(t[first])
 
 
 MIN_AFTER_S = 10.0  # least length of valid flight to diagnose
@@ -105,8 +95,7 @@ class OwnPast:
         if after < MIN_AFTER_S:
             raise ValueError(
                 f"{flight.name}: found {format_below(after, MIN_AFTER_S)} s of trusted flight after "
-                f"{self.until:.0f} s, "
-                f"expected {MIN_AFTER_S:.0f} s at least to diagnose; trust a shorter past"
+                f"{self.until:.0f} s, expected {MIN_AFTER_S:.0f} s at least to diagnose; trust a shorter past"
             )
         visible = conceal_channels(flight, conceal, part_before(flight, self.until))
         base = calibrate_past(flight, self.until, self.card, progress, visible if conceal else None)
@@ -114,15 +103,12 @@ class OwnPast:
             f"calibrated on {flight.seconds - after:.0f} s of its own past: effects present from the start and a mean "
             "wind count as nominal; the barometer is not checked"
         )
-        report = diagnose(
-            replace(part_after(visible, self.until - CONTEXT_S), limitations=(*visible.limitations, limitation)),
-            base,
-            progress,
-        )
+        later = part_after(visible, self.until - CONTEXT_S)
+        report = diagnose(replace(later, limitations=(*visible.limitations, limitation)), base, progress)
         return only_new_findings(report, find_tracking_loss(flight, self.until), self.until)
 
 
-def only_new_findings(report: Report, tracking_loss: TrackingLoss | None, until: float) -> Report:
+def only_new_findings(report: Report, tracking_loss: tuple[str, float] | None, until: float) -> Report:
     """Return the report without mismatches in the trusted past alone, and with a tracking loss after it.
 
     An effect that starts in the trusted past contradicts the assumption: the outcome is suspected instead of named.
@@ -130,17 +116,16 @@ def only_new_findings(report: Report, tracking_loss: TrackingLoss | None, until:
     """
     if any(finding.hypothesis.effect.variance for finding in report.findings):
         report = replace(report, outcome=ReportOutcome.NONE, findings=())
-    if (
-        any(finding.segments[0][0] < until - _ONSET_MARGIN_S for finding in report.findings)
-        and report.outcome is ReportOutcome.NAMED
-    ):
+    in_past = any(finding.segments[0][0] < until - _ONSET_MARGIN_S for finding in report.findings)
+    if in_past and report.outcome is ReportOutcome.NAMED:
         report = replace(report, outcome=ReportOutcome.SUSPECTED)
     channel, segments = report.where
     segments = tuple(pair for pair in segments if pair[1] > until)
     if report.outcome is ReportOutcome.NAMED or segments:
         return with_sentence(replace(report, where=(channel, segments)))
     if tracking_loss is not None:
-        where = (tracking_loss.signal, ((tracking_loss.since, float(report.series.t[-1])),))
+        signal, since = tracking_loss
+        where = (signal, ((since, float(report.series.t[-1])),))
         return with_sentence(replace(report, outcome=ReportOutcome.UNKNOWN, findings=(), terms={}, where=where))
     if report.outcome is ReportOutcome.UNKNOWN:
         return with_sentence(replace(report, outcome=ReportOutcome.NONE, findings=(), terms={}, where=("", ())))

@@ -13,11 +13,19 @@ import numpy as np
 from fleet.effects import Onset, Stage, catalogue
 from fleet.process.sanitise import format_below
 from twin_worker.diagnosis.baseline.calibrate import with_statistics
-from twin_worker.diagnosis.baseline.fit import RegressionData, axial_regression, fit, fit_timing, pitch_regression
+from twin_worker.diagnosis.baseline.fit import (
+    RegressionData,
+    axial_regression,
+    coef_change,
+    fit,
+    fit_timing,
+    pitch_regression,
+    stacked_coef,
+    terms_in_wind,
+)
 from twin_worker.diagnosis.data.card import AircraftCard
 from twin_worker.diagnosis.data.flight import FlightData
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
-from twin_worker.diagnosis.model import equations as eq
 from twin_worker.diagnosis.model.baseline import CHANNELS, IGNORED_SIGMA, Baseline, Noise, exclude_equations
 from twin_worker.diagnosis.model.residual import EquationTerms, ModelledFlight
 from twin_worker.diagnosis.model.weather import RAW_ROWS_PER_SAMPLE, weather_hypotheses
@@ -70,26 +78,22 @@ def calibrate_past(
     base, (weather,) = fit([past], card, timing, past.vane, _RIDGE)
     pieces = split(past)
     partial_fits = [fit([replace(past, ok=past.ok & ~piece.ok)], card, timing, past.vane, _RIDGE) for piece in pieces]
-    winds = [w for _, (w,) in partial_fits]
-    modelled_flights = [
-        ModelledFlight(piece, partial) for piece, (partial, _) in zip(pieces, partial_fits, strict=True)
-    ]
-    base = replace(
-        base, others=_uncertain_directions(flight, past, base, weather), r2=_predicted_share(modelled_flights, winds)
-    )
+    partial_bases, winds = [partial for partial, _ in partial_fits], [w for _, (w,) in partial_fits]
+    modelled_flights = list(map(ModelledFlight, pieces, partial_bases))
+    r2 = _predicted_share(modelled_flights, winds)
+    base = replace(base, others=_uncertain_directions(flight, past, base, weather), r2=r2)
     if concealed is not None:
         concealed_pieces = [replace(part_before(concealed, until), ok=piece.ok) for piece in pieces]
-        modelled_flights = [
-            ModelledFlight(piece, modelled.base)
-            for piece, modelled in zip(concealed_pieces, modelled_flights, strict=True)
-        ]
+        modelled_flights = list(map(ModelledFlight, concealed_pieces, partial_bases))
     base = with_statistics(base, modelled_flights, winds, progress, remove_mean=True)
     later_s = part_after(flight, until).seconds
     base = exclude_equations(base, [name for name, share in base.r2.items() if share < _MIN_R2])
     modelled_past = ModelledFlight(past, base)
+    # the barometer drifts over minutes, and the pieces of the past are too short: ignore it
+    is_baro = np.arange(len(CHANNELS)) == CHANNELS.index("baro")
     return replace(
         base,
-        noise=_without_baro(base.noise),
+        noise=Noise(base.noise.ar, np.where(is_baro, IGNORED_SIGMA, base.noise.sigma)),
         spread=base.spread | _bias_spreads(modelled_past, weather) | _weather_spreads(modelled_past, weather),
         chance=_chance_gains(base, max(later_s, past.seconds) * len(pieces) / past.seconds),
     )
@@ -118,35 +122,26 @@ def split(past: FlightData, pieces: int = PIECES) -> list[FlightData]:
     return [replace(past, ok=past.ok & (which == k)) for k in range(pieces)]
 
 
-def _regressions(modelled_flights: list[ModelledFlight], all_terms: list[EquationTerms]) -> dict[str, RegressionData]:
+def _regressions(terms: EquationTerms) -> dict[str, RegressionData]:
     """Return the regression data of every separately fitted equation."""
-    coef = modelled_flights[0].base.coef
-    out = {name: RegressionData(modelled_flights, all_terms, name) for name in ("alpha", "beta", "L", "N")}
-    return out | {
-        "X": axial_regression(modelled_flights, all_terms),
-        "M": pitch_regression(modelled_flights, all_terms, coef),
-    }
-
-
-def _stacked_coef(coef: dict[str, np.ndarray], name: str) -> np.ndarray:
-    return np.concatenate([coef["X"], coef["T"]]) if name == "X" else coef[name]
+    out = {name: RegressionData([terms], name) for name in ("alpha", "beta", "L", "N")}
+    return out | {"X": axial_regression([terms]), "M": pitch_regression([terms], terms.modelled.base.coef)}
 
 
 def _predicted_share(modelled_flights: list[ModelledFlight], winds: list[np.ndarray]) -> dict[str, float]:
     """Return the share of variance of every equation that the other pieces predict."""
     errors: dict[str, list[np.ndarray]] = {}
     measured: dict[str, list[np.ndarray]] = {}
-    for modelled, w in zip(modelled_flights, winds, strict=True):
-        for name, data in _regressions([modelled], [modelled.equation_terms(weather_hypotheses(w))]).items():
-            for target, x in (
-                (errors, data.residuals(_stacked_coef(modelled.base.coef, name))),
-                (measured, data.y[data.ok]),
-            ):
-                target.setdefault(name, []).append(x - x.mean())  # trim may differ
-    sums = {
-        name: [float((np.concatenate(target[name]) ** 2).sum()) for target in (errors, measured)] for name in errors
-    }
-    return {name: 1.0 - unexplained / max(total, 1e-12) for name, (unexplained, total) in sums.items()}
+    for terms in terms_in_wind(modelled_flights, winds):
+        for name, data in _regressions(terms).items():
+            error, y = data.residuals(stacked_coef(terms.modelled.base.coef, name)), data.y[data.ok]
+            errors.setdefault(name, []).append(error - error.mean())  # trim may differ
+            measured.setdefault(name, []).append(y - y.mean())
+    out = {}
+    for name, parts in errors.items():
+        unexplained, total = (float((np.concatenate(x) ** 2).sum()) for x in (parts, measured[name]))
+        out[name] = 1.0 - unexplained / max(total, 1e-12)
+    return out
 
 
 def _uncertain_directions(
@@ -158,14 +153,12 @@ def _uncertain_directions(
     all variance, in the principal axes of its effect on the whole flight.
     Source: Klein & Morelli 2006, section 5.1 (Bayesian estimation); Golub & Van Loan 2013, section 8.7.
     """
-    modelled_past, modelled_flight = ModelledFlight(past, base), ModelledFlight(flight, base)
     past_data, flight_data = (
-        _regressions([modelled], [modelled.equation_terms(weather_hypotheses(weather))])
-        for modelled in (modelled_past, modelled_flight)
+        _regressions(ModelledFlight(part, base).equation_terms(weather_hypotheses(weather))) for part in (past, flight)
     )
     out = []
     for name, data in past_data.items():
-        x = _stacked_coef(base.coef, name)
+        x = stacked_coef(base.coef, name)
         whiten = data.whitener(x)
         A, e = whiten(data.A)[data.lagged_ok], whiten(data.y - data.A @ x)[data.lagged_ok]
         prior_std = np.sqrt((data.y[data.ok] ** 2).mean() / ((data.A[data.ok] ** 2).mean(axis=0) + 1e-12))
@@ -174,20 +167,8 @@ def _uncertain_directions(
         B = flight_data[name].A[flight_data[name].ok] @ root
         eigenvalues, eigenvectors = np.linalg.eigh(B.T @ B / len(B))
         visible = np.sqrt(np.maximum(eigenvalues, 0.0)) > _MIN_VISIBLE_SHARE * data.residuals(x).std()
-        out += [_direction(base, name, d) for d in (root @ eigenvectors[:, visible]).T]
+        out += [coef_change(base.coef, name, d) for d in (root @ eigenvectors[:, visible]).T]
     return tuple(out)
-
-
-def _direction(base: Baseline, name: str, d: np.ndarray) -> dict[str, np.ndarray]:
-    out = {equation: np.zeros_like(x) for equation, x in base.coef.items()}
-    if name == "X":
-        return out | {"X": d[: len(eq.X)], "T": d[len(eq.X) :]}
-    return out | {name: d}
-
-
-def _without_baro(noise: Noise) -> Noise:
-    """Return noise that ignores the barometer: it drifts over minutes, and the pieces of the past are too short."""
-    return Noise(noise.ar, np.where(np.arange(len(CHANNELS)) == CHANNELS.index("baro"), IGNORED_SIGMA, noise.sigma))
 
 
 def _bias_spreads(modelled: ModelledFlight, weather: np.ndarray) -> dict[str, float]:
@@ -212,9 +193,8 @@ def _weather_spreads(modelled: ModelledFlight, weather: np.ndarray) -> dict[str,
     along = np.array([s["v_n"], s["v_e"]]) / np.maximum(np.hypot(s["v_n"], s["v_e"]), 1.0)
     H = np.stack([flow.Va, *along, *(along * flow.height / 100.0)], axis=1)[modelled.ok]
     e = modelled.residuals(weather_hypotheses(weather))[modelled.ok, CHANNELS.index("airspeed")]
-    precision = H.T @ H / (RAW_ROWS_PER_SAMPLE * max(e.var(), _MIN_AIRSPEED_STD**2)) + np.diag(
-        np.array(_PRIOR_STD) ** -2.0
-    )
+    precision = H.T @ H / (RAW_ROWS_PER_SAMPLE * max(e.var(), _MIN_AIRSPEED_STD**2))
+    precision = precision + np.diag(np.array(_PRIOR_STD) ** -2.0)
     scale = float(np.sqrt(np.linalg.inv(precision)[0, 0]))
     out = {"airspeed_scale:log_scale": max(scale, modelled.base.spread["airspeed_scale:log_scale"])}
     for axis in ("w_n", "w_e"):

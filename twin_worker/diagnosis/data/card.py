@@ -1,16 +1,17 @@
 """Read the aircraft card (mass, inertia, geometry, servo mapping) from an airframe TOML or JSON; fault hypotheses."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from fleet.airframes import Airframe, load
+from fleet.airframes import load
 from fleet.airframes.airframe import servo_map
-from fleet.effects import Body, Effect, Onset
+from fleet.effects import SURFACES, Body, Effect, Onset
 
 _REQUIRED = ("m", "S", "b", "c", "Ixx", "Iyy", "Izz", "Ixz")
 _MAX_VALUE = 1e6
@@ -43,10 +44,14 @@ class AircraftCard:
         u = (pulses[:, [0, 1, 3]] - 1500.0) / 500.0
         return np.column_stack([u, (pulses[:, 2] - 1000.0) / 1000.0])
 
-    def angles(self, surface: int) -> Callable[[np.ndarray], np.ndarray]:
-        """Return the function from command [-] to angle [rad] of one surface."""
+    def angle(self, surface: int, u: np.ndarray) -> np.ndarray:
+        """Convert commands of one surface [-] to angles [rad]."""
         low, high = self.throw[surface]
-        return lambda u: np.where(u > 0, high, low) * u
+        return np.where(u > 0, high, low) * u
+
+    def deflections(self, u: np.ndarray) -> np.ndarray:
+        """Convert commands to surface angles [rad] and throttle, (4, n)."""
+        return np.stack([*(self.angle(i, u[i]) for i in range(3)), u[3]])
 
 
 UNKNOWN = AircraftCard("no card", Body(), (1.0, 1.0, 1.0, 0.0), known=False)
@@ -61,7 +66,10 @@ def read_card(path: Path) -> AircraftCard:
         OSError: if the file does not exist.
     """
     if path.suffix != ".json":
-        return _of_airframe(load(str(path) if path.suffix or path.exists() else path.name))
+        airframe = load(str(path) if path.suffix or path.exists() else path.name)
+        v = airframe.value
+        body = Body(v["mass"], v["S"], v["b"], v["c"], v["c"])
+        return AircraftCard(airframe.name, body, (v["J_x"], v["J_y"], v["J_z"], v["J_xz"]))
     try:
         document = json.loads(path.read_text())
     except (ValueError, UnicodeDecodeError) as error:
@@ -74,12 +82,6 @@ def read_card(path: Path) -> AircraftCard:
     throw = _throws(path.name, document.get("surface_full_deg"))
     inertia = (value["Ixx"], value["Iyy"], value["Izz"], value["Ixz"])
     return AircraftCard(str(document.get("airframe", path.stem)), body, inertia, throw, pulses="servo" in document)
-
-
-def _of_airframe(airframe: Airframe) -> AircraftCard:
-    v = airframe.value
-    body = Body(v["mass"], v["S"], v["b"], v["c"], v["c"])
-    return AircraftCard(airframe.name, body, (v["J_x"], v["J_y"], v["J_z"], v["J_xz"]))
 
 
 def _number(file: str, document: Mapping[str, object], name: str) -> float:
@@ -96,7 +98,7 @@ def _throws(file: str, entry: object) -> tuple[tuple[float, float], ...]:
     if not isinstance(entry, dict):
         return ((1.0, 1.0),) * 3
     out = []
-    for name in ("aileron", "elevator", "rudder"):
+    for name in SURFACES:
         pair = entry.get(name)
         if not isinstance(pair, list) or len(pair) != 2 or not all(isinstance(x, int | float) for x in pair):
             raise ValueError(f"{file}: found surface_full_deg.{name} = {pair!r}, expected [down, up]; correct it")
@@ -164,6 +166,15 @@ class FaultHypothesis:
     def degrees_of_freedom(self) -> int:
         """Return the number of parameters, those of the onset profile included."""
         return self.effect.degrees_of_freedom + self.onset.n_parameters
+
+    def parameters_at(self, t: np.ndarray) -> np.ndarray:
+        """Return the parameters scaled by the onset profile at times t (n,), (k, n)."""
+        return np.asarray(self.par, float)[:, None] * self.onset.gate(t)
+
+    def act(self, on: Any, par: Iterable[Any]) -> dict[str, Any]:
+        """Evaluate the effect, of any stage but delta, at parameters `par` on a flow or on readings."""
+        target = {"of": self.target} if self.target else {}
+        return self.effect.act(on, *par, **target)  # type: ignore[no-any-return]
 
     def with_parameters(self, par: np.ndarray, onset: OnsetProfile | None = None) -> "FaultHypothesis":
         """Return a copy with other parameters, limited to their physical bounds."""

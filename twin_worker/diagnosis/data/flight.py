@@ -1,5 +1,6 @@
 """Read a recording, smooth it and resample each flight to one grid, with a mask of valid rows."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -152,24 +153,15 @@ def resample_flight(name: str, history: TelemetryHistory, params: dict[str, floa
         ValueError: if required telemetry is missing; the message names it.
     """
     series = {kind: history.rows(kind) for kind in ("attitude", "velocity", "position", "servo", "air", "imu")}
-    length = np.ptp(series["attitude"][0]) if len(series["attitude"][0]) else 0.0
-    if length < _MIN_FLIGHT_S:
-        raise ValueError(
-            f"{name}: found {format_below(length, _MIN_FLIGHT_S)} s, expected {_MIN_FLIGHT_S:.0f} s of flight "
-            "at least; record longer"
-        )
+    length = float(np.ptp(series["attitude"][0])) if len(series["attitude"][0]) else 0.0
+    _check_length(name, length, "s", "s of flight at least; record longer")
     for kind in ("attitude", "velocity", "position", "servo"):
         if len(series[kind][0]) < 50:
             raise ValueError(f"{name}: found no {kind} in it, expected telemetry of a flight; record that message too")
     t_start = float(series["attitude"][0][0])
     start = max(float(series[kind][0][0]) for kind in ("attitude", "velocity", "servo")) - t_start + 0.1
     stop = min(float(series[kind][0][-1]) for kind in ("attitude", "velocity", "servo")) - t_start - 0.1
-    if stop - start < _MIN_FLIGHT_S:
-        raise ValueError(
-            f"{name}: found {format_below(max(stop - start, 0.0), _MIN_FLIGHT_S)} s, expected "
-            f"{_MIN_FLIGHT_S:.0f} s of flight at least; "
-            "record longer"
-        )
+    _check_length(name, max(stop - start, 0.0), "s", "s of flight at least; record longer")
     t = np.arange(np.ceil(start / DT), np.floor(stop / DT)) * DT
     limitations: list[str] = []
     readings, vane = _readings(series, history, t, t_start, limitations)
@@ -178,21 +170,22 @@ def resample_flight(name: str, history: TelemetryHistory, params: dict[str, floa
     ned = to_ned(origin, *lla.T)
     readings["h"] = np.interp(t, t_p - t_start, lla[:, 2] * 1e-3)
     horizontal = np.column_stack([np.interp(t, t_p - t_start, ned[:, i]) for i in (0, 1)])
-    commands = card.commands(_interpolate(t, series["servo"], t_start), params)
+    commands = card.commands(_interpolated(t, series["servo"], t_start), params)
     commands[:, 3] = np.clip(commands[:, 3], 0.0, 1.0)
     ground = _ground_height(history, readings["h"], t, t_start)
     ok = _valid_rows(series, readings, t, t_start, ground)
     flight = FlightData(name, t, t_start, readings, commands, horizontal, ground, ok, vane, tuple(limitations))
-    if flight.seconds < _MIN_FLIGHT_S:
-        raise ValueError(
-            f"{name}: found {format_below(flight.seconds, _MIN_FLIGHT_S)} s in the air, expected "
-            f"{_MIN_FLIGHT_S:.0f} s at least; "
-            "check that the aircraft flew"
-        )
+    _check_length(name, flight.seconds, "s in the air", "s at least; check that the aircraft flew")
     return flight
 
 
-def _interpolate(t: np.ndarray, samples: tuple[np.ndarray, np.ndarray], t_start: float) -> np.ndarray:
+def _check_length(name: str, seconds: float, span: str, requirement: str) -> None:
+    if seconds < _MIN_FLIGHT_S:
+        least = f"{_MIN_FLIGHT_S:.0f} {requirement}"
+        raise ValueError(f"{name}: found {format_below(seconds, _MIN_FLIGHT_S)} {span}, expected {least}")
+
+
+def _interpolated(t: np.ndarray, samples: tuple[np.ndarray, np.ndarray], t_start: float) -> np.ndarray:
     times, x = samples
     return np.stack([np.interp(t, times - t_start, column) for column in x.T], axis=1)
 
@@ -205,26 +198,29 @@ def _readings(
     limitations: list[str],
 ) -> tuple[dict[str, np.ndarray], bool]:
     """Return the readings on the grid, and whether the accelerometer is fast enough to measure flow angles."""
+    out: dict[str, np.ndarray] = {}
+
+    def add(names: Iterable[str], times: np.ndarray, x: np.ndarray) -> None:
+        out.update(zip(names, _interpolated(t, (times, x), t_start).T, strict=True))
+
     attitude_t, attitude = series["attitude"]
+    gap = float(np.median(np.diff(attitude_t)))
     angles = np.column_stack([attitude[:, :2], np.unwrap(attitude[:, 2]), attitude[:, 3:]])
-    out = dict(
-        zip(("phi", "theta", "psi", "p", "q", "r"), _interpolate(t, (attitude_t, angles), t_start).T, strict=True)
-    )
-    out |= dict(zip(("v_n", "v_e", "v_d"), _interpolate(t, series["velocity"], t_start).T, strict=True))
+    add(("phi", "theta", "psi", "p", "q", "r"), attitude_t, angles)
+    add(("v_n", "v_e", "v_d"), *series["velocity"])
     imu_t, imu = series["imu"]
     usual = float(np.median(np.diff(imu_t))) if len(imu_t) > 50 else np.inf
     vane = usual <= 1.0 / VANE_HZ
     if len(imu_t) > 50:
-        out |= dict(zip(("a_x", "a_y", "a_z"), _interpolate(t, (imu_t, imu[:, :3]), t_start).T, strict=True))
-        gyros = _interpolate(t, (imu_t, imu[:, 3:]), t_start)
-        if vane or usual < _GYRO_GAP_RATIO * float(np.median(np.diff(attitude_t))):
-            out |= dict(zip(("p", "q", "r"), gyros.T, strict=True))
+        add(("a_x", "a_y", "a_z"), imu_t, imu[:, :3])
+        if vane or usual < _GYRO_GAP_RATIO * gap:
+            add(("p", "q", "r"), imu_t, imu[:, 3:])
     if not vane:
         rate = "no accelerometer" if not np.isfinite(usual) else f"the accelerometer at {1 / usual:.0f} Hz"
         limitations.append(
             f"{rate}: forces come from the velocity, with less sensitivity to gusts and small lift changes"
         )
-    if (gap := float(np.median(np.diff(attitude_t)))) > _MAX_GAP_S["attitude"]:
+    if gap > _MAX_GAP_S["attitude"]:
         limitations.append(f"attitude at {1 / gap:.1f} Hz: only effects of several seconds are detectable")
     air_t, air = series["air"]
     if len(air_t) > 50 and np.ptp(air[:, 0]) > 0.5:
@@ -233,7 +229,7 @@ def _readings(
         limitations.append("no airspeed: wind, air density and airspeed sensor faults are not separable")
     command_t, command = history.rows("command")
     if len(command_t) > 50:
-        out |= dict(zip(("low", "slow"), _interpolate(t, (command_t, command[:, 3:5]), t_start).T, strict=True))
+        add(("low", "slow"), command_t, command[:, 3:5])
     pressure_t, pressure = history.rows("pressure")
     if len(pressure_t) > 20:
         height = (1.0 - (np.clip(pressure[:, 0], 2e4, 1.2e5) / _SEA_LEVEL) ** (1 / _POWER)) / _LAPSE

@@ -8,15 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from fleet.effects import Onset, Stage, catalogue
-from twin_worker.diagnosis.data.card import ALWAYS, FaultHypothesis
+from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.data.flight import FlightData, decimated
 from twin_worker.diagnosis.inference.isolation.isolate import MIN_R2, ScoredHypothesis
 from twin_worker.diagnosis.inference.isolation.refine import refine
-from twin_worker.diagnosis.inference.isolation.select_hypotheses import (
-    SelectedEffect,
-    select_hypotheses,
-    turbulence_evidence,
-)
+from twin_worker.diagnosis.inference.isolation.select_hypotheses import select_hypotheses, turbulence_evidence
 from twin_worker.diagnosis.inference.isolation.unmodelled import find_anomalies, first_unexplained
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 from twin_worker.diagnosis.inference.report import (
@@ -79,40 +75,34 @@ def diagnose(flight: FlightData, base: Baseline, progress: ReportProgress = lamb
     progress("selecting effects")
     unconditioned = copy(whitened)
     named, ranked = select_hypotheses(whitened, weather, progress)
-    if gust_gain > _MIN_GUST_GAIN and gust_gain > sum(selected.scored.gain for selected in named):
+    if gust_gain > _MIN_GUST_GAIN and gust_gain > sum(selected.gain for selected in named):
         named = []
     progress("validating on held-out data")
     named, validation, findings = _cross_validated(unconditioned, named, before)
-    whitened.condition_on((*weather, *(selected.scored.hypothesis for selected in named)))
+    whitened.condition_on((*weather, *(selected.hypothesis for selected in named)))
     after, white_after = whitened.mean_square() / base.usual, _profiled_residuals(whitened)
     if not any(map(_is_significant, findings)):
         findings = ()
-    if (turbulence := _turbulence_finding(whitened, not named)) is not None:
-        findings = (*findings, turbulence)
-    force = force_prediction.predict_forces(modelled, weather, validation.fitted)
-    errors = [force_prediction.rms(modelled, force.measured - x) for x in (force.base, force.model)]
+    if not named and (turbulence := _turbulence_finding(whitened)) is not None:
+        findings = (turbulence,)
+    measured, simulated, with_effects = force_prediction.predict_forces(modelled, weather, validation.fitted)
+    errors = [force_prediction.rms(modelled, measured - x) for x in (simulated, with_effects)]
     strong_gain = sum(_strong_gain(base, finding) for finding in findings)
     outcome = _outcome(findings, validation, (1.0 - errors[1] / errors[0], strong_gain), before, after)
     accepted = findings if outcome is ReportOutcome.NAMED else ()
     if not accepted:
         whitened.condition_on(weather)
-    anomalies = (
-        []
-        if any(finding.hypothesis.effect.variance for finding in findings)
-        else find_anomalies(whitened, unconditioned)
-    )
-    anomaly = first_unexplained(
-        anomalies, base, sum(finding.gain for finding in accepted), still_high=after.max() > _MAX_RATIO_NAMED
-    )
+    turbulent = any(finding.hypothesis.effect.variance for finding in findings)
+    anomalies = [] if turbulent else find_anomalies(whitened, unconditioned)
+    accepted_gain = sum(finding.gain for finding in accepted)
+    anomaly = first_unexplained(anomalies, base, accepted_gain, still_high=after.max() > _MAX_RATIO_NAMED)
     if anomaly is not None:
         outcome = ReportOutcome.UNKNOWN
-    series = _series(modelled, white_before, white_after, force)
     where: tuple[str, tuple[tuple[float, float], ...]] = ("", ())
     terms: dict[str, float] = {}
     if outcome is ReportOutcome.UNKNOWN:
-        channel = (
-            CHANNELS.index(anomaly.channel) if anomaly else _JUDGED_CHANNELS[int(np.argmax(after[_JUDGED_CHANNELS]))]
-        )
+        judged = _JUDGED_CHANNELS[int(np.argmax(after[_JUDGED_CHANNELS]))]
+        channel = CHANNELS.index(anomaly.channel) if anomaly else judged
         where = (CHANNELS[channel], high_segments(modelled.t, white_after[:, channel], whitened.ok))
         terms = free_form(modelled, weather, channel)
     report = Report(
@@ -133,7 +123,17 @@ def diagnose(flight: FlightData, base: Baseline, progress: ReportProgress = lamb
         terms=terms,
         ranking=_ranking(ranked, named),
         limitations=(*flight.limitations, *uncovered_axes(base)),
-        series=series,
+        series=FigureSeries(
+            t=modelled.t,
+            ok=modelled.ok,
+            position=decimated(np.column_stack([flight.position, flight.readings["h"]])),
+            before=white_before,
+            after=white_after,
+            measured=measured,
+            base=simulated,
+            model=with_effects,
+            held_out=force_prediction.blocks(modelled.t, odd=True),
+        ),
         seconds=time.perf_counter() - started,
     )
     return with_sentence(report)
@@ -165,17 +165,14 @@ def uncovered_axes(base: Baseline) -> tuple[str, ...]:
     )
 
 
-def _ranking(ranked: list[ScoredHypothesis], named: list[SelectedEffect]) -> tuple[RankedCandidate, ...]:
+def _ranking(ranked: list[ScoredHypothesis], named: list[ScoredHypothesis]) -> tuple[RankedCandidate, ...]:
     """List every hypothesis tested, named and rival ones included, once per label with its best onset."""
-    best: dict[str, ScoredHypothesis] = {}
-    for scored in (*ranked, *(alternative for n in named for alternative in (n.scored, *n.rivals))):
-        if scored.hypothesis.label not in best or scored.gain > best[scored.hypothesis.label].gain:
-            best[scored.hypothesis.label] = scored
-    ordered = sorted(best.values(), key=lambda scored: -scored.gain)
-    return tuple(
-        RankedCandidate(scored.hypothesis.label, describe_onset(scored.hypothesis.onset), scored.gain)
-        for scored in ordered
-    )
+    best: dict[str, RankedCandidate] = {}
+    for scored in (*ranked, *(alternative for n in named for alternative in (n, *n.rivals))):
+        label = scored.hypothesis.label
+        if label not in best or scored.gain > best[label].gain:
+            best[label] = RankedCandidate(label, describe_onset(scored.hypothesis.onset), scored.gain)
+    return tuple(sorted(best.values(), key=lambda candidate: -candidate.gain))
 
 
 def _profiled_residuals(whitened: WhitenedResiduals) -> np.ndarray:
@@ -184,18 +181,15 @@ def _profiled_residuals(whitened: WhitenedResiduals) -> np.ndarray:
 
 
 def _cross_validated(
-    unconditioned: WhitenedResiduals, named: list[SelectedEffect], before: np.ndarray
-) -> tuple[list[SelectedEffect], CrossValidation, tuple[DiagnosisFinding, ...]]:
+    unconditioned: WhitenedResiduals, named: list[ScoredHypothesis], before: np.ndarray
+) -> tuple[list[ScoredHypothesis], CrossValidation, tuple[DiagnosisFinding, ...]]:
     """Cross-validate the selected effects; remove those after the first that held-out data do not confirm."""
     whitened, weather = copy(unconditioned), unconditioned.conditions
-    while True:
-        if not named:
-            return [], CrossValidation(np.nan, np.nan, (), ()), ()
-        proof = cross_validate.fit_and_validate(
-            unconditioned, tuple(selected.scored.hypothesis for selected in named), before
-        )
+    while named:
+        hypotheses = tuple(selected.hypothesis for selected in named)
+        proof = cross_validate.fit_and_validate(unconditioned, hypotheses, before)
         findings = _findings(whitened, weather, named, proof)
-        order = sorted(range(len(named)), key=lambda k: -named[k].scored.gain)
+        order = sorted(range(len(named)), key=lambda k: -named[k].gain)
         weak = [
             k for k in order[1:] if findings[k].held_out_share < _MIN_HELD_OUT_SHARE or not _is_significant(findings[k])
         ]
@@ -203,38 +197,36 @@ def _cross_validated(
             return named, proof, findings
         named = [selected for k, selected in enumerate(named) if k != weak[-1]]
         for i, selected in enumerate(named):
-            whitened.condition_on((*weather, *(other.scored.hypothesis for k, other in enumerate(named) if k != i)))
-            named[i] = replace(selected, scored=refine(whitened, selected.scored.hypothesis))
+            whitened.condition_on((*weather, *(other.hypothesis for k, other in enumerate(named) if k != i)))
+            named[i] = replace(refine(whitened, selected.hypothesis), rivals=selected.rivals)
+    return [], CrossValidation(np.nan, np.nan, (), ()), ()
 
 
 def _findings(
     whitened: WhitenedResiduals,
     weather: tuple[FaultHypothesis, ...],
-    named: list[SelectedEffect],
+    named: list[ScoredHypothesis],
     validation: CrossValidation,
 ) -> tuple[DiagnosisFinding, ...]:
-    hypotheses = [selected.scored.hypothesis for selected in named]
-    if not named:
-        return ()
     body = whitened.base.card.body
     findings = []
-    for i, (selected, covariance) in enumerate(zip(named, covariances(whitened, weather, hypotheses), strict=True)):
-        hypothesis = selected.scored.hypothesis
+    all_covariances = covariances(whitened, weather, [selected.hypothesis for selected in named])
+    for selected, covariance, held_out_gain in zip(named, all_covariances, validation.held_out_gains, strict=True):
+        hypothesis = selected.hypothesis
         rivals = [rival.hypothesis for rival in selected.rivals]
-        surface = hypothesis.target if hypothesis.effect.stage is Stage.DELTA else ""
         findings.append(
             DiagnosisFinding(
                 hypothesis=hypothesis,
-                gain=selected.scored.gain,
+                gain=selected.gain,
                 reported=hypothesis.effect.reported(hypothesis.effect, np.array(hypothesis.par), body),
                 sigma=reported_sigma(hypothesis, covariance, body),
                 parameter_sigma=tuple(np.sqrt(np.diag(covariance)).tolist()),
                 rivals=tuple(rival.effect.name for rival in rivals),
                 manoeuvres=tuple(recommend_manoeuvre(whitened, hypothesis, rival) for rival in rivals),
                 channel=hypothesis.effect.channel,
-                surface=surface,
+                surface=hypothesis.target if hypothesis.effect.stage is Stage.DELTA else "",
                 segments=(_segment(hypothesis, float(whitened.modelled.t[0]), float(whitened.modelled.t[-1])),),
-                held_out_share=validation.held_out_gains[i] / max(selected.scored.gain, 1e-9),
+                held_out_share=held_out_gain / max(selected.gain, 1e-9),
             )
         )
     return tuple(findings)
@@ -248,21 +240,28 @@ def _segment(hypothesis: FaultHypothesis, first: float, last: float) -> tuple[fl
     return max(hypothesis.onset.t0, first), last
 
 
-def _turbulence_finding(whitened: WhitenedResiduals, no_other: bool) -> DiagnosisFinding | None:
+def _turbulence_finding(whitened: WhitenedResiduals) -> DiagnosisFinding | None:
     """Return turbulence as a finding if the residuals scatter as gusts do."""
     gain, variance_ratio = turbulence_evidence(whitened)
-    if gain < _MIN_GUST_GAIN or not no_other:
+    if gain < _MIN_GUST_GAIN:
         return None
     effect = catalogue()["turbulence"]
     eq_terms = whitened.modelled.equation_terms(whitened.conditions)
     beta = np.radians(whitened.modelled.residuals(whitened.conditions)[whitened.ok][:, CHANNELS.index("side")])
     intensity = float(np.sqrt(1.0 - 1.0 / variance_ratio) * beta.std() * np.median(eq_terms.flow.Va))
-    hypothesis = FaultHypothesis(effect, "", (intensity,), ALWAYS)
-    segment = (float(whitened.modelled.t[0]), float(whitened.modelled.t[-1]))
     reported = effect.reported(effect, np.array([intensity]), whitened.base.card.body)
-    sigma = {name: _INTENSITY_SIGMA * x for name, x in reported.items()}
     return DiagnosisFinding(
-        hypothesis, gain, reported, sigma, (_INTENSITY_SIGMA * intensity,), (), (), "air", "", (segment,), 1.0
+        hypothesis=FaultHypothesis(effect, "", (intensity,)),
+        gain=gain,
+        reported=reported,
+        sigma={name: _INTENSITY_SIGMA * x for name, x in reported.items()},
+        parameter_sigma=(_INTENSITY_SIGMA * intensity,),
+        rivals=(),
+        manoeuvres=(),
+        channel="air",
+        surface="",
+        segments=((float(whitened.modelled.t[0]), float(whitened.modelled.t[-1])),),
+        held_out_share=1.0,
     )
 
 
@@ -316,20 +315,3 @@ def _at_bound(finding: DiagnosisFinding) -> bool:
     """Return whether a parameter except nuisances is at its physical bound; a share of 1 is allowed there."""
     counted = zip(finding.hypothesis.effect.parameters, finding.hypothesis.par, strict=True)
     return any(x and x in (p.low, p.high) and x != 1.0 and not p.nuisance for p, x in counted)
-
-
-def _series(
-    modelled: ModelledFlight, before: np.ndarray, after: np.ndarray, force: force_prediction.Forces
-) -> FigureSeries:
-    position = decimated(np.column_stack([modelled.flight.position, modelled.flight.readings["h"]]))
-    return FigureSeries(
-        t=modelled.t,
-        ok=modelled.ok,
-        position=position,
-        before=before,
-        after=after,
-        measured=force.measured,
-        base=force.base,
-        model=force.model,
-        held_out=force_prediction.blocks(modelled.t, odd=True),
-    )

@@ -164,23 +164,11 @@ def describe_onset(onset: OnsetProfile) -> str:
 def _describe_validation(report: Report) -> str:
     if not report.fit_before > 0:
         return "detected in the variance of the air data"
-    rms_drop, force_drop = (1.0 - b / a for a, b in _error_pairs(report))
-    if rms_drop >= MIN_RMS_DROP:
-        text = f"the residual falls from {report.fit_before:.2f} to {report.fit_after:.2f} ({rms_drop:.0%})"
-    else:
-        before, after = report.force_before, report.force_after
-        text = f"the error of specific force falls from {before:.2f} to {after:.2f} m/s2 ({force_drop:.0%})"
-    return f"on held-out blocks {text}{_describe_free_run(report)}"
-
-
-def _error_pairs(report: Report) -> tuple[tuple[float, float], tuple[float, float]]:
-    return (report.fit_before, report.fit_after), (report.force_before, report.force_after)
-
-
-def _describe_free_run(report: Report) -> str:
+    before, after, of_what, unit = report.fit_before, report.fit_after, "residual", ""
+    if not 1.0 - after / before >= MIN_RMS_DROP:
+        before, after, of_what, unit = report.force_before, report.force_after, "error of specific force", " m/s2"
+    text = f"on held-out blocks the {of_what} falls from {before:.2f} to {after:.2f}{unit} ({1.0 - after / before:.0%})"
     before, after = report.free_run_error_before, report.free_run_error_after
-    return (
-        f", and the attitude error of free runs of 5 s falls from {before:.1f} to {after:.1f} deg"
-        if after < 0.9 * before
-        else ""
-    )
+    if after < 0.9 * before:
+        text += f", and the attitude error of free runs of 5 s falls from {before:.1f} to {after:.1f} deg"
+    return text

@@ -17,7 +17,6 @@ from twin_worker.diagnosis.model import equations as eq
 from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline
 
 RHO_0 = 1.225  # [kg/m3]
-_COLUMN = {"aileron": 0, "elevator": 1, "rudder": 2}
 _DIFFERENTIATED = ("v_n", "v_e", "v_d", "phi", "theta", "psi", "p", "q", "r")
 Signals = dict[str, np.ndarray]
 
@@ -31,6 +30,7 @@ def density(h: Any) -> Any:
 class EquationTerms:
     """Equation terms on the decimated grid: flow, regressors (k, n) and measured side (n,) by equation."""
 
+    modelled: "ModelledFlight"
     flow: Flow
     add: Signals
     regressors: Signals
@@ -60,19 +60,20 @@ class ModelledFlight:
     def _sensor_agreement(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self._agreement(self._smooth)
 
-    def agreement(self, s: Signals) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _agreement(self, s: Signals) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the quantities that only sensor faults change: rotation to body axes (3, 3, n), dV/dt less gravity in
         body axes (3, n) [m/s2], and the difference between sensors, (n, 6), channels gps_x to gyro_yaw.
         """
-        return self._sensor_agreement if s is self._smooth else self._agreement(s)
-
-    def _agreement(self, s: Signals) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         R = rotation(s["phi"], s["theta"], s["psi"])
         derived = np.einsum("ijn,in->jn", R, np.array([s["v_n_dot"], s["v_e_dot"], s["v_d_dot"] - G]))
         out = np.zeros((len(self.t), 6))
         if "a_x" in s:
             out[:, :3] = (derived - np.array([s["a_x"], s["a_y"], s["a_z"]])).T
-        out[:, 3:] = _euler_rate_error(s)
+        sf, cf, p, q, r = np.sin(s["phi"]), np.cos(s["phi"]), s["p"], s["q"], s["r"]
+        turn = (q * sf + r * cf) / np.cos(s["theta"])
+        out[:, 3] = s["phi_dot"] - p - np.sin(s["theta"]) * turn
+        out[:, 4] = s["theta_dot"] - (q * cf - r * sf)
+        out[:, 5] = s["psi_dot"] - turn
         return R, derived, slow(out)
 
     @cached_property
@@ -100,7 +101,7 @@ class ModelledFlight:
         tau = timing.engine if column == 3 else timing.servo
         for hypothesis in acting:
             u, memory = u.copy(), np.full(MEMORY, u[0])
-            par = np.asarray(hypothesis.par)[:, None] * hypothesis.onset.gate(self.flight.t)
+            par = hypothesis.parameters_at(self.flight.t)
             if hypothesis.effect.takes_lag:
                 par[0], tau = par[0] + tau, 0.0
             hypothesis.effect.act(u, memory, DT, np.ascontiguousarray(par))
@@ -111,7 +112,7 @@ class ModelledFlight:
             u = lfilter(b, [1, -a], u, zi=[(1 - b[0]) * u[0]])[0]
         if timing.delay and column != 3:
             u = np.interp(self.flight.t - timing.delay, self.flight.t, u)
-        return u if column == 3 else self.base.card.angles(column)(u)
+        return u if column == 3 else self.base.card.angle(column, u)
 
     def corrected_readings(self, hypotheses: tuple[FaultHypothesis, ...]) -> Signals:
         """Return the filtered readings, corrected for the hypothesised sensor faults."""
@@ -120,15 +121,13 @@ class ModelledFlight:
             return self._smooth
         readings = {"t": self.flight.t, **self.flight.readings}
         for hypothesis in faults:
-            par = [-x * hypothesis.onset.gate(self.flight.t) for x in hypothesis.par]
+            par = -hypothesis.parameters_at(self.flight.t)
             try:
-                undone = hypothesis.effect.act(readings, *par, **_target_kwargs(hypothesis))
+                undone = hypothesis.act(readings, par)
             except KeyError:  # the flight lacks this reading: the fault has no influence
                 continue
             if "Va" in undone and self.base.vane:  # the raw noise scales with the reading
-                faster = hypothesis.effect.act(
-                    {**readings, "Va": readings["Va"] + 1.0}, *par, **_target_kwargs(hypothesis)
-                )
+                faster = hypothesis.act({**readings, "Va": readings["Va"] + 1.0}, par)
                 readings["Va_share"] = readings.get("Va_share", 1.0) * (faster["Va"] - undone["Va"])
             readings |= undone
         changed = {name: x for name, x in readings.items() if x is not self.flight.readings.get(name) and name != "t"}
@@ -140,20 +139,17 @@ class ModelledFlight:
         if not acting:
             return self._delta
         out = self._delta.copy()
-        for name in SURFACES:
+        for column, name in enumerate(SURFACES):
             own = [hypothesis for hypothesis in acting if hypothesis.target in (name, ALL_SURFACES)]
             if own:
-                out[_COLUMN[name]] = smooth(self.actuator_output(_COLUMN[name], own))
+                out[column] = smooth(self.actuator_output(column, own))
         return out
 
     def _increments(self, flow: Flow, hypotheses: tuple[FaultHypothesis, ...], stages: tuple[Stage, ...]) -> Signals:
         total: Signals = {}
         for hypothesis in hypotheses:
             if hypothesis.effect.stage in stages:
-                gate = hypothesis.onset.gate(self.t)
-                for name, x in hypothesis.effect.act(
-                    flow, *(x * gate for x in hypothesis.par), **_target_kwargs(hypothesis)
-                ).items():
+                for name, x in hypothesis.act(flow, hypothesis.parameters_at(self.t)).items():
                     total[name] = total.get(name, 0.0) + x
         return total
 
@@ -165,7 +161,7 @@ class ModelledFlight:
             self.t, s["h"], s["h"] - self.flight.ground, body, delta_t=d_t, throttle_time=self.throttle_integral
         )
         air = self._increments(flow, hypotheses, (Stage.AIR,))
-        R, derived, disagreement = self.agreement(s)
+        R, derived, disagreement = self._sensor_agreement if s is self._smooth else self._agreement(s)
         ground = np.array(
             [s["v_n"] - air.get("w_n", 0.0), s["v_e"] - air.get("w_e", 0.0), s["v_d"] - air.get("w_d", 0.0)]
         )
@@ -217,62 +213,40 @@ class ModelledFlight:
         intermediate["Va_share"] = s.get("Va_share", np.ones_like(Va))
         intermediate["baro"] = s.get("baro", s["h"]) - s.get("gnss", s["h"])
         scale = {"X": q_S, "L": q_S * body.b, "N": q_S * body.b, "M": q_S * body.c}
-        return EquationTerms(flow, add, regressors, measured, intermediate, scale)
+        return EquationTerms(self, flow, add, regressors, measured, intermediate, scale)
 
     def residuals(self, hypotheses: tuple[FaultHypothesis, ...] = ()) -> np.ndarray:
         """Return measured less simulated, (n, channels)."""
-        eq_terms = self.equation_terms(hypotheses)
-        return channel_residuals(self, eq_terms)
-
-
-def channel_residuals(modelled: ModelledFlight, eq_terms: EquationTerms) -> np.ndarray:
-    """Return the residuals of all channels from the equation terms, (n, channels)."""
-    base, flow, add, intermediate = modelled.base, eq_terms.flow, eq_terms.add, eq_terms.intermediate
-    q_S = eq_terms.scale["X"]
-    T = (base.coef["T"] @ eq_terms.regressors["T"]) * (1.0 + add.get("thrust", 0.0))
-    alpha, beta = base.coef["alpha"] @ eq_terms.regressors["alpha"], base.coef["beta"] @ eq_terms.regressors["beta"]
-    c_z = intermediate["c_z"]
-    lift = add.get("lift", 0.0) * -c_z + add.get("C_L", 0.0)  # increment of effects over the clean lift coefficient
-    X = (
-        q_S
-        * (
-            evaluate_equation(base, add, "X", eq_terms.regressors["X"])
-            + lift * np.sin(alpha)
-            - add.get("C_D", 0.0) * np.cos(alpha)
-        )
-        + T
-    )
-    L = eq_terms.scale["L"] * (
-        evaluate_equation(base, add, "L", eq_terms.regressors["L"]) + add.get("C_l", 0.0)
-    ) + add.get("L", 0.0)
-    N = eq_terms.scale["N"] * (
-        evaluate_equation(base, add, "N", eq_terms.regressors["N"]) + add.get("C_n", 0.0)
-    ) + add.get("N", 0.0)
-    M = (
-        eq_terms.scale["M"] * (evaluate_equation(base, add, "M", eq_terms.regressors["M"]) + add.get("C_m", 0.0))
-        + T * base.coef["M"][-1]
-        + add.get("M", 0.0)
-    )
-    if "x_cg" in add or "y_cg" in add:
-        x, y, force = add.get("x_cg", 0.0), add.get("y_cg", 0.0), intermediate["force"]
-        # gravity acts at the centre of gravity, the aerodynamic force at an offset from it
-        M, N, L = M + x * force[2], N - x * force[1] + y * force[0], L - y * force[2]
-    J_x, J_y, J_z, _ = base.card.inertia
-    out = np.zeros((len(modelled.t), len(CHANNELS)))
-    out[:, 0] = (eq_terms.measured["X"] - X) / intermediate["mass"]
-    out[:, 1] = np.degrees(eq_terms.measured["beta"] - beta)
-    out[:, 2] = np.degrees(eq_terms.measured["alpha"] - alpha)
-    out[:, 3] = (eq_terms.measured["L"] - L) / J_x
-    out[:, 4] = (eq_terms.measured["M"] - M) / J_y
-    out[:, 5] = (eq_terms.measured["N"] - N) / J_z
-    readings = modelled.flight.readings
-    if "Va" in readings:
-        out[:, 6] = eq_terms.measured["airspeed"] / base.airspeed - flow.Va * np.sqrt(flow.rho / RHO_0)
-        out[:, 6] /= intermediate["Va_share"]  # in units of the faulty sensor
-    out[:, 7:13] = intermediate["apart"]
-    if "baro" in readings:
-        out[:, 13] = intermediate["baro"] - modelled.baro_offset - add.get("baro", 0.0)
-    return out
+        terms = self.equation_terms(hypotheses)
+        base, flow, add, measured = self.base, terms.flow, terms.add, terms.measured
+        T = (base.coef["T"] @ terms.regressors["T"]) * (1.0 + add.get("thrust", 0.0))
+        alpha, beta = (base.coef[name] @ terms.regressors[name] for name in ("alpha", "beta"))
+        X, L, M, N = (evaluate_equation(base, add, name, terms.regressors[name]) for name in "XLMN")
+        # increment of effects over the clean lift coefficient
+        lift = add.get("lift", 0.0) * -terms.intermediate["c_z"] + add.get("C_L", 0.0)
+        X = terms.scale["X"] * (X + lift * np.sin(alpha) - add.get("C_D", 0.0) * np.cos(alpha)) + T
+        L = terms.scale["L"] * (L + add.get("C_l", 0.0)) + add.get("L", 0.0)
+        N = terms.scale["N"] * (N + add.get("C_n", 0.0)) + add.get("N", 0.0)
+        M = terms.scale["M"] * (M + add.get("C_m", 0.0)) + T * base.coef["M"][-1] + add.get("M", 0.0)
+        if "x_cg" in add or "y_cg" in add:
+            x, y, force = add.get("x_cg", 0.0), add.get("y_cg", 0.0), terms.intermediate["force"]
+            # gravity acts at the centre of gravity, the aerodynamic force at an offset from it
+            M, N, L = M + x * force[2], N - x * force[1] + y * force[0], L - y * force[2]
+        J_x, J_y, J_z, _ = base.card.inertia
+        out = np.zeros((len(self.t), len(CHANNELS)))
+        out[:, 0] = (measured["X"] - X) / terms.intermediate["mass"]
+        out[:, 1] = np.degrees(measured["beta"] - beta)
+        out[:, 2] = np.degrees(measured["alpha"] - alpha)
+        out[:, 3] = (measured["L"] - L) / J_x
+        out[:, 4] = (measured["M"] - M) / J_y
+        out[:, 5] = (measured["N"] - N) / J_z
+        if "Va" in self.flight.readings:
+            out[:, 6] = measured["airspeed"] / base.airspeed - flow.Va * np.sqrt(flow.rho / RHO_0)
+            out[:, 6] /= terms.intermediate["Va_share"]  # in units of the faulty sensor
+        out[:, 7:13] = terms.intermediate["apart"]
+        if "baro" in self.flight.readings:
+            out[:, 13] = terms.intermediate["baro"] - self.baro_offset - add.get("baro", 0.0)
+        return out
 
 
 def evaluate_equation(base: Baseline, add: Signals, equation: str, terms: np.ndarray) -> np.ndarray:
@@ -283,15 +257,3 @@ def evaluate_equation(base: Baseline, add: Signals, equation: str, terms: np.nda
         if (share := add.get(f"{equation}:{name}")) is not None:
             out = out + share * coef[k] * terms[k]
     return out
-
-
-def _euler_rate_error(s: Signals) -> np.ndarray:
-    """Return Euler rates less those computed from the gyros, (n, 3) [rad/s]."""
-    sf, cf, p, q, r = np.sin(s["phi"]), np.cos(s["phi"]), s["p"], s["q"], s["r"]
-    turn = (q * sf + r * cf) / np.cos(s["theta"])
-    rates = (s["phi_dot"] - p - np.sin(s["theta"]) * turn, s["theta_dot"] - (q * cf - r * sf), s["psi_dot"] - turn)
-    return np.array(rates).T
-
-
-def _target_kwargs(hypothesis: FaultHypothesis) -> dict[str, str]:
-    return {"of": hypothesis.target} if hypothesis.target else {}

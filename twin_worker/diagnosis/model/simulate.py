@@ -24,7 +24,6 @@ _MIN_AIRSPEED = 3.0  # least airspeed in the equations [m/s]
 _MAX_RATE = 8.0  # body rate above which a run counts as diverged [rad/s]
 
 Pilot = Callable[[int, np.ndarray], np.ndarray]
-Memories = dict[tuple[int, int, int], np.ndarray]  # run, input, effect -> servo memory
 
 
 @dataclass(frozen=True)
@@ -57,13 +56,13 @@ class Simulation:
     ) -> None:
         self.base, self.start_times, self.ground = base, np.asarray(start_times, float), ground
         self.runs = len(hypotheses)
-        self._groups = _group_effects(hypotheses)
-        self._servos = [
-            (run, g)
-            for run, run_hypotheses in enumerate(hypotheses)
-            for g in run_hypotheses
-            if g.effect.stage is Stage.DELTA
-        ]
+        acting = [(g, run) for run, run_hypotheses in enumerate(hypotheses) for g in run_hypotheses]
+        groups: dict[str, list[tuple[FaultHypothesis, int]]] = {}
+        for g, run in acting:
+            if g.effect.stage in (Stage.AIR, Stage.WRENCH, Stage.MASS):
+                groups.setdefault(f"{g.effect.stage}:{g.label}", []).append((g, run))
+        self._groups = [_EffectGroup([g for g, _ in group], [run for _, run in group]) for group in groups.values()]
+        self._servos = [(run, g) for g, run in acting if g.effect.stage is Stage.DELTA]
         self._no_wind = np.zeros((3, self.runs))
 
     def simulate(self, start: np.ndarray, pilot: Pilot, n: int) -> Runs:
@@ -73,10 +72,10 @@ class Simulation:
             start: states in the order of `STATE`, (10, runs)
             pilot: `(step, states (10, runs))` to commands delta_a delta_e delta_r delta_t, (4, runs)
         """
-        x = np.array(start, float)
+        x, deflections = np.array(start, float), self.base.card.deflections
         states, force = np.empty((n, len(STATE), self.runs)), np.empty((n, 3, self.runs))
         commands, speed, rho = np.empty((n, 4, self.runs)), np.empty((n, self.runs)), np.empty((n, self.runs))
-        memories: Memories = {}
+        memories: dict[tuple[int, int, int], np.ndarray] = {}  # run, input, effect -> servo memory
         actuated: np.ndarray | None = None
         used = np.zeros(self.runs)
         half_step, full_step = self._lag_share(0.5 * DT), self._lag_share(DT)
@@ -87,12 +86,12 @@ class Simulation:
             actuated = faulty if actuated is None else actuated
             used += commands[k, 3] * DT
             self._gate(t)
-            first, middle = self._angles(actuated), self._angles(actuated + half_step * (faulty - actuated))
+            first, middle = deflections(actuated), deflections(actuated + half_step * (faulty - actuated))
             actuated = actuated + full_step * (faulty - actuated)
             k1, force[k], speed[k], rho[k] = self.derivatives(x, first, t, used)
             k2 = self.derivatives(x + 0.5 * DT * k1, middle, t + 0.5 * DT, used)[0]
             k3 = self.derivatives(x + 0.5 * DT * k2, middle, t + 0.5 * DT, used)[0]
-            k4 = self.derivatives(x + DT * k3, self._angles(actuated), t + DT, used)[0]
+            k4 = self.derivatives(x + DT * k3, deflections(actuated), t + DT, used)[0]
             x = x + DT / 6.0 * (k1 + 2 * k2 + 2 * k3 + k4)
             diverged = ~(np.abs(x[3:6]).max(axis=0) < _MAX_RATE)
             x[:, diverged] = np.where(np.isfinite(states[k][:, diverged]), states[k][:, diverged], 0.0)
@@ -115,7 +114,9 @@ class Simulation:
                     share[column, run] = 1.0
         return share
 
-    def _faulty_commands(self, commands: np.ndarray, t: np.ndarray, memories: Memories) -> np.ndarray:
+    def _faulty_commands(
+        self, commands: np.ndarray, t: np.ndarray, memories: dict[tuple[int, int, int], np.ndarray]
+    ) -> np.ndarray:
         """Apply the servo faults to the commands, (4, runs)."""
         out = commands.copy()
         for run, hypothesis in self._servos:
@@ -124,7 +125,7 @@ class Simulation:
                     continue
                 u = out[column, run : run + 1].copy()
                 memory = memories.setdefault((run, column, id(hypothesis)), np.full(MEMORY, u[0]))
-                par = np.asarray(hypothesis.par)[:, None] * hypothesis.onset.gate(t[run : run + 1])
+                par = hypothesis.parameters_at(t[run : run + 1])
                 if hypothesis.effect.takes_lag:
                     par[0] += self.base.timing.servo + self.base.timing.delay
                 hypothesis.effect.act(u, memory, DT, par)
@@ -139,7 +140,7 @@ class Simulation:
     def _increments(self, flow: Flow, stages: tuple[Stage, ...]) -> dict[str, np.ndarray]:
         total: dict[str, np.ndarray] = {}
         for group in self._groups:
-            if group.effect.stage not in stages:
+            if group.stage not in stages:
                 continue
             for name, x in group.act(flow).items():
                 if name not in total:
@@ -151,9 +152,6 @@ class Simulation:
         if not air:
             return self._no_wind
         return np.stack([air.get(name, self._no_wind[0]) for name in ("w_n", "w_e", "w_d")])
-
-    def _angles(self, u: np.ndarray) -> np.ndarray:
-        return np.stack([*(self.base.card.angles(i)(u[i]) for i in range(3)), u[3]])
 
     def derivatives(
         self, x: np.ndarray, delta: np.ndarray, t: np.ndarray, used: np.ndarray
@@ -202,18 +200,10 @@ class Simulation:
         x_cg, y_cg = add.get("x_cg", zero), add.get("y_cg", zero)
         M, N, L = M + x_cg * force[2], N - x_cg * force[1] + y_cg * force[0], L - y_cg * force[2]
         f = force / (body.mass * (1.0 + add.get("mass", zero)))
-        return (
-            np.concatenate([self._acceleration(R, f), self._rotation_derivatives(x, (L, M, N)), -v[2:3]]),
-            f,
-            flow.Va,
-            flow.rho,
-        )
-
-    @staticmethod
-    def _acceleration(R: np.ndarray, f: np.ndarray) -> np.ndarray:
-        out = np.einsum("ijn,jn->in", R, f)
-        out[2] += G
-        return out
+        acceleration = np.einsum("ijn,jn->in", R, f)
+        acceleration[2] += G
+        rates = np.concatenate([acceleration, self._rotation_derivatives(x, (L, M, N)), -v[2:3]])
+        return rates, f, flow.Va, flow.rho
 
     def _rotation_derivatives(self, x: np.ndarray, moments: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
         (L, M, N), (p, q, r), phi = moments, x[3:6], x[6]
@@ -246,31 +236,20 @@ class _EffectGroup:
     """Hypotheses of one effect on one target, and the runs in which they are active."""
 
     def __init__(self, hypotheses: list[FaultHypothesis], runs: list[int]) -> None:
-        self.effect, self._onsets = hypotheses[0].effect, [hypothesis.onset for hypothesis in hypotheses]
-        self._runs, self._target_kwargs = np.array(runs), {"of": hypotheses[0].target} if hypotheses[0].target else {}
+        self.stage, self._hypotheses, self._runs = hypotheses[0].effect.stage, hypotheses, np.array(runs)
         contiguous = np.array_equal(self._runs, np.arange(runs[0], runs[0] + len(runs)))
         self.run_index = slice(runs[0], runs[0] + len(runs)) if contiguous else self._runs  # a slice yields views
-        self._full = self._par = np.array([hypothesis.par for hypothesis in hypotheses]).T
-        self._time_varying = any(onset.kind is not Onset.ALWAYS for onset in self._onsets)
+        self._par = np.array([hypothesis.par for hypothesis in hypotheses]).T
+        self._time_varying = any(hypothesis.onset.kind is not Onset.ALWAYS for hypothesis in hypotheses)
 
     def gate(self, t: np.ndarray) -> None:
         """Set the parameters at times t, (runs,) of all runs."""
         if self._time_varying:
-            gates = [onset.gate(t[run : run + 1])[0] for onset, run in zip(self._onsets, self._runs, strict=True)]
-            self._par = self._full * np.array(gates)
+            pairs = zip(self._hypotheses, self._runs, strict=True)
+            self._par = np.hstack([hypothesis.parameters_at(t[run : run + 1]) for hypothesis, run in pairs])
 
     def act(self, flow: Flow) -> dict[str, np.ndarray]:
         """Return the increments of the active runs."""
         fields = {name: x[self.run_index] if isinstance(x, np.ndarray) else x for name, x in vars(flow).items()}
         part = Flow(**fields)  # type: ignore[arg-type]
-        return self.effect.act(part, *self._par, **self._target_kwargs)  # type: ignore[no-any-return]
-
-
-def _group_effects(hypotheses: Sequence[Sequence[FaultHypothesis]]) -> list[_EffectGroup]:
-    """Group the hypotheses of all runs by effect and target."""
-    groups: dict[str, list[tuple[FaultHypothesis, int]]] = {}
-    for run, run_hypotheses in enumerate(hypotheses):
-        for hypothesis in run_hypotheses:
-            if hypothesis.effect.stage in (Stage.AIR, Stage.WRENCH, Stage.MASS):
-                groups.setdefault(f"{hypothesis.effect.stage}:{hypothesis.label}", []).append((hypothesis, run))
-    return [_EffectGroup([g for g, _ in group], [run for _, run in group]) for group in groups.values()]
+        return self._hypotheses[0].act(part, self._par)

@@ -19,8 +19,9 @@ _PRIOR_WEIGHT = np.array([0.5, 0.5, 100.0])  # prior weights: inverse standard d
 def weather_hypotheses(w: np.ndarray) -> tuple[FaultHypothesis, ...]:
     """Return weather (4,) as hypotheses: wind, (2,) [m/s], and wind shear, (2,) [m/s per 100 m]."""
     effects = catalogue()
-    return FaultHypothesis(effects["wind_steady"], "", tuple(w[:2].tolist())), FaultHypothesis(
-        effects["wind_shear"], "", tuple(w[2:].tolist())
+    return (
+        FaultHypothesis(effects["wind_steady"], "", tuple(w[:2].tolist())),
+        FaultHypothesis(effects["wind_shear"], "", tuple(w[2:].tolist())),
     )
 
 

@@ -18,7 +18,6 @@ from fleet.report.report_text import printable
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.output.keep import safe
 from twin_worker.diagnosis.output.traces import (
-    LEGEND,
     OUTCOME_TEXT,
     format_segments,
     marks,
@@ -34,6 +33,15 @@ _MAX_STEM = 50  # letters of a flight name in a file name, which is limited to 2
 _MAX_TITLE = 40  # letters of a flight name in a title
 _MAX_CANDIDATES = 12  # candidates in the figure
 _MIN_CANDIDATES = 4  # least number of rows, so that a single bar stays thin
+_STYLE: Any = {  # of all figures
+    "figure.constrained_layout.use": True,
+    "axes.labelsize": 9,
+    "axes.labelcolor": INK,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "legend.labelcolor": INK,
+    "text.parse_math": False,
+}
 _RIVAL: Any = {"facecolor": "white", "edgecolor": INK, "hatch": "////", "lw": 0.8}
 _OTHER: Any = {"color": MUTED, "alpha": 0.45}
 _SMALL: Any = {"fontsize": 8, "color": INK, "va": "center"}
@@ -54,19 +62,14 @@ def draw(report: Report, folder: Path, stem: str = "") -> list[Path]:
     name = printable(report.flight)
     shown = replace(report, flight=name if len(name) <= _MAX_TITLE else name[: _MAX_TITLE - 2] + " …")
     paths = [folder / f"{stem}-{kind}.png" for kind in KINDS]
-    with matplotlib.rc_context({"text.parse_math": False}), warnings.catch_warnings():
+    with matplotlib.rc_context(_STYLE), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a letter without a glyph becomes a box
         for path, draw_figure in zip(paths, (_path, residuals, simulated, _candidates), strict=True):
-            _save(draw_figure(shown), path)
+            drawn = io.BytesIO()
+            draw_figure(shown).savefig(drawn, dpi=_DPI)
+            with Image.open(drawn) as picture:
+                picture.convert("RGB").quantize(_N_COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
     return paths
-
-
-def _save(figure: Figure, path: Path) -> None:
-    """Save a figure as a PNG with a reduced palette."""
-    drawn = io.BytesIO()
-    figure.savefig(drawn, dpi=_DPI)
-    with Image.open(drawn) as picture:
-        picture.convert("RGB").quantize(_N_COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def stems(flights: Sequence[str]) -> list[str]:
@@ -84,7 +87,7 @@ def stems(flights: Sequence[str]) -> list[str]:
 def _path(report: Report) -> Figure:
     """Draw the path from above and the height over time, located segments in colour."""
     series = report.series
-    figure = Figure(figsize=(11, 5.4), layout="constrained")
+    figure = Figure(figsize=(11, 5.4))
     above, height = figure.subplots(1, 2, width_ratios=(1.15, 1))
     north, east, up = series.position.T
     valid = np.isfinite(series.position).all(axis=1)
@@ -99,12 +102,11 @@ def _path(report: Report) -> Figure:
             show_empty(ax, "no position")
     above.set_aspect("equal", adjustable="datalim")
     height.set_xlim(*time_limits(series))
-    for ax, labels in ((above, ("east [m]", "north [m]")), (height, ("time [s]", "height [m]"))):
-        ax.set_xlabel(labels[0], fontsize=9, color=INK)
-        ax.set_ylabel(labels[1], fontsize=9, color=INK)
+    above.set(xlabel="east [m]", ylabel="north [m]")
+    height.set(xlabel="time [s]", ylabel="height [m]")
     style_axes(above, "from above")
     style_axes(height, "height over time")
-    figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=3, **LEGEND)
+    figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     figure.suptitle(f"{report.flight}: {OUTCOME_TEXT[report.outcome]}", fontsize=10, color=INK)
     return figure
 
@@ -123,7 +125,7 @@ def _draw_located(ax: Any, report: Report, x: np.ndarray, y: np.ndarray) -> None
 def _candidates(report: Report) -> Figure:
     """Draw the gain of every candidate: selected ones in colour, inseparable ones hatched."""
     ranked = sorted(report.ranking, key=lambda candidate: -candidate.gain)[:_MAX_CANDIDATES]
-    figure = Figure(figsize=(11, 0.3 * max(len(ranked), _MIN_CANDIDATES) + 1.5), layout="constrained")
+    figure = Figure(figsize=(11, 0.3 * max(len(ranked), _MIN_CANDIDATES) + 1.5))
     ax = figure.subplots()
     chosen = {
         finding.hypothesis.label: mark.colour for finding, mark in zip(report.findings, marks(report), strict=False)
@@ -146,13 +148,13 @@ def _candidates(report: Report) -> Figure:
     ax.margins(x=0.1)
     ax.set_ylim(max(len(ranked), _MIN_CANDIDATES) - 0.4, -0.6)
     ax.set_axisbelow(True)
-    ax.set_xlabel("gain: drop of the whitened sum of squares", fontsize=9, color=INK)
+    ax.set_xlabel("gain: drop of the whitened sum of squares")
     count_text = f", the best {len(ranked)} of {len(report.ranking)}" if ranked else ""
     style_axes(ax, f"{report.flight}: candidates{count_text}")
     ax.tick_params(axis="y", labelsize=8, labelcolor=INK, length=0)
     ax.grid(visible=False, axis="y")
     if ranked:
-        figure.legend(handles=list(legend.values()), loc="outside lower center", ncols=4, **LEGEND)
+        figure.legend(handles=list(legend.values()), loc="outside lower center", ncols=4)
     else:
         show_empty(ax, "no candidate with a significant gain")
         ax.set(xticks=[], xlabel="")

@@ -7,12 +7,13 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
-from fleet.effects import Body, Onset, catalogue
-from twin_worker.diagnosis.data.card import AircraftCard, FaultHypothesis, OnsetProfile
+from fleet.effects import catalogue
+from twin_worker.diagnosis.data.card import FaultHypothesis, OnsetProfile
 from twin_worker.diagnosis.inference.report import DiagnosisFinding, Report, ReportOutcome
-from twin_worker.diagnosis.model.baseline import CHANNELS, ActuatorTiming, Baseline, Noise
+from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline
 from twin_worker.diagnosis.model.equations import TERMS
 
 FORMAT = "parauav.simulation.1"
@@ -31,7 +32,7 @@ def save(path: Path, base: Baseline, findings: Sequence[DiagnosisFinding] = ()) 
         }
         for finding in findings
     ]
-    simulation = {field.name: _plain(getattr(base, field.name)) for field in fields(base)}
+    simulation = msgspec.to_builtins(base, enc_hook=np.ndarray.tolist)
     path.write_text(json.dumps({"format": FORMAT, **simulation, "effects": effects}, indent=1) + "\n")
 
 
@@ -44,7 +45,7 @@ def load(path: Path) -> tuple[Baseline, tuple[FaultHypothesis, ...]]:
     """
     try:
         document = json.loads(path.read_text())
-    except (ValueError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise ValueError(
             f"{path.name}: found no JSON ({error}), expected a model; make it with `fleet calibrate`"
         ) from None
@@ -54,74 +55,39 @@ def load(path: Path) -> tuple[Baseline, tuple[FaultHypothesis, ...]]:
             f"{path.name}: found format {format_name!r}, expected {FORMAT}; make it with `fleet calibrate`"
         )
     try:
-        return _baseline(document), tuple(_hypothesis(entry) for entry in document["effects"])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        if missing := [field.name for field in fields(Baseline) if field.name not in document]:
+            raise KeyError(*missing)
+        base = msgspec.convert(document, Baseline, dec_hook=lambda _, x: np.array(x, float))
+        _check_shapes(base)
+        return base, tuple(_hypothesis(entry) for entry in document["effects"])
+    except (KeyError, TypeError, ValueError, msgspec.ValidationError) as error:
         raise ValueError(
             f"{path.name}: found {error!r}, expected a complete model; make it with `fleet calibrate`"
         ) from None
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, dict):
-        return {name: _plain(x) for name, x in value.items()}
-    if isinstance(value, tuple | list):
-        return [_plain(x) for x in value]
-    if hasattr(value, "__dataclass_fields__"):
-        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
-    return value
+def _check_shapes(base: Baseline) -> None:
+    n = len(CHANNELS)
+    for coef in (base.coef, *base.others):
+        for name, terms in TERMS.items():
+            _check_array(coef[name], (len(terms),))
+    for array, shape in ((base.noise.ar, (n, 2)), (base.noise.sigma, (n,)), (base.usual, (n,))):
+        _check_array(array, shape)
+    for value in (base.speed, base.airspeed):
+        if not isfinite(value) or value <= 0:
+            raise ValueError(f"{value!r}, expected a number above 0")
 
 
-def _baseline(document: dict[str, Any]) -> Baseline:
-    card, noise = document["card"], document["noise"]
-    inertia, throw = tuple(card["inertia"]), tuple(tuple(pair) for pair in card["throw"])
-    coef = _coefficients(document["coef"])
-    return Baseline(
-        card=AircraftCard(card["name"], Body(**card["body"]), inertia, throw, card["pulses"], card["known"]),  # type: ignore[arg-type]
-        coef=coef,
-        speed=_number(document["speed"]),
-        airspeed=_number(document["airspeed"]),
-        timing=ActuatorTiming(**document["timing"]),
-        vane=bool(document["vane"]),
-        r2={name: float(x) for name, x in document["r2"].items()},
-        noise=Noise(_array(noise["ar"], (len(CHANNELS), 2)), _array(noise["sigma"], (len(CHANNELS),))),
-        spread={name: float(x) for name, x in document["spread"].items()},
-        chance={name: float(x) for name, x in document["chance"].items()},
-        others=tuple(_coefficients(other) for other in document["others"]),
-        usual=_array(document["usual"], (len(CHANNELS),)),
-        flights=tuple(document["flights"]),
-    )
-
-
-def _coefficients(entry: dict[str, list[float]]) -> dict[str, np.ndarray]:
-    return {name: _array(entry[name], (len(terms),)) for name, terms in TERMS.items()}
-
-
-def _array(values: Any, shape: tuple[int, ...]) -> np.ndarray:
-    array = np.array(values, float)
+def _check_array(array: np.ndarray, shape: tuple[int, ...]) -> None:
     if array.shape != shape or not np.isfinite(array).all():
         raise ValueError(f"shape {array.shape} or non-finite numbers, expected finite numbers of shape {shape}")
-    return array
-
-
-def _number(value: Any) -> float:
-    if not isinstance(value, int | float) or not isfinite(value) or value <= 0:
-        raise ValueError(f"{value!r}, expected a number above 0")
-    return float(value)
 
 
 def _hypothesis(entry: dict[str, Any]) -> FaultHypothesis:
-    effect = catalogue()[entry["effect"]]
-    onset = entry["when"]
-    hypothesis = FaultHypothesis(effect, str(entry["of"]), (0.0,) * effect.n_parameters)
-    return hypothesis.with_parameters(
-        _array(entry["par"], (effect.n_parameters,)),
-        OnsetProfile(Onset(onset["kind"]), float(onset["t0"]), float(onset["T"])),
-    )
-
-
-_VERDICT = {ReportOutcome.SUSPECTED: "none"}
+    effect, par = catalogue()[entry["effect"]], np.array(entry["par"], float)
+    _check_array(par, (effect.n_parameters,))
+    onset = msgspec.convert(entry["when"], OnsetProfile)
+    return FaultHypothesis(effect, str(entry["of"]), ()).with_parameters(par, onset)
 
 
 def write(reports: Sequence[Report], path: Path) -> None:
@@ -137,10 +103,18 @@ def as_json(report: Report, predictions: Path | None = None) -> dict[str, Any]:
     located = [_located(finding.channel, finding.surface, finding.segments) for finding in named]
     if report.outcome is ReportOutcome.UNKNOWN:
         located = [_located(report.where[0], "", report.where[1])]
+    suspects = [
+        {
+            "name": finding.hypothesis.effect.name,
+            "parameters": _finite(finding.reported),
+            "sigma": _finite(finding.sigma),
+        }
+        for finding in report.findings
+    ]
     return {
         "flight": report.flight,
         "abstained": report.outcome is ReportOutcome.UNKNOWN,
-        "verdict": _VERDICT.get(report.outcome, report.outcome.value),
+        "verdict": "none" if report.outcome is ReportOutcome.SUSPECTED else report.outcome.value,
         "sentence": report.sentence,
         "named": [finding.hypothesis.effect.name for finding in named],
         "equivalents": [list(finding.rivals) for finding in named],
@@ -148,7 +122,7 @@ def as_json(report: Report, predictions: Path | None = None) -> dict[str, Any]:
         "located": located,
         "parameters": [_finite(finding.reported) for finding in named],
         "sigma": [_finite(finding.sigma) for finding in named],
-        "suspects": [_suspect(finding) for finding in report.findings] if not named else [],
+        "suspects": suspects if not named else [],
         "fit_before": _or_none(report.fit_before),
         "fit_after": _or_none(report.fit_after),
         "force_before": _or_none(report.force_before),
@@ -181,14 +155,6 @@ def _write_predictions(report: Report, path: Path) -> Path | None:
 
 def _located(channel: str, surface: str, segments: tuple[tuple[float, float], ...]) -> dict[str, Any]:
     return {"channel": channel, "surface": surface or None, "segments": [list(pair) for pair in segments]}
-
-
-def _suspect(finding: DiagnosisFinding) -> dict[str, Any]:
-    return {
-        "name": finding.hypothesis.effect.name,
-        "parameters": _finite(finding.reported),
-        "sigma": _finite(finding.sigma),
-    }
 
 
 def _finite(values: dict[str, float]) -> dict[str, float | None]:

@@ -53,7 +53,6 @@ def write(reports: Sequence[Report], folder: Path) -> Path:
 
 
 def _overview(title: str, reports: Sequence[Report], names: Sequence[str]) -> str:
-    """Return a table of all flights with their summary sentences."""
     table_rows = "".join(
         f'<tr><td>{_chip(report.outcome)}</td><td><a href="{name}.html">{escape_text(report.flight)}</a></td>'
         f"<td>{escape_text(report.sentence)}</td><td "
@@ -65,13 +64,14 @@ def _overview(title: str, reports: Sequence[Report], names: Sequence[str]) -> st
 
 
 def _section(report: Report, figures: Sequence[Path]) -> str:
+    limitations = "".join(f"<li>{escape_text(limitation)}</li>" for limitation in report.limitations)
     parts = (
         f"<h2>{_chip(report.outcome)} {escape_text(report.flight)}</h2>",
         f'<p class="say">{escape_text(report.sentence)}</p>',
         _cards(report),
         *(_finding_section(finding) for finding in report.findings),
         _unknown_section(report),
-        _limitations(report),
+        f"<h3>Limitations</h3><ul>{limitations}</ul>" if limitations else "",
         *_figures(report, figures),
     )
     return "<section>" + "\n".join(filter(None, parts)) + "</section>"
@@ -79,11 +79,10 @@ def _section(report: Report, figures: Sequence[Path]) -> str:
 
 def _cards(report: Report) -> str:
     """Return cards with the errors on held-out data, before and after."""
+    force = _change(report.force_before, report.force_after)
     values_by_label = {
         "residual on held-out blocks, whitened rms": _change(report.fit_before, report.fit_after),
-        "simulated specific force on held-out blocks, rms error [m/s²]": _change(
-            report.force_before, report.force_after
-        ),
+        "simulated specific force on held-out blocks, rms error [m/s²]": force,
         "computed in": f"{report.seconds:.1f} s",
     }
     cards = "".join(
@@ -101,17 +100,16 @@ def _finding_section(finding: DiagnosisFinding) -> str:
         f"<td>{escape_text(unit(name, effect))}</td></tr>"
         for name, value in finding.reported.items()
     )
-    rivals = "".join(
-        _rival(name, manoeuvre, effect) for name, manoeuvre in zip(finding.rivals, finding.manoeuvres, strict=True)
-    )
-    rival_list = (
-        f"<p>Not separable from:</p><ul>{rivals}</ul>" if rivals else "<p>Separable from every other effect.</p>"
-    )
-    gain_text = (
-        f"{100 * finding.held_out_share:.0f} % of its gain is present on held-out data; gain"
-        if finding.held_out_share
-        else "Gain"
-    )
+    rivals = ""
+    for name, manoeuvre in zip(finding.rivals, finding.manoeuvres, strict=True):
+        text = ". ".join(filter(None, (effect.confusable_with.get(name), f"To separate them: {manoeuvre}")))
+        rivals += f'<li><b>{escape_text(name)}</b> <span class="soft">{escape_text(text)}.</span></li>'
+    rival_list = "<p>Separable from every other effect.</p>"
+    if rivals:
+        rival_list = f"<p>Not separable from:</p><ul>{rivals}</ul>"
+    gain_text = "Gain"
+    if finding.held_out_share:
+        gain_text = f"{100 * finding.held_out_share:.0f} % of its gain is present on held-out data; gain"
     return (
         f"<h3>{escape_text(finding.hypothesis.label)}</h3><p><code>{escape_text(effect.equation)}</code></p>"
         f"<p>Where: {escape_text(where)}. When: {format_segments(finding.segments)}. "
@@ -120,13 +118,6 @@ def _finding_section(finding: DiagnosisFinding) -> str:
         f"deviation</th><th>unit</th></tr>{table_rows}</table>"
         f"<p>{rival_list}</p>"
     )
-
-
-def _rival(name: str, manoeuvre: str, effect: Effect) -> str:
-    """Return one rival with the known difference and the manoeuvre that separates it."""
-    hint = effect.confusable_with.get(name)
-    text = ". ".join(filter(None, (hint, f"To separate them: {manoeuvre}")))
-    return f'<li><b>{escape_text(name)}</b> <span class="soft">{escape_text(text)}.</span></li>'
 
 
 def _unknown_section(report: Report) -> str:
@@ -145,11 +136,6 @@ def _unknown_section(report: Report) -> str:
     head = '<tr><th>term</th><th class="num">coefficient</th></tr>'
     note = "Sparse free-form fit of the residual, without physical meaning."
     return f"{intro}<p>{note}</p><table>{head}{table_rows}</table>"
-
-
-def _limitations(report: Report) -> str:
-    items = "".join(f"<li>{escape_text(limitation)}</li>" for limitation in report.limitations)
-    return f"<h3>Limitations</h3><ul>{items}</ul>" if items else ""
 
 
 def _figures(report: Report, figures: Sequence[Path]) -> Iterator[str]:

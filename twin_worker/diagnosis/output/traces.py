@@ -1,5 +1,6 @@
 """Figures over time: residuals before and after, measured against simulated specific force, and marks of effects."""
 
+import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -45,7 +46,6 @@ BEFORE, AFTER = LINES[1], LINES[0]  # without and with the effects, in every fig
 _COLOURS = (LINES[4], LINES[2], LINES[3], LINES[7])  # of located segments, distinct from those two
 _EDGE_S = 1.0  # an effect that starts earlier counts as present throughout [s]
 _MAX_SEGMENTS = 3  # segments listed in full
-LEGEND: Any = {"frameon": False, "fontsize": 8, "labelcolor": INK}
 
 
 class FigureMark(NamedTuple):
@@ -72,20 +72,15 @@ class FigureMark(NamedTuple):
 
 def marks(report: Report) -> list[FigureMark]:
     """Return one mark for every finding, and one for an unknown mismatch."""
-    located = [
-        (
-            finding.hypothesis.label,
-            finding.segments,
-            None if finding.hypothesis.onset.kind is Onset.ALWAYS else finding.hypothesis.onset.t0,
-        )
-        for finding in report.findings
-    ]
+    located: list[tuple[str, Segments, float | None]] = []
+    for finding in report.findings:
+        onset = finding.hypothesis.onset
+        located.append((finding.hypothesis.label, finding.segments, None if onset.kind is Onset.ALWAYS else onset.t0))
     channel, segments = report.where
     if report.outcome is ReportOutcome.UNKNOWN and channel:
         located.append((f"unknown, {CHANNEL_TEXT.get(channel, channel)}", segments, None))
-    return [
-        FigureMark(name, _COLOURS[k % len(_COLOURS)], tuple(s), onset) for k, (name, s, onset) in enumerate(located)
-    ]
+    colours = itertools.cycle(_COLOURS)
+    return [FigureMark(name, next(colours), tuple(s), since) for name, s, since in located]
 
 
 def format_segments(segments: Segments) -> str:
@@ -123,7 +118,7 @@ def residuals(report: Report) -> Figure:
     """Draw each channel that differs from its usual, before and after, worst first."""
     names, title = choose_channels(report)
     n_rows = max((len(names) + 1) // 2, 1)
-    figure = Figure(figsize=(11, max(1.8 * n_rows + 1.0, 3.6)), layout="constrained")
+    figure = Figure(figsize=(11, max(1.8 * n_rows + 1.0, 3.6)))
     panels = list(figure.subplots(n_rows, 2, sharex=True, squeeze=False).flat)
     for ax, name in zip(panels, names, strict=False):
         _residual(ax, report, name)
@@ -131,10 +126,10 @@ def residuals(report: Report) -> Figure:
         ax.set_visible(False)
     for ax in panels[max(len(names) - 2, 0) : len(names)]:
         ax.tick_params(labelbottom=True)  # the right column may have one row less
-        ax.set_xlabel("time [s]", fontsize=9, color=INK)
+        ax.set_xlabel("time [s]")
     if names:
         panels[0].set_xlim(*time_limits(report.series))
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, **LEGEND)
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
     figure.supylabel("standard deviations of nominal flights", fontsize=9, color=INK)
     figure.suptitle(f"{report.flight}: {title}", fontsize=10, color=INK)
     return figure
@@ -186,7 +181,7 @@ def _residual(ax: Any, report: Report, name: str) -> None:
 def simulated(report: Report) -> Figure:
     """Draw measured specific force and that simulated without and with the effects; on the right one block enlarged."""
     series = report.series
-    figure = Figure(figsize=(11, 6.8), layout="constrained")
+    figure = Figure(figsize=(11, 6.8))
     panels = figure.subplots(3, 2, sharex="col", sharey="row", width_ratios=(2.6, 1), squeeze=False)
     block = _median_block(report)
     caption = "one held-out block" + (", of median gain" if report.findings else "") if block else "no held-out block"
@@ -196,22 +191,16 @@ def simulated(report: Report) -> Figure:
         style_axes(pair[0], f"{_FORCES[i]} [m/s²]")
         style_axes(pair[1], "" if i else caption)
     for ax in panels[-1]:
-        ax.set_xlabel("time [s]", fontsize=9, color=INK)
+        ax.set_xlabel("time [s]")
     panels[0, 0].set_xlim(*time_limits(series))
     panels[0, 1].set_xlim(*(block or time_limits(series)))
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, **LEGEND)
-    figure.suptitle(f"{report.flight}: specific force, {_rms_text(report)}", fontsize=10, color=INK)
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    text = "measured against simulated"
+    if np.isfinite(report.force_before):
+        change = f" → {report.force_after:.2f}" if report.findings and np.isfinite(report.force_after) else ""
+        text = f"rms error of the simulation on held-out blocks {report.force_before:.2f}{change} m/s²"
+    figure.suptitle(f"{report.flight}: specific force, {text}", fontsize=10, color=INK)
     return figure
-
-
-def _rms_text(report: Report) -> str:
-    """Return the rms error on held-out blocks as text."""
-    if not np.isfinite(report.force_before):
-        return "measured against simulated"
-    text = f"rms error of the simulation on held-out blocks {report.force_before:.2f}"
-    if report.findings and np.isfinite(report.force_after):
-        text += f" → {report.force_after:.2f}"
-    return f"{text} m/s²"
 
 
 def _force(ax: Any, report: Report, i: int, width: float) -> None:

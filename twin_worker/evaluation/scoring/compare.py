@@ -30,12 +30,15 @@ def resolve_start(reference: ReferenceFlight, start: EvaluationStart) -> Evaluat
     positions[(instants > end) | ~reference.has_position(instants)] = np.nan
     grid = np.arange(0.0, start.ahead[-1] + 1.0)  # 1 s: position noise adds no length, and turns are resolved
     length = path_length(reference.positions_at(start.origin, start.t + grid), start.speed)
+    legs = np.empty((0, 9))
+    if len(reference.items) > 1:
+        legs = unroll_route(reference.items, seq=1, origin=start.origin, params={}).legs
     return EvaluationCase(
         start=start,
         positions=positions,
         length=np.interp(start.ahead, grid, length),
         phase=_phase(reference, start),
-        route=_mission_corners(reference, start),
+        route=legs[:, P_N : P_D + 1],
         exclusion=_exclusion_reason(reference, start, end, reason),
     )
 
@@ -66,16 +69,6 @@ def _phase(reference: ReferenceFlight, start: EvaluationStart) -> str:
     return classify_phase(float(bank.mean()), -float(velocity[:, 2].mean()))
 
 
-def _mission_corners(reference: ReferenceFlight, start: EvaluationStart) -> np.ndarray:
-    """Return the corners of the whole mission, for figures only, (n, 3) [m]."""
-    legs = (
-        unroll_route(reference.items, seq=1, origin=start.origin, params={}).legs
-        if len(reference.items) > 1
-        else np.empty((0, 9))
-    )
-    return legs[:, P_N : P_D + 1]
-
-
 _DRAWS = 2000
 _SEED = 5
 _INTERVAL_PERCENT = (2.5, 97.5)  # the interval [%]
@@ -99,12 +92,8 @@ def compare(scores: dict[str, MethodScores]) -> dict[str, Any]:
 
 
 def _compare_with(own_scores: MethodScores, other_scores: MethodScores) -> dict[str, Any]:
-    pairs = np.column_stack(
-        [
-            np.minimum(method_scores.passages[LIMITS[0]][:, 0], MIN_EVENT_FREE_S)
-            for method_scores in (own_scores, other_scores)
-        ]
-    )
+    passages = [one.passages[LIMITS[0]][:, 0] for one in (own_scores, other_scores)]
+    pairs = np.minimum(np.column_stack(passages), MIN_EVENT_FREE_S)
     out: dict[str, Any] = {"t10_s": _difference(pairs, own_scores.flight, np.mean, better=1.0)}
     for seconds in _ERRORS_S:
         column = own_scores.column_at(seconds)
@@ -129,24 +118,18 @@ def _difference(
         statistic: mean or median
         better: sign of a difference in our favour
     """
-    names = np.unique(flight)
-    if not len(names):
-        return {"difference": None, "low": None, "high": None, "verdict": ONE_FLIGHT}
-    value = float(np.subtract(*statistic(pairs, axis=0)))
-    if len(names) < 2:
-        return {"difference": round(value, 2), "low": None, "high": None, "verdict": ONE_FLIGHT}
-    by_flight = [pairs[flight == name] for name in names]
+
+    def difference(rows: np.ndarray) -> float:
+        return float(np.subtract(*statistic(rows, axis=0)))
+
+    by_flight = [pairs[flight == name] for name in np.unique(flight)]
+    n = len(by_flight)
+    if n < 2:
+        value = round(difference(pairs), 2) if n else None
+        return {"difference": value, "low": None, "high": None, "verdict": ONE_FLIGHT}
+    value = difference(pairs)
     rng = np.random.default_rng(_SEED)
-    resampled = [
-        float(
-            np.subtract(
-                *statistic(
-                    np.concatenate([by_flight[i] for i in rng.integers(len(by_flight), size=len(by_flight))]), axis=0
-                )
-            )
-        )
-        for _ in range(_DRAWS)
-    ]
+    resampled = [difference(np.concatenate([by_flight[i] for i in rng.integers(n, size=n)])) for _ in range(_DRAWS)]
     low, high = np.percentile(resampled, _INTERVAL_PERCENT)
     verdict = MATCHED if low <= 0 <= high else BEATEN if value * better > 0 else WORSE
     return {

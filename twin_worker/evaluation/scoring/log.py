@@ -64,16 +64,9 @@ class ReferenceFlight:
 
     def next_event(self, t: float) -> tuple[float, str]:
         """Return the time of the first event after `t`, or of the recording's end [s since 1970], and its name."""
-        later_events = [
-            (self.end_t(), "recording ends"),
-            *((event_t, reason) for event_t, reason in self.events if event_t > t),
-        ]
-        return min(later_events)
-
-    def end_t(self) -> float:
-        """Return the time of the last position [s since 1970]."""
-        t, _ = self._position_rows()
-        return float(t[-1]) if len(t) else -np.inf
+        position_t, _ = self._position_rows()
+        end = (float(position_t[-1]) if len(position_t) else -np.inf, "recording ends")
+        return min([end, *(event for event in self.events if event[0] > t)])
 
     def positions_at(self, origin: Origin, instants: np.ndarray) -> np.ndarray:
         """Return the positions at some instants, NED, interpolated linearly across gaps, (n, 3) [m]."""

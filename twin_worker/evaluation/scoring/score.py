@@ -59,21 +59,6 @@ class MethodScores:
         valid = np.isfinite(self.error).all(axis=2) & np.isfinite(self.tube).all(axis=2)
         return np.where(valid, (np.abs(self.error) <= self.tube).all(axis=2), np.nan)
 
-    def select(self, rows: np.ndarray) -> "MethodScores":
-        """Return the scores of these rows."""
-        passages = {limit: rows_of_limit[rows] for limit, rows_of_limit in self.passages.items()}
-        return MethodScores(
-            self.ahead,
-            self.flight[rows],
-            self.source[rows],
-            self.error[rows],
-            self.distance[rows],
-            passages,
-            self.m2_passages[rows],
-            self.tube[rows],
-            self.horizon[rows],
-        )
-
 
 def score_method(cases: Sequence[EvaluationCase], method: str) -> MethodScores:
     """Score one method over starts with the same look-aheads."""
@@ -82,7 +67,10 @@ def score_method(cases: Sequence[EvaluationCase], method: str) -> MethodScores:
     distance = np.linalg.norm(positions - path, axis=2)
     ahead = cases[0].start.ahead
     relative = distance / np.array([case.length for case in cases])
-    m2_error = distance / np.array([_displacement(case) for case in cases])
+    displacement = [
+        np.fmax(np.linalg.norm(case.positions - case.positions[0], axis=1), min_path_length(case.start.speed))
+        for case in cases
+    ]
     unknown = np.full((len(ahead), 3), np.nan)
     return MethodScores(
         ahead=ahead,
@@ -91,15 +79,10 @@ def score_method(cases: Sequence[EvaluationCase], method: str) -> MethodScores:
         error=along_cross_down(track_frame(path, ahead), positions - path),
         distance=distance,
         passages={limit: first_passages(relative, ahead, limit) for limit in LIMITS},
-        m2_passages=first_passages(m2_error, ahead, ERROR_LIMIT),
+        m2_passages=first_passages(distance / np.array(displacement), ahead, ERROR_LIMIT),
         tube=np.array([unknown if one.tube is None else one.tube for one in forecasts]),
         horizon=np.array([one.horizon_s for one in forecasts]),
     )
-
-
-def _displacement(case: EvaluationCase) -> np.ndarray:
-    """Return the distance from the start, at least two seconds of ground speed, (k,) [m]."""
-    return np.fmax(np.linalg.norm(case.positions - case.positions[0], axis=1), min_path_length(case.start.speed))
 
 
 def first_passages(relative: np.ndarray, ahead: np.ndarray, limit: float) -> np.ndarray:

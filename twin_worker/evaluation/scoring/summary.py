@@ -25,9 +25,8 @@ def summarise(cases: Sequence[EvaluationCase]) -> dict[str, Any]:
     names = list(dict.fromkeys(name for case in counted for name in case.start.forecasts))
     complete = [case for case in counted if set(names) == set(case.start.forecasts)]  # every method on the same starts
     scores = {name: score_method(complete, name) for name in names} if complete else {}
-    phases = np.array([case.phase for case in complete])
     out: dict[str, Any] = {
-        name: method_figures(method_scores) | {"phases": _phase_figures(method_scores, phases)}
+        name: method_figures(method_scores) | {"phases": _phase_figures(complete, name)}
         for name, method_scores in scores.items()
     }
     out["compare"] = compare(scores)
@@ -37,17 +36,14 @@ def summarise(cases: Sequence[EvaluationCase]) -> dict[str, Any]:
 
 def method_figures(method_scores: MethodScores) -> dict[str, Any]:
     """Compute the figures of one method."""
-    columns = {str(s): column for s in REPORTED_S if (column := method_scores.column_at(s)) is not None}
+    columns = _reported_columns(method_scores)
     sources = Counter(method_scores.source.tolist())
     out: dict[str, Any] = {}
     for name, limit in zip(_PASSAGE_KEYS, LIMITS, strict=True):
         out[f"m1_{name}_lq_s"] = _round(passage_quantile(method_scores.passages[limit], 0.25))
         out[f"m1_{name}_median_s"] = _round(passage_quantile(method_scores.passages[limit], 0.5))
-    out["followed_s"] = _max_followed(method_scores)
-    out["survive_60"] = _round(survival_at(method_scores.passages[LIMITS[0]], MIN_EVENT_FREE_S), 3)
+    out |= _error_figures(method_scores)
     out["m2_t10_lq_s"] = _round(passage_quantile(method_scores.m2_passages, 0.25))
-    out["p50_m"] = {s: _round(_percentile(method_scores.distance[:, k], 50)) for s, k in columns.items()}
-    out["p90_m"] = {s: _round(_percentile(method_scores.distance[:, k], 90)) for s, k in columns.items()}
     for i, axis in enumerate(("along", "cross", "vertical")):
         out[f"{axis}_p50_m"] = {
             s: _round(_percentile(np.abs(method_scores.error[:, k, i]), 50)) for s, k in columns.items()
@@ -57,6 +53,21 @@ def method_figures(method_scores: MethodScores) -> dict[str, Any]:
         "starts": len(method_scores.flight),
         "flights": len(set(method_scores.flight.tolist())),
         "made_by": dict(sources.most_common()),
+    }
+
+
+def _reported_columns(method_scores: MethodScores) -> dict[str, int]:
+    return {str(s): column for s in REPORTED_S if (column := method_scores.column_at(s)) is not None}
+
+
+def _error_figures(method_scores: MethodScores) -> dict[str, Any]:
+    """Compute survival and quantiles of the error by look-ahead."""
+    columns = _reported_columns(method_scores)
+    return {
+        "followed_s": _max_followed(method_scores),
+        "survive_60": _round(survival_at(method_scores.passages[LIMITS[0]], MIN_EVENT_FREE_S), 3),
+        "p50_m": {s: _round(_percentile(method_scores.distance[:, k], 50)) for s, k in columns.items()},
+        "p90_m": {s: _round(_percentile(method_scores.distance[:, k], 90)) for s, k in columns.items()},
     }
 
 
@@ -94,22 +105,14 @@ def _horizon_scores(method_scores: MethodScores) -> tuple[float, float]:
     return hit, float(scipy.stats.spearmanr(time, horizon).statistic)
 
 
-def _phase_figures(method_scores: MethodScores, phases: np.ndarray) -> dict[str, Any]:
-    """Compute passages and errors by flight phase after the start."""
+def _phase_figures(cases: Sequence[EvaluationCase], method: str) -> dict[str, Any]:
+    """Compute passages and errors of a method by flight phase after the start."""
     out = {}
     for phase in PHASES:
-        if not (rows := phases == phase).any():
-            continue
-        phase_scores = method_scores.select(rows)
-        columns = {str(s): column for s in REPORTED_S if (column := phase_scores.column_at(s)) is not None}
-        out[phase] = {
-            "starts": int(rows.sum()),
-            "m1_t10_lq_s": _round(passage_quantile(phase_scores.passages[LIMITS[0]], 0.25)),
-            "followed_s": _max_followed(phase_scores),
-            "survive_60": _round(survival_at(phase_scores.passages[LIMITS[0]], MIN_EVENT_FREE_S), 3),
-            "p50_m": {s: _round(_percentile(phase_scores.distance[:, k], 50)) for s, k in columns.items()},
-            "p90_m": {s: _round(_percentile(phase_scores.distance[:, k], 90)) for s, k in columns.items()},
-        }
+        if phase_cases := [case for case in cases if case.phase == phase]:
+            scores = score_method(phase_cases, method)
+            lower = _round(passage_quantile(scores.passages[LIMITS[0]], 0.25))
+            out[phase] = {"starts": len(phase_cases), "m1_t10_lq_s": lower} | _error_figures(scores)
     return out
 
 

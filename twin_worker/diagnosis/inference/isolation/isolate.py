@@ -22,10 +22,11 @@ _BUMPS_S = (3.0, 5.0, 8.0, 14.0, 25.0, 45.0)
 
 @dataclass(frozen=True)
 class ScoredHypothesis:
-    """A hypothesis and its gain: decrease of the whitened sum of squares."""
+    """A hypothesis, its gain (decrease of the whitened sum of squares), and hypotheses of equal explanatory power."""
 
     gain: float
     hypothesis: FaultHypothesis
+    rivals: tuple["ScoredHypothesis", ...] = ()  # best first
 
     @property
     def kind(self) -> str:
@@ -42,11 +43,8 @@ def scan(whitened: WhitenedResiduals) -> list[ScoredHypothesis]:
     """Return the best hypothesis of every effect, target and kind of onset, best first."""
     out = []
     for effect, target in candidates(whitened):
-        out += (
-            _scan_by_start(whitened, effect, target)
-            if effect.initial_guesses
-            else _scan_by_slope(whitened, effect, target)
-        )
+        scan_effect = _scan_by_start if effect.initial_guesses else _scan_by_slope
+        out += scan_effect(whitened, effect, target)
     return sorted(out, key=lambda scored: -scored.net_gain)
 
 
@@ -76,9 +74,8 @@ def _scan_by_slope(whitened: WhitenedResiduals, effect: Effect, target: str) -> 
     if not (scale > 1e-9).all():
         return []
     J = J / scale
-    by_row = (
-        whitened.base.vane and Onset.STEP in effect.onsets
-    )  # a force derived from the velocity does not resolve the first rows
+    # a force derived from the velocity does not resolve the first rows
+    by_row = whitened.base.vane and Onset.STEP in effect.onsets
     onset_slopes = whitened.whiten_onset_slopes(raw_slopes) / scale if by_row else None
     out = []
     for kind in effect.onsets:
@@ -168,12 +165,10 @@ def _scan_by_start(whitened: WhitenedResiduals, effect: Effect, target: str) -> 
         gain = before - (whitened.clipped((hypothesis,)) ** 2).sum(axis=1)
         tail_gain = np.cumsum(gain[::-1])[::-1][onset_rows]
         i = int(np.argmax(tail_gain))
+        step = OnsetProfile(Onset.STEP, float(t[onset_rows[i]]))
         options = {
             Onset.ALWAYS: ScoredHypothesis(float(gain.sum()), hypothesis),
-            Onset.STEP: ScoredHypothesis(
-                float(tail_gain[i]),
-                hypothesis.with_parameters(np.array(start), OnsetProfile(Onset.STEP, float(t[onset_rows[i]]))),
-            ),
+            Onset.STEP: ScoredHypothesis(float(tail_gain[i]), hypothesis.with_parameters(np.array(start), step)),
         }
         for kind, scored in options.items():
             if kind in effect.onsets and (kind not in out or scored.gain > out[kind].gain):

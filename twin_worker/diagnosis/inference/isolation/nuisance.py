@@ -27,7 +27,16 @@ _DRIFT_FLOORS = {  # drift during a flight: effect -> floor of the drift over th
 }
 
 _SHARES = ("L:delta_a", "L:p", "L:beta", "M:delta_e", "M:c_z", "M:q", "N:delta_r", "N:r", "N:beta")
-_OFFSETS = ("C_L", "C_D", "C_l", "C_m", "C_n", "thrust", "rho", "side")
+_OFFSET_FLOORS = {  # least spread of each offset
+    "C_L": 0.004,
+    "C_D": 0.0005,
+    "C_l": 0.0001,
+    "C_m": 0.0003,
+    "C_n": 0.0001,
+    "thrust": 0.005,
+    "rho": 0.003,
+    "side": 0.05,
+}
 _QNH_M, _LAPSE = 30.0, 5.0  # sea level pressure as a height [m], and lapse rate [m per 100 m], unknown
 
 
@@ -44,7 +53,7 @@ SCATTER = Effect(
     parameters=(Parameter("x", "-", "offset", step=0.01, low=-1.0, high=1.0),),
     act=_act,
     examples=((0.01,),),
-    targets=(*_SHARES, *_OFFSETS),
+    targets=(*_SHARES, *_OFFSET_FLOORS),
 )
 LAPSE = replace(SCATTER, name="lapse", act=lambda flow, x: {"baro": x * flow.height / 100.0}, targets=())
 DENSITY = replace(SCATTER, stage=Stage.AIR)
@@ -112,14 +121,13 @@ class DriftMode:
     floor: float
 
 
-def drift_modes(nuisances: Sequence[Nuisance], vane: bool) -> tuple[DriftMode, ...]:
+def drift_modes(vane: bool) -> tuple[DriftMode, ...]:
     """List the drift modes of all drifting nuisances; none without a fast accelerometer, where noise covers them."""
     return tuple(
         DriftMode(f"{n.name}~{half_waves}", k, half_waves, _DRIFT_FLOORS[n.effect.name] * n.floor)
-        for k, n in enumerate(nuisances)
+        for k, n in enumerate(list_nuisances(vane) if vane else ())
         if n.effect.name in _DRIFT_FLOORS
         for half_waves in range(1, DRIFT_HARMONICS + 1)
-        if vane
     )
 
 
@@ -149,20 +157,8 @@ def list_nuisances(vane: bool) -> tuple[Nuisance, ...]:
     add("wind_shear", 0.2)
     add("imu_misalignment", 0.004)
     add("airspeed_scale", 0.003)
-    floors = {
-        "C_L": 0.004,
-        "C_D": 0.0005,
-        "C_l": 0.0001,
-        "C_m": 0.0003,
-        "C_n": 0.0001,
-        "thrust": 0.005,
-        "rho": 0.003,
-        "side": 0.05,
-    }
-    out += [
-        Nuisance(target, DENSITY if target == "rho" else SCATTER, target, 0, floors[target], floors[target])
-        for target in _OFFSETS
-    ]
+    for target, floor in _OFFSET_FLOORS.items():
+        out.append(Nuisance(target, DENSITY if target == "rho" else SCATTER, target, 0, floor, floor))
     out.append(Nuisance("baro", effects["baro_bias"], "", 0, _QNH_M, 1.0))
     out.append(Nuisance("lapse", LAPSE, "", 0, _LAPSE, 0.5))
     if not vane:

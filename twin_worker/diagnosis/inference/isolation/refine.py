@@ -1,9 +1,11 @@
 """Refine one hypothesis: Gauss-Newton for the parameters, a search with halved steps for the onset."""
 
+from functools import partial
+
 import numpy as np
 
 from fleet.effects import Onset, Stage
-from twin_worker.diagnosis.data.card import FaultHypothesis
+from twin_worker.diagnosis.data.card import FaultHypothesis, OnsetProfile
 from twin_worker.diagnosis.inference.isolation.isolate import ScoredHypothesis
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 
@@ -70,19 +72,6 @@ def normal_at(whitened: WhitenedResiduals, hypothesis: FaultHypothesis) -> tuple
     return A, b
 
 
-def _search_jump(
-    whitened: WhitenedResiduals, hypothesis: FaultHypothesis, best_cost: float
-) -> tuple[FaultHypothesis, float]:
-    """Search the onset of a sensor jump on a fine grid: its slope is visible only at the exact sample."""
-    for moves in (_COARSE_STEPS_S, _FINE_STEPS_S):
-        trials = [hypothesis.with_parameters(np.array(hypothesis.par), hypothesis.onset.shifted(dt)) for dt in moves]
-        costs = [whitened.cost((trial,)) for trial in trials]
-        k = int(np.argmin(costs))
-        if costs[k] < best_cost:
-            hypothesis, best_cost = trials[k], costs[k]
-    return hypothesis, best_cost
-
-
 def _search_onset(
     whitened: WhitenedResiduals, hypothesis: FaultHypothesis, best_cost: float
 ) -> tuple[FaultHypothesis, float]:
@@ -91,17 +80,20 @@ def _search_onset(
         return hypothesis, best_cost
     best = hypothesis
     if hypothesis.effect.stage is Stage.SENSOR and hypothesis.onset.kind is Onset.STEP:
-        best, best_cost = _search_jump(whitened, hypothesis, best_cost)
-    for move in _ONSET_STEPS_S:
-        for dt in (move, -move):
-            trial = best.with_parameters(np.array(best.par), best.onset.shifted(dt))
-            cost = whitened.cost((trial,))
-            if cost < best_cost - 1e-9:
-                best, best_cost = trial, cost
+        # the slope of a jump is visible only at the exact sample: search a fine grid first
+        for moves in (_COARSE_STEPS_S, _FINE_STEPS_S):
+            trials = [best.with_parameters(np.array(best.par), best.onset.shifted(dt)) for dt in moves]
+            costs = [whitened.cost((trial,)) for trial in trials]
+            k = int(np.argmin(costs))
+            if costs[k] < best_cost:
+                best, best_cost = trials[k], costs[k]
+    changes = [partial(OnsetProfile.shifted, dt=dt) for move in _ONSET_STEPS_S for dt in (move, -move)]
     if hypothesis.onset.kind is not Onset.STEP:
-        for by in (*_STRETCH_FACTORS, *(1 / s for s in _STRETCH_FACTORS)):
-            trial = best.with_parameters(np.array(best.par), best.onset.stretched(by))
-            cost = whitened.cost((trial,))
-            if cost < best_cost - 1e-9:
-                best, best_cost = trial, cost
+        factors = (*_STRETCH_FACTORS, *(1 / s for s in _STRETCH_FACTORS))
+        changes += [partial(OnsetProfile.stretched, by=by) for by in factors]
+    for change in changes:
+        trial = best.with_parameters(np.array(best.par), change(best.onset))
+        cost = whitened.cost((trial,))
+        if cost < best_cost - 1e-9:
+            best, best_cost = trial, cost
     return best, best_cost

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
@@ -32,22 +32,9 @@ _MIN_TIE, _MAX_TIE = 20.0, 300.0
 ReportProgress = Callable[[str], None]
 
 
-@dataclass(frozen=True)
-class SelectedEffect:
-    """One selected effect.
-
-    Attributes:
-        scored: the hypothesis and its gain
-        rivals: hypotheses with equal explanatory power, best first
-    """
-
-    scored: ScoredHypothesis
-    rivals: tuple[ScoredHypothesis, ...]
-
-
 def select_hypotheses(
     whitened: WhitenedResiduals, weather: tuple[FaultHypothesis, ...], progress: ReportProgress = lambda message: None
-) -> tuple[list[SelectedEffect], list[ScoredHypothesis]]:
+) -> tuple[list[ScoredHypothesis], list[ScoredHypothesis]]:
     """Select the effects that explain the flight; return them and the first ranking. Modifies `whitened`.
 
     Args:
@@ -55,16 +42,19 @@ def select_hypotheses(
         weather: hypotheses included throughout
         progress: callback for progress messages
     """
-    named: list[SelectedEffect] = []
+    named: list[ScoredHypothesis] = []
     ranking: list[ScoredHypothesis] = []
     joint = JointGain(whitened)
     while len(named) < MAX_EFFECTS:
         progress(f"effect {len(named) + 1}")
-        candidates = best_hypotheses(whitened, [selected.scored.hypothesis for selected in named])
+        candidates = best_hypotheses(whitened, [selected.hypothesis for selected in named])
         ranking = ranking or candidates
-        gain_test = GainTest(whitened, named, joint.channel_gain(named))
+        before, others_gain = whitened.channel_cost(()), joint.channel_gain(named)
         candidates = [
-            scored for scored in candidates if gain_test.passes(scored) and is_plausible(whitened, scored.hypothesis)
+            scored
+            for scored in candidates
+            if _has_required_gain(whitened, named, scored, before, others_gain)
+            and is_plausible(whitened, scored.hypothesis)
         ]
         if not candidates:
             break
@@ -74,7 +64,7 @@ def select_hypotheses(
             if not joint.accepts(extended, named):
                 break
         named = extended
-        whitened.condition_on((*weather, *(selected.scored.hypothesis for selected in named)))
+        whitened.condition_on((*weather, *(selected.hypothesis for selected in named)))
     return named, ranking
 
 
@@ -85,48 +75,46 @@ class JointGain:
         self._whitened = copy(whitened)
         self._no_effect_cost, self._no_effect_channels = self._whitened.cost(()), self._whitened.channel_cost(())
 
-    def gain(self, named: list[SelectedEffect]) -> float:
+    def gain(self, named: list[ScoredHypothesis]) -> float:
         """Return the joint gain."""
-        return self._no_effect_cost - self._whitened.cost([selected.scored.hypothesis for selected in named])
+        return self._no_effect_cost - self._whitened.cost([selected.hypothesis for selected in named])
 
-    def channel_gain(self, named: list[SelectedEffect]) -> np.ndarray:
+    def channel_gain(self, named: list[ScoredHypothesis]) -> np.ndarray:
         """Return the joint gain by channel, (c,)."""
-        return self._no_effect_channels - self._whitened.channel_cost(
-            [selected.scored.hypothesis for selected in named]
-        )
+        return self._no_effect_channels - self._whitened.channel_cost([selected.hypothesis for selected in named])
 
-    def accepts(self, extended: list[SelectedEffect], current: list[SelectedEffect]) -> bool:
+    def accepts(self, extended: list[ScoredHypothesis], current: list[ScoredHypothesis]) -> bool:
         """Return whether a further effect adds enough gain, without effects that cancel each other."""
         gain = self.gain(extended)
         without = min(self.gain([selected for selected in extended if selected is not omitted]) for omitted in extended)
         cancelling = gain - without > _CANCEL_RATIO * gain
         before = self.channel_gain(current)
-        gained = min(
-            gain - self.gain(current), excess_gain(self._whitened, self.channel_gain(extended) - before, before)
-        )
-        return not cancelling and gained > required_gain(self._whitened, current, extended[-1].scored)
+        excess = excess_gain(self._whitened, self.channel_gain(extended) - before, before)
+        gained = min(gain - self.gain(current), excess)
+        return not cancelling and gained > required_gain(self._whitened, current, extended[-1])
 
 
-class GainTest:
-    """Test whether a further hypothesis adds enough gain to the selected effects.
+def _has_required_gain(
+    whitened: WhitenedResiduals,
+    named: list[ScoredHypothesis],
+    scored: ScoredHypothesis,
+    before: np.ndarray,
+    others_gain: np.ndarray,
+) -> bool:
+    """Return whether a hypothesis exceeds the required gain beyond the model errors of the selected effects.
 
     Args:
         whitened: residuals conditioned on the selected effects
         named: effects selected so far
-        channel_gain: their joint gain by channel, (c,)
+        scored: the further hypothesis
+        before: their cost by channel, (c,)
+        others_gain: their joint gain by channel, (c,)
     """
-
-    def __init__(self, whitened: WhitenedResiduals, named: list[SelectedEffect], channel_gain: np.ndarray) -> None:
-        self._whitened, self._named, self._channel_gain = whitened, named, channel_gain
-        self._before = whitened.channel_cost(())
-
-    def passes(self, scored: ScoredHypothesis) -> bool:
-        """Return whether a hypothesis exceeds the required gain beyond the model errors of the selected effects."""
-        threshold = required_gain(self._whitened, self._named, scored)
-        if not self._named or scored.gain <= threshold:
-            return scored.gain > threshold
-        own = self._before - self._whitened.channel_cost((scored.hypothesis,))
-        return excess_gain(self._whitened, own, self._channel_gain) > threshold
+    threshold = required_gain(whitened, named, scored)
+    if not named or scored.gain <= threshold:
+        return scored.gain > threshold
+    own = before - whitened.channel_cost((scored.hypothesis,))
+    return excess_gain(whitened, own, others_gain) > threshold
 
 
 def excess_gain(whitened: WhitenedResiduals, own: np.ndarray, others_gain: np.ndarray) -> float:
@@ -151,17 +139,13 @@ def best_hypotheses(whitened: WhitenedResiduals, selected: Sequence[FaultHypothe
         if len(candidates) >= _N_REFINED:
             break
     fitted = [refine(whitened, scored.hypothesis, move_onset=False) for scored in candidates]
-    if not fitted:
-        return []
-    least = _REFINE_SHARE * max(penalised_gain(whitened, refined) for refined in fitted)
+    least = _REFINE_SHARE * max((penalised_gain(whitened, refined) for refined in fitted), default=0.0)
     # a slightly misplaced bump gains little before its onset is fitted: the score of the scan counts too
-    promising = [
-        max(penalised_gain(whitened, refined), scored.net_gain) > least
-        for refined, scored in zip(fitted, candidates, strict=True)
-    ]
     moved = [
-        refine(whitened, refined.hypothesis) if good else refined
-        for refined, good in zip(fitted, promising, strict=True)
+        refine(whitened, refined.hypothesis)
+        if max(penalised_gain(whitened, refined), scored.net_gain) > least
+        else refined
+        for refined, scored in zip(fitted, candidates, strict=True)
     ]
     return sorted(moved, key=lambda refined: -penalised_gain(whitened, refined))
 
@@ -173,47 +157,32 @@ def penalised_gain(whitened: WhitenedResiduals, scored: ScoredHypothesis) -> flo
     return scored.gain * (1.0 - share) - PARAMETER_COST * scored.hypothesis.degrees_of_freedom
 
 
-def tie_margin(whitened: WhitenedResiduals, scored: ScoredHypothesis) -> float:
-    """Return the score difference within which two hypotheses are inseparable."""
-    if not whitened.base.vane:
-        return max(_MIN_TIE, _RIVAL_SHARE_COARSE * scored.gain)
-    return max(_MIN_TIE, _TIE_SHARE * scored.gain, min(_RIVAL_SHARE * scored.gain, _MAX_TIE))
-
-
-def select_simplest(whitened: WhitenedResiduals, candidates: list[ScoredHypothesis]) -> SelectedEffect:
+def select_simplest(whitened: WhitenedResiduals, candidates: list[ScoredHypothesis]) -> ScoredHypothesis:
     """Select the hypothesis with the fewest parameters among the best ties; the others become its rivals."""
-    first = candidates[0]
-    ties = [
-        scored
-        for scored in candidates
-        if penalised_gain(whitened, scored) > penalised_gain(whitened, first) - max(_MIN_TIE, _TIE_SHARE * first.gain)
-    ]
-    chosen = min(ties, key=lambda scored: (scored.hypothesis.degrees_of_freedom, -penalised_gain(whitened, scored)))
+    scores = [penalised_gain(whitened, scored) for scored in candidates]
+    gain = candidates[0].gain
+    margin = max(_MIN_TIE, _RIVAL_SHARE_COARSE * gain)
+    if whitened.base.vane:
+        margin = max(_MIN_TIE, _TIE_SHARE * gain, min(_RIVAL_SHARE * gain, _MAX_TIE))
+    least_tie = scores[0] - max(_MIN_TIE, _TIE_SHARE * gain)
+    ties = [k for k, score in enumerate(scores) if score > least_tie]
+    chosen = candidates[min(ties, key=lambda k: (candidates[k].hypothesis.degrees_of_freedom, -scores[k]))]
     rivals: dict[str, ScoredHypothesis] = {}
-    for scored in candidates:
-        if penalised_gain(whitened, scored) < penalised_gain(whitened, first) - tie_margin(whitened, first):
-            continue
-        if scored.hypothesis.effect.name != chosen.hypothesis.effect.name:
-            rivals.setdefault(scored.hypothesis.effect.name, scored)
-    return SelectedEffect(chosen, tuple(rivals.values()))
+    for scored, score in zip(candidates, scores, strict=True):
+        name = scored.hypothesis.effect.name
+        if score >= scores[0] - margin and name != chosen.hypothesis.effect.name:
+            rivals.setdefault(name, scored)
+    return replace(chosen, rivals=tuple(rivals.values()))
 
 
-def required_gain(whitened: WhitenedResiduals, named: list[SelectedEffect], scored: ScoredHypothesis) -> float:
+def required_gain(whitened: WhitenedResiduals, named: list[ScoredHypothesis], scored: ScoredHypothesis) -> float:
     """Return the least gain of a hypothesis, from the chance gain and a share of the first effect's gain."""
     chance_gains = whitened.base.chance
-    chance = _CHANCE_FACTOR_COARSE * chance_gains.get(scored.kind, 0.0)
     if whitened.base.vane:
-        chance = _CHANCE_FACTOR * max(
-            (x for kind, x in chance_gains.items() if _is_related(kind, scored.hypothesis)), default=0.0
-        )
-    least = _MIN_GAIN if whitened.base.vane else _MIN_GAIN_COARSE
-    if not named:
-        return max(least, chance)
-    return (
-        max(_MIN_FURTHER_GAIN, chance)
-        if whitened.base.vane
-        else max(least, chance, _FURTHER_SHARE_COARSE * named[0].scored.gain)
-    )
+        related = (x for kind, x in chance_gains.items() if _is_related(kind, scored.hypothesis))
+        return max(_MIN_FURTHER_GAIN if named else _MIN_GAIN, _CHANCE_FACTOR * max(related, default=0.0))
+    least = max(_MIN_GAIN_COARSE, _CHANCE_FACTOR_COARSE * chance_gains.get(scored.kind, 0.0))
+    return max(least, _FURTHER_SHARE_COARSE * named[0].gain) if named else least
 
 
 def _is_related(kind: str, hypothesis: FaultHypothesis) -> bool:
@@ -249,36 +218,29 @@ def _own_share(whitened: WhitenedResiduals, hypothesis: FaultHypothesis) -> floa
 
 
 def _reselect(
-    whitened: WhitenedResiduals, named: list[SelectedEffect], weather: tuple[FaultHypothesis, ...]
-) -> list[SelectedEffect]:
+    whitened: WhitenedResiduals, named: list[ScoredHypothesis], weather: tuple[FaultHypothesis, ...]
+) -> list[ScoredHypothesis]:
     """Reselect each effect given the others, because the first selection ignored later effects."""
     for i in range(len(named)):
-        others = [selected.scored.hypothesis for k, selected in enumerate(named) if k != i]
+        others = [selected.hypothesis for k, selected in enumerate(named) if k != i]
         whitened.condition_on((*weather, *others))
         candidates = [
             scored for scored in best_hypotheses(whitened, others) if is_plausible(whitened, scored.hypothesis)
         ]
-        refitted = refine(whitened, named[i].scored.hypothesis)
         if candidates:
-            named[i] = select_simplest(
-                whitened, sorted([refitted, *candidates], key=lambda scored: -penalised_gain(whitened, scored))
-            )
+            candidates.insert(0, refine(whitened, named[i].hypothesis))
+            candidates.sort(key=lambda scored: -penalised_gain(whitened, scored))
+            named[i] = select_simplest(whitened, candidates)
     return named
 
 
 def turbulence_evidence(whitened: WhitenedResiduals) -> tuple[float, float]:
     """Return gain and variance ratio of gusts: sideslip, lift and airspeed scatter more, the sensor channels do not."""
     air_channels = [CHANNELS.index(name) for name in ("side", "lift", "airspeed")]
-    other_channels = [
-        CHANNELS.index(name) for name in ("gps_x", "gps_y", "gps_z", "gyro_roll", "gyro_pitch", "gyro_yaw")
-    ]
+    sensor_channels = [k for k, name in enumerate(CHANNELS) if name.startswith(("gps", "gyro"))]
     mean_square = whitened.mean_square() / whitened.base.usual
-    ratio = mean_square[air_channels]
-    if (
-        ratio.min() < _GUST_RATIOS[0]
-        or np.median(ratio) < _GUST_RATIOS[1]
-        or mean_square[other_channels].mean() > _GUST_RATIOS[1]
-    ):
+    ratio, sensor_ratio = mean_square[air_channels], mean_square[sensor_channels].mean()
+    if ratio.min() < _GUST_RATIOS[0] or np.median(ratio) < _GUST_RATIOS[1] or sensor_ratio > _GUST_RATIOS[1]:
         return 0.0, 1.0
     n_rows = int(whitened.ok.sum())
     return float(sum(n_rows * (x - 1 - np.log(x)) for x in ratio)), float(np.median(ratio))

@@ -24,7 +24,6 @@ from twin_worker.diagnosis.inference.isolation.isolate import (
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 from twin_worker.diagnosis.model import equations as eq
 from twin_worker.diagnosis.model.baseline import CHANNEL_OF, CHANNELS, Baseline
-from twin_worker.diagnosis.model.residual import EquationTerms
 
 _AIR_LAG_S = 4.0  # time constant of a partly blocked pressure line
 _MIN_SIDE_S = 25.0  # least length of data before and after the onset
@@ -76,16 +75,19 @@ class ChannelEquation:
 def channel_equations(whitened: WhitenedResiduals) -> Iterator[ChannelEquation]:
     """Yield every sufficiently calibrated channel with the terms that may change."""
     eq_terms = whitened.modelled.equation_terms(whitened.conditions)
+    f_x, f_y, _ = eq_terms.intermediate["f"]
+    # thrust, and loads that shift under specific force
+    extra_terms = {"force_x": {"thrust": eq_terms.regressors["T"][0]}, "roll": {"f_y": f_y}, "pitch": {"f_x": f_x}}
     for equation, channel in CHANNEL_OF.items():
         if whitened.base.r2.get(equation, 1.0) > MIN_R2:
             own = eq_terms.regressors[equation] * eq_terms.scale.get(equation, 1.0)
-            yield ChannelEquation(
-                whitened, channel, dict(zip(eq.TERMS[equation], own, strict=False)) | _extra_terms(channel, eq_terms)
-            )
+            terms = dict(zip(eq.TERMS[equation], own, strict=False)) | extra_terms.get(channel, {})
+            yield ChannelEquation(whitened, channel, terms)
     flow = eq_terms.flow
     constant = np.ones_like(flow.Va)
     if "Va" in whitened.modelled.flight.readings:
-        late = _lagged(flow.Va, _AIR_LAG_S) - flow.Va
+        decay = np.exp(-STEP_S / _AIR_LAG_S)
+        late = lfilter([1.0 - decay], [1.0, -decay], flow.Va, zi=[decay * flow.Va[0]])[0] - flow.Va
         yield ChannelEquation(whitened, "airspeed", {"1": constant, "Va": flow.Va, _SLOW: late})
     for channel, rate in (("gyro_roll", flow.p), ("gyro_pitch", flow.q), ("gyro_yaw", flow.r)):
         yield ChannelEquation(whitened, channel, {"1": constant, _RATE: rate})
@@ -112,39 +114,18 @@ def _with_free_terms(whitened: WhitenedResiduals, J: np.ndarray) -> WhitenedResi
     return out
 
 
-def _extra_terms(channel: str, eq_terms: EquationTerms) -> dict[str, np.ndarray]:
-    """Return non-aerodynamic terms of a channel: thrust, and loads that shift under specific force."""
-    f_x, f_y, _ = eq_terms.intermediate["f"]
-    extra = {"force_x": {"thrust": eq_terms.regressors["T"][0]}, "roll": {"f_y": f_y}, "pitch": {"f_x": f_x}}
-    return extra.get(channel, {})
-
-
-def _lagged(x: np.ndarray, tau: float) -> np.ndarray:
-    """Filter x, (n,), by a first-order lag of time constant tau [s]."""
-    decay = np.exp(-STEP_S / tau)
-    out: np.ndarray = lfilter([1.0 - decay], [1.0, -decay], x, zi=[decay * x[0]])[0]
-    return out
-
-
 _BAND_HZ = 0.1, 1.45  # the mission is slower, the filter removes what is faster
 _OVERSAMPLING = 2.0  # oversampling of the frequency resolution
 _BLOCKS, _MIN_BLOCKS = 12, 4  # tested starts; least blocks after a start
 
 
-class Tone(NamedTuple):
-    """Peak of the periodogram over the mean power, channel, onset [s]; for a pure tone the ratio is the row count."""
+def find_tones(whitened: WhitenedResiduals) -> Iterator["Anomaly"]:
+    """Yield the strongest tone of each calibrated channel, with the nuisances profiled out.
 
-    power_ratio: float
-    channel: str
-    t0: float
-
-
-def find_tones(whitened: WhitenedResiduals) -> Iterator[Tone]:
-    """Yield the strongest tone of each calibrated channel, with the nuisances profiled out."""
-    t, profiled = (
-        whitened.modelled.t,
-        (whitened.e + np.einsum("tck,k->tc", whitened.Jn, whitened.xn)) * whitened.ok[:, None],
-    )
+    Its gain is the peak of the periodogram over the mean power; for a pure tone this is the row count.
+    """
+    t = whitened.modelled.t
+    profiled = (whitened.e + np.einsum("tck,k->tc", whitened.Jn, whitened.xn)) * whitened.ok[:, None]
     frequencies = np.arange(*_BAND_HZ, 1.0 / (_OVERSAMPLING * (t[-1] - t[0])))
     starts = np.linspace(0, len(t), _BLOCKS, endpoint=False).astype(int)
     waves = np.exp(-2j * np.pi * np.outer(t, frequencies))
@@ -153,7 +134,7 @@ def find_tones(whitened: WhitenedResiduals) -> Iterator[Tone]:
             x = profiled[:, CHANNELS.index(channel)]
             power = np.abs(_tail_sums(waves * x[:, None], starts)) ** 2 / (_tail_sums(x * x, starts)[:, None] + 1e-9)
             start, peak = np.unravel_index(int(np.argmax(power[:-_MIN_BLOCKS])), power[:-_MIN_BLOCKS].shape)
-            yield Tone(2.0 * float(power[start, peak]), channel, float(t[starts[start]]))
+            yield Anomaly(2.0 * float(power[start, peak]), channel, float(t[starts[start]]), "tone")
 
 
 def _tail_sums(x: np.ndarray, starts: np.ndarray) -> np.ndarray:
@@ -224,14 +205,13 @@ def find_anomalies(whitened: WhitenedResiduals, unconditioned: WhitenedResiduals
     if not whitened.base.vane:
         return []
     bounded = whitened.with_nuisance_priors()  # no nuisance released
-    out = [Anomaly(*tone, "tone") for tone in find_tones(bounded)]
+    out = list(find_tones(bounded))
     for equation in channel_equations(bounded):
         for rule, (net_gain, t0) in (("odd", equation.gain_of_all()), ("shift", equation.gain_in_flight())):
             out.append(Anomaly(net_gain, equation.channel, t0, rule))
     for equation in channel_equations(unconditioned):
-        out += [
-            Anomaly(net_gain, equation.channel, t0, "one", name) for name, (net_gain, t0) in equation.gain_per_term()
-        ]
+        for name, (net_gain, t0) in equation.gain_per_term():
+            out.append(Anomaly(net_gain, equation.channel, t0, "one", name))
     return sorted(out, key=lambda anomaly: -anomaly.net_gain)
 
 

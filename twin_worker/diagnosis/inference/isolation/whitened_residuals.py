@@ -14,7 +14,7 @@ from twin_worker.diagnosis.inference.isolation.nuisance import (
     drift_slopes,
     list_nuisances,
 )
-from twin_worker.diagnosis.model.baseline import CHANNELS, wind_is_nominal
+from twin_worker.diagnosis.model.baseline import CHANNELS, Noise, wind_is_nominal
 from twin_worker.diagnosis.model.residual import ModelledFlight
 
 CLIP = 6.0  # clipping limit of whitened residuals [-]
@@ -45,7 +45,7 @@ class WhitenedResiduals:
         self.noise = self._scaled_noise()
         self.wind_nominal = wind_is_nominal(self.base)
         self.nuisances: tuple[Nuisance, ...] = list_nuisances(self.base.vane)
-        self.drift_modes = drift_modes(self.nuisances, self.base.vane)
+        self.drift_modes = drift_modes(self.base.vane)
         self.clip = np.full(len(CHANNELS), CLIP)
         if self.base.vane:
             self.clip[CHANNELS.index("baro")] = _BARO_CLIP
@@ -64,7 +64,7 @@ class WhitenedResiduals:
         out._profile()
         return out
 
-    def _scaled_noise(self):  # type: ignore[no-untyped-def]
+    def _scaled_noise(self) -> Noise:
         """Scale the noise to the scatter of this flight: down for all channels, up only where wind is nominal."""
         noise = self.base.noise
         e = noise.whiten(self.modelled.residuals())[self.ok]
@@ -78,12 +78,9 @@ class WhitenedResiduals:
                 highest[CHANNELS.index("force_x")] = _MAX_AXIAL_SCATTER
         return replace(noise, sigma=noise.sigma * np.clip(scatter, _MIN_SCATTER, highest))
 
-    def residuals(self, hypotheses: Sequence[FaultHypothesis]) -> np.ndarray:
+    def residuals(self, hypotheses: Sequence[FaultHypothesis], modelled: ModelledFlight | None = None) -> np.ndarray:
         """Return whitened residuals with the conditions and these hypotheses, zero on invalid rows, (n, c)."""
-        return self._residuals_of(self.modelled, hypotheses)
-
-    def _residuals_of(self, modelled: ModelledFlight, hypotheses: Sequence[FaultHypothesis]) -> np.ndarray:
-        e = self.noise.whiten(modelled.residuals((*self.conditions, *hypotheses)))
+        e = self.noise.whiten((modelled or self.modelled).residuals((*self.conditions, *hypotheses)))
         e[~self.ok] = 0.0
         return e
 
@@ -103,13 +100,11 @@ class WhitenedResiduals:
         self.e = np.clip(self.raw, -self.clip, self.clip)
         steps = [self.residuals((n.hypothesis(n.step),)) for n in self.nuisances]
         own = np.stack([(e - self.raw) / n.step for e, n in zip(steps, self.nuisances, strict=True)], axis=2)
-        others = [self._residuals_varied(k)[:, :, None] - self.raw[:, :, None] for k in range(len(self.base.others))]
+        flight, bases = self.modelled.flight, [self.base.varied(k) for k in range(len(self.base.others))]
+        varied = [self.residuals((), ModelledFlight(flight, base, template=self.modelled)) for base in bases]
+        others = [e[:, :, None] - self.raw[:, :, None] for e in varied]
         self.Jn = np.concatenate([own, drift_slopes(own, self.drift_modes, self.modelled.t), *others], axis=2)
         self._profile()
-
-    def _residuals_varied(self, k: int) -> np.ndarray:
-        """Return the whitened residuals under the k-th varied coefficients, (n, c)."""
-        return self._residuals_of(ModelledFlight(self.modelled.flight, self.base.varied(k), template=self.modelled), ())
 
     def _profile(self) -> None:
         """Estimate the nuisances; fix those beyond their spread at zero, so that hypotheses explain them."""
@@ -119,13 +114,15 @@ class WhitenedResiduals:
         self.prior_precision = self.precision.copy()
         free = np.array([n.is_unbounded or (self.wind_nominal and n.is_wind) for n in self.nuisances])
         free = np.concatenate([free, np.zeros(len(drift_spreads) + len(extra), bool)])
+        limits = [n.release_sigmas for n in self.nuisances]  # in spreads
+        limits += [limits[mode.nuisance_index] for mode in self.drift_modes] + len(extra) * [RELEASE_SIGMAS]
         flat = self.Jn.reshape(-1, self.Jn.shape[2])
         G, self.bn = flat.T @ flat, -flat.T @ self.e.ravel()
         for _ in range(6):
             self.Ann = G + np.diag(self.precision)
             self.xn = np.linalg.solve(self.Ann, self.bn)
             unreleased = self.precision < 0.1 * _FIXED_PRECISION
-            excess = np.abs(self.xn) * np.sqrt(self.precision) * unreleased * ~free / self._bounds(len(extra))
+            excess = np.abs(self.xn) * np.sqrt(self.precision) * unreleased * ~free / np.array(limits)
             worst = int(np.argmax(excess))
             if excess[worst] < 1.0:
                 break
@@ -138,21 +135,13 @@ class WhitenedResiduals:
         out.xn = np.linalg.solve(out.Ann, self.bn)
         return out
 
-    def _bounds(self, n_extra: int) -> np.ndarray:
-        """Return the number of spreads at which each nuisance is released, (nuisances + drift modes + n_extra,)."""
-        own = [n.release_sigmas for n in self.nuisances]
-        return np.array([*own, *(own[mode.nuisance_index] for mode in self.drift_modes), *n_extra * [RELEASE_SIGMAS]])
-
     def _spread(self, n: Nuisance) -> float:
         spread = self.base.spread.get(n.name, n.floor)
         return max(spread, 2.5) if self.wind_nominal and n.effect.name == "wind_steady" else spread
 
     def cost(self, hypotheses: Sequence[FaultHypothesis]) -> float:
         """Return the sum of squares with these hypotheses, the nuisances profiled out."""
-        return self.cost_of(self.clipped(hypotheses))
-
-    def cost_of(self, e: np.ndarray) -> float:
-        """Return the sum of squares of whitened residuals, the nuisances profiled out."""
+        e = self.clipped(hypotheses)
         b = -np.einsum("tci,tc->i", self.Jn, e)
         return float((e * e).sum() - b @ np.linalg.solve(self.Ann, b))
 

@@ -5,7 +5,6 @@ the rolling or yawing moment; dynamic pressure from velocity, or from the airspe
 acts: the combination of sources is selected on the blocks of the fit and evaluated on the others.
 """
 
-from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -30,39 +29,28 @@ def blocks(t: np.ndarray, odd: bool) -> np.ndarray:
     return (np.floor(t / BLOCK_S) % 2 == 1) == odd
 
 
-@dataclass(frozen=True)
-class Forces:
-    """Specific force on the decimated grid, (n, 3) each [m/s2]: measured, predicted without and with the effects."""
-
-    measured: np.ndarray
-    base: np.ndarray
-    model: np.ndarray
-
-
 def predict_forces(
     modelled: ModelledFlight, weather: tuple[FaultHypothesis, ...], fitted: tuple[FaultHypothesis, ...]
-) -> Forces:
-    """Predict forces without and with effects, from the sources with the largest error drop on even blocks."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Predict forces without and with effects, from the sources with the largest error drop on even blocks.
+
+    Returns:
+        specific force measured, predicted without and with the effects, on the decimated grid, (n, 3) each [m/s2]
+    """
     before, after = modelled.equation_terms(weather), modelled.equation_terms((*weather, *fitted))
     measured = before.intermediate["f"].T
-    sources = [
-        combination
-        for combination in product(LIFT, SIDE, PRESSURE)
-        if combination[2] == "velocity" or "Va" in modelled.flight.readings
-    ]
+    sources = list(product(LIFT, SIDE, PRESSURE if "Va" in modelled.flight.readings else ("velocity",)))
     if not fitted:
-        predicted = predict_force(modelled, before, sources[0])
-        return Forces(measured, predicted, predicted)
+        predicted = predict_force(before, sources[0])
+        return measured, predicted, predicted
     even = modelled.ok & blocks(modelled.t, odd=False)
 
     def error_drop(source: tuple[str, str, str]) -> float:
-        errors = [
-            ((predict_force(modelled, eq_terms, source) - measured)[even] ** 2).mean() for eq_terms in (before, after)
-        ]
+        errors = [((predict_force(terms, source) - measured)[even] ** 2).mean() for terms in (before, after)]
         return float(1.0 - np.sqrt(errors[1] / max(errors[0], 1e-12)))
 
     best = max(sources, key=error_drop)
-    return Forces(measured, predict_force(modelled, before, best), predict_force(modelled, after, best))
+    return measured, predict_force(before, best), predict_force(after, best)
 
 
 def rms(modelled: ModelledFlight, error: np.ndarray) -> float:
@@ -71,9 +59,10 @@ def rms(modelled: ModelledFlight, error: np.ndarray) -> float:
     return float(np.sqrt((error[mask] ** 2).mean())) if mask.any() else float("nan")
 
 
-def predict_force(modelled: ModelledFlight, eq_terms: EquationTerms, source: tuple[str, str, str]) -> np.ndarray:
+def predict_force(eq_terms: EquationTerms, source: tuple[str, str, str]) -> np.ndarray:
     """Predict specific force, (n, 3) [m/s2], from `eq_terms` without its accelerometer."""
-    base, body, flow, add = modelled.base, modelled.base.card.body, eq_terms.flow, eq_terms.add
+    base, flow, add = eq_terms.modelled.base, eq_terms.flow, eq_terms.add
+    body = base.card.body
     q_bar = flow.q_bar
     if source[2] == "airspeed":
         q_bar = 0.5 * RHO_0 * (eq_terms.measured["airspeed"] / base.airspeed) ** 2

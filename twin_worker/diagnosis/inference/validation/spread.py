@@ -64,12 +64,11 @@ def reported_sigma(hypothesis: FaultHypothesis, covariance: np.ndarray, body: ob
     for k in range(len(par)):
         moved = effect.reported(effect, par + h[k] * np.eye(len(par))[k], body)  # type: ignore[arg-type]
         for name, x in moved.items():
-            J.setdefault(name, np.zeros(len(par)))[k] = _wrapped(name, x - reference[name]) / h[k]
+            change = x - reference[name]
+            if name == "from_deg":
+                change = (change + 180.0) % 360.0 - 180.0
+            J.setdefault(name, np.zeros(len(par)))[k] = change / h[k]
     return {name: float(np.sqrt(max(row @ covariance @ row, 0.0))) for name, row in J.items()}
-
-
-def _wrapped(name: str, difference: float) -> float:
-    return (difference + 180.0) % 360.0 - 180.0 if name == "from_deg" else difference
 
 
 def _sandwich(whitened: WhitenedResiduals, hypotheses: Sequence[FaultHypothesis]) -> np.ndarray:
@@ -123,8 +122,12 @@ _LONGEST_S = 600.0
 
 def recommend_manoeuvre(whitened: WhitenedResiduals, hypothesis: FaultHypothesis, rival: FaultHypothesis) -> str:
     """Describe the manoeuvre with which the next diagnosis separates two hypotheses."""
-    power = _difference_power(whitened, hypothesis, rival)
-    density = {name: float(power[mask].mean()) / STEP_S for name, mask in _long_manoeuvres(whitened)}
+    d = whitened.residuals((hypothesis,)) - whitened.residuals((rival,))
+    hidden = np.linalg.solve(whitened.Ann, np.einsum("tci,tc->i", whitened.Jn, d))
+    power = ((d - whitened.Jn @ hidden) ** 2).sum(axis=1)
+    rows = {name: decimated(mask) & whitened.ok for name, mask in _manoeuvres(whitened.modelled.flight)}
+    long = {name: mask for name, mask in rows.items() if mask.sum() * STEP_S >= _MIN_DURATION_S}
+    density = {name: float(power[mask].mean()) / STEP_S for name, mask in long.items()}
     mean_density = float(power[whitened.ok].mean()) / STEP_S
     best = max(density, key=lambda name: density[name], default="")
     if not best or _REQUIRED_POWER / max(density[best], 1e-9) > _LONGEST_S:
@@ -132,25 +135,8 @@ def recommend_manoeuvre(whitened: WhitenedResiduals, hypothesis: FaultHypothesis
     seconds = _REQUIRED_POWER / density[best]
     if density[best] < _MIN_DENSITY_RATIO * mean_density:
         return f"no manoeuvre of this flight separates them better than the others: record {seconds:.0f} s more"
-    return (
-        f"{best}: {density[best] / mean_density:.1f} times the mean information of this flight; fly {seconds:.0f} "
-        "s of it"
-    )
-
-
-def _difference_power(whitened: WhitenedResiduals, hypothesis: FaultHypothesis, rival: FaultHypothesis) -> np.ndarray:
-    """Return the squared whitened difference of two hypotheses, the nuisances profiled out, (n,)."""
-    d = whitened.residuals((hypothesis,)) - whitened.residuals((rival,))
-    hidden = np.linalg.solve(whitened.Ann, np.einsum("tci,tc->i", whitened.Jn, d))
-    return ((d - whitened.Jn @ hidden) ** 2).sum(axis=1)
-
-
-def _long_manoeuvres(whitened: WhitenedResiduals) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield each manoeuvre of sufficient duration with its rows, (n,) bool."""
-    for name, mask in _manoeuvres(whitened.modelled.flight):
-        mask = decimated(mask) & whitened.ok
-        if mask.sum() * STEP_S >= _MIN_DURATION_S:
-            yield name, mask
+    ratio = density[best] / mean_density
+    return f"{best}: {ratio:.1f} times the mean information of this flight; fly {seconds:.0f} s of it"
 
 
 def _manoeuvres(flight: FlightData) -> Iterator[tuple[str, np.ndarray]]:
