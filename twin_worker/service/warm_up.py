@@ -6,8 +6,7 @@ from fleet.airframes import GENERIC, load
 from fleet.airframes.airframe import servo_map
 from fleet.autopilots import arduplane, copter, greybox
 from fleet.autopilots.shadow import replay_controller
-from fleet.bus.codec import encode
-from fleet.contract import Array, History, Item, Prediction, Rows, Sample, TwinState
+from fleet.contract import Array, Item, Prediction, TwinState
 from fleet.frames import Origin, to_geodetic, wrap
 from fleet.mission import unroll_route
 from fleet.physics import point_mass
@@ -23,7 +22,6 @@ from twin_worker.identification.fixed_wing.plant import bias_corrected
 from twin_worker.identification.linear.linear_model import AXES, identify_axis
 from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.numerics.prediction_errors import AHEAD
-from twin_worker.ownership.history_decoder import decode_history
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.resample import Resampler
 from twin_worker.twin.state.flight_phase import speed_extremes
@@ -65,7 +63,6 @@ def warm_up() -> None:
     segments, parameters = np.ones((2, copter.N_SEGMENT)), np.ones(copter.N_PAR)
     _run_traffic()
     _run_propagation()
-    _run_history_decoder()
     _run_telemetry(window)
     _run_identification()
     copter.follow(np.zeros(copter.N_FOLLOW), segments, np.zeros(3), np.zeros(3), parameters, 0.1, ahead)  # type: ignore
@@ -110,12 +107,6 @@ def _run_propagation() -> None:
     widen_tube(ahead, path, 1.0, np.empty((4, 3), np.float32))  # type: ignore[call-arg]
     speed_extremes(np.zeros((3, 3)))  # type: ignore[call-arg]
     WindFilter().update(1e9, np.array([_SPEED, 0.0, 0.0]), _SPEED, 0.0)
-
-
-def _run_history_decoder() -> None:
-    """Decode a history message."""
-    rows = Rows(t=Array.of([1e9], "<f8"), x=Array.of(np.zeros((1, 3))))
-    decode_history(encode(History(uav=0, t=1e9, samples=(Sample(uav=0, t=1e9, velocity=rows),))))
 
 
 def _run_telemetry(window: Window) -> None:

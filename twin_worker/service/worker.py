@@ -24,9 +24,10 @@ from twin_worker.alerts.hysteresis import AlertState
 from twin_worker.alerts.traffic import TrafficMonitor
 from twin_worker.mismatch.coordinator import Coordinator
 from twin_worker.mismatch.job import summary
+from twin_worker.ownership.cold_start import LATCHED_TYPES
 from twin_worker.ownership.handover import Snapshot
 from twin_worker.ownership.protocol import OwnershipProtocol
-from twin_worker.ownership.twin_store import LATCHED_TYPES, LocalTwinStore, OwnedTwin
+from twin_worker.ownership.twin_store import OwnedTwin, TwinStore
 from twin_worker.service.busy_fallback import (
     CHECK_PERIOD_S,
     fallback_prediction,
@@ -85,7 +86,7 @@ class Worker:
         self._sweep_start = float("-inf")  # start of the last sweep [s, monotonic]
         self._first_index = 0  # index of the first aircraft of the next sweep
         self.traffic = TrafficMonitor(separation or Separation())
-        self._twins = LocalTwinStore(bus, uavs, self._create_twin, self)
+        self._twins = TwinStore(bus, uavs, self._create_twin, self)
         self._twins.run_paced = self.cpu_share.run
         self._owned = self._twins.by_uav
         self.ownership = OwnershipProtocol(bus, uavs, self._twins)

@@ -35,7 +35,7 @@ from fleet.contract import (
 from gateway.publication import Publisher
 from tests.bench.asking.answerer import prediction
 from tests.support import flights as f
-from twin_worker.ownership.history_decoder import decode_history
+from twin_worker.ownership.cold_start import decode_history
 from twin_worker.ownership.protocol import OwnershipProtocol
 from twin_worker.service.worker import Worker
 from twin_worker.twin.state.budget import Schedule
