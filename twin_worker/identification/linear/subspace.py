@@ -12,11 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin_worker.identification.linear.black_box_prediction_error import fit_inputs
 from twin_worker.identification.linear.state_space import StateSpace
+from twin_worker.numerics.ridge_regression import solve_ridge
 
 PAST = 12  # samples of the past in the regression [-]
 FUTURE = 8  # block rows of the observability matrix [-]
+_INPUT_PENALTY = 1e-5  # ridge penalty of B, c and x0 [-]
 _MIN_INDEPENDENCE = 1e-8  # minimum fraction of a column that is independent of the others [-]
 
 
@@ -187,6 +188,31 @@ def projection(
     C, A = O[:l], np.linalg.lstsq(O[:-l], O[l:], rcond=None)[0]  # eq. 7
     start = StateSpace.of(A, np.zeros((order, m)), C)
     return fit_inputs(start.stabilised(), y, u, ok=ok)  # eq. 15
+
+
+def fit_inputs(
+    model: StateSpace, y: np.ndarray, u: np.ndarray, *, ok: np.ndarray, with_bias: bool = False
+) -> StateSpace:
+    """Solve B, x0 and, with a bias, c for given A and C by least squares on the free run.
+
+    Args:
+        model: A and C
+        y, u: scaled outputs (N, l) and inputs (N, m)
+        ok: fitted rows, (N,) bool; the others are simulated
+        with_bias: include a constant state bias c
+    Source: Huang 2021, eq. 15 with D = 0.
+    """
+    n, m = model.order, u.shape[1]
+    w = np.hstack([u, np.ones((len(u), 1))]) if with_bias else u
+    q = w.shape[1]
+    responses = [
+        StateSpace.of(model.A, unit[: n * q].reshape(n, q), model.C, x0=unit[n * q :]).run(w)[ok].ravel()
+        for unit in np.eye(n * q + n)
+    ]
+    solution = solve_ridge(np.column_stack(responses), y[ok].ravel(), _INPUT_PENALTY)
+    G = solution[: n * q].reshape(n, q)
+    c = G[:, m] if with_bias else np.zeros(n)
+    return StateSpace.of(model.A, G[:, :m], model.C, c=c, x0=solution[n * q :])
 
 
 def _hankel(data: np.ndarray, depth: int) -> np.ndarray:
