@@ -90,10 +90,8 @@ def geofence_hazard(
     )
 
 
-MIN_HEIGHT_WINGS_M, MIN_HEIGHT_ROTORS_M = (
-    30.0,
-    5.0,
-)  # minimum height above home outside landings, fixed wings and multirotors [m]
+MIN_HEIGHT_WINGS_M = 30.0  # minimum height above home of fixed wings outside landings [m]
+MIN_HEIGHT_ROTORS_M = 5.0  # the same of multirotors [m]
 _MIN_PROBABILITY = 0.02  # below this probability no alert text is composed [-]
 _GROUND_CLEAR_TEXT = "no descent below the minimum height predicted"
 
