@@ -16,8 +16,8 @@ from twin_worker.alerts.traffic import TrafficMonitor
 from twin_worker.confidence.adaptive_conformal import AdaptiveLevels
 from twin_worker.confidence.prediction_log import PredictionLog
 from twin_worker.estimation.wind_filter import WindFilter
-from twin_worker.identification.fixed_wing import energy_balance as attitude_lag
 from twin_worker.identification.fixed_wing.derivatives_model import identify, linearise
+from twin_worker.identification.fixed_wing.energy_balance import fit_attitude_lag
 from twin_worker.identification.fixed_wing.plant import bias_corrected
 from twin_worker.identification.linear.linear_model import AXES, identify_axis
 from twin_worker.numerics.interpolation import zero_order_hold
@@ -78,7 +78,7 @@ def _run_point_mass(control: tuple[np.ndarray, np.ndarray, np.ndarray], window: 
     )
     batch = [np.tile(row, (2, 1)) for row in (parameters, air, start)]
     point_mass.simulate_ensemble(control, *batch, noise, np.arange(0, 17, 4), np.empty((2, 5, 3)))  # type: ignore
-    attitude_lag.identify(window.x[:, 6], window.x[:, 6])
+    fit_attitude_lag(window.x[:, 6], window.x[:, 6])
 
 
 def _run_traffic() -> None:

@@ -41,7 +41,7 @@ def second_order_response(command: np.ndarray, y: np.ndarray, lag: np.ndarray, o
             angle += h * rate
 
 
-def identify(command: np.ndarray, y: np.ndarray, warm_start: np.ndarray | None = None) -> np.ndarray:
+def fit_attitude_lag(command: np.ndarray, y: np.ndarray, warm_start: np.ndarray | None = None) -> np.ndarray:
     """Estimate wn, zeta, b that minimise the free-run error, (3,).
 
     Args:
@@ -120,11 +120,10 @@ class PointMassData:
 
 @dataclass(frozen=True)
 class RegressionResult:
-    """Result of a regression with a prior: value (k,), covariance (k, k), residual standard deviation."""
+    """Result of a regression with a prior: value (k,), covariance (k, k)."""
 
     value: np.ndarray
     cov: np.ndarray
-    residual_std: float
 
 
 def regress_with_prior(X: np.ndarray, y: np.ndarray, prior: tuple[np.ndarray, np.ndarray, float]) -> RegressionResult:
@@ -133,7 +132,7 @@ def regress_with_prior(X: np.ndarray, y: np.ndarray, prior: tuple[np.ndarray, np
     information = X.T @ X / _WINDOW_ROWS / noise**2 + np.diag(prior_sigma**-2.0)
     cov = np.linalg.inv(information)
     value = cov @ (X.T @ y / _WINDOW_ROWS / noise**2 + prior_mean / prior_sigma**2)
-    return RegressionResult(value, cov, float(np.std(y - X @ value)))
+    return RegressionResult(value, cov)
 
 
 def moving_mean(x: np.ndarray) -> np.ndarray:
@@ -196,6 +195,6 @@ def fit_excess_power(data: PointMassData, t_0: float, V_0: float) -> RegressionR
     prior_mean[1] = _THRUST_SLOPE * G / _GLIDE_RATIO / max(t_0, 0.15)
     if np.isfinite(instruments).all():
         X = instruments @ np.linalg.lstsq(instruments, X, rcond=1e-6)[0]
-        return regress_with_prior(X, y, (prior_mean, prior_sigma, noise))
-    X[:, 1:] = 0.0
+    else:
+        X[:, 1:] = 0.0
     return regress_with_prior(X, y, (prior_mean, prior_sigma, noise))

@@ -210,10 +210,8 @@ class _GaussNewton:
     def __init__(self, problem: EstimationProblem, par0: np.ndarray, Lambda: np.ndarray) -> None:
         self.problem, self.par0, self.Lambda = problem, par0, Lambda
         measured = [problem.y[a:b] for a, b in problem.segments]
-        self.start_prior, self.state_std = (
-            np.array([line_fit_start(y) for y in measured]),
-            np.concatenate(measured).std(axis=0),
-        )
+        self.start_prior = np.array([line_fit_start(y) for y in measured])
+        self.state_std = np.concatenate(measured).std(axis=0)
         self.K = 1.0 / SIGMA**2
         lengths = (problem.segments[:, 1] - problem.segments[:, 0]) // GROUP
         self.bounds = np.concatenate([[0], np.cumsum(lengths)])
@@ -227,10 +225,7 @@ class _GaussNewton:
         squares = residuals_and_jacobian(
             par, starts, problem.segments, problem.y, problem.delta, problem.trim_velocity, problem.dt, np.sqrt(W), e, J
         )
-        par_offset, start_offset = par - self.par0, starts - self.start_prior
-        return problem.effective_fraction * squares + float(
-            par_offset @ self.Lambda @ par_offset + (self.K * start_offset**2).sum()
-        )
+        return self.cost(squares, par, starts)
 
     def update_weights(self, W: np.ndarray) -> np.ndarray:
         """Estimate W from the residuals; rescale residuals and sensitivities."""
@@ -240,10 +235,10 @@ class _GaussNewton:
         self.J *= ratio[:, None]
         return W_new
 
-    def cost(self, par: np.ndarray, starts: np.ndarray) -> float:
-        """Return the cost of the stored residuals."""
+    def cost(self, squares: float, par: np.ndarray, starts: np.ndarray) -> float:
+        """Return the cost for a sum of squared residuals."""
         par_offset, start_offset = par - self.par0, starts - self.start_prior
-        return self.problem.effective_fraction * float((self.e**2).sum()) + float(
+        return self.problem.effective_fraction * squares + float(
             par_offset @ self.Lambda @ par_offset + (self.K * start_offset**2).sum()
         )
 
@@ -302,7 +297,7 @@ def _descend(optimiser: _GaussNewton, par: np.ndarray, steps: int, weight: np.nd
             break
         if cold and count in (1, 3):
             W = optimiser.update_weights(W)
-            cost = optimiser.cost(par, starts)
+            cost = optimiser.cost(float((optimiser.e**2).sum()), par, starts)
         H, g, start_moves = optimiser.normal_equations(par, starts)
         lhs = H + optimiser.Lambda
         for _ in range(_MAX_DAMPINGS):

@@ -27,13 +27,11 @@ class SubspaceStates:
 
     Attributes:
         x: sqrt(S) V', most important first, (most, N')
-        singular_values: singular value of each state, (most,)
         y, u: outputs and inputs of the same samples, (N', l), (N', m)
         rows: indices of these samples, (N',)
     """
 
     x: np.ndarray
-    singular_values: np.ndarray
     y: np.ndarray
     u: np.ndarray
     rows: np.ndarray
@@ -75,9 +73,7 @@ def subspace_states(
     n = y.shape[1]
     k = n + u.shape[1]
     past_rows = np.hstack([np.hstack([y[past - i : -i], u[past - i : -i]]) for i in range(1, past + 1)])
-    unbroken = (
-        np.lib.stride_tricks.sliding_window_view(ok, past + 1).all(axis=1) if len(ok) > past else np.zeros(0, bool)
-    )
+    unbroken = _unbroken(ok, past + 1)
     if unbroken.sum() < 3 * past * k:
         raise ValueError(f"subspace: found {unbroken.sum()} unbroken rows, needs {3 * past * k}; wait for more")
     z, target = past_rows[unbroken], y[past:][unbroken]
@@ -89,7 +85,14 @@ def subspace_states(
     squared, left_vectors = np.linalg.eigh(product @ moment @ product.T)  # of (product z')(product z')', a small matrix
     squared, left_vectors = np.maximum(squared[::-1], 1e-12), left_vectors[:, ::-1]
     x = squared[:, None] ** -0.25 * (left_vectors.T @ product @ z.T)  # sqrt(S) V'
-    return SubspaceStates(x, np.sqrt(squared), target, u[past:][unbroken], np.flatnonzero(unbroken))
+    return SubspaceStates(x, target, u[past:][unbroken], np.flatnonzero(unbroken))
+
+
+def _unbroken(ok: np.ndarray, length: int) -> np.ndarray:
+    """Return at which rows `length` measured rows begin, (N - length + 1,) bool."""
+    if len(ok) < length:
+        return np.zeros(0, bool)
+    return np.lib.stride_tricks.sliding_window_view(ok, length).all(axis=1)
 
 
 def pbsid(
@@ -173,9 +176,7 @@ def projection(
     l, m = y.shape[1], u.shape[1]
     if not 1 <= order <= l * (depth - 1):
         raise ValueError(f"projection: found order {order}, expected 1..{l * (depth - 1)}; lower it or raise the depth")
-    unbroken = (
-        np.lib.stride_tricks.sliding_window_view(ok, depth).all(axis=1) if len(ok) >= depth else np.zeros(0, bool)
-    )
+    unbroken = _unbroken(ok, depth)
     if unbroken.sum() < 2 * depth * (l + m):
         raise ValueError(
             f"projection: found {unbroken.sum()} unbroken rows, needs {2 * depth * (l + m)}; wait for more"
