@@ -114,9 +114,7 @@ def ground_hazard(flight: GaussianForecast, home: Origin, margin: float, until: 
     probability = float(ndtr(z.max()))
     if probability < _MIN_PROBABILITY:
         return HazardEstimate(AlertKind.GROUND, probability, "", _GROUND_CLEAR_TEXT)
-    first = int(
-        np.flatnonzero(z >= min(z.max(), 0.0))[0]
-    )  # where the mean goes below the margin, else the lowest point
+    first = int(np.flatnonzero(z >= min(z.max(), 0.0))[0])  # where the mean is below the margin, else the lowest point
     t = float(flight.t[first])
     message = (
         f"{probability:.0%} chance that it sinks below {margin:.0f} m above home (terrain unknown) in "

@@ -173,9 +173,9 @@ class PredictionLog:
     uncensored: np.ndarray  # neither exceeded nor censored
     horizon_pending: np.ndarray  # its horizon is neither met nor missed yet
     evaluated_until: float  # end of the scored flight [s since 1970]
-    _min_length: np.ndarray  # least path length [m]
-    _start_length: np.ndarray  # path length at t0 [m]
-    _last_error: np.ndarray  # relative error at the previous look-ahead [-]
+    min_length: np.ndarray  # least path length [m]
+    start_length: np.ndarray  # path length at t0 [m]
+    last_error: np.ndarray  # relative error at the previous look-ahead [-]
     _odometer: np.ndarray  # time, and path length flown until then [s since 1970, m]
     _stride_start: np.ndarray  # position at the end of the last interval
     _newest_row: int  # newest row
@@ -199,9 +199,9 @@ class PredictionLog:
         self.uncensored = np.zeros(rows, bool)
         self.horizon_pending = np.zeros(rows, bool)
         self.evaluated_until = -np.inf
-        self._min_length = np.ones(rows)
-        self._start_length = np.full(rows, np.nan)
-        self._last_error = np.zeros(rows)
+        self.min_length = np.ones(rows)
+        self.start_length = np.full(rows, np.nan)
+        self.last_error = np.zeros(rows)
         self._odometer = np.empty((0, 2))
         self._stride_start = np.zeros(3)
         self._newest_row = -1
@@ -219,7 +219,7 @@ class PredictionLog:
         self.path[row, :n], self.direction[row, :n] = path, track_frame(path, AHEAD[:n])
         self.score[row], self.next_column[row], self.live[row] = np.nan, 0, True
         self.followed[row], self.exceeded[row], self.uncensored[row], self.horizon_pending[row] = 0.0, False, True, True
-        self._min_length[row], self._start_length[row], self._last_error[row] = min_path_length(speed), np.nan, 0.0
+        self.min_length[row], self.start_length[row], self.last_error[row] = min_path_length(speed), np.nan, 0.0
         return row
 
     @property
@@ -252,22 +252,7 @@ class PredictionLog:
         self._update_odometer(t, positions)
         self.evaluated_until = float(t[-1])
         evaluated = np.empty((int((self.size - self.next_column)[self.live].sum()), 2), np.int64)
-        arrays = LogArrays(
-            self.t0,
-            self.size,
-            self.path,
-            self.direction,
-            self.tube,
-            self._min_length,
-            self.score,
-            self.next_column,
-            self.live,
-            self.followed,
-            self.exceeded,
-            self.uncensored,
-            self._start_length,
-            self._last_error,
-        )
+        arrays = LogArrays(*(getattr(self, name) for name in LogArrays._fields))
         flight = np.ascontiguousarray(t, float), np.ascontiguousarray(positions, float), self._odometer
         n = evaluate_all(arrays, flight, evaluated)  # type: ignore[call-arg]
         rows, columns = np.ascontiguousarray(evaluated[:n].T)  # contiguous rows and columns

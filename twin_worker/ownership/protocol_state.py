@@ -207,24 +207,22 @@ class OwnershipState:
         if self.leaving or not self.may_write(now) or now < self._settled_t:
             return plan
         plan.valid = True
-        plan.acquire += [uav for uav, epoch in self.owned.items() if self._superseded(uav, epoch)]
+        for uav, epoch in self.owned.items():
+            token = self.highest[uav]
+            if token > FencingToken(epoch, self.worker_id) and not self.is_live(token.worker):
+                plan.acquire.append(uav)
         inputs = self.known - self.owned.keys(), {self.worker_id: self.ids} | self.successors()
         if inputs != self._assignments[0]:  # rarely
             self._assignments = inputs, owners(sorted(inputs[0]), inputs[1])
         for uav, assigned in self._assignments[1].items():
             if assigned != self.worker_id:
                 continue
-            token = self.highest.get(uav)
-            if token is not None and self.is_live(token.worker):
-                plan.request.setdefault(token.worker, []).append(uav)
+            claim = self.highest.get(uav)
+            if claim is not None and self.is_live(claim.worker):
+                plan.request.setdefault(claim.worker, []).append(uav)
             else:
                 plan.acquire.append(uav)
         return plan
-
-    def _superseded(self, uav: int, epoch: int) -> bool:
-        """Return whether a dead worker has a higher claim on an owned aircraft."""
-        token = self.highest[uav]
-        return token > FencingToken(epoch, self.worker_id) and not self.is_live(token.worker)
 
     def successors(self) -> dict[str, range]:
         """Return the id ranges of the other live workers that are not leaving."""

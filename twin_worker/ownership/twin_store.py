@@ -200,9 +200,8 @@ class TwinStore:
             rollout = twin.prediction.last_rollout
             for message in past:
                 ingest(twin, message)
-            twin.prediction.set_rollout(
-                rollout
-            )  # mission and parameters are new only to this twin: the continued path used them already
+            # mission and parameters are new only to this twin: the continued path used them already
+            twin.prediction.set_rollout(rollout)
             restored = model is not None and restore_model(twin, model)
             stagger_work(
                 twin, phase, has_prediction=owned.ready and isfinite(twin.config.schedule.renew), has_model=restored

@@ -57,9 +57,8 @@ def warm_up() -> None:
 
     _run_point_mass((ctl.copy(), par, legs), window)
     ahead, factors = np.empty((5, 3)), np.ones(greybox.N_PAR)
-    greybox.follow(
-        kinematic_ctl, par, legs, factors, np.array([*window.p[-1], _SPEED, 0.0, 0.0, 0.0]), np.zeros(2), 0.1, ahead
-    )  # type: ignore
+    start = np.array([*window.p[-1], _SPEED, 0.0, 0.0, 0.0])
+    greybox.follow(kinematic_ctl, par, legs, factors, start, np.zeros(2), 0.1, ahead)  # type: ignore
     segments, parameters = np.ones((2, copter.N_SEGMENT)), np.ones(copter.N_PAR)
     _run_traffic()
     _run_propagation()

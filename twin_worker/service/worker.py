@@ -74,9 +74,8 @@ class Worker:
         self.bus, self.uavs, self.diagnosis = bus, uavs, diagnosis
         self.omega, self.method, self.airframe = omega, method, airframe or load(GENERIC)
         self.schedule = schedule or Schedule()
-        self._late_after_s = min(
-            max(_LATE_PERIODS * self.schedule.renew, _LATE_LIMITS_S[0]), _LATE_LIMITS_S[1]
-        )  # short for frequent propagation
+        # short for frequent propagation
+        self._late_after_s = min(max(_LATE_PERIODS * self.schedule.renew, _LATE_LIMITS_S[0]), _LATE_LIMITS_S[1])
         self.quota = ComputeBudget(max_limit=_HEAVY_SHARE * self._late_after_s)
         self.sentence = self._diagnosis_defect = ""
         self._diagnosis_resume_t = float("-inf")  # earliest next diagnosis [s, monotonic]
@@ -91,9 +90,7 @@ class Worker:
         self._owned = self._twins.by_uav
         self.ownership = OwnershipProtocol(bus, uavs, self._twins)
         self._wakeup = threading.Event()
-        self._fallback_lock = (
-            threading.Lock()
-        )  # in use while fallback predictions are published; the sweep waits for it
+        self._fallback_lock = threading.Lock()  # in use while fallback predictions are published; the sweep waits
 
     def connect(self) -> None:
         """Subscribe, declare the query handlers, and query the aircraft that exist already."""

@@ -123,14 +123,13 @@ class DerivativesModel:
         """Return the covariance of the parameters, (37, 37)."""
         return np.linalg.inv(self.fisher_information + self.prior_precision)
 
-    def free_run(self, x0: np.ndarray, delta: np.ndarray, dt: float) -> np.ndarray:
-        """Simulate from x0 with actuator states, (n, 4); return states, (n, 9), nan after leaving the envelope."""
-        return self.free_run_segments(x0[None], np.zeros(1, np.int64), len(delta), delta, dt)
-
     def free_run_segments(
         self, starts: np.ndarray, start_rows: np.ndarray, length: int, delta: np.ndarray, dt: float
     ) -> np.ndarray:
-        """Simulate from several rows, `length` rows each; arguments as for `fleet.physics.dynamics.free_runs`."""
+        """Simulate from several rows, `length` rows each, nan after leaving the envelope, (n, 9).
+
+        Arguments as for `fleet.physics.dynamics.free_runs`.
+        """
         out = np.empty((len(delta), 9))
         free_runs(starts, start_rows, length, delta, self.par, self.trim_velocity, dt, out)
         return out

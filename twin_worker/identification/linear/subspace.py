@@ -17,6 +17,7 @@ from twin_worker.numerics.ridge_regression import solve_ridge
 
 PAST = 12  # samples of the past in the regression [-]
 FUTURE = 8  # block rows of the observability matrix [-]
+_RIDGE = 1e-3  # regularisation per sample [-]
 _INPUT_PENALTY = 1e-5  # ridge penalty of B, c and x0 [-]
 _MIN_INDEPENDENCE = 1e-8  # minimum fraction of a column that is independent of the others [-]
 
@@ -56,7 +57,7 @@ class SubspaceStates:
 
 
 def subspace_states(
-    y: np.ndarray, u: np.ndarray, ok: np.ndarray, *, past: int = PAST, future: int = FUTURE, ridge: float = 1e-3
+    y: np.ndarray, u: np.ndarray, ok: np.ndarray, *, past: int = PAST, future: int = FUTURE
 ) -> SubspaceStates:
     """Estimate the states of all orders up to outputs times `future`.
 
@@ -66,7 +67,6 @@ def subspace_states(
         ok: measured rows, (N,) bool
         past: samples in the vector autoregression, at least `future`
         future: block rows of the observability matrix
-        ridge: regularisation per sample [-]
     Raises:
         ValueError: if there are too few gap-free rows; wait for a longer window.
     """
@@ -78,7 +78,7 @@ def subspace_states(
         raise ValueError(f"subspace: found {unbroken.sum()} unbroken rows, needs {3 * past * k}; wait for more")
     z, target = past_rows[unbroken], y[past:][unbroken]
     moment = z.T @ z
-    markov = np.linalg.solve(moment + ridge * len(z) * np.eye(z.shape[1]), z.T @ target).T  # [C B~, C A~ B~, ...]
+    markov = np.linalg.solve(moment + _RIDGE * len(z) * np.eye(z.shape[1]), z.T @ target).T  # [C B~, C A~ B~, ...]
     # block row i of the observability matrix times the reachability matrix: the same coefficients, i steps later
     shifted = [np.hstack([markov[:, i * k :], np.zeros((n, i * k))]) for i in range(future)]
     product = np.vstack(shifted)
@@ -92,7 +92,7 @@ def _unbroken(ok: np.ndarray, length: int) -> np.ndarray:
     """Return at which rows `length` measured rows begin, (N - length + 1,) bool."""
     if len(ok) < length:
         return np.zeros(0, bool)
-    return np.lib.stride_tricks.sliding_window_view(ok, length).all(axis=1)
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(ok, length).all(axis=1))
 
 
 def pbsid(
@@ -137,20 +137,19 @@ def check_excitation(y: np.ndarray, u: np.ndarray, ok: np.ndarray) -> None:
             raise ValueError(f"subspace: {name} {column} repeats the columns before it; leave it out")
 
 
-def subspace(y: np.ndarray, u: np.ndarray, ok: np.ndarray, ridge: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
+def subspace(y: np.ndarray, u: np.ndarray, ok: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Identify x' = A x + B u + K e, y = x + e of order n = number of outputs.
 
     Args:
         y: outputs, zero mean and unit scale, (N, n)
         u: inputs, zero mean and unit scale; a constant input gets almost no effect, (N, m)
         ok: measured rows, (N,) bool
-        ridge: regularisation per sample [-]
     Returns:
         A (n, n), B (n, m)
     Raises:
         ValueError: if there are too few gap-free rows; wait for a longer window.
     """
-    model = subspace_states(y, u, ok, ridge=ridge).model(y.shape[1]).outputs_as_states()
+    model = subspace_states(y, u, ok).model(y.shape[1]).outputs_as_states()
     return model.A, model.B
 
 
