@@ -27,24 +27,6 @@ _POLL_S = 0.5
 _RESTART_DELAY_S = 5.0  # before a restart, so that an immediate failure does not loop at full load [s]
 
 
-def run_many(options: list[list[str]], stop: threading.Event) -> int:
-    """Run one worker per list of options until `stop` is set; restart failed ones, end all on a usage error."""
-    with Children() as children:
-        options_by_name = {f"worker {k}": arguments for k, arguments in enumerate(options)}
-        for name, each in options_by_name.items():
-            children.start(name, "twin_worker", *each)
-        while not stop.wait(_POLL_S):
-            failed = children.failures()
-            for code, sentence in failed:
-                report_progress("twin_worker", sentence)
-                if code == 2:
-                    return 2
-            if failed and not stop.wait(_RESTART_DELAY_S):
-                for name in children.failed_names():
-                    children.start(name, "twin_worker", *options_by_name[name])
-    return 0
-
-
 if TYPE_CHECKING:
     from twin_worker.diagnosis.model.baseline import Baseline
 
@@ -52,9 +34,7 @@ SWITCH_INTERVAL_S = 5e-4  # maximum wait of a bus thread for the interpreter [s]
 EXIT_TIMEOUT_S = 10.0  # time from a stop signal to a forced exit [s]
 NICE_INCREMENT = 5  # increment of the nice value of the warm-up thread
 GC_THRESHOLD = 50_000  # allocations between garbage collections
-MMAP_THRESHOLD_B = (
-    256 * 1024
-)  # malloc block size above which memory is returned: a snapshot would fragment the heap [bytes]
+MMAP_THRESHOLD_B = 256 * 1024  # malloc blocks above this are returned: a snapshot would fragment the heap [bytes]
 EXAMPLES = """
   twin_worker --uavs 0-49
   twin_worker --uavs 0-199 --pace identify=5,predict=5,ensemble=5,renew=0.1       many aircraft, 10 Hz extrapolation
@@ -155,18 +135,32 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _run_many(args: argparse.Namespace) -> int:
-    """Run several worker processes with the same options.
+    """Run several worker processes with the same options; restart failed ones, end all on a usage error.
 
     Raises:
         ValueError: when `--processes` is out of range; set 1 to 256.
     """
     if not 1 <= args.processes <= 256:
         raise ValueError(f"--processes: found {args.processes}, expected 1 to 256; set one per core")
-    options = [[*args.options, "--processes=1"] for _ in range(args.processes)]
+    options_by_name = {f"worker {k}": [*args.options, "--processes=1"] for k in range(args.processes)}
     if args.metrics:
         host, port = parse_address(args.metrics)
-        options = [[*arguments, f"--metrics={host}:{port + k}"] for k, arguments in enumerate(options)]
-    return run_many(options, stop_on_signal())
+        for k, options in enumerate(options_by_name.values()):
+            options.append(f"--metrics={host}:{port + k}")
+    stop = stop_on_signal()
+    with Children() as children:
+        for name, options in options_by_name.items():
+            children.start(name, "twin_worker", *options)
+        while not stop.wait(_POLL_S):
+            failed = children.failures()
+            for code, sentence in failed:
+                report_progress("twin_worker", sentence)
+                if code == 2:
+                    return 2
+            if failed and not stop.wait(_RESTART_DELAY_S):
+                for name in children.failed_names():
+                    children.start(name, "twin_worker", *options_by_name[name])
+    return 0
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -1,14 +1,15 @@
 """What-if queries: parse a query, modify a copy of the twin, predict; twin and aircraft are not affected."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from math import degrees, isfinite, pi
 
 import msgspec
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from fleet.contract import MAX_ITEMS, Array, Item, Mission, Prediction, Status, WhatIf, WhatIfStart
+from fleet.contract import MAX_ITEMS, Array, Mission, Prediction, Status, WhatIf, WhatIfStart
 from fleet.frames import Origin, to_geodetic, to_ned, wrap
 from fleet.mission import FIRST_ITEM
 from twin_worker.confidence.tube_and_horizon import AHEAD
@@ -20,37 +21,37 @@ from twin_worker.twin.steps.kinematic_prediction import recent_track
 from twin_worker.twin.steps.predict_step import predict
 
 
-@dataclass(frozen=True)
-class Motion:
-    """Rigid motion of the flight so far.
+def move_history(
+    history: TelemetryHistory,
+    origin: Origin,
+    *,
+    start: Origin | None = None,
+    heading: float | None = None,
+    wind: np.ndarray,
+    new_wind: np.ndarray,
+) -> None:
+    """Move the telemetry history as a rigid body, in place.
 
-    Attributes:
+    Args:
+        history: the flight so far
+        origin: of the local frame
         start: new end position of the flight so far; None: unchanged
         heading: new heading of the nose [rad]; None: unchanged
         wind, new_wind: actual and hypothetical wind, NED, (3,) [m/s]
     """
-
-    start: Origin | None
-    heading: float | None
-    wind: np.ndarray
-    new_wind: np.ndarray
-
-
-def move_history(history: TelemetryHistory, origin: Origin, motion: Motion) -> None:
-    """Move the telemetry history, in place."""
     t_p, geodetic = history.rows("position")
     t_v, v = history.rows("velocity")
     t_a, attitude = history.rows("attitude")
     if not len(t_p):
         return
-    rotation = 0.0 if motion.heading is None else motion.heading - _heading(attitude, v - motion.wind)
+    rotation = 0.0 if heading is None else heading - _heading(attitude, v - wind)
     c, s = np.cos(rotation), np.sin(rotation)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     p, relative_t = to_ned(origin, *geodetic.T), (t_p - t_p[-1])[:, None]
-    path = (p - p[-1] - motion.wind * relative_t) @ R.T + motion.new_wind * relative_t  # from the last position
-    moved_positions = to_geodetic(origin, p[-1] + path) if motion.start is None else to_geodetic(motion.start, path)
+    path = (p - p[-1] - wind * relative_t) @ R.T + new_wind * relative_t  # from the last position
+    moved_positions = to_geodetic(origin, p[-1] + path) if start is None else to_geodetic(start, path)
     history.replace_rows("position", t_p, moved_positions.astype(float))
-    history.replace_rows("velocity", t_v, (v - motion.wind) @ R.T + motion.new_wind)
+    history.replace_rows("velocity", t_v, (v - wind) @ R.T + new_wind)
     if len(t_a):
         attitude[:, 2] = wrap(attitude[:, 2] + rotation)
         history.replace_rows("attitude", t_a, attitude)
@@ -146,20 +147,21 @@ def _move_flight(twin: Twin, query: WhatIf) -> None:
             np.append(wind_and_airspeed(track, None)[0], 0.0) if track is not None and track.ok.any() else np.zeros(3)
         )
     wind_after = wind_before if query.wind is None else np.array([*query.wind, 0.0])
-    winds = (np.zeros(3), np.zeros(3)) if twin.vehicle_class.is_rotorcraft else (wind_before, wind_after)
+    move = partial(move_history, twin.telemetry.history, twin.telemetry.origin, wind=wind_before, new_wind=wind_after)
+    if twin.vehicle_class.is_rotorcraft:
+        move = partial(move, wind=np.zeros(3), new_wind=np.zeros(3))
     if (start := query.start) is None:
-        move_history(twin.telemetry.history, twin.telemetry.origin, Motion(None, None, *winds))
+        move()
     else:
         to = Origin(start.lat_e7, start.lon_e7, start.alt_mm)
-        move_history(twin.telemetry.history, twin.telemetry.origin, Motion(to, start.heading, *winds))
+        move(start=to, heading=start.heading)
         offset = to_ned(twin.telemetry.origin, *(np.array([x]) for x in to))[0]
         if float(np.linalg.norm(offset)) > _NEW_FRAME_M:
             twin.telemetry.set_origin(to)
     if query.wind is not None:
         twin.environment.wind.reset_wind(twin.telemetry.history.newest, wind_after)
-        twin.telemetry.history.replace_rows(
-            "wind", np.array([twin.telemetry.history.newest]), wind_after[None, :2]
-        )  # the autopilot's estimate, too
+        newest = np.array([twin.telemetry.history.newest])
+        twin.telemetry.history.replace_rows("wind", newest, wind_after[None, :2])  # the autopilot's estimate, too
         wind = float(wind_after[0]), float(wind_after[1])
         twin.models.store_multirotor(replace(twin.models.multirotor, wind=wind))
     twin.telemetry.resampler.clear()
@@ -181,22 +183,18 @@ def _override(twin: Twin, query: WhatIf) -> RouteOverride:
     params = dict(query.params)
     if query.speed is not None:
         params = dict.fromkeys(SPEED_PARAMETERS, query.speed) | params
-        items = tuple(_with_speed(item, query.speed) for item in items)
-    seq = query.seq
-    if seq is None:
-        seq = _first_item(items, twin) if query.items is not None else _active_seq(twin)
+        items = tuple(
+            msgspec.structs.replace(item, param2=query.speed) if item.command == _CHANGE_SPEED else item
+            for item in items
+        )
+    if query.seq is not None:
+        seq = query.seq
+    elif query.items is None:
+        seq = _active_seq(twin)
+    else:
+        seq = min((item.seq for item in items if item.seq >= twin.first_item), default=twin.first_item)
     restart = (query.seq is not None and query.seq != _active_seq(twin)) or query.start is not None
     return RouteOverride(items, seq, params, restart, query.start.speed if query.start else None, twin.first_item)
-
-
-def _with_speed(item: Item, speed: float) -> Item:
-    return msgspec.structs.replace(item, param2=speed) if item.command == _CHANGE_SPEED else item
-
-
-def _first_item(items: tuple[Item, ...], twin: Twin) -> int:
-    """Return the sequence number of the first item to fly."""
-    first = twin.first_item
-    return min((item.seq for item in items if item.seq >= first), default=first)
 
 
 def _active_seq(twin: Twin) -> int:
@@ -243,9 +241,7 @@ def resample(prediction: Prediction, grid: np.ndarray | None) -> Prediction:
         return prediction
     ahead = prediction.ahead.numpy().astype(float)
     grid = grid[grid <= ahead[-1] + 1e-6]
-    path = CubicSpline(ahead, prediction.path.numpy())(
-        grid
-    )  # linear interpolation over 4 s of a turn has errors of metres
+    path = CubicSpline(ahead, prediction.path.numpy())(grid)  # linear over 4 s of a turn has errors of metres
     tube = np.column_stack(
         [np.interp(grid, ahead, column) for column in prediction.prediction_region_half_axes.numpy().T]
     )

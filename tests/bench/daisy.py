@@ -24,6 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tests.bench.black_box import estimate_x0
 from tests.bench.daisy_peers import Peer, peers, quietly
 from tests.bench.order_selection import select_order
 from twin_worker.identification.linear.state_space import StateSpace
@@ -69,7 +70,7 @@ def halves(folder: Path, name: str) -> Halves:
 def free_run_fit(models: Committee, y: np.ndarray, u: np.ndarray) -> float:
     """Run models freely over data they have not seen, (N, l) and (N, m) [%]."""
     first = max(_LEAST, len(y) // 10)
-    y_hat = np.median([model.run(u, model.estimate_x0(y[:first], u[:first], len(y))) for model in models], axis=0)
+    y_hat = np.median([model.run(u, estimate_x0(model, y[:first], u[:first], len(y))) for model in models], axis=0)
     miss = np.linalg.norm(y - y_hat, axis=0) / np.linalg.norm(y - y.mean(axis=0), axis=0)
     return float(np.mean(100 * (1 - miss)))
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from twin_worker.identification.linear.black_box_prediction_error import fit_inputs, refine_black_box
+from tests.bench.black_box import estimate_x0, refine_black_box
 from twin_worker.identification.linear.state_space import StateSpace
-from twin_worker.identification.linear.subspace import check_excitation, subspace_states
+from twin_worker.identification.linear.subspace import check_excitation, fit_inputs, subspace_states
 
 PAST_HORIZONS = (6, 10, 15, 25)  # tried past horizons [samples]
 _FOLDS = 3
@@ -139,6 +139,6 @@ def _undo_input_advance(model: StateSpace, u0: np.ndarray) -> StateSpace:
 def _fold_fit(model: StateSpace, y: np.ndarray, u: np.ndarray) -> float:
     """Return the mean fit of the outputs over a held-out fold, at least -100 [%]."""
     first = min(max(_MIN_START_SAMPLES, len(y) // 10), len(y))
-    y_hat = model.run(u, model.estimate_x0(y[:first], u[:first], len(y)))
+    y_hat = model.run(u, estimate_x0(model, y[:first], u[:first], len(y)))
     relative_error = np.linalg.norm(y - y_hat, axis=0) / np.maximum(np.linalg.norm(y - y.mean(axis=0), axis=0), 1e-9)
     return float(np.mean(np.maximum(100 * (1 - relative_error), -100.0)))

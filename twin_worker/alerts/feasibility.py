@@ -80,20 +80,19 @@ def feasibility_hazard(state: MissionState, limits: FlightLimits) -> HazardEstim
     if not np.isfinite(state.wind).all():
         return HazardEstimate(AlertKind.NOT_ACHIEVABLE, 0.0, "", _CLEAR_TEXT)
     t, start = state.t, state.route.start if np.isfinite(state.route.start).all() else state.position
-    worst: tuple[float, str, np.ndarray, float] | None = None
+    assessed: list[tuple[float, str, np.ndarray, float]] = []
     for leg in state.route.legs[:_LEGS]:
         end = leg[m.P_N : m.P_D + 1]
         Va = leg[m.VA_C] * parameters.eas2tas(state.origin.alt_mm * 1e-3 - end[2]) if leg[m.VA_C] > 0 else limits.Va
         if not isfinite(Va):
             break
         speed, (probability, reason) = _assess_leg(leg, start, Va, limits, state.wind)
-        if probability > (worst[0] if worst is not None else 0.0):
-            worst = probability, reason, leg, t
+        assessed.append((probability, reason, leg, t))
         t += float(np.hypot(*(end - start)[:2])) / max(speed, _MIN_GROUND_SPEED)
         start = end
-    if worst is None:
+    probability, reason, leg, t = max(assessed, key=lambda each: each[0], default=(0.0, "", np.empty(0), t))
+    if not probability > 0.0:
         return HazardEstimate(AlertKind.NOT_ACHIEVABLE, 0.0, "", _CLEAR_TEXT)
-    probability, reason, leg, t = worst
     position = Origin(*map(int, to_geodetic(state.origin, leg[m.P_N : m.P_D + 1])))
     item = f"mission item {int(leg[m.SEQ])}" if leg[m.SEQ] >= 0 else "the return to launch"
     return HazardEstimate(

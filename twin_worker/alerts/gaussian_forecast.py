@@ -19,14 +19,13 @@ from functools import lru_cache
 from math import ceil, floor, isfinite
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from scipy.stats import norm, qmc
 
 from fleet.contract import Prediction
 from fleet.frames import Origin, to_geodetic
-from twin_worker.confidence.tube_and_horizon import track_frame
 from twin_worker.numerics.interpolation import interpolate_rows
+from twin_worker.numerics.prediction_errors import track_frame
 
 STEP = 2.0  # grid in fleet time, the same for all: instants k STEP [s since 1970]
 MAX_AHEAD_S = 180.0  # longest look-ahead used [s]
@@ -51,9 +50,9 @@ class GaussianForecast(NamedTuple):
 
     def covariance(self) -> np.ndarray:
         """Return nn, ne, ee of the horizontal covariance and the vertical variance, (n, 4) [m2]."""
-        out = np.empty((len(self.path), 4))
-        _ned_covariance(self.along, self.sigma, out)
-        return out
+        c, s = self.along.T
+        a, b, vertical = self.sigma.T**2
+        return np.column_stack([a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c, vertical])
 
     def draws(self, until: float = np.inf) -> np.ndarray:
         """Return 128 equally probable paths up to an instant [s since 1970], NED, (128, k, 3) [m]."""
@@ -104,16 +103,6 @@ def to_gaussian(prediction: Prediction) -> GaussianForecast | None:
     return GaussianForecast(prediction, first, mean, along, sigma)
 
 
-@nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]
-def _ned_covariance(along: np.ndarray, sigma: np.ndarray, out: np.ndarray) -> None:
-    """Compute the NED covariance of every row into `out`, (n, 4)."""
-    for k in range(len(out)):
-        c, s = along[k, 0], along[k, 1]
-        a, b = sigma[k, 0] ** 2, sigma[k, 1] ** 2
-        out[k, 0], out[k, 1], out[k, 2] = a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c
-        out[k, 3] = sigma[k, 2] ** 2
-
-
 def _is_valid(prediction: Prediction, ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> bool:
     """Return whether times rise, shapes agree, numbers are finite and the origin is a valid position."""
     n = len(ahead) if ahead.ndim == 1 else 0
@@ -124,20 +113,11 @@ def _is_valid(prediction: Prediction, ahead: np.ndarray, path: np.ndarray, tube:
         0 < prediction.t < 4e9
         and 0 < prediction.quantile < 1
         and isfinite(prediction.quantile)
-        and _is_plausible(ahead, path, tube)
+        and np.isfinite(ahead).all()
+        and (np.diff(ahead) > 0).all()
+        and (np.abs(path) < _MAX_DISTANCE).all()
+        and ((tube >= 0.0) & (tube < _MAX_DISTANCE)).all()
         and abs(lat) < 8.9e8
         and abs(lon) <= 1.8e9
         and abs(alt) <= 1e8
     )
-
-
-@nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]
-def _is_plausible(ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> bool:
-    """Return whether times are finite and rise, and positions and half-axes are within bounds; false for nan."""
-    for k in range(len(ahead)):
-        if not np.isfinite(ahead[k]) or (k and not ahead[k] > ahead[k - 1]):
-            return False
-        for i in range(3):
-            if not (abs(path[k, i]) < _MAX_DISTANCE and 0.0 <= tube[k, i] < _MAX_DISTANCE):
-                return False
-    return True

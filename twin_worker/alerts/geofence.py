@@ -90,10 +90,8 @@ def geofence_hazard(
     )
 
 
-MIN_HEIGHT_WINGS_M, MIN_HEIGHT_ROTORS_M = (
-    30.0,
-    5.0,
-)  # minimum height above home outside landings, fixed wings and multirotors [m]
+MIN_HEIGHT_WINGS_M = 30.0  # minimum height above home of fixed wings outside landings [m]
+MIN_HEIGHT_ROTORS_M = 5.0  # the same of multirotors [m]
 _MIN_PROBABILITY = 0.02  # below this probability no alert text is composed [-]
 _GROUND_CLEAR_TEXT = "no descent below the minimum height predicted"
 
@@ -116,9 +114,7 @@ def ground_hazard(flight: GaussianForecast, home: Origin, margin: float, until: 
     probability = float(ndtr(z.max()))
     if probability < _MIN_PROBABILITY:
         return HazardEstimate(AlertKind.GROUND, probability, "", _GROUND_CLEAR_TEXT)
-    first = int(
-        np.flatnonzero(z >= min(z.max(), 0.0))[0]
-    )  # where the mean goes below the margin, else the lowest point
+    first = int(np.flatnonzero(z >= min(z.max(), 0.0))[0])  # where the mean is below the margin, else the lowest point
     t = float(flight.t[first])
     message = (
         f"{probability:.0%} chance that it sinks below {margin:.0f} m above home (terrain unknown) in "

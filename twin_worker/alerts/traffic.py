@@ -17,22 +17,23 @@ _MIN_PERIOD_S = 2.0  # minimum period between stored predictions of one aircraft
 _CORNER = np.array([1e4, 1e4, -1e4])  # point whose image determines the scale from one NED frame to another [m]
 
 
-@dataclass
 class TrafficPicture:
     """Predictions in slots, one per UAV; a slot is rewritten at the first assessment after a new prediction."""
 
-    _slots: dict[int, int] = field(default_factory=dict)  # slot by UAV id
-    _pending: dict[int, Prediction] = field(default_factory=dict)  # received, not yet in a slot
-    _newest_t: dict[int, float] = field(default_factory=dict)  # time of the newest prediction [s since 1970]
-    _forecasts: list[GaussianForecast | None] = field(default_factory=list)
-    first: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
-    rows: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
-    path: np.ndarray = field(default_factory=lambda: np.zeros((0, _ROWS, 3)))
-    covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, _ROWS, 4)))
-    uav: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
-    t: np.ndarray = field(default_factory=lambda: np.zeros(0))  # time of the prediction [s since 1970]
-    origin: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # [1e-7 deg, 1e-7 deg, mm]
-    corner: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # geodetic position of `_CORNER`, same units
+    def __init__(self) -> None:
+        self._slots: dict[int, int] = {}  # slot by UAV id
+        self._pending: dict[int, Prediction] = {}  # received, not yet in a slot
+        self._newest_t: dict[int, float] = {}  # time of the newest prediction [s since 1970]
+        self._forecasts: list[GaussianForecast | None] = [None] * _MAX_AIRCRAFT
+        # one row per slot; the operating system provides memory only for rows in use
+        self.first = np.zeros(_MAX_AIRCRAFT, np.int64)
+        self.rows = np.zeros(_MAX_AIRCRAFT, np.int64)
+        self.path = np.zeros((_MAX_AIRCRAFT, _ROWS, 3))
+        self.covariance = np.zeros((_MAX_AIRCRAFT, _ROWS, 4))
+        self.uav = np.zeros(_MAX_AIRCRAFT, np.int64)
+        self.t = np.zeros(_MAX_AIRCRAFT)  # time of the prediction [s since 1970]
+        self.origin = np.zeros((_MAX_AIRCRAFT, 3))  # [1e-7 deg, 1e-7 deg, mm]
+        self.corner = np.zeros((_MAX_AIRCRAFT, 3))  # geodetic position of `_CORNER`, same units
 
     def receive(self, prediction: Prediction) -> None:
         """Store the newest prediction of an aircraft; thread-safe."""
@@ -46,18 +47,8 @@ class TrafficPicture:
         """Write pending predictions to their slots; an invalid prediction empties its slot."""
         while self._pending:
             uav, prediction = self._pending.popitem()
-            slot = self._slots.setdefault(uav, len(self._slots))
-            if slot >= len(self.uav):
-                self._grow(max(2 * len(self.uav), 8))
-            self._write_slot(slot, uav, prediction)
-
-    def _grow(self, slots: int) -> None:
-        for name in ("first", "rows", "path", "covariance", "uav", "t", "origin", "corner"):
-            old = getattr(self, name)
-            new = np.zeros((slots, *old.shape[1:]), old.dtype)
-            new[: len(old)] = old
-            setattr(self, name, new)
-        self._forecasts += [None] * (slots - len(self._forecasts))
+            if uav in self._slots or len(self._slots) < _MAX_AIRCRAFT:
+                self._write_slot(self._slots.setdefault(uav, len(self._slots)), uav, prediction)
 
     def _write_slot(self, slot: int, uav: int, prediction: Prediction) -> None:
         forecast = to_gaussian(prediction)
@@ -148,7 +139,7 @@ class TrafficMonitor:
 
     def active(self, uav: int) -> list[Alert]:
         """Return the active conflict alerts of one owned aircraft."""
-        return self._states[uav].active if uav in self._states else []
+        return self.state_of(uav).active
 
     def _conflicts(self, uav: int, now: float) -> list[HazardEstimate]:
         self.picture.update_slots()

@@ -19,8 +19,8 @@ _GAP_S = 2.5  # positions farther apart than this are a telemetry gap [s]
 _exact = nb.njit(cache=True, error_model="numpy", nogil=True)  # no fastmath: as numpy does it
 
 
-class PredictionColumns(NamedTuple):
-    """Arrays of `PredictionLog` that describe the predictions, one row each."""
+class LogArrays(NamedTuple):
+    """Arrays of `PredictionLog` for the compiled scoring, one row per prediction; those from `score` on are changed."""
 
     t0: np.ndarray
     size: np.ndarray
@@ -28,11 +28,6 @@ class PredictionColumns(NamedTuple):
     direction: np.ndarray
     tube: np.ndarray
     min_length: np.ndarray
-
-
-class ScoringState(NamedTuple):
-    """Arrays of `PredictionLog` that describe the scores so far, changed in place."""
-
     score: np.ndarray
     next_column: np.ndarray
     live: np.ndarray
@@ -67,23 +62,23 @@ def _length_until(instant: float, odometer: np.ndarray) -> float:
 
 
 @_exact
-def _update_passage(row: int, column: int, relative_error: float, state: ScoringState) -> None:
+def _update_passage(row: int, column: int, relative_error: float, log: LogArrays) -> None:
     """Update the first passage of an uncensored prediction at one look-ahead."""
-    last_error, last_ahead = state.last_error[row], AHEAD[max(column - 1, 0)]
-    state.followed[row] = AHEAD[column]
+    last_error, last_ahead = log.last_error[row], AHEAD[max(column - 1, 0)]
+    log.followed[row] = AHEAD[column]
     if relative_error > ERROR_LIMIT:
         fraction = (ERROR_LIMIT - last_error) / max(relative_error - last_error, 1e-9) if column > 0 else 0.0
-        state.followed[row] = last_ahead + min(max(fraction, 0.0), 1.0) * (AHEAD[column] - last_ahead)
-        state.exceeded[row], state.uncensored[row] = True, False
-    state.last_error[row] = relative_error
+        log.followed[row] = last_ahead + min(max(fraction, 0.0), 1.0) * (AHEAD[column] - last_ahead)
+        log.exceeded[row], log.uncensored[row] = True, False
+    log.last_error[row] = relative_error
 
 
 @_exact
-def evaluate_all(predictions: PredictionColumns, state: ScoringState, flight: tuple, evaluated: np.ndarray) -> int:
+def evaluate_all(log: LogArrays, flight: tuple, evaluated: np.ndarray) -> int:
     """Score the look-aheads that have been flown, of every open prediction.
 
     Args:
-        predictions, state: one row each
+        log: predictions and their scores
         flight: times, rising, (n,) [s since 1970], positions, NED, (n, 3) [m], and times and path lengths, (m, 2)
         evaluated: rows and columns that were evaluated, those in telemetry gaps included, filled in, (k, 2)
     Returns:
@@ -91,37 +86,37 @@ def evaluate_all(predictions: PredictionColumns, state: ScoringState, flight: tu
     """
     t, positions, odometer = flight
     n, until, error, axes = 0, t[-1], np.empty(3), np.empty(3)
-    for row in range(len(predictions.t0)):
-        if not state.live[row]:
+    for row in range(len(log.t0)):
+        if not log.live[row]:
             continue
-        for column in range(state.next_column[row], predictions.size[row]):
-            instant = predictions.t0[row] + AHEAD[column]
+        for column in range(log.next_column[row], log.size[row]):
+            instant = log.t0[row] + AHEAD[column]
             if not instant <= until:
                 break
             evaluated[n, 0], evaluated[n, 1] = row, column
             n += 1
-            state.next_column[row] = column + 1
-            if state.start_length[row] != state.start_length[row]:
-                state.start_length[row] = _length_until(predictions.t0[row], odometer)
+            log.next_column[row] = column + 1
+            if log.start_length[row] != log.start_length[row]:
+                log.start_length[row] = _length_until(log.t0[row], odometer)
             k = _row_before(instant, t)
             if not (t[k + 1] - t[k] <= _GAP_S and instant >= t[0] - 1e-6):
-                state.uncensored[row] = False
+                log.uncensored[row] = False
                 continue
             for i in range(3):
                 error[i] = (
                     _interpolate(instant, t[k], t[k + 1], positions[k, i], positions[k + 1, i])
-                    - predictions.path[row, column, i]
+                    - log.path[row, column, i]
                 )
-            c, s = predictions.direction[row, column, 0], predictions.direction[row, column, 1]
+            c, s = log.direction[row, column, 0], log.direction[row, column, 1]
             axes[0], axes[1], axes[2] = error[0] * c + error[1] * s, error[1] * c - error[0] * s, error[2]
             max_ratio = 0.0
             for i in range(3):
-                max_ratio = max(max_ratio, abs(axes[i]) / predictions.tube[row, column, i])
-            state.score[row, column] = max_ratio
-            if state.uncensored[row]:
-                length = max(_length_until(instant, odometer) - state.start_length[row], predictions.min_length[row])
-                _update_passage(row, column, sqrt(error[0] ** 2 + error[1] ** 2 + error[2] ** 2) / length, state)
-        state.live[row] = state.next_column[row] < predictions.size[row]
+                max_ratio = max(max_ratio, abs(axes[i]) / log.tube[row, column, i])
+            log.score[row, column] = max_ratio
+            if log.uncensored[row]:
+                length = max(_length_until(instant, odometer) - log.start_length[row], log.min_length[row])
+                _update_passage(row, column, sqrt(error[0] ** 2 + error[1] ** 2 + error[2] ** 2) / length, log)
+        log.live[row] = log.next_column[row] < log.size[row]
     return n
 
 
@@ -178,9 +173,9 @@ class PredictionLog:
     uncensored: np.ndarray  # neither exceeded nor censored
     horizon_pending: np.ndarray  # its horizon is neither met nor missed yet
     evaluated_until: float  # end of the scored flight [s since 1970]
-    _min_length: np.ndarray  # least path length [m]
-    _start_length: np.ndarray  # path length at t0 [m]
-    _last_error: np.ndarray  # relative error at the previous look-ahead [-]
+    min_length: np.ndarray  # least path length [m]
+    start_length: np.ndarray  # path length at t0 [m]
+    last_error: np.ndarray  # relative error at the previous look-ahead [-]
     _odometer: np.ndarray  # time, and path length flown until then [s since 1970, m]
     _stride_start: np.ndarray  # position at the end of the last interval
     _newest_row: int  # newest row
@@ -204,9 +199,9 @@ class PredictionLog:
         self.uncensored = np.zeros(rows, bool)
         self.horizon_pending = np.zeros(rows, bool)
         self.evaluated_until = -np.inf
-        self._min_length = np.ones(rows)
-        self._start_length = np.full(rows, np.nan)
-        self._last_error = np.zeros(rows)
+        self.min_length = np.ones(rows)
+        self.start_length = np.full(rows, np.nan)
+        self.last_error = np.zeros(rows)
         self._odometer = np.empty((0, 2))
         self._stride_start = np.zeros(3)
         self._newest_row = -1
@@ -224,7 +219,7 @@ class PredictionLog:
         self.path[row, :n], self.direction[row, :n] = path, track_frame(path, AHEAD[:n])
         self.score[row], self.next_column[row], self.live[row] = np.nan, 0, True
         self.followed[row], self.exceeded[row], self.uncensored[row], self.horizon_pending[row] = 0.0, False, True, True
-        self._min_length[row], self._start_length[row], self._last_error[row] = min_path_length(speed), np.nan, 0.0
+        self.min_length[row], self.start_length[row], self.last_error[row] = min_path_length(speed), np.nan, 0.0
         return row
 
     @property
@@ -257,19 +252,9 @@ class PredictionLog:
         self._update_odometer(t, positions)
         self.evaluated_until = float(t[-1])
         evaluated = np.empty((int((self.size - self.next_column)[self.live].sum()), 2), np.int64)
-        predictions = PredictionColumns(self.t0, self.size, self.path, self.direction, self.tube, self._min_length)
-        state = ScoringState(
-            self.score,
-            self.next_column,
-            self.live,
-            self.followed,
-            self.exceeded,
-            self.uncensored,
-            self._start_length,
-            self._last_error,
-        )
+        arrays = LogArrays(*(getattr(self, name) for name in LogArrays._fields))
         flight = np.ascontiguousarray(t, float), np.ascontiguousarray(positions, float), self._odometer
-        n = evaluate_all(predictions, state, flight, evaluated)  # type: ignore[call-arg]
+        n = evaluate_all(arrays, flight, evaluated)  # type: ignore[call-arg]
         rows, columns = np.ascontiguousarray(evaluated[:n].T)  # contiguous rows and columns
         return rows, columns
 

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -13,9 +14,7 @@ from twin_worker.numerics.prediction_errors import NOMINAL_COVERAGE
 
 ANY = "*"
 _FAMILY = dict.fromkeys(("hybrid", "both", "dynamics"), "route")  # selected in flight; they share one ensemble
-_FAST_SPEED = (
-    40.0  # usual speed above which a fixed wing forms a class of its own; well above small ones in tailwind [m/s]
-)
+_FAST_SPEED = 40.0  # usual speed above which a fixed wing forms a class of its own: well above small ones [m/s]
 
 
 def group_name(method: str, law: str, airframe: str, parameters: str) -> str:
@@ -57,7 +56,6 @@ FORMAT = 1
 UNCALIBRATED = "not calibrated"  # begins the sentence of a prediction without a calibrated table
 _FOLDER = Path(__file__).parent
 _INNERMOST = re.compile(r"\[[^\[\]{}]*\]")  # innermost lists: one per line
-_DEFAULT_ALONE = 0.94  # default of `CalibrationTable.alone`; measured: 0.96 to 30 s, 0.94 to 60 s, 0.91 to 120 s
 _MAX_VALUE = 1e6  # larger numbers are invalid
 
 
@@ -69,22 +67,6 @@ class TableSource(msgspec.Struct, frozen=True):
     flights: tuple[str, ...]
 
 
-class TableRecord(msgspec.Struct, frozen=True):
-    """One table as stored; scale, lag, floor and factor by axis, then knot."""
-
-    group: str
-    starts: int
-    flights: int
-    scale: list[list[float]]
-    lag: list[list[float]]
-    floor: list[list[float]]
-    factor: list[list[float]]
-    scores: list[float]
-    risks: list[float]
-    held_out: dict[str, float] = {}
-    alone: float = _DEFAULT_ALONE
-
-
 class TableFile(msgspec.Struct, frozen=True):
     """A file of tables."""
 
@@ -93,7 +75,7 @@ class TableFile(msgspec.Struct, frozen=True):
     command: str
     sources: tuple[TableSource, ...]
     knots_s: list[float]
-    tables: tuple[TableRecord, ...]
+    tables: tuple[CalibrationTable, ...]
 
 
 class TableSet:
@@ -120,40 +102,38 @@ def read_tables(path: Path) -> TableSet:
         ValueError: when it is invalid; the message names the remedy.
     """
     try:
-        content = msgspec.json.decode(path.read_bytes(), type=TableFile)
+        content = msgspec.json.decode(path.read_bytes(), type=TableFile, dec_hook=_array)
     except (OSError, msgspec.DecodeError) as error:
         raise ValueError(f"calibration {path.name}: found no tables ({error}); fit it again") from None
     if content.format != FORMAT or content.knots_s != KNOTS.tolist():
         raise ValueError(f"calibration {path.name}: found format {content.format}, expected {FORMAT}; fit it again")
-    return TableSet({row.group: _table_from_record(path.name, row) for row in content.tables})
+    for table in content.tables:
+        _check(path.name, table)
+    return TableSet({table.group: table for table in content.tables})
 
 
-def _table_from_record(file: str, record: TableRecord) -> CalibrationTable:
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("scale", "lag", "floor", "factor"), (3, 13))
+def _array(_: type, values: list) -> np.ndarray:
+    """Return an array of a table from its values by axis, then knot."""
+    return np.array(values, float).T
+
+
+def _check(file: str, table: CalibrationTable) -> None:
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("scale", "lag", "floor", "factor"), (len(KNOTS), 3))
     shapes |= dict.fromkeys(("scores", "risks"), (ATOMS,))
-    arrays = {}
     for name, shape in shapes.items():
-        try:
-            arrays[name] = np.array(getattr(record, name), float)
-        except ValueError:
-            arrays[name] = np.empty(0)
-        array = arrays[name]
+        array = getattr(table, name)
         if array.shape != shape or not ((array >= 0) & (array < _MAX_VALUE)).all():
             raise ValueError(
-                f"calibration {file}: found {name} of {record.group} of shape {array.shape}, "
-                f"expected {shape}, finite, not negative; fit it again"
+                f"calibration {file}: found {name} of {table.group} of shape {array.T.shape}, "
+                f"expected {shape[::-1]}, finite, not negative; fit it again"
             )
-    if not ((arrays["factor"] > 0).all() and (arrays["scores"] > 0).all() and (arrays["floor"] > 0).all()):
-        raise ValueError(f"calibration {file}: found a zero width for {record.group}, expected more; fit it again")
-    if not NOMINAL_COVERAGE <= record.alone < 1.0:
+    if not ((table.factor > 0).all() and (table.scores > 0).all() and (table.floor > 0).all()):
+        raise ValueError(f"calibration {file}: found a zero width for {table.group}, expected more; fit it again")
+    if not NOMINAL_COVERAGE <= table.alone < 1.0:
         raise ValueError(
-            f"calibration {file}: found alone {record.alone} of {record.group}, expected {NOMINAL_COVERAGE} "
+            f"calibration {file}: found alone {table.alone} of {table.group}, expected {NOMINAL_COVERAGE} "
             "to 1; fit it again"
         )
-    by_knot = {name: arrays.pop(name).T for name in ("scale", "lag", "floor", "factor")}
-    return CalibrationTable(
-        record.group, record.starts, record.flights, **by_knot, **arrays, held_out=record.held_out, alone=record.alone
-    )
 
 
 @lru_cache(maxsize=8)
@@ -173,29 +153,19 @@ def write(
     path: Path, tables: Sequence[CalibrationTable], sources: Sequence[TableSource], date: str, command: str
 ) -> None:
     """Write tables with their sources."""
-    content = TableFile(FORMAT, date, command, tuple(sources), KNOTS.tolist(), tuple(map(_record_from_table, tables)))
-    text = msgspec.json.format(msgspec.json.encode(content), indent=1).decode()
+    rounded = [
+        replace(
+            table,
+            held_out={name: round(value, 4) for name, value in table.held_out.items() if np.isfinite(value)},
+            alone=round(table.alone, 4),
+        )
+        for table in tables
+    ]
+    content = TableFile(FORMAT, date, command, tuple(sources), KNOTS.tolist(), tuple(rounded))
+    text = msgspec.json.format(msgspec.json.encode(content, enc_hook=_four_digits), indent=1).decode()
     path.write_text(_INNERMOST.sub(lambda match: " ".join(match[0].split()), text) + "\n")
 
 
-def _record_from_table(table: CalibrationTable) -> TableRecord:
-    parts = table.scale.T, table.lag.T, table.floor.T, table.factor.T, table.scores, table.risks
-    scale, lag, floor, factor, scores, risks = map(_four_digits, parts)
-    held_out = {name: round(value, 4) for name, value in table.held_out.items() if np.isfinite(value)}
-    return TableRecord(
-        table.group,
-        table.starts,
-        table.flights,
-        scale,
-        lag,
-        floor,
-        factor,
-        scores,
-        risks,
-        held_out,
-        round(table.alone, 4),
-    )
-
-
 def _four_digits(values: np.ndarray) -> list:
-    return np.vectorize(lambda x: float(f"{x:.4g}"))(values).tolist()
+    """Return the values of a table by axis, then knot, with four digits."""
+    return np.vectorize(lambda x: float(f"{x:.4g}"))(values.T).tolist()

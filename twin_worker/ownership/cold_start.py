@@ -1,16 +1,93 @@
 """Start a twin without a snapshot: from the last minutes of telemetry and the last published model."""
 
+from collections.abc import Mapping
+
 import msgspec
 import numpy as np
 
-from fleet.contract import Array, Model, Outcome, Prediction, TwinState
+from fleet.bus.bus_protocol import Bus
+from fleet.contract import (
+    COLUMNS,
+    Array,
+    History,
+    Message,
+    Mission,
+    Model,
+    Outcome,
+    Params,
+    Prediction,
+    Rows,
+    Sample,
+    Status,
+    TwinState,
+)
 from fleet.physics.wrench import N_PAR, NAMES
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel, prior
 from twin_worker.twin.state.models import VerifiedModel
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.extrapolate import MAX_ROLLOUT_AGE_S
 
+LATCHED_TYPES: tuple[type[Message], ...] = (Status, Params, Mission)
+"""Rare messages of which the last one stays valid."""
+_QUERY_TIMEOUT_S = 0.5  # for one message from a gateway [s]
+_HISTORY_TIMEOUT_S = 2.0  # for a history of several megabytes [s]
+_TRIES = 2  # large answers are dropped on a congested link
 _DEFAULT_TRIM_INPUT = np.array([0.0, 0.0, 0.0, 0.5])  # trim inputs, as none are published
+_HISTORY_DECODER = msgspec.msgpack.Decoder(History)
+
+
+def query_history(bus: Bus, uav: int, cached: Mapping[type, Message]) -> list[Message]:
+    """Query the past messages of an aircraft for a new twin; types in `cached` are not queried.
+
+    Raises:
+        ConnectionError: when the session is closed; stop, the worker is shutting down.
+    """
+    latched: list[Message] = []
+    for kind in LATCHED_TYPES:
+        latched += (
+            [cached[kind]] if kind in cached else [message for message, _ in bus.get(kind, uav, _QUERY_TIMEOUT_S)]
+        )
+    for _ in range(_TRIES):
+        samples = [
+            sample
+            for sample in map(decode_history, bus.get_payloads(History, uav, _HISTORY_TIMEOUT_S))
+            if sample is not None and sample.uav == uav
+        ]
+        if samples:
+            return [*latched, *samples]
+    return latched
+
+
+def decode_history(payload: bytes) -> Sample | None:
+    """Decode a `History` into one sample with all its rows; None if it is invalid or empty.
+
+    Rows are skipped if their shape does not match their byte count, or their dtype is not that of the newest rows.
+    """
+    try:
+        history = _HISTORY_DECODER.decode(payload)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return None
+    joined = {}
+    for kind, columns in COLUMNS.items():
+        received = [rows for sample in history.samples if (rows := getattr(sample, kind)) is not None]
+        valid = [rows for rows in received if _is_consistent(rows, len(columns))]
+        parts = [rows for rows in valid if rows.x.dtype == valid[-1].x.dtype]
+        if parts:
+            n, t, x = (
+                sum(rows.t.shape[0] for rows in parts),
+                b"".join([rows.t.data for rows in parts]),
+                b"".join([rows.x.data for rows in parts]),
+            )
+            joined[kind] = Rows(t=Array("<f8", (n,), t), x=Array(parts[0].x.dtype, (n, len(columns)), x))
+    return Sample(uav=history.uav, t=history.t, **joined) if joined else None
+
+
+def _is_consistent(rows: Rows, columns: int) -> bool:
+    try:
+        t, x = rows.t.numpy(), rows.x.numpy()
+    except ValueError:
+        return False
+    return rows.t.dtype == "<f8" and t.ndim == 1 and len(t) > 0 and x.shape == (len(t), columns)
 
 
 def restore_model(twin: Twin, model: Model) -> bool:

@@ -37,13 +37,7 @@ class Snapshot:
     mismatch: Mismatch | None = None
 
 
-class _Encoded(msgspec.Struct, array_like=True):
-    """A snapshot as bytes: every queued message with its topic."""
-
-    twin: Twin
-    inbox: list[tuple[str, msgspec.Raw]]
-    traffic_alerts: AlertState
-    mismatch: Mismatch | None
+_Encoded = tuple[Twin, list[tuple[str, msgspec.Raw]], AlertState, Mismatch | None]  # queued messages with their topics
 
 
 def encode_snapshot(snapshot: Snapshot) -> bytes:
@@ -55,7 +49,7 @@ def encode_snapshot(snapshot: Snapshot) -> bytes:
     encode = msgspec.msgpack.Encoder(enc_hook=_to_parts).encode
     inbox = [(message.topic, msgspec.Raw(encode(message))) for message in snapshot.inbox]
     twin = msgspec.structs.replace(snapshot.twin, budget=None)  # the new owner has its own
-    return encode(_Encoded(twin, inbox, snapshot.traffic_alerts, snapshot.mismatch))
+    return encode((twin, inbox, snapshot.traffic_alerts, snapshot.mismatch))
 
 
 def decode_snapshot(data: bytes, uav: int) -> Snapshot:
@@ -65,20 +59,19 @@ def decode_snapshot(data: bytes, uav: int) -> Snapshot:
         ValueError: when the bytes are not a twin of this aircraft; start it from published data instead.
     """
     try:
-        encoded = msgspec.msgpack.decode(data, type=_Encoded, dec_hook=_from_parts)
-        inbox: list[Message] = [msgspec.msgpack.decode(message, type=TOPICS[topic]) for topic, message in encoded.inbox]
+        twin, queued, *rest = msgspec.msgpack.decode(data, type=_Encoded, dec_hook=_from_parts)
+        inbox: list[Message] = [msgspec.msgpack.decode(message, type=TOPICS[topic]) for topic, message in queued]
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         raise ValueError(
             f"uav-{uav}: found {len(data)} invalid bytes ({error}), expected its twin; it starts without a snapshot"
         ) from None
-    if encoded.twin.config.uav != uav:
+    if twin.config.uav != uav:
         raise ValueError(
-            f"uav-{uav}: found the twin of uav-{encoded.twin.config.uav}, expected its own; "
-            "it starts without a snapshot"
+            f"uav-{uav}: found the twin of uav-{twin.config.uav}, expected its own; it starts without a snapshot"
         )
-    if not encoded.twin.telemetry.history.is_consistent():
+    if not twin.telemetry.history.is_consistent():
         raise ValueError(f"uav-{uav}: found other telemetry columns, expected ours; it starts without a snapshot")
-    return Snapshot(encoded.twin, inbox, encoded.traffic_alerts, encoded.mismatch)
+    return Snapshot(twin, inbox, *rest)
 
 
 def _to_parts(value: Any) -> Any:

@@ -16,8 +16,8 @@ import logging
 import platform
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
-from typing import Any, Protocol
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import msgspec
 
@@ -27,6 +27,7 @@ from fleet.bus.codec import MAX_EPOCH_AHEAD_MS, Stamp, is_plausible_epoch
 from fleet.bus.session import Bus
 from fleet.contract import Claim, Handover, HandoverRequest
 from twin_worker.ownership.protocol_state import FencingToken, OwnershipState
+from twin_worker.ownership.twin_store import TwinStore
 
 _log = logging.getLogger(__name__)
 _STEP_PERIOD_S = 0.1  # between steps without an event [s]
@@ -41,40 +42,6 @@ _SNAPSHOT_TIMEOUT_S = (
 _LEAVE_TIMEOUT_S = 5.0  # for the other workers to acquire everything at shutdown [s]
 _REPAIR_PERIOD_S = 1.0  # between checks for incomplete acquisitions [s]
 _MAX_CLOCK_WARNINGS = 100  # maximum number of workers with a clock warning
-
-
-class TwinStore(Protocol):
-    """Stores the twins of the owned aircraft."""
-
-    def expect(self, uavs: Iterable[int]) -> None:
-        """Queue messages of these aircraft before their twins arrive."""
-
-    def acquire(self, uav: int, epoch: int, twin: Handover | None) -> None:
-        """Acquire one aircraft, with a snapshot of its twin or without."""
-
-    def rehydrate(self, uavs: list[int]) -> None:
-        """Query the past telemetry of aircraft acquired without a snapshot."""
-
-    def set_epoch(self, uav: int, epoch: int) -> None:
-        """Publish under another epoch from now on."""
-
-    def release(self, uavs: Iterable[int]) -> None:
-        """Release these aircraft."""
-
-    def snapshot(self, uav: int, epoch: int) -> Handover | None:
-        """Return a snapshot of one twin; None if it is not available now."""
-
-    @property
-    def ready_by_uav(self) -> dict[int, bool]:
-        """Return for each owned or expected aircraft whether its twin is ready."""
-
-    @property
-    def not_publishing(self) -> frozenset[int]:
-        """Return the aircraft acquired by snapshot that this worker does not publish yet."""
-
-    @property
-    def without_history(self) -> tuple[int, ...]:
-        """Return the aircraft without past telemetry."""
 
 
 class OwnershipProtocol:
@@ -177,7 +144,11 @@ class OwnershipProtocol:
 
     def _on_handover_query(self, payload: bytes) -> Iterator[tuple[Handover, None]]:
         """Yield snapshots of owned aircraft, one by one; the requester acquires them and announces it."""
-        for uav in _decode_wanted(payload).uavs if payload else ():
+        try:
+            wanted = msgspec.msgpack.decode(payload, type=HandoverRequest).uavs if payload else ()
+        except (msgspec.DecodeError, RecursionError) as error:
+            raise ValueError(f"handover: found no Wanted ({error}); see `fleet schema @handover`") from None
+        for uav in wanted:
             with self._lock:
                 epoch = self.state.owned.get(uav)
             if epoch is not None and (twin := self._store.snapshot(uav, epoch)) is not None:
@@ -203,7 +174,9 @@ class OwnershipProtocol:
         """Run whatever is due."""
         if not self.tick():
             return
-        self._replace_future_epochs()
+        with self._lock:  # after the clock was set back
+            renewed = self.state.drop_future_epochs(_wall_ms() + MAX_EPOCH_AHEAD_MS, _wall_ms())
+        self._store.set_epochs(renewed)
         if self.state.unsynchronised:
             self._synchronise()
         with self._lock:
@@ -212,23 +185,20 @@ class OwnershipProtocol:
         if plan.valid:  # a short unsynchronised phase, as on a busy machine, does not restart the timeouts
             self._acquire(self._request_handovers(plan.request))
             self._repair()
-        if self._claim_changed() or time.monotonic() - self._announced_t >= _ANNOUNCE_PERIOD_S:
-            self._announce()
+        self._announce(only_if_due=True)
 
     def leave(self) -> None:
         """Hand all aircraft over to the other workers, within a few seconds."""
         with self._lock:
             self.state.leaving = True
         until, pause = time.monotonic() + _LEAVE_TIMEOUT_S, threading.Event()
-        while self.tick() and self._has_successors() and time.monotonic() < until:
+        while self.tick() and time.monotonic() < until:
+            with self._lock:
+                successors = self.state.successors().values()
+                if not any(uav in ids for uav in self.state.owned for ids in successors):
+                    return
             self._announce()
             pause.wait(_STEP_PERIOD_S)
-
-    def _has_successors(self) -> bool:
-        """Return whether another worker can acquire an aircraft still owned here."""
-        with self._lock:
-            others = self.state.successors().values()
-            return any(uav in ids for uav in self.state.owned for ids in others)
 
     def tick(self) -> bool:
         """Update the clock and the router state; return whether the router is connected."""
@@ -247,15 +217,7 @@ class OwnershipProtocol:
             previous = dict(self.state.owned)
             self.state.resynchronise(_wall_ms())
             renewed = {uav: epoch for uav, epoch in self.state.owned.items() if previous[uav] != epoch}
-        for uav, epoch in renewed.items():
-            self._store.set_epoch(uav, epoch)
-
-    def _replace_future_epochs(self) -> None:
-        """Claim aircraft again whose epochs are ahead of this clock after it was set back."""
-        with self._lock:
-            renewed = self.state.drop_future_epochs(_wall_ms() + MAX_EPOCH_AHEAD_MS, _wall_ms())
-        for uav, epoch in renewed.items():
-            self._store.set_epoch(uav, epoch)
+        self._store.set_epochs(renewed)
 
     def _is_timely(self, worker: str, epoch: int) -> bool:
         """Return whether a worker's epoch is within the limit; warn once if it is far ahead of this clock."""
@@ -353,22 +315,13 @@ class OwnershipProtocol:
             _log.exception("takeover failed with an internal error; report it")
         self._wakeup.set()
 
-    def _claim_changed(self) -> bool:
-        """Return whether the claim differs from the last announced one."""
-        claim = self.claim()
-        return (claim.owned, claim.without_history) != self._announced
-
-    def _announce(self) -> None:
-        claim = self.claim()
-        self._announced_t, self._announced = time.monotonic(), (claim.owned, claim.without_history)
-        self._bus.publish(claim)
-
-
-def _decode_wanted(payload: bytes) -> HandoverRequest:
-    try:
-        return msgspec.msgpack.decode(payload, type=HandoverRequest)
-    except (msgspec.DecodeError, RecursionError) as error:
-        raise ValueError(f"handover: found no Wanted ({error}); see `fleet schema @handover`") from None
+    def _announce(self, *, only_if_due: bool = False) -> None:
+        """Publish the claim; with `only_if_due` only after a change or a period."""
+        claim, now = self.claim(), time.monotonic()
+        content = claim.owned, claim.without_history
+        if not only_if_due or content != self._announced or now - self._announced_t >= _ANNOUNCE_PERIOD_S:
+            self._announced_t, self._announced = now, content
+            self._bus.publish(claim)
 
 
 def _wall_ms() -> int:

@@ -204,42 +204,29 @@ class OwnershipState:
     def plan(self, now: float) -> OwnershipPlan:
         """Return the aircraft this worker should own and does not."""
         plan = OwnershipPlan()
-        if not self._may_claim(now):
+        if self.leaving or not self.may_write(now) or now < self._settled_t:
             return plan
         plan.valid = True
-        plan.acquire += [uav for uav, epoch in self.owned.items() if self._superseded(uav, epoch)]
-        inputs = self.known - self.owned.keys(), self._candidates()
+        for uav, epoch in self.owned.items():
+            token = self.highest[uav]
+            if token > FencingToken(epoch, self.worker_id) and not self.is_live(token.worker):
+                plan.acquire.append(uav)
+        inputs = self.known - self.owned.keys(), {self.worker_id: self.ids} | self.successors()
         if inputs != self._assignments[0]:  # rarely
             self._assignments = inputs, owners(sorted(inputs[0]), inputs[1])
         for uav, assigned in self._assignments[1].items():
             if assigned != self.worker_id:
                 continue
-            owner = self._live_owner(uav)
-            if owner is None:
-                plan.acquire.append(uav)
+            claim = self.highest.get(uav)
+            if claim is not None and self.is_live(claim.worker):
+                plan.request.setdefault(claim.worker, []).append(uav)
             else:
-                plan.request.setdefault(owner, []).append(uav)
+                plan.acquire.append(uav)
         return plan
-
-    def _may_claim(self, now: float) -> bool:
-        return not self.leaving and self.may_write(now) and now >= self._settled_t
-
-    def _superseded(self, uav: int, epoch: int) -> bool:
-        """Return whether a dead worker has a higher claim on an owned aircraft."""
-        token = self.highest[uav]
-        return token > FencingToken(epoch, self.worker_id) and not self.is_live(token.worker)
-
-    def _candidates(self) -> dict[str, range]:
-        return {self.worker_id: self.ids} | self.successors()
 
     def successors(self) -> dict[str, range]:
         """Return the id ranges of the other live workers that are not leaving."""
         return {name: peer.ids for name, peer in self.peers.items() if self.is_live(name) and not peer.leaving}
-
-    def _live_owner(self, uav: int) -> str | None:
-        """Return the live owner of an aircraft; None if there is none."""
-        token = self.highest.get(uav)
-        return token.worker if token is not None and self.is_live(token.worker) else None
 
     def acquire(self, uav: int, wall_ms: int) -> int:
         """Acquire an aircraft; return its epoch, above every known one and not below the clock's."""

@@ -18,49 +18,23 @@ from fleet.bus.codec import EncodedMessage, Stamp
 from fleet.bus.session import Bus
 from fleet.contract import (
     Handover,
-    History,
     Message,
     Mismatch,
-    Mission,
     Model,
-    Params,
     Prediction,
     Rows,
     Sample,
-    Status,
 )
 from twin_worker.alerts.hysteresis import AlertState
-from twin_worker.ownership.cold_start import continue_prediction, restore_model, stagger_work
+from twin_worker.ownership.cold_start import (
+    LATCHED_TYPES,
+    continue_prediction,
+    query_history,
+    restore_model,
+    stagger_work,
+)
 from twin_worker.ownership.handover import Snapshot, decode_snapshot, encode_snapshot
-from twin_worker.ownership.history_decoder import decode_history
 from twin_worker.twin.state.state import Twin, ingest
-
-QUERY_TIMEOUT_S = 0.5  # for one message from a gateway [s]
-_HISTORY_TIMEOUT_S = 2.0  # for a history of several megabytes [s]
-_TRIES = 2  # large answers are dropped on a congested link
-LATCHED_TYPES: tuple[type[Message], ...] = (Status, Params, Mission)
-"""Rare messages of which the last one stays valid."""
-
-
-def query_history(bus: Bus, uav: int, cached: Mapping[type, Message]) -> list[Message]:
-    """Query the past messages of an aircraft for a new twin; types in `cached` are not queried.
-
-    Raises:
-        ConnectionError: when the session is closed; stop, the worker is shutting down.
-    """
-    latched: list[Message] = []
-    for kind in LATCHED_TYPES:
-        latched += [cached[kind]] if kind in cached else [message for message, _ in bus.get(kind, uav, QUERY_TIMEOUT_S)]
-    for _ in range(_TRIES):
-        samples = [
-            sample
-            for sample in map(decode_history, bus.get_payloads(History, uav, _HISTORY_TIMEOUT_S))
-            if sample is not None and sample.uav == uav
-        ]
-        if samples:
-            return [*latched, *samples]
-    return latched
-
 
 _log = logging.getLogger(__name__)
 INBOX_SIZE = 4096  # queued messages per UAV; the oldest are dropped and counted
@@ -105,8 +79,8 @@ class Companion(Protocol):
         """Discard the data of an aircraft."""
 
 
-class LocalTwinStore:
-    """In-process `TwinStore`.
+class TwinStore:
+    """Stores the twins of the owned aircraft.
 
     Args:
         bus: connected bus
@@ -227,9 +201,8 @@ class LocalTwinStore:
             rollout = twin.prediction.last_rollout
             for message in past:
                 ingest(twin, message)
-            twin.prediction.set_rollout(
-                rollout
-            )  # mission and parameters are new only to this twin: the continued path used them already
+            # mission and parameters are new only to this twin: the continued path used them already
+            twin.prediction.set_rollout(rollout)
             restored = model is not None and restore_model(twin, model)
             stagger_work(
                 twin, phase, has_prediction=owned.ready and isfinite(twin.config.schedule.renew), has_model=restored
@@ -241,10 +214,11 @@ class LocalTwinStore:
         else:
             self._start(owned, twin, [])
 
-    def set_epoch(self, uav: int, epoch: int) -> None:
-        """Publish under another epoch from now on."""
-        if (owned := self.by_uav.get(uav)) is not None:
-            owned.epoch = epoch
+    def set_epochs(self, epochs: Mapping[int, int]) -> None:
+        """Publish these aircraft under other epochs from now on."""
+        for uav, epoch in epochs.items():
+            if (owned := self.by_uav.get(uav)) is not None:
+                owned.epoch = epoch
 
     def _reserve(self, uav: int) -> OwnedTwin:
         with self.lock:

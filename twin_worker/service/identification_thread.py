@@ -41,10 +41,7 @@ class CpuShareLimiter:
         cpu, wall = time.thread_time(), time.monotonic()
         task()
         cpu, wall = time.thread_time() - cpu, time.monotonic() - wall
-        self._rest(cpu, wall, stop or threading.Event())
-
-    def _rest(self, cpu: float, wall: float, stop: threading.Event) -> None:
-        process_cpu, started = time.process_time(), time.monotonic()
+        stop, process_cpu, started = stop or threading.Event(), time.process_time(), time.monotonic()
         while (
             time.process_time() - process_cpu < self.rest_s(cpu)
             and (remaining_s := self.rest_s(wall) - (time.monotonic() - started)) > 0.0
@@ -55,7 +52,6 @@ class CpuShareLimiter:
 
 _log = logging.getLogger(__name__)
 _IDLE_S = 0.05
-Publish = Callable[[Message, OwnedTwin], None]
 
 
 class IdentificationThread:
@@ -92,7 +88,13 @@ class IdentificationThread:
 
     def _run_one(self, owned: OwnedTwin) -> None:
         try:
-            self._identify(owned)
+            with owned.lock:
+                if not owned.ready:
+                    return
+                results = identify(owned.twin)
+            self._rates.record(Work.IDENTIFY, time.monotonic())
+            for result in results:
+                self._publish(result, owned)
         except Exception as error:  # an error in one aircraft must not stop the others
             owned.defect = f"{owned.twin.name}: found an internal error ({error}), expected a model; report it"
             _log.exception(owned.defect)
@@ -104,12 +106,3 @@ class IdentificationThread:
             if owned.twin.prediction.latest is not None and identify_due(owned.twin)
         ]
         return min(due, key=lambda owned: owned.twin.identification.timer.last, default=None)
-
-    def _identify(self, owned: OwnedTwin) -> None:
-        with owned.lock:
-            if not owned.ready:
-                return
-            results = identify(owned.twin)
-        self._rates.record(Work.IDENTIFY, time.monotonic())
-        for result in results:
-            self._publish(result, owned)

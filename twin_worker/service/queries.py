@@ -11,9 +11,8 @@ from msgspec import Raw
 
 from fleet.bus.codec import EncodedMessage, Stamp, encode
 from fleet.contract import Prediction, Predictions, WhatIf
-from twin_worker import whatif as query
 from twin_worker.ownership.twin_store import OwnedTwin
-from twin_worker.whatif import answer_query, read_grid, resample
+from twin_worker.whatif import answer_query, read_grid, read_query, resample
 
 _log = logging.getLogger(__name__)
 StampedMessages = Iterator[tuple[Any, Stamp]]
@@ -38,7 +37,12 @@ class QueryHandlers:
         """
         grid = read_grid(parameters)
         if payload:
-            what_ifs = self._what_if_predictions(uav, query.read_query(payload))
+            what_if = read_query(payload)
+            if uav is None:
+                raise ValueError(
+                    "what if: found a query for every aircraft, expected one; ask e.g. parauav/7/prediction"
+                )
+            what_ifs = [(owned, _run_what_if(owned, what_if)) for owned in self.select(uav)]
             return self.with_stamps((owned, resample(prediction, grid)) for owned, prediction in what_ifs)
         latest = ((owned, latest_prediction(owned)) for owned in self.select(uav))
         if grid is None:
@@ -63,23 +67,9 @@ class QueryHandlers:
         """Pair each message with its stamp; skip None."""
         return ((message, Stamp(owned.epoch, self._writer)) for owned, message in pairs if message is not None)
 
-    def _what_if_predictions(self, uav: int | None, what_if: WhatIf) -> list[tuple[OwnedTwin, Prediction]]:
-        """Run a what-if on a copy of one twin.
 
-        Raises:
-            ValueError: when it does not select a single aircraft, or its twin cannot run it; ask one UAV.
-        """
-        if uav is None:
-            raise ValueError("what if: found a query for every aircraft, expected one; ask e.g. parauav/7/prediction")
-        return [(owned, run_what_if(owned, what_if)) for owned in self.select(uav)]
-
-
-def run_what_if(owned: OwnedTwin, what_if: WhatIf) -> Prediction:
-    """Run a what-if on a copy of the twin, on the caller's thread.
-
-    Raises:
-        ValueError: when it cannot be answered; the message states the reason.
-    """
+def _run_what_if(owned: OwnedTwin, what_if: WhatIf) -> Prediction:
+    """Run a what-if on a copy of the twin, on the caller's thread; an internal error becomes a `ValueError`."""
     with owned.lock:
         twin = copy.deepcopy(owned.twin)
     try:

@@ -6,8 +6,7 @@ from fleet.airframes import GENERIC, load
 from fleet.airframes.airframe import servo_map
 from fleet.autopilots import arduplane, copter, greybox
 from fleet.autopilots.shadow import replay_controller
-from fleet.bus.codec import encode
-from fleet.contract import Array, History, Item, Prediction, Rows, Sample, TwinState
+from fleet.contract import Array, Item, Prediction, TwinState
 from fleet.frames import Origin, to_geodetic, wrap
 from fleet.mission import unroll_route
 from fleet.physics import point_mass
@@ -17,13 +16,12 @@ from twin_worker.alerts.traffic import TrafficMonitor
 from twin_worker.confidence.adaptive_conformal import AdaptiveLevels
 from twin_worker.confidence.prediction_log import PredictionLog
 from twin_worker.estimation.wind_filter import WindFilter
-from twin_worker.identification.fixed_wing import energy_balance as attitude_lag
 from twin_worker.identification.fixed_wing.derivatives_model import identify, linearise
+from twin_worker.identification.fixed_wing.energy_balance import fit_attitude_lag
 from twin_worker.identification.fixed_wing.plant import bias_corrected
 from twin_worker.identification.linear.linear_model import AXES, identify_axis
 from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.numerics.prediction_errors import AHEAD
-from twin_worker.ownership.history_decoder import decode_history
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.resample import Resampler
 from twin_worker.twin.state.flight_phase import speed_extremes
@@ -59,13 +57,11 @@ def warm_up() -> None:
 
     _run_point_mass((ctl.copy(), par, legs), window)
     ahead, factors = np.empty((5, 3)), np.ones(greybox.N_PAR)
-    greybox.follow(
-        kinematic_ctl, par, legs, factors, np.array([*window.p[-1], _SPEED, 0.0, 0.0, 0.0]), np.zeros(2), 0.1, ahead
-    )  # type: ignore
+    start = np.array([*window.p[-1], _SPEED, 0.0, 0.0, 0.0])
+    greybox.follow(kinematic_ctl, par, legs, factors, start, np.zeros(2), 0.1, ahead)  # type: ignore
     segments, parameters = np.ones((2, copter.N_SEGMENT)), np.ones(copter.N_PAR)
     _run_traffic()
     _run_propagation()
-    _run_history_decoder()
     _run_telemetry(window)
     _run_identification()
     copter.follow(np.zeros(copter.N_FOLLOW), segments, np.zeros(3), np.zeros(3), parameters, 0.1, ahead)  # type: ignore
@@ -81,7 +77,7 @@ def _run_point_mass(control: tuple[np.ndarray, np.ndarray, np.ndarray], window: 
     )
     batch = [np.tile(row, (2, 1)) for row in (parameters, air, start)]
     point_mass.simulate_ensemble(control, *batch, noise, np.arange(0, 17, 4), np.empty((2, 5, 3)))  # type: ignore
-    attitude_lag.identify(window.x[:, 6], window.x[:, 6])
+    fit_attitude_lag(window.x[:, 6], window.x[:, 6])
 
 
 def _run_traffic() -> None:
@@ -110,12 +106,6 @@ def _run_propagation() -> None:
     widen_tube(ahead, path, 1.0, np.empty((4, 3), np.float32))  # type: ignore[call-arg]
     speed_extremes(np.zeros((3, 3)))  # type: ignore[call-arg]
     WindFilter().update(1e9, np.array([_SPEED, 0.0, 0.0]), _SPEED, 0.0)
-
-
-def _run_history_decoder() -> None:
-    """Decode a history message."""
-    rows = Rows(t=Array.of([1e9], "<f8"), x=Array.of(np.zeros((1, 3))))
-    decode_history(encode(History(uav=0, t=1e9, samples=(Sample(uav=0, t=1e9, velocity=rows),))))
 
 
 def _run_telemetry(window: Window) -> None:

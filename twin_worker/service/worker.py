@@ -25,9 +25,10 @@ from twin_worker.alerts.hysteresis import AlertState
 from twin_worker.alerts.traffic import TrafficMonitor
 from twin_worker.mismatch.coordinator import Coordinator
 from twin_worker.mismatch.job import summary
+from twin_worker.ownership.cold_start import LATCHED_TYPES
 from twin_worker.ownership.handover import Snapshot
 from twin_worker.ownership.protocol import OwnershipProtocol
-from twin_worker.ownership.twin_store import LATCHED_TYPES, LocalTwinStore, OwnedTwin
+from twin_worker.ownership.twin_store import OwnedTwin, TwinStore
 from twin_worker.service.busy_fallback import (
     CHECK_PERIOD_S,
     fallback_prediction,
@@ -74,9 +75,8 @@ class Worker:
         self.bus, self.uavs, self.diagnosis = bus, uavs, diagnosis
         self.omega, self.method, self.airframe = omega, method, airframe or load(GENERIC)
         self.schedule = schedule or Schedule()
-        self._late_after_s = min(
-            max(_LATE_PERIODS * self.schedule.renew, _LATE_LIMITS_S[0]), _LATE_LIMITS_S[1]
-        )  # short for frequent propagation
+        # short for frequent propagation
+        self._late_after_s = min(max(_LATE_PERIODS * self.schedule.renew, _LATE_LIMITS_S[0]), _LATE_LIMITS_S[1])
         self.quota = ComputeBudget(max_limit=_HEAVY_SHARE * self._late_after_s)
         self.sentence = self._diagnosis_defect = ""
         self._diagnosis_resume_t = float("-inf")  # earliest next diagnosis [s, monotonic]
@@ -86,14 +86,12 @@ class Worker:
         self._sweep_start = float("-inf")  # start of the last sweep [s, monotonic]
         self._first_index = 0  # index of the first aircraft of the next sweep
         self.traffic = TrafficMonitor(separation or Separation())
-        self._twins = LocalTwinStore(bus, uavs, self._create_twin, self)
+        self._twins = TwinStore(bus, uavs, self._create_twin, self)
         self._twins.run_paced = self.cpu_share.run
         self._owned = self._twins.by_uav
         self.ownership = OwnershipProtocol(bus, uavs, self._twins)
         self._wakeup = threading.Event()
-        self._fallback_lock = (
-            threading.Lock()
-        )  # in use while fallback predictions are published; the sweep waits for it
+        self._fallback_lock = threading.Lock()  # in use while fallback predictions are published; the sweep waits
 
     def connect(self) -> None:
         """Subscribe, declare the query handlers, and query the aircraft that exist already."""

@@ -43,26 +43,17 @@ class AlphaBetaFilter:
             y: measured states, u v w over the ground, (n, 9)
             delta: actuator states, (n, 4)
         """
-        out = np.empty((len(y), N_X + 6))
-        _filter_rows(
-            y, delta, self.model.par, self.model.trim_velocity, self.dt, self.gust_decay, out, np.empty_like(y)
-        )
-        return out
+        return self._filter(y, delta)[0]
 
     def one_step(self, y: np.ndarray, delta: np.ndarray) -> np.ndarray:
         """Predict every row from the rows before it, (n, 9); the first is measured. Arguments as for `filter`."""
-        predicted = np.empty_like(y)
-        _filter_rows(
-            y,
-            delta,
-            self.model.par,
-            self.model.trim_velocity,
-            self.dt,
-            self.gust_decay,
-            np.empty((len(y), N_X + 6)),
-            predicted,
-        )
-        return predicted
+        return self._filter(y, delta)[1]
+
+    def _filter(self, y: np.ndarray, delta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        par, trim_velocity = self.model.par, self.model.trim_velocity
+        filtered, predicted = np.empty((len(y), N_X + 6)), np.empty_like(y)
+        _filter_rows(y, delta, par, trim_velocity, self.dt, self.gust_decay, filtered, predicted)
+        return filtered, predicted
 
     def free_run(self, filtered: np.ndarray, start_rows: np.ndarray, length: int, delta: np.ndarray) -> np.ndarray:
         """Simulate from filtered rows, (m, 15), at `start_rows`, (m,), with decaying gusts; return (m, length, 9)."""

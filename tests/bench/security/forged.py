@@ -31,9 +31,9 @@ class _Keeper:
         """Note the epoch."""
         self.epochs[uav] = epoch
 
-    def set_epoch(self, uav: int, epoch: int) -> None:
-        """Note the epoch."""
-        self.epochs[uav] = epoch
+    def set_epochs(self, epochs: dict[int, int]) -> None:
+        """Note the epochs."""
+        self.epochs.update(epochs)
 
     def release(self, uavs: object) -> None:
         """Do nothing."""

@@ -15,8 +15,9 @@ from fleet.bus.codec import encode
 from fleet.contract import Claim, Handover, HandoverRequest, History, Message, Sample, Status
 from tests.support import flights as f
 from tests.support.memory_bus import MemoryBus
+from twin_worker.ownership.cold_start import query_history
 from twin_worker.ownership.protocol import OwnershipProtocol
-from twin_worker.ownership.twin_store import INBOX_SIZE, query_history
+from twin_worker.ownership.twin_store import INBOX_SIZE
 from twin_worker.service.worker import Worker
 
 OTHER = WorkerToken("00000000000000aa", range(5), 1)

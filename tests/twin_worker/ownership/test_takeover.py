@@ -34,7 +34,7 @@ from gateway.publication import Publisher
 from tests.bench.asking.answerer import prediction
 from tests.support import flights as f
 from tests.support.memory_bus import MemoryBus
-from twin_worker.ownership.history_decoder import decode_history
+from twin_worker.ownership.cold_start import decode_history
 from twin_worker.ownership.protocol import OwnershipProtocol
 from twin_worker.service.worker import Worker
 from twin_worker.twin.state.budget import Schedule

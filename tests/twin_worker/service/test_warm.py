@@ -27,7 +27,7 @@ from numba.core.dispatcher import Dispatcher
 from fleet.bus.codec import encode
 from fleet.contract import History, Sample
 from twin_worker.ownership.handover import Snapshot, decode_snapshot, encode_snapshot
-from twin_worker.ownership.history_decoder import decode_history
+from twin_worker.ownership.cold_start import decode_history
 from twin_worker.twin.state.state import ingest
 
 ours = [name for name in sys.modules if name.startswith(("twin_worker", "fleet"))]

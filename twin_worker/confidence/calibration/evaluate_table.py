@@ -1,7 +1,5 @@
 """Evaluation of tables on given predictions: coverage, half-axes and horizons, with and without adaptation."""
 
-from collections.abc import Iterable
-
 import numpy as np
 from scipy.stats import spearmanr
 
@@ -82,7 +80,8 @@ def figures(predictions: ScoredPredictions, regions: Regions) -> dict[str, float
     valid: np.ndarray = np.isfinite(error[..., 0])
     inside = np.all(error[..., :3] <= tube, axis=2)
     out = {"coverage": _mean(inside[:, 1:][valid[:, 1:]])}
-    flights = [_mean(inside[in_flight, 1:][valid[in_flight, 1:]]) for in_flight in _masks_by_name(predictions.flight)]
+    masks = [predictions.flight == name for name in dict.fromkeys(predictions.flight.tolist())]
+    flights = [_mean(inside[in_flight, 1:][valid[in_flight, 1:]]) for in_flight in masks]
     out["coverage_worst_flight"] = float(np.nanmin(flights))
     for ahead_s, j in zip(REPORTED_S, _COLUMNS, strict=True):
         out[f"coverage_{ahead_s}"] = _mean(inside[valid[:, j], j])
@@ -104,10 +103,6 @@ def _horizon_figures(relative: np.ndarray, valid: np.ndarray, horizon: np.ndarra
         float(spearmanr(passage[complete], horizon[complete]).statistic) if varied else float("nan")
     )
     return out
-
-
-def _masks_by_name(names: np.ndarray) -> Iterable[np.ndarray]:
-    return (names == name for name in dict.fromkeys(names.tolist()))
 
 
 def _mean(values: np.ndarray) -> float:

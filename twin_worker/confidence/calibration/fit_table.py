@@ -115,9 +115,7 @@ def _max_likelihood(s2: np.ndarray, r2: np.ndarray, e2: np.ndarray) -> np.ndarra
 def fit(predictions: ScoredPredictions, group: str) -> CalibrationTable:
     """Fit the table of one group to its predictions; every score comes from a fit without its flight."""
     error, folds = predictions.errors()[..., :3], predictions.folds(group)
-    weight = (
-        1.0 / np.maximum(np.bincount(folds), _MIN_FLIGHT_STARTS)[folds]
-    )  # equal weight per flight, less for short ones
+    weight = 1.0 / np.maximum(np.bincount(folds), _MIN_FLIGHT_STARTS)[folds]  # equal per flight, less for short ones
     sigma = fit_sigma(predictions.features, error)
     ratio = np.empty(error.shape)  # to sigma
     batch = folds % min(_FOLDS, int(folds.max()) + 1)

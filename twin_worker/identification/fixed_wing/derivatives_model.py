@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg
 
 from fleet.airframes import Airframe, derivatives
-from fleet.contract import Array, LinearModel
+from fleet.contract import LinearModel
 from fleet.frames import G, ned_to_body
 from fleet.physics.dynamics import free_runs, jacobian, rates_of_change
 from fleet.physics.simulate import TAU, lagged
@@ -23,6 +23,7 @@ from twin_worker.identification.fixed_wing.output_error import (
     estimate,
     unbroken_segments,
 )
+from twin_worker.identification.linear.linear_model import about_trim
 
 _SIGMA_TABLE = {  # added to the derivative's magnitude; the sum is scaled by `doubt` of the airframe
     "X": {"0": 2.0, "u": 0.2, "w": 0.3, "de": 1.2, "dt": 1.0, "ww": 0.05},
@@ -86,6 +87,9 @@ EFFECTIVE_FRACTION = 0.12  # effective fraction of residuals, one in four sample
 COLD_STEPS, WARM_STEPS = 8, 1  # maximum steps of a first and of a repeated search
 # retained fraction of earlier information per window [-]
 _RETENTION, _RETENTION_OFFSETS, _RETENTION_WIND = 0.7, 0.5, 0.7
+_RETENTION_VECTOR = np.full(N_PAR, _RETENTION)
+_RETENTION_VECTOR[list(OFFSETS)] *= _RETENTION_OFFSETS
+_RETENTION_VECTOR[WIND:] *= _RETENTION_WIND
 
 
 @dataclass(frozen=True)
@@ -119,14 +123,13 @@ class DerivativesModel:
         """Return the covariance of the parameters, (37, 37)."""
         return np.linalg.inv(self.fisher_information + self.prior_precision)
 
-    def free_run(self, x0: np.ndarray, delta: np.ndarray, dt: float) -> np.ndarray:
-        """Simulate from x0 with actuator states, (n, 4); return states, (n, 9), nan after leaving the envelope."""
-        return self.free_run_segments(x0[None], np.zeros(1, np.int64), len(delta), delta, dt)
-
     def free_run_segments(
         self, starts: np.ndarray, start_rows: np.ndarray, length: int, delta: np.ndarray, dt: float
     ) -> np.ndarray:
-        """Simulate from several rows, `length` rows each; arguments as for `fleet.physics.dynamics.free_runs`."""
+        """Simulate from several rows, `length` rows each, nan after leaving the envelope, (n, 9).
+
+        Arguments as for `fleet.physics.dynamics.free_runs`.
+        """
         out = np.empty((len(delta), 9))
         free_runs(starts, start_rows, length, delta, self.par, self.trim_velocity, dt, out)
         return out
@@ -156,15 +159,14 @@ def identify(
     y, delta = window.over_ground, lagged(window.u, window.dt, TAU)
     mean, precision, trim_velocity, nominal = _prior_from(window, wind, airframe, prior_model)
     problem = EstimationProblem(y, delta, segments, trim_velocity, window.dt, EFFECTIVE_FRACTION)
+    result = None
     if warm_start is not None:
         result = estimate(problem, warm_start.par, (mean, precision), WARM_STEPS, warm_start.weight)
-    else:
+    if result is None or not _is_finite(result):
         result = estimate(problem, mean, (mean, precision), COLD_STEPS, None)
-    if warm_start is not None and not _is_finite(result):
-        result = estimate(problem, mean, (mean, precision), COLD_STEPS, None)
-    if prior_model is not None and not _is_finite(result):  # the earlier model misleads: restart without it
-        return identify(window, wind, airframe)
     if not _is_finite(result):
+        if prior_model is not None:  # the earlier model misleads: restart without it
+            return identify(window, wind, airframe)
         raise ValueError("identify: found no free run that stays in its envelope, needs one; wait for calmer flight")
     t = window.t
     return DerivativesModel(
@@ -216,11 +218,6 @@ def _prior_from(
     return mean, precision, prior_model.trim_velocity, prior_model.airframe_prior
 
 
-_RETENTION_VECTOR = np.full(N_PAR, _RETENTION)
-_RETENTION_VECTOR[list(OFFSETS)] *= _RETENTION_OFFSETS
-_RETENTION_VECTOR[WIND:] *= _RETENTION_WIND
-
-
 _AXES = (
     (("u", "w", "q", "theta"), ("delta_e", "delta_t")),
     (("phi", "psi", "p", "r", "v"), ("delta_a", "delta_r")),
@@ -263,16 +260,4 @@ def _axis(slopes: np.ndarray, x: np.ndarray, u: np.ndarray, axis: tuple, dt: flo
     n, m = len(rows), len(columns)
     augmented = np.zeros((n + m + 1, n + m + 1))
     augmented[:n] = slopes[np.ix_(rows, [*rows, *(len(x) + k for k in columns), -1])]
-    A, B, c = np.split(scipy.linalg.expm(augmented * dt)[:n], (n, n + m), axis=1)
-    shift = np.linalg.lstsq(np.eye(n) - A, c[:, 0], rcond=1e-3)[0]
-    return LinearModel(
-        states=names,
-        inputs=inputs,
-        A=Array.of(A),
-        B=Array.of(B),
-        C=Array.of(np.eye(n)),
-        D=Array.of(np.zeros((n, m))),
-        x_trim=Array.of(x[rows] + shift),
-        u_trim=Array.of(u[columns]),
-        dt_s=dt,
-    )
+    return about_trim(axis, scipy.linalg.expm(augmented * dt)[:n], (x[rows], u[columns]), dt)

@@ -10,6 +10,7 @@ import numba as nb
 import numpy as np
 
 from fleet.frames import G
+from twin_worker.numerics.gauss_newton import gauss_newton
 
 STEP = 0.1  # interval of the rows [s]
 _SUBSTEPS = 4
@@ -41,7 +42,7 @@ def second_order_response(command: np.ndarray, y: np.ndarray, lag: np.ndarray, o
             angle += h * rate
 
 
-def identify(command: np.ndarray, y: np.ndarray, warm_start: np.ndarray | None = None) -> np.ndarray:
+def fit_attitude_lag(command: np.ndarray, y: np.ndarray, warm_start: np.ndarray | None = None) -> np.ndarray:
     """Estimate wn, zeta, b that minimise the free-run error, (3,).
 
     Args:
@@ -52,31 +53,25 @@ def identify(command: np.ndarray, y: np.ndarray, warm_start: np.ndarray | None =
     weight = 1.0 / _NOISE / np.sqrt(_CORRELATED_ROWS)
     y, out = np.where(np.isfinite(y), y, 0.0), np.empty(len(y))
     valid = np.isfinite(command)
-    lag = (_PRIOR_MEAN if warm_start is None else warm_start).copy()
+    start = _PRIOR_MEAN if warm_start is None else warm_start
 
-    def residual_of(parameters: np.ndarray) -> np.ndarray:
-        second_order_response(command, y, parameters, out)
+    def residual_of(lag: np.ndarray) -> np.ndarray:
+        second_order_response(command, y, lag, out)
         return np.where(valid, (out - y) * weight, 0.0)
 
-    residual = residual_of(lag)
-    cost = _cost(residual, lag, weight)
-    for _ in range(_MAX_STEPS):
+    def linearise(lag: np.ndarray, count: int) -> tuple[float, np.ndarray, np.ndarray]:
+        residual = residual_of(lag)
         J = np.column_stack([(residual_of(lag + step) - residual) / step.sum() for step in np.diag(_DIFFERENCE_STEP)])
         huber_weight = 1.0 / np.maximum(np.abs(residual) / (_HUBER_LIMIT * weight * _NOISE), 1.0)
         H = (J * huber_weight[:, None]).T @ J + np.diag(_PRIOR_SIGMA**-2.0)
-        descent = np.linalg.solve(H, (J * huber_weight[:, None]).T @ residual + (lag - _PRIOR_MEAN) / _PRIOR_SIGMA**2)
-        for fraction in (1.0, 0.3, 0.1):
-            trial = np.clip(lag - fraction * descent, _LOWER, _UPPER)
-            trial_residual = residual_of(trial)
-            if _cost(trial_residual, trial, weight) < cost:
-                break
-        else:
-            break
-        gain = cost - _cost(trial_residual, trial, weight)
-        lag, residual, cost = trial, trial_residual, cost - gain
-        if gain < 1e-3 * cost:
-            break
-    return lag
+        ascent = (J * huber_weight[:, None]).T @ residual + (lag - _PRIOR_MEAN) / _PRIOR_SIGMA**2
+        return _cost(residual, lag, weight), H, -ascent
+
+    def move(lag: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, float]:
+        candidate = np.clip(lag + change, _LOWER, _UPPER)
+        return candidate, _cost(residual_of(candidate), candidate, weight)
+
+    return gauss_newton(start.copy(), linearise, move, steps=_MAX_STEPS, mu=0.0)[0]
 
 
 def _cost(residual: np.ndarray, lag: np.ndarray, weight: float) -> float:
@@ -120,11 +115,10 @@ class PointMassData:
 
 @dataclass(frozen=True)
 class RegressionResult:
-    """Result of a regression with a prior: value (k,), covariance (k, k), residual standard deviation."""
+    """Result of a regression with a prior: value (k,), covariance (k, k)."""
 
     value: np.ndarray
     cov: np.ndarray
-    residual_std: float
 
 
 def regress_with_prior(X: np.ndarray, y: np.ndarray, prior: tuple[np.ndarray, np.ndarray, float]) -> RegressionResult:
@@ -133,7 +127,7 @@ def regress_with_prior(X: np.ndarray, y: np.ndarray, prior: tuple[np.ndarray, np
     information = X.T @ X / _WINDOW_ROWS / noise**2 + np.diag(prior_sigma**-2.0)
     cov = np.linalg.inv(information)
     value = cov @ (X.T @ y / _WINDOW_ROWS / noise**2 + prior_mean / prior_sigma**2)
-    return RegressionResult(value, cov, float(np.std(y - X @ value)))
+    return RegressionResult(value, cov)
 
 
 def moving_mean(x: np.ndarray) -> np.ndarray:
@@ -196,6 +190,6 @@ def fit_excess_power(data: PointMassData, t_0: float, V_0: float) -> RegressionR
     prior_mean[1] = _THRUST_SLOPE * G / _GLIDE_RATIO / max(t_0, 0.15)
     if np.isfinite(instruments).all():
         X = instruments @ np.linalg.lstsq(instruments, X, rcond=1e-6)[0]
-        return regress_with_prior(X, y, (prior_mean, prior_sigma, noise))
-    X[:, 1:] = 0.0
+    else:
+        X[:, 1:] = 0.0
     return regress_with_prior(X, y, (prior_mean, prior_sigma, noise))

@@ -16,6 +16,7 @@ import numpy as np
 from fleet.physics.dynamics import N_X, is_diverged, jacobian, step
 from fleet.physics.kernel import kernel, no_alloc_kernel
 from fleet.physics.wrench import N_AERO, N_PAR, ROW, WIND
+from twin_worker.numerics.gauss_newton import gauss_newton
 
 GROUP = 4  # samples per residual; 2 ** _DOUBLINGS
 _DOUBLINGS = 2
@@ -136,8 +137,8 @@ SIGMA = np.array([0.08, 0.08, 0.08, 0.005, 0.005, 0.005, 0.004, 0.004, 0.008])  
 SEGMENT_S = 10.0  # free run [s]
 MIN_SEGMENT_S = 2.0  # shorter segments between gaps are ignored [s]
 LINE_SAMPLES = 6  # samples of the line fit of a segment's start state [-]
-_MIN_DESCENT = 1e-3  # relative descent that stops the search [-]
-_MAX_DAMPINGS = 6  # maximum damping values per step
+_WEIGHT_UPDATES = (1, 3)  # steps before which a cold search updates the weights
+Point = tuple[np.ndarray, np.ndarray]  # parameters (37,), start states (m, 9)
 
 
 @dataclass(frozen=True)
@@ -210,10 +211,8 @@ class _GaussNewton:
     def __init__(self, problem: EstimationProblem, par0: np.ndarray, Lambda: np.ndarray) -> None:
         self.problem, self.par0, self.Lambda = problem, par0, Lambda
         measured = [problem.y[a:b] for a, b in problem.segments]
-        self.start_prior, self.state_std = (
-            np.array([line_fit_start(y) for y in measured]),
-            np.concatenate(measured).std(axis=0),
-        )
+        self.start_prior = np.array([line_fit_start(y) for y in measured])
+        self.state_std = np.concatenate(measured).std(axis=0)
         self.K = 1.0 / SIGMA**2
         lengths = (problem.segments[:, 1] - problem.segments[:, 0]) // GROUP
         self.bounds = np.concatenate([[0], np.cumsum(lengths)])
@@ -227,10 +226,7 @@ class _GaussNewton:
         squares = residuals_and_jacobian(
             par, starts, problem.segments, problem.y, problem.delta, problem.trim_velocity, problem.dt, np.sqrt(W), e, J
         )
-        par_offset, start_offset = par - self.par0, starts - self.start_prior
-        return problem.effective_fraction * squares + float(
-            par_offset @ self.Lambda @ par_offset + (self.K * start_offset**2).sum()
-        )
+        return self.cost(squares, par, starts)
 
     def update_weights(self, W: np.ndarray) -> np.ndarray:
         """Estimate W from the residuals; rescale residuals and sensitivities."""
@@ -240,10 +236,10 @@ class _GaussNewton:
         self.J *= ratio[:, None]
         return W_new
 
-    def cost(self, par: np.ndarray, starts: np.ndarray) -> float:
-        """Return the cost of the stored residuals."""
+    def cost(self, squares: float, par: np.ndarray, starts: np.ndarray) -> float:
+        """Return the cost for a sum of squared residuals."""
         par_offset, start_offset = par - self.par0, starts - self.start_prior
-        return self.problem.effective_fraction * float((self.e**2).sum()) + float(
+        return self.problem.effective_fraction * squares + float(
             par_offset @ self.Lambda @ par_offset + (self.K * start_offset**2).sum()
         )
 
@@ -291,35 +287,35 @@ def estimate(
         return EstimationResult(par, np.zeros((N_PAR, N_PAR)), SIGMA**-2, 0, float("nan"))
 
 
-def _descend(optimiser: _GaussNewton, par: np.ndarray, steps: int, weight: np.ndarray | None) -> EstimationResult:
+def _descend(problem: _GaussNewton, par: np.ndarray, steps: int, weight: np.ndarray | None) -> EstimationResult:
     cold = weight is None
-    W = 1.0 / np.maximum(0.05 * optimiser.state_std**2, SIGMA**2) if weight is None else weight
-    starts, mu, steps_taken = optimiser.start_prior.copy(), 1e-3 if cold else 1e-5, 0
-    cost = optimiser.simulate(par, starts, W, True)
-    H = np.zeros((N_PAR, N_PAR))
-    for count in range(steps):
+    W = 1.0 / np.maximum(0.05 * problem.state_std**2, SIGMA**2) if weight is None else weight
+    H, start_moves = np.zeros((N_PAR, N_PAR)), np.empty(0)
+
+    def linearise(x: Point, count: int) -> tuple[float, np.ndarray, np.ndarray]:
+        nonlocal W, H, start_moves
+        cost = problem.simulate(*x, W, True)
         if not np.isfinite(cost):
-            break
-        if cold and count in (1, 3):
-            W = optimiser.update_weights(W)
-            cost = optimiser.cost(par, starts)
-        H, g, start_moves = optimiser.normal_equations(par, starts)
-        lhs = H + optimiser.Lambda
-        for _ in range(_MAX_DAMPINGS):
-            move = np.linalg.solve(lhs + np.diag(mu * np.diag(lhs)), g)
-            candidate = par + move, starts + start_moves[..., -1] - start_moves[..., :-1] @ move
-            trial_cost = optimiser.simulate(*candidate, W, False)
-            if trial_cost < cost:
-                break
-            mu = max(8 * mu, 1e-3)
-        else:
-            break
-        (par, starts), mu, steps_taken = candidate, max(mu / 5, 1e-6), steps_taken + 1
-        descent, cost = cost - trial_cost, trial_cost
-        if (not cold or count > 3) and descent < _MIN_DESCENT * cost:
-            break
-        if count < steps - 1:
-            cost = optimiser.simulate(par, starts, W, True)
+            return cost, H, H[0]
+        if cold and count in _WEIGHT_UPDATES:
+            W = problem.update_weights(W)
+            cost = problem.cost(float((problem.e**2).sum()), *x)
+        H, g, start_moves = problem.normal_equations(*x)
+        return cost, H + problem.Lambda, g
+
+    def move(x: Point, change: np.ndarray) -> tuple[Point, float]:
+        candidate = x[0] + change, x[1] + start_moves[..., -1] - start_moves[..., :-1] @ change
+        return candidate, problem.simulate(*candidate, W, False)
+
+    start = par, problem.start_prior.copy()
+    (par, _), cost, steps_taken = gauss_newton(
+        start,
+        linearise,
+        move,
+        steps=steps,
+        mu=1e-3 if cold else 1e-5,
+        converges_from=_WEIGHT_UPDATES[-1] + 1 if cold else 0,
+    )
     if not cold and np.isfinite(cost):
-        W = 1.0 / np.maximum(0.9 / W + 0.1 * (optimiser.e**2).mean(axis=0) / W, SIGMA**2)
+        W = 1.0 / np.maximum(0.9 / W + 0.1 * (problem.e**2).mean(axis=0) / W, SIGMA**2)
     return EstimationResult(par, H, W, steps_taken, cost if np.isfinite(cost) else float("nan"))

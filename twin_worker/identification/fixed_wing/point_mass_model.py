@@ -6,19 +6,24 @@ import numpy as np
 
 from fleet.physics import point_mass as H
 from fleet.window import Window
-from twin_worker.identification.fixed_wing import energy_balance
-from twin_worker.identification.fixed_wing import energy_balance as attitude_lag
 from twin_worker.identification.fixed_wing.energy_balance import (
+    STEP,
     PointMassData,
     RegressionResult,
     excess_power_residual,
+    fit_angle_of_attack,
+    fit_attitude_lag,
+    fit_excess_power,
+    fit_turn_rate,
     load_factor,
 )
+from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.numerics.ridge_regression import solve_ridge
 from twin_worker.telemetry.history import TelemetryHistory
 
 FIT_WINDOW_S = 120.0  # identification window [s]
 MIN_FIT_S = 20.0  # minimum window [s]
+_MAX_COMMAND_AGE_S = 1.0  # longest hold of a reported command [s]
 _SMOOTH_ROWS = 51  # smoothing of the commanded height [rows]
 
 
@@ -38,7 +43,7 @@ class PointMassModel:
 
 
 def point_mass_data(window: Window, history: TelemetryHistory, scale: float) -> PointMassData:
-    """Resample the flight in rows of `attitude_lag.STEP`, newest last.
+    """Resample the flight in rows of `STEP`, newest last.
 
     Args:
         window: telemetry without gaps
@@ -50,7 +55,7 @@ def point_mass_data(window: Window, history: TelemetryHistory, scale: float) -> 
     def resampled(x: np.ndarray) -> np.ndarray:
         return np.interp(times, window.t, x)
 
-    commands = _reported_commands(history, times)
+    commands = zero_order_hold(*history.rows_since("command", times[0] - 2.0), times, _MAX_COMMAND_AGE_S)
     h = -resampled(window.p[:, 2])
     V_c = commands[:, 4] + V / scale
     return PointMassData(
@@ -69,8 +74,8 @@ def point_mass_data(window: Window, history: TelemetryHistory, scale: float) -> 
 
 
 def airspeed_of(window: Window, history: TelemetryHistory, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return times at `attitude_lag.STEP`, newest last, (n,) [s], and true airspeed, (n,) [m/s]."""
-    times = window.t[-1] - attitude_lag.STEP * np.arange(int(window.seconds / attitude_lag.STEP) + 1)[::-1]
+    """Return times at `STEP`, newest last, (n,) [s], and true airspeed, (n,) [m/s]."""
+    times = window.t[-1] - STEP * np.arange(int(window.seconds / STEP) + 1)[::-1]
     t_air, air = history.rows_since("air", times[0] - 2.0)
     if len(t_air) > 1 and float(air[:, 0].max()) > 3.0:
         return times, np.interp(times, t_air, air[:, 0]) * scale
@@ -80,22 +85,8 @@ def airspeed_of(window: Window, history: TelemetryHistory, scale: float) -> tupl
 def _climb_command(h_c: np.ndarray) -> np.ndarray:
     """Return the smoothed slope of the commanded height, (n,) [m/s]; a step counts as a climb."""
     padded = np.pad(h_c, _SMOOTH_ROWS // 2, mode="edge")
-    return np.clip(
-        np.gradient(np.convolve(padded, np.ones(_SMOOTH_ROWS) / _SMOOTH_ROWS, "valid")[: len(h_c)], attitude_lag.STEP),
-        -5.0,
-        5.0,
-    )
-
-
-def _reported_commands(history: TelemetryHistory, times: np.ndarray) -> np.ndarray:
-    """Return the reported commands, zero-order hold for at most 1 s, nan where missing, (n, 5)."""
-    t, x = history.rows_since("command", times[0] - 2.0)
-    if not len(t):
-        return np.full((len(times), 5), np.nan)
-    k = np.searchsorted(t, times, side="right") - 1
-    out = x[np.clip(k, 0, None)].copy()
-    out[(k < 0) | (times - t[np.clip(k, 0, None)] > 1.0)] = np.nan
-    return out
+    smoothed = np.convolve(padded, np.ones(_SMOOTH_ROWS) / _SMOOTH_ROWS, "valid")[: len(h_c)]
+    return np.clip(np.gradient(smoothed, STEP), -5.0, 5.0)
 
 
 def identify(
@@ -117,10 +108,10 @@ def identify(
     parameters[[H.T_0, H.V_0]] = data.delta_t.mean(), data.V.mean()
     for first, command, angle in ((H.WN_PHI, data.phi_c, data.phi), (H.WN_THETA, data.theta_c, data.theta)):
         warm_lag = None if warm_start is None else warm_start.parameters[first : first + 3]
-        parameters[first : first + 3] = attitude_lag.identify(command, angle, warm_lag)
-    parameters[H.K_PSI : H.B_PSI + 1] = energy_balance.fit_turn_rate(data).value
-    parameters[H.A_0 : H.A_N + 1] = energy_balance.fit_angle_of_attack(data, parameters[H.V_0]).value
-    excess_power = energy_balance.fit_excess_power(data, parameters[H.T_0], parameters[H.V_0])
+        parameters[first : first + 3] = fit_attitude_lag(command, angle, warm_lag)
+    parameters[H.K_PSI : H.B_PSI + 1] = fit_turn_rate(data).value
+    parameters[H.A_0 : H.A_N + 1] = fit_angle_of_attack(data, parameters[H.V_0]).value
+    excess_power = fit_excess_power(data, parameters[H.T_0], parameters[H.V_0])
     parameters[H.C_0 : H.C_N + 1] = excess_power.value
     return PointMassModel(parameters, excess_power, float(window.t[-1]))
 
@@ -166,19 +157,15 @@ def with_effects(
     parameters[H.C_0 : H.C_N + 1] += d_power
     if window.seconds >= _MIN_FIT_S:
         data = point_mass_data(window, history, scale)
-        for column, faulty in zip((H.WN_PHI, H.WN_THETA), increments.servo_faulty, strict=True):
+        lags = ((H.WN_PHI, data.phi_c, data.phi), (H.WN_THETA, data.theta_c, data.theta))
+        for (first, command, angle), faulty in zip(lags, increments.servo_faulty, strict=True):
             if faulty:
-                parameters[column : column + 3] = _lag(data, column, parameters[column : column + 3])
+                parameters[first : first + 3] = fit_attitude_lag(command, angle, parameters[first : first + 3])
         parameters[H.C_0] += float(
             excess_power_residual(data, parameters[H.C_0 : H.C_N + 1], parameters[H.T_0], parameters[H.V_0]).mean()
         )
     cov = model.excess_power.cov + np.diag((_INCREMENT_SIGMA * d_power) ** 2)
     return PointMassModel(parameters, replace(model.excess_power, cov=cov), float(window.t[-1]))
-
-
-def _lag(data: PointMassData, column: int, warm_start: np.ndarray) -> np.ndarray:
-    command, angle = (data.phi_c, data.phi) if column == H.WN_PHI else (data.theta_c, data.theta)
-    return attitude_lag.identify(command, angle, warm_start)
 
 
 def _power_increments(parameters: np.ndarray, increments: EffectIncrements) -> np.ndarray:

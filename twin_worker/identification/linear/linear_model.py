@@ -84,6 +84,7 @@ def _entry_sigma(row: str, column: str, slope: float | None) -> float:
 
 
 AXES = tuple(STATES)
+_MAX_POLE_RADIUS = 1.02  # largest pole of a first-step model; the prior mean replaces an unstable one [-]
 _PRIOR_SCALE = 0.3  # prior standard deviation of a verified model, relative to that of a generic fixed wing [-]
 
 
@@ -127,21 +128,34 @@ class AxisModel:
 
     def linear(self) -> LinearModel:
         """Export as matrices about the trim point (the offset c moves into the trim). Source: Huang 2021 eq. 2-4."""
-        n, m = len(self.y_mean), len(self.u_mean)
-        D = self.physical()
-        A, B, c = D[:, :n], D[:, n : n + m], D[:, -1]
-        shift = np.linalg.lstsq(np.eye(n) - A, c, rcond=1e-3)[0]
-        return LinearModel(
-            states=self.states,
-            inputs=self.inputs,
-            A=Array.of(A),
-            B=Array.of(B),
-            C=Array.of(np.eye(n)),
-            D=Array.of(np.zeros((n, m))),
-            x_trim=Array.of(self.y_mean + shift),
-            u_trim=Array.of(self.u_mean),
-            dt_s=self.dt,
-        )
+        return about_trim((self.states, self.inputs), self.physical(), (self.y_mean, self.u_mean), self.dt)
+
+
+def about_trim(
+    names: tuple[tuple[str, ...], tuple[str, ...]], D: np.ndarray, mean: tuple[np.ndarray, np.ndarray], dt: float
+) -> LinearModel:
+    """Export x' = A x + B u + c as matrices about the trim point: the offset c moves into the trim.
+
+    Args:
+        names: states and inputs
+        D: [A B c] for deviations from the mean, (n, n + m + 1)
+        mean: states (n,) and inputs (m,)
+        dt: sample time [s]
+    """
+    n, m = map(len, mean)
+    A, B, c = D[:, :n], D[:, n : n + m], D[:, -1]
+    shift = np.linalg.lstsq(np.eye(n) - A, c, rcond=1e-3)[0]
+    return LinearModel(
+        states=names[0],
+        inputs=names[1],
+        A=Array.of(A),
+        B=Array.of(B),
+        C=Array.of(np.eye(n)),
+        D=Array.of(np.zeros((n, m))),
+        x_trim=Array.of(mean[0] + shift),
+        u_trim=Array.of(mean[1]),
+        dt_s=dt,
+    )
 
 
 def identify_axis(
@@ -174,17 +188,10 @@ def identify_axis(
     mean, sigma = mean * column_scale / y_scale[:, None], sigma * column_scale / y_scale[:, None]
     A, B = subspace(y, u, ok)
     first = np.hstack([A, B, np.zeros((len(A), 1))])
-    first = _stable_or_prior(first, mean)
+    if not (np.isfinite(first).all() and np.abs(np.linalg.eigvals(A)).max() < _MAX_POLE_RADIUS):
+        first = mean.copy()
     length = max(int(length_s / window.dt), 10)
     refined = refine(first, y, u, ok, prior=mean, precision=sigma**-2.0, length=length)
     return tuple(  # type: ignore[return-value]
         AxisModel(states, inputs, D, y_mean, y_scale, u_mean, u_scale, window.dt) for D in (first, refined)
     )
-
-
-def _stable_or_prior(D: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    """Return the first-step model, or the prior mean if that model is not finite or unstable."""
-    n = len(D)
-    if np.isfinite(D).all() and np.abs(np.linalg.eigvals(D[:, :n])).max() < 1.02:
-        return D
-    return mean.copy()

@@ -1,4 +1,4 @@
-"""`StateSpace`: a discrete linear model of any order with simulation, prediction, transformation, stabilisation.
+"""`StateSpace`: a discrete linear model of any order with simulation, transformation, stabilisation.
 
 x' = A x + B u + K e + c,  y = C x + D u + e;  D = 0 in closed loop with an autopilot.
 """
@@ -10,8 +10,6 @@ import numpy as np
 from twin_worker.identification.linear.prediction_error_method import free_run
 
 _MAX_RADIUS = 0.9995  # largest pole radius after stabilisation [-]
-_GRAMIAN_WEIGHT = 0.01  # weight of the observability Gramian against the fit [-]
-_CAP = 1e6  # bound of the observability rows [scaled units]
 
 
 @dataclass(frozen=True)
@@ -59,41 +57,6 @@ class StateSpace:
         step = np.hstack([self.A, self.B, self.c[:, None]])
         free_run(step, np.asarray(self.x0 if x0 is None else x0, float), np.ascontiguousarray(u, float), x)
         return x @ self.C.T + u @ self.D.T
-
-    def one_step(self, y: np.ndarray, u: np.ndarray, x0: np.ndarray | None = None) -> np.ndarray:
-        """Predict every y (N, l) from the samples before it."""
-        predictor = StateSpace(
-            A=self.A - self.K @ self.C,
-            B=np.hstack([self.B - self.K @ self.D, self.K]),
-            C=self.C,
-            K=self.K,
-            c=self.c,
-            x0=self.x0,
-            D=np.hstack([self.D, np.zeros((len(self.C), len(self.C)))]),
-        )
-        return predictor.run(np.hstack([u, y]), x0)
-
-    def estimate_x0(self, y: np.ndarray, u: np.ndarray, length: int) -> np.ndarray:
-        """Estimate the state at the first sample by regularised least squares, (n,).
-
-        The observability Gramian of the complete run is the regulariser: it prevents an uncertain state from growing
-        into a large error later.
-
-        Args:
-            y, u: the first outputs (k, l) and inputs (k, m) of the run
-            length: samples of the complete run
-        """
-        residual = y - self.run(u, np.zeros(self.order))
-        observability = np.empty((len(y), *self.C.shape))
-        gramian, row = np.zeros((self.order, self.order)), self.C
-        for k in range(length):
-            if k < len(y):
-                observability[k] = row
-            gramian += row.T @ row
-            row = np.clip(row @ self.A, -_CAP, _CAP)
-        rows = observability.reshape(-1, self.order)
-        lhs = rows.T @ rows + _GRAMIAN_WEIGHT * len(y) / length * gramian
-        return np.linalg.lstsq(lhs, rows.T @ residual.ravel(), rcond=1e-12)[0]
 
     def transformed(self, T: np.ndarray) -> "StateSpace":
         """Return the equivalent model with state T x."""

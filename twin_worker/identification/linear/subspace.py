@@ -12,11 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin_worker.identification.linear.black_box_prediction_error import fit_inputs
 from twin_worker.identification.linear.state_space import StateSpace
+from twin_worker.numerics.ridge_regression import solve_ridge
 
 PAST = 12  # samples of the past in the regression [-]
 FUTURE = 8  # block rows of the observability matrix [-]
+_RIDGE = 1e-3  # regularisation per sample [-]
+_INPUT_PENALTY = 1e-5  # ridge penalty of B, c and x0 [-]
 _MIN_INDEPENDENCE = 1e-8  # minimum fraction of a column that is independent of the others [-]
 
 
@@ -26,13 +28,11 @@ class SubspaceStates:
 
     Attributes:
         x: sqrt(S) V', most important first, (most, N')
-        singular_values: singular value of each state, (most,)
         y, u: outputs and inputs of the same samples, (N', l), (N', m)
         rows: indices of these samples, (N',)
     """
 
     x: np.ndarray
-    singular_values: np.ndarray
     y: np.ndarray
     u: np.ndarray
     rows: np.ndarray
@@ -57,7 +57,7 @@ class SubspaceStates:
 
 
 def subspace_states(
-    y: np.ndarray, u: np.ndarray, ok: np.ndarray, *, past: int = PAST, future: int = FUTURE, ridge: float = 1e-3
+    y: np.ndarray, u: np.ndarray, ok: np.ndarray, *, past: int = PAST, future: int = FUTURE
 ) -> SubspaceStates:
     """Estimate the states of all orders up to outputs times `future`.
 
@@ -67,28 +67,32 @@ def subspace_states(
         ok: measured rows, (N,) bool
         past: samples in the vector autoregression, at least `future`
         future: block rows of the observability matrix
-        ridge: regularisation per sample [-]
     Raises:
         ValueError: if there are too few gap-free rows; wait for a longer window.
     """
     n = y.shape[1]
     k = n + u.shape[1]
     past_rows = np.hstack([np.hstack([y[past - i : -i], u[past - i : -i]]) for i in range(1, past + 1)])
-    unbroken = (
-        np.lib.stride_tricks.sliding_window_view(ok, past + 1).all(axis=1) if len(ok) > past else np.zeros(0, bool)
-    )
+    unbroken = _unbroken(ok, past + 1)
     if unbroken.sum() < 3 * past * k:
         raise ValueError(f"subspace: found {unbroken.sum()} unbroken rows, needs {3 * past * k}; wait for more")
     z, target = past_rows[unbroken], y[past:][unbroken]
     moment = z.T @ z
-    markov = np.linalg.solve(moment + ridge * len(z) * np.eye(z.shape[1]), z.T @ target).T  # [C B~, C A~ B~, ...]
+    markov = np.linalg.solve(moment + _RIDGE * len(z) * np.eye(z.shape[1]), z.T @ target).T  # [C B~, C A~ B~, ...]
     # block row i of the observability matrix times the reachability matrix: the same coefficients, i steps later
     shifted = [np.hstack([markov[:, i * k :], np.zeros((n, i * k))]) for i in range(future)]
     product = np.vstack(shifted)
     squared, left_vectors = np.linalg.eigh(product @ moment @ product.T)  # of (product z')(product z')', a small matrix
     squared, left_vectors = np.maximum(squared[::-1], 1e-12), left_vectors[:, ::-1]
     x = squared[:, None] ** -0.25 * (left_vectors.T @ product @ z.T)  # sqrt(S) V'
-    return SubspaceStates(x, np.sqrt(squared), target, u[past:][unbroken], np.flatnonzero(unbroken))
+    return SubspaceStates(x, target, u[past:][unbroken], np.flatnonzero(unbroken))
+
+
+def _unbroken(ok: np.ndarray, length: int) -> np.ndarray:
+    """Return at which rows `length` measured rows begin, (N - length + 1,) bool."""
+    if len(ok) < length:
+        return np.zeros(0, bool)
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(ok, length).all(axis=1))
 
 
 def pbsid(
@@ -133,20 +137,19 @@ def check_excitation(y: np.ndarray, u: np.ndarray, ok: np.ndarray) -> None:
             raise ValueError(f"subspace: {name} {column} repeats the columns before it; leave it out")
 
 
-def subspace(y: np.ndarray, u: np.ndarray, ok: np.ndarray, ridge: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
+def subspace(y: np.ndarray, u: np.ndarray, ok: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Identify x' = A x + B u + K e, y = x + e of order n = number of outputs.
 
     Args:
         y: outputs, zero mean and unit scale, (N, n)
         u: inputs, zero mean and unit scale; a constant input gets almost no effect, (N, m)
         ok: measured rows, (N,) bool
-        ridge: regularisation per sample [-]
     Returns:
         A (n, n), B (n, m)
     Raises:
         ValueError: if there are too few gap-free rows; wait for a longer window.
     """
-    model = subspace_states(y, u, ok, ridge=ridge).model(y.shape[1]).outputs_as_states()
+    model = subspace_states(y, u, ok).model(y.shape[1]).outputs_as_states()
     return model.A, model.B
 
 
@@ -172,9 +175,7 @@ def projection(
     l, m = y.shape[1], u.shape[1]
     if not 1 <= order <= l * (depth - 1):
         raise ValueError(f"projection: found order {order}, expected 1..{l * (depth - 1)}; lower it or raise the depth")
-    unbroken = (
-        np.lib.stride_tricks.sliding_window_view(ok, depth).all(axis=1) if len(ok) >= depth else np.zeros(0, bool)
-    )
+    unbroken = _unbroken(ok, depth)
     if unbroken.sum() < 2 * depth * (l + m):
         raise ValueError(
             f"projection: found {unbroken.sum()} unbroken rows, needs {2 * depth * (l + m)}; wait for more"
@@ -187,6 +188,31 @@ def projection(
     C, A = O[:l], np.linalg.lstsq(O[:-l], O[l:], rcond=None)[0]  # eq. 7
     start = StateSpace.of(A, np.zeros((order, m)), C)
     return fit_inputs(start.stabilised(), y, u, ok=ok)  # eq. 15
+
+
+def fit_inputs(
+    model: StateSpace, y: np.ndarray, u: np.ndarray, *, ok: np.ndarray, with_bias: bool = False
+) -> StateSpace:
+    """Solve B, x0 and, with a bias, c for given A and C by least squares on the free run.
+
+    Args:
+        model: A and C
+        y, u: scaled outputs (N, l) and inputs (N, m)
+        ok: fitted rows, (N,) bool; the others are simulated
+        with_bias: include a constant state bias c
+    Source: Huang 2021, eq. 15 with D = 0.
+    """
+    n, m = model.order, u.shape[1]
+    w = np.hstack([u, np.ones((len(u), 1))]) if with_bias else u
+    q = w.shape[1]
+    responses = [
+        StateSpace.of(model.A, unit[: n * q].reshape(n, q), model.C, x0=unit[n * q :]).run(w)[ok].ravel()
+        for unit in np.eye(n * q + n)
+    ]
+    solution = solve_ridge(np.column_stack(responses), y[ok].ravel(), _INPUT_PENALTY)
+    G = solution[: n * q].reshape(n, q)
+    c = G[:, m] if with_bias else np.zeros(n)
+    return StateSpace.of(model.A, G[:, :m], model.C, c=c, x0=solution[n * q :])
 
 
 def _hankel(data: np.ndarray, depth: int) -> np.ndarray:

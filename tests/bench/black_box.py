@@ -8,7 +8,7 @@ J = sum_k e' e,  e = y - y_hat over the measured rows of one long run; D = 0.
 Source: Huang 2021, eq. 16-17; Ljung 1999, sections 7.3 and 10.2; McKelvey, Helmersson 2004 (free parametrisation).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numba as nb
 import numpy as np
@@ -18,6 +18,8 @@ from twin_worker.identification.linear.state_space import StateSpace
 
 _BLOCK = 64  # samples per block product [-]
 _CAP = 1e4  # divergence limit of a run [scaled units]
+_GRAMIAN_WEIGHT = 0.01  # weight of the observability Gramian against the fit [-]
+_ROW_CAP = 1e6  # bound of the observability rows [scaled units]
 
 
 @nb.njit(cache=True, nogil=True)
@@ -191,25 +193,38 @@ def _damped_step(g: np.ndarray, H: np.ndarray, mu: float) -> np.ndarray:
     return scaling * scipy.linalg.solve(scaled, scaling * g, assume_a="pos")
 
 
-def fit_inputs(
-    model: StateSpace, y: np.ndarray, u: np.ndarray, ok: np.ndarray | None = None, with_bias: bool = False
-) -> StateSpace:
-    """Solve B, c and x0 for given A and C by least squares on the free run.
+def one_step(model: StateSpace, y: np.ndarray, u: np.ndarray, x0: np.ndarray | None = None) -> np.ndarray:
+    """Predict every y (N, l) from the samples before it."""
+    predictor = StateSpace(
+        A=model.A - model.K @ model.C,
+        B=np.hstack([model.B - model.K @ model.D, model.K]),
+        C=model.C,
+        K=model.K,
+        c=model.c,
+        x0=model.x0,
+        D=np.hstack([model.D, np.zeros((len(model.C), len(model.C)))]),
+    )
+    return predictor.run(np.hstack([u, y]), x0)
 
-    Source: Huang 2021, eq. 15 with D = 0.
+
+def estimate_x0(model: StateSpace, y: np.ndarray, u: np.ndarray, length: int) -> np.ndarray:
+    """Estimate the state at the first sample by regularised least squares, (n,).
+
+    The observability Gramian of the complete run is the regulariser: it prevents an uncertain state from growing
+    into a large error later.
+
+    Args:
+        y, u: the first outputs (k, l) and inputs (k, m) of the run
+        length: samples of the complete run
     """
-    parametrisation = _parametrise(model, y, u, ok, innovations_form=False, with_bias=with_bias)
-    zero_input = replace(
-        model, B=np.zeros((model.order, u.shape[1])), c=np.zeros(model.order), x0=np.zeros(model.order)
-    )
-    par = parametrisation.pack(zero_input)
-    squares, g, H = normal_equations(*parametrisation.matrices(par), parametrisation.y, parametrisation.w)
-    free = np.ones(len(par), bool)
-    free[: parametrisation.offsets[0]] = np.tile(
-        np.arange(model.order + parametrisation.w.shape[1]) >= model.order, model.order
-    )
-    free[parametrisation.offsets[0] : parametrisation.offsets[1]] = False
-    if not np.isfinite(squares).all():
-        return model
-    par[free] = _damped_step(g[free], H[np.ix_(free, free)], 1e-10)
-    return parametrisation.unpack(par)
+    residual = y - model.run(u, np.zeros(model.order))
+    observability = np.empty((len(y), *model.C.shape))
+    gramian, row = np.zeros((model.order, model.order)), model.C
+    for k in range(length):
+        if k < len(y):
+            observability[k] = row
+        gramian += row.T @ row
+        row = np.clip(row @ model.A, -_ROW_CAP, _ROW_CAP)
+    rows = observability.reshape(-1, model.order)
+    lhs = rows.T @ rows + _GRAMIAN_WEIGHT * len(y) / length * gramian
+    return np.linalg.lstsq(lhs, rows.T @ residual.ravel(), rcond=1e-12)[0]
