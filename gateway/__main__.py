@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
     gc.set_threshold(GC_THRESHOLD, *gc.get_threshold()[1:])
     enable_malloc_trim(TRIM_BYTES)
     with connect(bus_config_from(args, GATEWAY), retry=budget is not None) as bus, contextlib.ExitStack() as stack:
-        stack.enter_context(replay_process(files, args, _log.warning))
+        stack.enter_context(replay_process(files, args))
         links: list[Endpoint] = []
         ids = IdAllocator()
         for spec in specs:
