@@ -217,9 +217,8 @@ class Publisher:
             if kind in RESULT_TYPES and getattr(message, "kind", None) is not AlertKind.SECOND_SENDER:
                 message, stamp = self._with_epoch(message)
             if kind in self._latest:
-                self._store_latest(
-                    kind, (getattr(message, "uav", 0), str(getattr(message, "kind", ""))), message, stamp
-                )
+                key = (getattr(message, "uav", 0), str(getattr(message, "kind", "")))
+                self._store_latest(kind, key, message, stamp)
             wire = EncodedMessage(kind, message.uav if kind in PER_UAV else -1, encode(message), message.t)
             self._send([wire], stamp)
 
@@ -237,9 +236,8 @@ class Publisher:
 
     def snapshot(self) -> StatusSnapshot:
         """Return the newest statistics, and the newest status of every aircraft by id."""
-        return self.newest_account, [
-            s for s, _ in sorted(self._answer_latest(Status, None, {}, b""), key=lambda pair: pair[0].uav)
-        ]
+        statuses = [status for status, _ in self._answer_latest(Status, None, {}, b"")]
+        return self.newest_account, sorted(statuses, key=lambda status: status.uav)
 
     def repeat(self, now: float) -> None:
         """Repeat missions and parameters when due; `now` is any monotonic clock [s]."""
@@ -286,8 +284,5 @@ class Publisher:
 
     def _answer_account(self, uav: int | None, settings: dict[str, str], payload: bytes) -> Replies:
         del uav, settings, payload
-        return (
-            []
-            if self.newest_account is None
-            else [(msgspec.structs.replace(self.newest_account, wall_t=time.time()), None)]
-        )
+        account = self.newest_account
+        return [] if account is None else [(msgspec.structs.replace(account, wall_t=time.time()), None)]
