@@ -37,9 +37,7 @@ SWITCH_S = 5e-4  # longest wait of a receiving thread for the interpreter [s]
 COLD_S = 2.0  # compilation that takes longer is logged [s]
 COMPILING = "compiling the decoder for this machine, once; links open when that is done"
 GC_THRESHOLD = 50_000  # allocations between cycle collections; a tick allocates thousands of objects without cycles
-TRIM_BYTES = (
-    1 << 20
-)  # larger allocations are returned to the system: batches of a flood, not those of every tick [bytes]
+TRIM_BYTES = 1 << 20  # larger allocations are returned to the system: batches of a flood, not of every tick [bytes]
 DEFAULT_LINK = "udpin:127.0.0.1:14550"
 EXAMPLES = """
   gateway                                              listen on loopback, port 14550
@@ -79,17 +77,15 @@ def run(args: argparse.Namespace) -> int:
     if args.most_uavs < 1:
         raise ValueError(f"--most-uavs: found {args.most_uavs}, expected at least 1; write e.g. 250")
     gates = make_admissions(specs, len(args.forward), args.keys)
-    budget = (
-        DiskBudget(args.record, read_size(args.record_budget, "--record-budget")) if args.record is not None else None
-    )
+    disk = DiskBudget(args.record, read_size(args.record_budget, "--record-budget")) if args.record else None
     stop = stop_on_signal()
     sys.setswitchinterval(SWITCH_S)
     compile_decoder()
     gc.freeze()
     gc.set_threshold(GC_THRESHOLD, *gc.get_threshold()[1:])
     enable_malloc_trim(TRIM_BYTES)
-    with connect(bus_config_from(args, GATEWAY), retry=budget is not None) as bus, contextlib.ExitStack() as stack:
-        stack.enter_context(replay_process(files, args, _log.warning))
+    with connect(bus_config_from(args, GATEWAY), retry=disk is not None) as bus, contextlib.ExitStack() as stack:
+        stack.enter_context(replay_process(files, args))
         links: list[Endpoint] = []
         ids = IdAllocator()
         for spec in specs:
@@ -101,9 +97,9 @@ def run(args: argparse.Namespace) -> int:
         with show_progress(replays, _report):
             for replay in replays:
                 replay.read_ahead(stop)
-            recorder = (
-                None if budget is None else stack.enter_context(LinkRecorder(budget, [spec.text for spec in specs]))
-            )
+            recorder = LinkRecorder(disk, [spec.text for spec in specs]) if disk is not None else None
+            if recorder is not None:
+                stack.enter_context(recorder)
             pipeline = Pipeline(
                 links,
                 bus,
@@ -119,9 +115,8 @@ def run(args: argparse.Namespace) -> int:
                 console = Console() if sys.stdout.isatty() and not replays else None
                 stack.enter_context(status_display(pipeline.publisher.snapshot, _report, console))
             if args.metrics:
-                _report(
-                    f"counters at {stack.enter_context(serve(args.metrics, counters(pipeline.publisher.snapshot)))}"
-                )
+                address = stack.enter_context(serve(args.metrics, counters(pipeline.publisher.snapshot)))
+                _report(f"counters at {address}")
             pipeline.run(stop)
     return 0
 

@@ -18,12 +18,11 @@ from fleet.telemetry.mavlink.parsing.scan import COMPONENT, EXTRA, START, STOP, 
 from fleet.telemetry.mavlink.parsing.scan import SIGNED as FLAG
 from gateway.link_spec import LinkSpec, MessageFilter
 
-WRONG, REPLAYED, STALE, UNSIGNED = (
-    "signature: wrong",
-    "signature: its time was used before",
-    "signature: its time lies more than a minute back",
-    "signature: none, and this link requires one",
-)
+FILTERED = "excluded by the filter of the link"
+WRONG = "signature: wrong"
+REPLAYED = "signature: its time was used before"
+STALE = "signature: its time lies more than a minute back"
+UNSIGNED = "signature: none, and this link requires one"
 _EPOCH_S = 1_420_070_400  # 2015-01-01 [s since 1970]
 _UNITS = 100_000  # of a time stamp [1/s]
 _WINDOW = 60 * _UNITS  # oldest time accepted from a new sender
@@ -93,12 +92,9 @@ class Signing:
     def verify(self, frames: Frames, refused: Counter[str]) -> np.ndarray:
         """Return whether each frame is accepted, (n,) bool; refused frames are counted by reason."""
         passed = np.ones(len(frames.headers), bool)
-        for i in range(len(frames.headers)):
-            columns = frames.headers[i]
-            reason = self._rejection_reason(
-                frames.buf[columns[START] : columns[STOP]].tobytes(), int(columns[SYSTEM]), int(columns[COMPONENT])
-            )
-            if reason:
+        for i, header in enumerate(frames.headers.tolist()):
+            frame = frames.buf[header[START] : header[STOP]].tobytes()
+            if reason := self._rejection_reason(frame, header[SYSTEM], header[COMPONENT]):
                 passed[i] = False
                 refused[reason] += 1
         return passed
@@ -134,9 +130,6 @@ class Signing:
 
     def _signature(self, signed: bytes) -> bytes:
         return hashlib.sha256(self._key + signed).digest()[:_SIGNATURE]
-
-
-FILTERED = "excluded by the filter of the link"
 
 
 class Admission:
@@ -179,12 +172,10 @@ def make_admissions(specs: Sequence[LinkSpec], stations: int = 0, keys: Path | N
     keys_by_name = read_keys(keys) if keys is not None else {}
     admissions = []
     for number, spec in enumerate(specs):
-        signing = (
-            Signing(select_key(keys_by_name, spec.key, spec.text), spec.sign == "require", number)
-            if spec.sign
-            else None
-        )
-        admissions.append(
-            Admission(spec.message_filter if number < len(specs) - stations else MessageFilter(), signing)
-        )
+        signing = None
+        if spec.sign:
+            key = select_key(keys_by_name, spec.key, spec.text)
+            signing = Signing(key, spec.sign == "require", number)
+        is_station = number >= len(specs) - stations
+        admissions.append(Admission(MessageFilter() if is_station else spec.message_filter, signing))
     return admissions

@@ -40,10 +40,8 @@ class Routes:
         keys, last, number = np.unique(key[::-1], return_index=True, return_inverse=True)
         arrivals = frames.arrival[::-1][last].tolist()
         owns = [
-            self._claim(
-                Port(link, frames.senders[packed_key >> 16]), (packed_key >> 8 & 0xFF, packed_key & 0xFF), arrival
-            )
-            for packed_key, arrival in zip(keys.tolist(), arrivals, strict=True)
+            self._claim(Port(link, frames.senders[one >> 16]), (one >> 8 & 0xFF, one & 0xFF), arrival)
+            for one, arrival in zip(keys.tolist(), arrivals, strict=True)
         ]
         return np.array(owns, bool)[number[::-1]]
 
@@ -58,9 +56,7 @@ class Routes:
         """Return the ports of a component; component 0: of all components of the system."""
         if component:
             return [self._routes[system, component][0]] if (system, component) in self._routes else []
-        return list(
-            dict.fromkeys(port for (owner_system, _), (port, _) in self._routes.items() if owner_system == system)
-        )
+        return list(dict.fromkeys(port for (owner, _), (port, _) in self._routes.items() if owner == system))
 
     def peers(self, link: int) -> list[Hashable]:
         """Return the peers of one link that have sent frames."""
@@ -96,9 +92,8 @@ def targets(frames: Frames) -> tuple[np.ndarray, np.ndarray]:
 
 def _read_field(frames: Frames, offsets: np.ndarray) -> np.ndarray:
     frame_offsets, values = offsets[frames.headers[:, ID]], np.zeros(len(frames.headers), np.int64)
-    present = np.flatnonzero(
-        (frame_offsets != ABSENT) & (frame_offsets < frames.headers[:, SIZE])
-    )  # trailing zeros are not transmitted
+    sent = frame_offsets < frames.headers[:, SIZE]  # trailing zeros are not
+    present = np.flatnonzero((frame_offsets != ABSENT) & sent)
     values[present] = frames.buf[frames.headers[present, PAYLOAD] + frame_offsets[present]]
     return values
 

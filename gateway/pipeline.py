@@ -4,7 +4,7 @@ import gc
 import queue
 import threading
 import time
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 
 import msgspec
 
@@ -60,17 +60,15 @@ class Pipeline:
     ) -> None:
         self.links = links
         self.forwarder = FrameForwarder(links, stations, listen_only)
-        self._admissions = (
-            make_admissions([link.spec for link in links], stations) if admissions is None else admissions
-        )
+        self._admissions = admissions or make_admissions([link.spec for link in links], stations)
         self._unforwarded: set[int] = set()  # links with frames to forward
         self._new_bytes = 0  # bytes received since the last publication
         self._stations = range(len(links) - stations, len(links))
         self.statistics = StatisticsCollector(links, recorder)
         self.publisher = Publisher(bus, results=any(link.spec.results for link in links))
-        aircraft_by_uav = self._aircraft_by_uav = dict[int, AircraftLink]()
+        self._aircraft_by_uav: dict[int, AircraftLink] = {}
         self.intakes = [
-            MavlinkReceiver(link.spec.offset, aircraft_by_uav, max_uavs, admission.admit)
+            MavlinkReceiver(link.spec.offset, self._aircraft_by_uav, max_uavs, admission.admit)
             for link, admission in zip(links, self._admissions, strict=True)
         ]
         self._requesters = [RequestSender(budget_of(link.spec, budget), cache) for link in links]
@@ -151,20 +149,22 @@ class Pipeline:
         self._forward_pending()
         self._new_bytes = 0
         for number in self._live:
-            intake, link, admission, now = self.intakes[number], self.links[number], self._admissions[number], wall()
+            intake, now = self.intakes[number], wall()
             messages = intake.flush_packed(now)
             self.publisher.put([message for message in messages if isinstance(message, EncodedMessage)])
             self.publisher.publish([one for one in messages if not isinstance(one, EncodedMessage)])
             if not self._listen_only:
-                for where, data in self._requesters[number].tick(now, intake.aircraft.values(), link.known_peers):
-                    self._send(number, where, admission.sign(data))
+                self._send_requests(number, now)
         self.publisher.repeat(mono)
 
-    def _send(self, number: int, where: Hashable, data: bytes) -> None:
-        self.links[number].send(where, data)
-        self.statistics.sent(number, len(data))
-        if self._recorder is not None:
-            self._recorder.add(number, ReceivedBytes.from_pieces([(wall(), ("sent", where), data)]))
+    def _send_requests(self, number: int, now: float) -> None:
+        link, aircraft = self.links[number], self.intakes[number].aircraft.values()
+        for where, unsigned in self._requesters[number].tick(now, aircraft, link.known_peers):
+            data = self._admissions[number].sign(unsigned)
+            link.send(where, data)
+            self.statistics.sent(number, len(data))
+            if self._recorder is not None:
+                self._recorder.add(number, ReceivedBytes.from_pieces([(wall(), ("sent", where), data)]))
 
     def _remove_silent(self, now: float) -> None:
         """Remove silent aircraft of live links; `now` is fleet time [s since 1970]."""
@@ -177,7 +177,8 @@ class Pipeline:
         now = wall() if self._live else self._newest_recorded_t
         self._remove_silent(wall())
         self.forwarder.remove_silent(wall())
-        shares = [requester.share for requester in self._requesters]
-        account = self.statistics.account(now, self.intakes, self._replayed_uavs, self.publisher.session, shares)
+        account = self.statistics.account(
+            now, self.intakes, self._replayed_uavs, self.publisher.session, self._requesters
+        )
         refused, history_bytes = {**account.refused, **self.forwarder.refused}, self.publisher.history.size
         self.publisher.account(msgspec.structs.replace(account, refused=refused, history_bytes=history_bytes))

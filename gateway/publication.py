@@ -5,7 +5,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import partial
 from math import isfinite
 from typing import Any
@@ -201,9 +201,10 @@ class Publisher:
         self._bus = bus
         self._lock = threading.Lock()  # queries arrive on a thread of the bus
         kinds = tuple(dict.fromkeys(LATEST_KINDS + RESULT_TYPES)) if results else LATEST_KINDS
-        self._latest: dict[type, dict[Hashable, tuple[Any, Stamp | None]]] = {kind: {} for kind in kinds}
+        self._latest: dict[type, dict[tuple[int, str], tuple[EncodedMessage, Stamp | None]]] = {
+            kind: {} for kind in kinds
+        }
         self.newest_account: GatewayCounters | None = None  # the newest statistics
-        self._repeated_wires: dict[tuple[type, int], EncodedMessage] = {}  # the latest mission and parameters, packed
         self._repeated_t = 0.0
         for kind in kinds:
             bus.declare_queryable(kind, partial(self._answer_latest, kind))
@@ -213,22 +214,14 @@ class Publisher:
     def publish(self, messages: Iterable[Any]) -> None:
         """Put messages on the bus."""
         for message in messages:
-            kind = type(message)
-            stamp = None
+            kind, stamp = type(message), None
             if kind in RESULT_TYPES and getattr(message, "kind", None) is not AlertKind.SECOND_SENDER:
                 message, stamp = self._with_epoch(message)
-            if kind in self._latest:
-                self._store_latest(
-                    kind, (getattr(message, "uav", 0), str(getattr(message, "kind", ""))), message, stamp
-                )
             wire = EncodedMessage(kind, message.uav if kind in PER_UAV else -1, encode(message), message.t)
-            self._send([wire], stamp)
+            self._send([wire], str(getattr(message, "kind", "")), stamp)
 
     def put(self, wires: Sequence[EncodedMessage]) -> None:
         """Put packed messages on the bus; they never contain results of workers."""
-        for wire in wires:
-            if wire.kind in self._latest:
-                self._store_latest(wire.kind, (wire.uav, ""), wire, None)
         self._send(wires)
 
     def account(self, account: GatewayCounters) -> None:
@@ -238,9 +231,8 @@ class Publisher:
 
     def snapshot(self) -> StatusSnapshot:
         """Return the newest statistics, and the newest status of every aircraft by id."""
-        return self.newest_account, [
-            s for s, _ in sorted(self._answer_latest(Status, None, {}, b""), key=lambda pair: pair[0].uav)
-        ]
+        statuses = [status for status, _ in self._answer_latest(Status, None, {}, b"")]
+        return self.newest_account, sorted(statuses, key=lambda status: status.uav)
 
     def repeat(self, now: float) -> None:
         """Repeat missions and parameters when due; `now` is any monotonic clock [s]."""
@@ -248,27 +240,24 @@ class Publisher:
         if now - self._repeated_t < REPEAT_S and not connected:
             return
         self._repeated_t = now
-        self._send(list(self._repeated_wires.values()))
+        self._send([wire for kind in REPEATED_KINDS for wire, _ in self._latest[kind].values()])
 
     def remove(self, uavs: Collection[int]) -> None:
         """Remove aircraft; queries no longer return them."""
         with self._lock:
             for kind, latest in self._latest.items():
-                self._latest[kind] = {
-                    key: entry for key, entry in latest.items() if getattr(entry[0], "uav", -1) not in uavs
-                }
-        self._repeated_wires = {who: wire for who, wire in self._repeated_wires.items() if who[1] not in uavs}
+                self._latest[kind] = {key: entry for key, entry in latest.items() if entry[0].uav not in uavs}
         self.history.remove(uavs)
         self._bus.remove_publishers(uavs)
 
-    def _send(self, wires: Sequence[EncodedMessage], stamp: Stamp | None = None) -> None:
-        self._repeated_wires.update({(wire.kind, wire.uav): wire for wire in wires if wire.kind in REPEATED_KINDS})
+    def _send(self, wires: Sequence[EncodedMessage], variant: str = "", stamp: Stamp | None = None) -> None:
+        """Store and put messages; the latest of each `variant`, e.g. kind of alert, is stored."""
+        with self._lock:
+            for wire in wires:
+                if wire.kind in self._latest:
+                    self._latest[wire.kind][wire.uav, variant] = wire, stamp
         self.history.add(wires)
         self.session.send(wires, stamp)
-
-    def _store_latest(self, kind: type, key: Hashable, message: Any, stamp: Stamp | None) -> None:
-        with self._lock:
-            self._latest[kind][key] = message, stamp
 
     def _with_epoch(self, message: Any) -> tuple[Any, Stamp]:
         """Stamp a recorded result with a new epoch, which supersedes results of workers for the same aircraft."""
@@ -282,13 +271,9 @@ class Publisher:
         del settings, payload
         with self._lock:
             entries = list(self._latest[kind].values())
-        answers = [(entry.message() if isinstance(entry, EncodedMessage) else entry, stamp) for entry, stamp in entries]
-        return [(one, stamp) for one, stamp in answers if uav is None or getattr(one, "uav", uav) == uav]
+        return [(wire.message(), stamp) for wire, stamp in entries if uav is None or wire.uav in (uav, -1)]
 
     def _answer_account(self, uav: int | None, settings: dict[str, str], payload: bytes) -> Replies:
         del uav, settings, payload
-        return (
-            []
-            if self.newest_account is None
-            else [(msgspec.structs.replace(self.newest_account, wall_t=time.time()), None)]
-        )
+        account = self.newest_account
+        return [] if account is None else [(msgspec.structs.replace(account, wall_t=time.time()), None)]

@@ -24,7 +24,7 @@ from fleet.report.progress import run_alongside
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
 from gateway.links.link import Endpoint
-from gateway.onboard.questions import RateShare
+from gateway.onboard import RequestSender
 from gateway.publication import RouterSession, StatusSnapshot
 from gateway.record.recorder import LinkRecorder, RecordingCounters
 from gateway.record.tape import format_size
@@ -98,46 +98,36 @@ def render(account: GatewayCounters, statuses: list[Status]) -> Group:
     """Render the statistics as tables."""
     warnings = [link.sentence for link in account.per_link if link.sentence]
     warnings += [] if account.uavs or not account.sentence else [account.sentence]
-    parts: list[Text | Table] = [
-        Text(format_line(account, statuses)),
-        _links(account),
-        *([_uavs(statuses)] if statuses else []),
-    ]
-    return Group(*parts, *(Text(f"! {printable(warning)}") for warning in warnings))
+    tables = [_links(account), *([_uavs(statuses)] if statuses else [])]
+    return Group(
+        Text(format_line(account, statuses)), *tables, *(Text(f"! {printable(warning)}") for warning in warnings)
+    )
 
 
 def _links(account: GatewayCounters) -> Table:
-    table = _columns(
-        "link", "bytes/s", "messages/s", "bad frames", "bad bytes", "dropped", "overrun", "sent", "recorded"
-    )
+    titles = ("link", "bytes/s", "messages/s", "bad frames", "bad bytes", "dropped", "overrun", "sent", "recorded")
+    table = _columns(*titles)
     for link in account.per_link:
-        numbers = (
-            link.bad_frames,
-            link.bad_bytes,
-            link.dropped,
-            "-" if link.overrun is None else link.overrun,
-            link.sent,
-        )
-        size_text = format_size(link.recorded) + (f" (-{format_size(link.unrecorded)})" if link.unrecorded else "")
+        overrun = "-" if link.overrun is None else link.overrun
+        counts = (link.bad_frames, link.bad_bytes, link.dropped, overrun, link.sent)
+        recorded = format_size(link.recorded) if link.recorded or link.unrecorded else "-"
+        recorded += f" (-{format_size(link.unrecorded)})" if link.unrecorded else ""
         rates = (format_size(link.bytes_s), f"{link.messages_hz:.0f}")
-        recorded_text = size_text if link.recorded or link.unrecorded else "-"
-        table.add_row(escape(printable(link.link)), *rates, *map(str, numbers), recorded_text)
+        table.add_row(escape(printable(link.link)), *rates, *map(str, counts), recorded)
     return table
 
 
 def _uavs(statuses: list[Status]) -> Table:
-    table = _columns(
-        "UAV", "link", "mode", "messages/s", "received", "missed", "rejected", "latency ms", "round trip ms"
-    )
+    titles = ("UAV", "link", "mode", "messages/s", "received", "missed", "rejected", "latency ms", "round trip ms")
+    table = _columns(*titles)
     table.add_column("", overflow="fold")
     shown = sorted(statuses, key=lambda s: (s.link is Link.LIVE and not s.sentence, s.uav))[:MAX_UAVS_SHOWN]
     for s in sorted(shown, key=lambda s: s.uav):
         later = f"{s.latency_s * 1e3:.0f} ({s.latency_worst_s * 1e3:.0f})"
         trip = "-" if s.round_trip_s is None else f"{s.round_trip_s * 1e3:.0f}"
         counts = (f"{sum(s.rates_hz.values()):.0f}", str(s.received), str(s.missed), str(s.rejected))
-        table.add_row(
-            str(s.uav), s.link.value, escape(printable(s.mode)), *counts, later, trip, escape(printable(s.sentence))
-        )
+        mode, sentence = escape(printable(s.mode)), escape(printable(s.sentence))
+        table.add_row(str(s.uav), s.link.value, mode, *counts, later, trip, sentence)
     if len(statuses) > len(shown):
         table.caption = f"{len(statuses) - len(shown)} more without warnings"
     return table
@@ -152,6 +142,7 @@ def _columns(first: str, *others: str) -> Table:
 
 
 SMOOTHING = 0.3  # weight of the newest second in a rate
+_SUMMED = ("datagrams", "bytes_in", "messages", "bad_bytes", "bad_frames")  # over the links; exported per link
 _PROC_FILES = (Path("/proc/net/udp"), Path("/proc/net/udp6"))
 
 
@@ -199,14 +190,14 @@ class StatisticsCollector:
         intakes: Sequence[MavlinkReceiver],
         replayed: set[int],
         session: RouterSession,
-        shares: Sequence[RateShare],
+        requesters: Sequence[RequestSender],
     ) -> GatewayCounters:
         """Return the statistics message; `t` is fleet time [s since 1970], `replayed` the UAV ids of recordings."""
-        recordings = (
-            self._recorder.counters() if self._recorder is not None else [RecordingCounters() for _ in self._links]
-        )
+        recorder = self._recorder
+        recordings = [RecordingCounters()] * len(self._links) if recorder is None else recorder.counters()
         self._overruns = overruns()
-        accounts = tuple(self._link(t, k, intakes[k], recordings[k], share) for k, share in enumerate(shares))
+        rows = zip(intakes, recordings, requesters, strict=True)
+        accounts = tuple(self._link(t, number, *row) for number, row in enumerate(rows))
         refused: Counter[str] = Counter()
         uavs = set(replayed)
         for intake in intakes:
@@ -220,11 +211,7 @@ class StatisticsCollector:
             t=t,
             links=tuple(link.link for link in accounts),
             uavs=tuple(sorted(uavs)),
-            datagrams=sum(link.datagrams for link in accounts),
-            bytes_in=sum(link.bytes_in for link in accounts),
-            messages=sum(link.messages for link in accounts),
-            bad_bytes=sum(link.bad_bytes for link in accounts),
-            bad_frames=sum(link.bad_frames for link in accounts),
+            **{name: sum(getattr(link, name) for link in accounts) for name in _SUMMED},
             refused=dict(refused),
             sentence="" if uavs else "no aircraft received yet; send its telemetry to one of the links",
             per_link=accounts,
@@ -232,14 +219,14 @@ class StatisticsCollector:
             unsent=session.unsent,
             unconfirmed=session.unconfirmed,
             router=session.connected,
-            removed=self._recorder.budget.removed if self._recorder is not None else 0,
+            removed=0 if recorder is None else recorder.budget.removed,
             wall_t=time.time(),
             machine=platform.node(),
             code=SOURCES,
         )
 
     def _link(
-        self, t: float, number: int, intake: MavlinkReceiver, recording: RecordingCounters, share: RateShare
+        self, t: float, number: int, intake: MavlinkReceiver, recording: RecordingCounters, requester: RequestSender
     ) -> LinkCounters:
         flow, link, counts = self._flows[number], self._links[number], intake.counters()
         flow.measure(t, counts["messages"])
@@ -261,8 +248,8 @@ class StatisticsCollector:
             noise=recording.noise,
             unrecorded=recording.lost + recording.dropped,
             unwritten=recording.waiting,
-            rate_fraction=share.value,
-            sentence="; ".join(filter(None, (recording.fault, share.sentence, getattr(link, "damage", "")))),
+            rate_fraction=requester.share,
+            sentence="; ".join(filter(None, (recording.fault, requester.sentence, getattr(link, "damage", "")))),
         )
 
 
@@ -279,26 +266,11 @@ def overruns(files: Sequence[Path] = _PROC_FILES) -> Counter[int]:
     return dropped
 
 
-GAUGES = {
-    "bytes_s",
-    "messages_hz",
-    "unwritten",
-    "rate_fraction",
-    "router",
-    "history_bytes",
-    "link",
-    "armed",
-    "clock_offset_s",
-}
-GAUGES |= {"clock_drift", "latency_s", "latency_worst_s", "round_trip_s", "gps_offset_s"}
-_RENAMED = {
-    "bytes_s": "bytes_per_second",
-    "overrun": "overrun_datagrams",
-    "dropped": "dropped_datagrams",
-    "sent": "sent_datagrams",
-}
-_PER_LINK = {"t", "wall_t", "datagrams", "bytes_in", "messages", "bad_bytes", "bad_frames"}  # exported per link
-_GATEWAY = MetricNaming("parauav_gateway", gauges=GAUGES, renamed=_RENAMED, excluded=_PER_LINK)
+GAUGES = {"bytes_s", "messages_hz", "unwritten", "rate_fraction", "router", "history_bytes", "link", "armed"}
+GAUGES |= {"clock_offset_s", "clock_drift", "latency_s", "latency_worst_s", "round_trip_s", "gps_offset_s"}
+_RENAMED = {"bytes_s": "bytes_per_second"}
+_RENAMED |= {name: f"{name}_datagrams" for name in ("overrun", "dropped", "sent")}
+_GATEWAY = MetricNaming("parauav_gateway", gauges=GAUGES, renamed=_RENAMED, excluded=("t", "wall_t", *_SUMMED))
 _LINK = MetricNaming("parauav_link", ("link",), GAUGES, _RENAMED)
 _UAV = MetricNaming("parauav_uav", ("uav",), GAUGES, _RENAMED)
 

@@ -6,21 +6,19 @@ Source: recvmmsg(2), udp(7), socket(7), cmsg(3); structures as in <sys/socket.h>
 import ctypes
 import logging
 import mmap
-import queue
 import selectors
 import socket
 import sys
-import threading
 import time
-from collections.abc import Hashable, Sequence
-from typing import Any, Protocol, cast
+from collections.abc import Hashable
+from typing import Any, cast
 
 import numba as nb
 import numpy as np
 
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes, compact, read_only
 from gateway.link_spec import LinkSpec
-from gateway.links.link import POLL_S, BackOff, Batch, BatchWriter, wall
+from gateway.links.link import FIRST_RETRY_S, LAST_RETRY_S, POLL_S, Endpoint, wall
 
 MAX_DATAGRAMS = 256  # datagrams per batch, at most 16 MB
 SLOT_BYTES = 65_536  # maximum size of a datagram [bytes]
@@ -32,16 +30,18 @@ _STAMPED = socket.SOL_SOCKET | _TIMESTAMPNS << 32
 _MAX_DELAY_S = 1.0  # upper bound of the delay of a datagram, for steps of the system's clock
 _MAX_ADDRESSES = 4096  # parsed addresses that are cached
 _DONTWAIT = getattr(socket, "MSG_DONTWAIT", 0)
+_VECTOR = np.dtype([("base", "u8"), ("size", "u8")])  # struct iovec
+_MESSAGE = np.dtype(  # struct mmsghdr
+    {
+        "names": ["name", "name_size", "vectors", "vector_count", "control", "control_size", "length"],
+        "formats": ["u8", "u4", "u8", "u8", "u8", "u8", "u4"],
+        "offsets": [0, 8, 16, 24, 32, 40, 56],
+        "itemsize": 64,
+    }
+)
 
 
-class Receiver(Protocol):
-    """Receiver of the pending datagrams of a socket."""
-
-    def receive(self) -> ReceivedBytes | None:
-        """Return the pending datagrams; None without any."""
-
-
-def make_receiver(sock: socket.socket) -> Receiver:
+def make_receiver(sock: socket.socket) -> "BatchReceiver | SingleReceiver":
     """Return the fastest way to read a socket on this machine."""
     try:
         return BatchReceiver(sock)
@@ -68,26 +68,6 @@ class SingleReceiver:
         return ReceivedBytes.from_pieces(pieces) if pieces else None
 
 
-class _Vector(ctypes.Structure):
-    _fields_ = (("base", ctypes.c_void_p), ("size", ctypes.c_size_t))
-
-
-class _Header(ctypes.Structure):
-    _fields_ = (
-        ("name", ctypes.c_void_p),
-        ("name_size", ctypes.c_uint32),
-        ("vectors", ctypes.c_void_p),
-        ("vector_count", ctypes.c_size_t),
-        ("control", ctypes.c_void_p),
-        ("control_size", ctypes.c_size_t),
-        ("flags", ctypes.c_int),
-    )
-
-
-class _Message(ctypes.Structure):
-    _fields_ = (("header", _Header), ("length", ctypes.c_uint32))
-
-
 class BatchReceiver:
     """Receiver of up to `MAX_DATAGRAMS` per call; pages touched by long datagrams are returned to the system."""
 
@@ -104,36 +84,29 @@ class BatchReceiver:
         self._stamps = np.zeros((MAX_DATAGRAMS, _STAMP_NUMBERS), np.int64)
         self._newest = 0.0  # arrival [s since 1970]
         self._starts = np.arange(MAX_DATAGRAMS) * SLOT_BYTES
-        self._vectors, self._messages = (_Vector * MAX_DATAGRAMS)(), (_Message * MAX_DATAGRAMS)()
-        for i, (vector, message) in enumerate(zip(self._vectors, self._messages, strict=True)):
-            vector.base, vector.size = self._slots.ctypes.data + i * SLOT_BYTES, SLOT_BYTES
-            message.header.name = self._names.ctypes.data + i * _ADDRESS
-            message.header.vectors, message.header.vector_count = ctypes.addressof(vector), 1
-            message.header.control = self._stamps.ctypes.data + i * self._stamps.strides[0]
+        self._vectors, self._messages = np.zeros(MAX_DATAGRAMS, _VECTOR), np.zeros(MAX_DATAGRAMS, _MESSAGE)
+        self._vectors["base"], self._vectors["size"] = self._slots.ctypes.data + self._starts, SLOT_BYTES
+        self._messages["vectors"], self._messages["vector_count"] = _addresses(self._vectors), 1
+        self._messages["name"], self._messages["control"] = _addresses(self._names), _addresses(self._stamps)
+        self._messages_at = self._messages.ctypes.data
         sock.setsockopt(socket.SOL_SOCKET, _TIMESTAMPNS, 1)
-        self._lengths = self._column(_Message.length.offset)
-        self._name_sizes = self._column(_Message.header.offset + _Header.name_size.offset)
-        self._stamp_sizes = self._column(_Message.header.offset + _Header.control_size.offset)
-        self._addresses: dict[bytes, Hashable] = {}
+        self._name_sizes, self._stamp_sizes = self._messages["name_size"], self._messages["control_size"]
+        self._senders: dict[bytes, Hashable] = {}
         number_addresses(self._names[:2], self._name_sizes[:2])  # compile before the first datagram
-
-    def _column(self, offset: int) -> np.ndarray:
-        stride = ctypes.sizeof(_Message)
-        return np.ndarray((MAX_DATAGRAMS,), np.uint32, memoryview(self._messages).cast("B"), offset, (stride,))
 
     def receive(self) -> ReceivedBytes | None:
         """Return the pending datagrams; None without any."""
         self._name_sizes[:], self._stamp_sizes[:] = _ADDRESS, self._stamps.itemsize * _STAMP_NUMBERS
-        count = self._recvmmsg(self._sock.fileno(), ctypes.addressof(self._messages), MAX_DATAGRAMS, _DONTWAIT, None)
+        count = self._recvmmsg(self._sock.fileno(), self._messages_at, MAX_DATAGRAMS, _DONTWAIT, None)
         if count <= 0:  # no datagram, or an earlier send failed
             return None
-        lengths = self._lengths[:count].astype(np.int64)
+        lengths = self._messages["length"][:count].astype(np.int64)
         buf, stop = compact(self._slots, self._starts[:count], lengths)
         if lengths.max() > _PAGE:
             self._memory.madvise(mmap.MADV_DONTNEED)
         sender, first = number_addresses(self._names[:count], self._name_sizes[:count])
         names = [self._names[i, : self._name_sizes[i]].tobytes() for i in first.tolist()]
-        return ReceivedBytes(buf, stop - lengths, stop, self._arrivals(count), sender, tuple(map(self._address, names)))
+        return ReceivedBytes(buf, stop - lengths, stop, self._arrivals(count), sender, tuple(map(self._sender, names)))
 
     def _arrivals(self, count: int) -> np.ndarray:
         """Return the arrival times, non-decreasing, (n,) [s since 1970]; now for datagrams without a time stamp."""
@@ -144,12 +117,17 @@ class BatchReceiver:
         self._newest = float(arrivals[-1])
         return arrivals
 
-    def _address(self, raw: bytes) -> Hashable:
-        if raw not in self._addresses:
-            if len(self._addresses) >= _MAX_ADDRESSES:
-                self._addresses.clear()
-            self._addresses[raw] = read_address(raw)
-        return self._addresses[raw]
+    def _sender(self, address: bytes) -> Hashable:
+        if address not in self._senders:
+            if len(self._senders) >= _MAX_ADDRESSES:
+                self._senders.clear()
+            self._senders[address] = read_address(address)
+        return self._senders[address]
+
+
+def _addresses(array: np.ndarray) -> np.ndarray:
+    """Return the memory address of each row, (n,)."""
+    return array.ctypes.data + np.arange(len(array)) * array.strides[0]
 
 
 @nb.njit(cache=True, nogil=True)
@@ -192,56 +170,48 @@ _FLOOD_BYTES_S = 4e8  # buffer use of a flood of 300,000 datagrams a second [byt
 _log = logging.getLogger(__name__)
 
 
-class Udp:
-    """UDP socket and its thread.
+class Udp(Endpoint):
+    """UDP socket.
 
     Raises:
         OSError: when the listening port is in use.
     """
 
     def __init__(self, spec: LinkSpec) -> None:
-        self.spec = spec
-        self.dropped = self.unsent = 0
-        self.known_peers: Sequence[Hashable] = ()
+        super().__init__(spec)
         self._socket = _open_listening(spec) if spec.kind == "udpin" else None
-        self._thread: threading.Thread | None = None
 
     @property
     def port(self) -> int:
         """Return the local port; 0 before the socket is open."""
         return int(self._socket.getsockname()[1]) if self._socket is not None else 0
 
-    def start(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
-        """Receive in a thread, which only time-stamps and queues datagrams."""
-        outlet = BatchWriter(number, out, self)
-        self._thread = threading.Thread(target=self._run, args=(outlet, stop), name=self.spec.text)
-        self._thread.start()
-
-    def _run(self, outlet: BatchWriter, stop: threading.Event) -> None:
-        back_off = BackOff()
-        while self._socket is None and not stop.is_set():
+    def _run(self) -> None:
+        wait_s = FIRST_RETRY_S
+        while self._socket is None and not self._stop.is_set():
             try:
                 self._socket, where = _open_outgoing(self.spec)
                 self.known_peers = (where,)
             except OSError as error:  # no network yet, or an unresolved host name
                 _log.warning("link %s: %s; trying again", self.spec.text, error.strerror or error)
-                back_off.wait(stop)
+                self._stop.wait(wait_s)
+                wait_s = min(2 * wait_s, LAST_RETRY_S)
         if self._socket is not None:
-            self._receive(self._socket, outlet, stop)
+            self._receive(self._socket)
 
-    def _receive(self, sock: socket.socket, outlet: BatchWriter, stop: threading.Event) -> None:
+    def _receive(self, sock: socket.socket) -> None:
         source = make_receiver(sock)
         size = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         wait_s = min(_MAX_WAIT_S, size / _FLOOD_BYTES_S)  # a batch of datagrams costs little more than one
         with selectors.DefaultSelector() as ready:
             ready.register(sock, selectors.EVENT_READ)
-            while not stop.is_set():
+            while not self._stop.is_set():
                 if ready.select(POLL_S):
                     received = source.receive()
                     if received is not None:
-                        outlet.put(received)
+                        self._put(received)
                     if received is None or len(received.start) < MAX_DATAGRAMS:  # else there is more
-                        stop.wait(wait_s)
+                        self._stop.wait(wait_s)
 
     def send(self, where: Hashable, data: bytes, messages: int = 1) -> None:
         """Send one datagram; count its messages as unsent if the buffer is full or the peer unreachable."""
@@ -254,8 +224,7 @@ class Udp:
 
     def close(self) -> None:
         """Wait for the thread and free the port."""
-        if self._thread is not None:
-            self._thread.join()
+        super().close()
         if self._socket is not None:
             self._socket.close()
 

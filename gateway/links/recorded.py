@@ -9,7 +9,7 @@ import queue
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -23,7 +23,7 @@ from fleet.telemetry.recording.opening import ReplayPace
 from fleet.telemetry.recording.recordings import Recording
 from fleet.telemetry.replay.offset_copies import OffsetCopies
 from gateway.link_spec import LinkSpec
-from gateway.links.link import POLL_S, QUEUE, Batch
+from gateway.links.link import POLL_S, QUEUE, Batch, Endpoint
 
 READ_AHEAD_S = 3.0  # recorded time read ahead to find the aircraft [s]
 _MAX_READ_AHEAD = 100  # steps read ahead before the first message
@@ -32,7 +32,7 @@ _IN_FLIGHT = 4096  # messages between replay and publication, approximately
 _log = logging.getLogger(__name__)
 
 
-class ReplayLink:
+class ReplayLink(Endpoint):
     """Recording replayed at a multiple of real time.
 
     Args:
@@ -44,16 +44,13 @@ class ReplayLink:
     """
 
     def __init__(self, spec: LinkSpec, ids: IdAllocator | None = None) -> None:
-        self.spec = spec
-        self.dropped = self.unsent = 0
-        self.known_peers: Sequence[Hashable] = ()
+        super().__init__(spec)
         self.recording = Recording(spec.address, spec.offset)
         self.pace = ReplayPace(spec.speed)
         self._ids = IdAllocator() if ids is None else ids
         self._copies = OffsetCopies(spec.copies)
         self._uav_ids: dict[int, int] = {}  # UAV id by recorded id
         self._steps: Iterator[tuple[float, list[Any]]] | None = None
-        self._thread: threading.Thread | None = None
 
     @property
     def name(self) -> str:
@@ -113,36 +110,44 @@ class ReplayLink:
         """Replay in a thread."""
         if self._steps is None:
             self.read_ahead(stop)
-        self._thread = threading.Thread(target=self._play, args=(number, out, stop), name=self.spec.text)
-        self._thread.start()
+        super().start(number, out, stop)
 
-    def _play(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
+    def _run(self) -> None:
         try:
-            self._play_steps(number, out, stop)
+            self._replay()
         except (ValueError, OSError) as error:  # a read error, or a file without aircraft
-            if not stop.is_set():
+            if not self._stop.is_set():
                 _log.warning("%s", error)
         finally:
-            for sentence in [] if stop.is_set() else self.recording.skipped:
+            for sentence in [] if self._stop.is_set() else self.recording.skipped:
                 _log.warning("%s", sentence)
-            _put(out, Batch(number, ended=True), stop, QUEUE)
+            self._wait_and_put(Batch(self._number, ended=True), QUEUE)
 
-    def _play_steps(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
+    def _replay(self) -> None:
         assert self._steps is not None
         max_queued = max(_IN_FLIGHT // self.spec.copies, 8)
         now = 0.0
         for now, messages in self._steps:
-            if self.pace.wait(now, stop):
+            if self.pace.wait(now, self._stop):
                 return
             self._assign_ids(messages)
             renumbered_batch = self._renumber(messages)
             copied = self._copies.step(renumbered_batch)
             if renumbered_batch or copied:
-                _put(out, Batch(number, messages=renumbered_batch, copies=copied), stop, max_queued)
+                self._wait_and_put(Batch(self._number, messages=renumbered_batch, copies=copied), max_queued)
         for k, copied in enumerate(self._copies.remaining(), start=1):
-            if self.pace.wait(now + k * STEP_S, stop):
+            if self.pace.wait(now + k * STEP_S, self._stop):
                 return
-            _put(out, Batch(number, copies=copied), stop, max_queued)
+            self._wait_and_put(Batch(self._number, copies=copied), max_queued)
+
+    def _wait_and_put(self, batch: Batch, max_queued: int) -> None:
+        """Queue a batch once fewer than `max_queued` are queued."""
+        while not self._stop.is_set():
+            if self._out.qsize() >= max_queued:
+                self._stop.wait(0.005)
+                continue
+            with contextlib.suppress(queue.Full):
+                return self._out.put(batch, timeout=POLL_S)
 
     def _renumber(self, messages: Sequence[Any]) -> list[Any]:
         """Return the messages with the assigned UAV ids."""
@@ -151,27 +156,6 @@ class ReplayLink:
         renamed = (renumbered(message, lambda uav: self._uav_ids.get(uav, uav)) for message in messages)
         return [message for message in renamed if message is not None]
 
-    def send(self, where: Hashable, data: bytes, messages: int = 1) -> None:
-        """Ignore the data: a recording does not receive."""
-
-    def close(self) -> None:
-        """Wait for the thread."""
-        if self._thread is not None:
-            self._thread.join()
-
-
-def _put(out: "queue.Queue[Batch]", batch: Batch, stop: threading.Event, max_queued: int) -> None:
-    """Queue a batch once fewer than `max_queued` are queued."""
-    while not stop.is_set():
-        if out.qsize() >= max_queued:
-            stop.wait(0.005)
-            continue
-        with contextlib.suppress(queue.Full):
-            return out.put(batch, timeout=POLL_S)
-
-
-LogCallback = Callable[[str], None]
-Process = subprocess.Popen[bytes]
 
 _STOP_TIMEOUT_S = 8.0  # between the request to terminate and the kill [s]
 
@@ -184,18 +168,15 @@ def split_replays(specs: Sequence[LinkSpec]) -> tuple[list[LinkSpec], list[LinkS
 
 
 @contextmanager
-def replay_process(
-    files: Sequence[LinkSpec], args: argparse.Namespace, report: LogCallback
-) -> Iterator[Process | None]:
+def replay_process(files: Sequence[LinkSpec], args: argparse.Namespace) -> Iterator[None]:
     """Replay recordings in a separate process until they or the block end.
 
     Args:
         files: the recordings; none: no process
         args: arguments of this gateway; those of the router and the limits are passed on
-        report: called with a message if the process fails
     """
     if not files:
-        yield None
+        yield
         return
     options = [f"--link={spec.text.partition('#')[0]}#offset={spec.offset}" for spec in files]
     options += [*router_options(args), "--listen-only", f"--most-uavs={args.most_uavs}"]
@@ -203,10 +184,10 @@ def replay_process(
     command = [sys.executable, "-m", "gateway", *options]
     child = subprocess.Popen(command, stdin=subprocess.DEVNULL, env=os.environ | {PARENT: str(os.getpid())})
     ended = threading.Event()
-    watcher = threading.Thread(target=_report_exit, args=(child, ended, report), daemon=True)
+    watcher = threading.Thread(target=_report_exit, args=(child, ended), daemon=True)
     watcher.start()
     try:
-        yield child
+        yield
     finally:
         ended.set()
         if child.poll() is None:
@@ -219,7 +200,7 @@ def replay_process(
         watcher.join()
 
 
-def _report_exit(child: Process, ended: threading.Event, report: LogCallback) -> None:
+def _report_exit(child: subprocess.Popen[bytes], ended: threading.Event) -> None:
     code = child.wait()
     if code and not ended.is_set():
-        report(f"the replay of recordings ended with exit code {code}; the live links continue")
+        _log.warning("the replay of recordings ended with exit code %d; the live links continue", code)

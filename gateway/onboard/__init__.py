@@ -3,16 +3,22 @@
 from collections.abc import Hashable, Iterable, Sequence
 from typing import Any
 
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from fleet.contract import Link
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
 from gateway.onboard.parameter_cache_check import Cache
-from gateway.onboard.questions import RateShare, RequestScheduler
+from gateway.onboard.questions import WANTED_HZ, RequestScheduler, size_of
+from gateway.record.tape import format_size
 
 # Other ground stations use 255: they must not receive our answers, and an aircraft must detect the loss of theirs.
 SYSTEM, COMPONENT = 254, dialect.MAV_COMP_ID_MISSIONPLANNER
 HEARTBEAT_S = 1.0
+MIN_SHARE = 0.1  # minimum share of the wanted rates: lower rates are not useful
+_HYSTERESIS = 0.15  # smaller relative changes of the share are ignored
+WANTED_BYTES_S = sum(hz * size_of(name) for name, hz in WANTED_HZ.items())
+"""Data rate of the wanted messages of one aircraft [bytes/s]."""
 
 
 class RequestSender:
@@ -24,8 +30,9 @@ class RequestSender:
     """
 
     def __init__(self, budget: float = float("inf"), cache: Cache | None = None) -> None:
-        self.share = RateShare(budget)
-        self._cache = cache
+        self.share = 1.0  # of the wanted rates that fits the link, the same for all of its aircraft
+        self.sentence = ""  # note for the operator if not all of them fit
+        self._budget, self._cache = budget, cache
         self._mav = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
         self._schedulers: dict[int, RequestScheduler] = {}
         self._heartbeat_t = float("-inf")
@@ -50,13 +57,30 @@ class RequestSender:
                 (source, self._pack(beat))
                 for source in dict.fromkeys([*known_peers, *(recipient.source for recipient in live)])
             ]
-        share = self.share.update(live)
+        self._update_share(live)
         for craft in live:
             scheduler = self._schedulers.get(craft.system)
             if scheduler is None or scheduler.aircraft is not craft:
                 scheduler = self._schedulers[craft.system] = RequestScheduler(craft, now, self._cache)
-            out += [(craft.source, self._pack(message)) for message in scheduler.requests(now, share)]
+            out += [(craft.source, self._pack(message)) for message in scheduler.requests(now, self.share)]
         return out
+
+    def _update_share(self, live: Sequence[AircraftLink]) -> None:
+        """Fit the wanted rates of these aircraft to the rest of the budget: they also send unrequested messages."""
+        unrequested = sum(
+            hz * size_of(name) for aircraft in live for name, hz in aircraft.rates.items() if name not in WANTED_HZ
+        )
+        wanted = WANTED_BYTES_S * len(live)
+        fitting = float(np.clip((self._budget - unrequested) / wanted, MIN_SHARE, 1.0)) if live else 1.0
+        if abs(fitting - self.share) > _HYSTERESIS * self.share or (fitting == 1.0) != (self.share == 1.0):
+            self.share = fitting
+        self.sentence = ""
+        if self.share < 1.0:
+            required, budget = format_size(wanted + unrequested), format_size(self._budget)
+            self.sentence = (
+                f"{len(live)} aircraft would send {required}/s, the budget is {budget}/s: {self.share:.0%} of the "
+                "wanted rates are requested; raise --budget if the link has more capacity"
+            )
 
     def _pack(self, message: Any) -> bytes:
         packed = bytes(message.pack(self._mav))

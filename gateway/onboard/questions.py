@@ -3,17 +3,15 @@
 Source: MAVLink services "Parameter Protocol", "Mission Protocol", "Message interval".
 """
 
-from collections.abc import Collection
 from typing import Any
 
-import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
 from fleet.telemetry.mavlink.parsing.decode import layout
 from gateway.link_spec import LinkSpec
 from gateway.onboard.parameter_cache_check import ANY, DIALECTS, STREAMS, Cache, CacheCheck, RequestDialect
-from gateway.record.tape import format_size, read_size
+from gateway.record.tape import read_size
 
 WANTED_HZ: dict[str, float] = {  # [Hz]
     "ATTITUDE": 25,
@@ -23,11 +21,9 @@ WANTED_HZ: dict[str, float] = {  # [Hz]
     "NAV_CONTROLLER_OUTPUT": 5,
     "MISSION_CURRENT": 1,
 }
-MIN_SHARE = 0.1  # minimum share of the wanted rates: lower rates are not useful
 DEFAULT_BUDGET = "1M"  # default rate that the aircraft of one link may send together [bytes/s]
 _FRAME_BYTES = 12  # bytes of a frame without payload
 _SERIAL_SHARE = 0.7  # share of a serial line that telemetry may fill
-_HYSTERESIS = 0.15  # smaller relative changes of the share are ignored
 
 
 def budget_of(spec: LinkSpec, text: str = "") -> float:
@@ -44,44 +40,6 @@ def budget_of(spec: LinkSpec, text: str = "") -> float:
 def size_of(name: str) -> int:
     """Return the length of a message on the wire without truncation [bytes]."""
     return _FRAME_BYTES + layout(name).itemsize
-
-
-WANTED_BYTES_S = sum(hz * size_of(name) for name, hz in WANTED_HZ.items())
-"""Data rate of the wanted messages of one aircraft [bytes/s]."""
-
-
-class RateShare:
-    """Share of the wanted rates that fits a link, the same for all of its aircraft.
-
-    Args:
-        budget: rate that they may send together [bytes/s]
-    """
-
-    def __init__(self, budget: float) -> None:
-        self.value = 1.0
-        self.sentence = ""
-        self._budget = budget
-
-    def update(self, all_aircraft: Collection[AircraftLink]) -> float:
-        """Return the share for these aircraft; messages that were not requested use part of the budget."""
-        unrequested = sum(
-            hz * size_of(name)
-            for aircraft in all_aircraft
-            for name, hz in aircraft.rates.items()
-            if name not in WANTED_HZ
-        )
-        wanted = WANTED_BYTES_S * len(all_aircraft)
-        fitting = float(np.clip((self._budget - unrequested) / wanted, MIN_SHARE, 1.0)) if all_aircraft else 1.0
-        if abs(fitting - self.value) > _HYSTERESIS * self.value or (fitting == 1.0) != (self.value == 1.0):
-            self.value = fitting
-        self.sentence = ""
-        if self.value < 1.0:
-            required = format_size(wanted + unrequested)
-            self.sentence = (
-                f"{len(all_aircraft)} aircraft would send {required}/s, the budget is {format_size(self._budget)}/s: "
-                f"{self.value:.0%} of the wanted rates are requested; raise --budget if the link has more capacity"
-            )
-        return self.value
 
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 1.0, 60.0  # for a complete list, doubled at every attempt [s]
@@ -109,10 +67,8 @@ class RetryTimer:
 RETRY_S = 0.5  # for one item or a few parameters [s]
 ITEM_TRIES = 20  # unsuccessful attempts after which the list is requested again: it may have become shorter
 WATCH_S, CONFIRM_S = 15.0, 1.0  # between two checks of an item: verified; from the cache and not yet verified [s]
-REDOWNLOAD_S, REDOWNLOAD_ITEM_S = (
-    60.0,
-    2.0,
-)  # between two downloads where single items cannot be requested, and per item [s]
+REDOWNLOAD_S = 60.0  # between two downloads where single items cannot be requested [s]
+REDOWNLOAD_ITEM_S = 2.0  # the same, per item [s]
 STORE_S, FIRST_STORE_S = 60.0, 15.0  # between two updates of the cache, and before the first [s]
 TIMESYNC_S = 10.0  # between two time requests [s]
 PARAMS_AT_ONCE = 10
@@ -146,7 +102,11 @@ class RequestScheduler:
         if self._cache_check is not None and now - self._store_t >= STORE_S:
             self._store_t = now
             self._cache_check.store()
-        return self._mission(now) + self._params(now) + self._rates(now, share) + self._time(now)
+        requests = self._mission(now) + self._params(now) + self._rates(now, share)
+        if now - self._timesync_t >= TIMESYNC_S:  # to measure the round-trip time
+            self._timesync_t = now
+            requests.append(dialect.MAVLink_timesync_message(0, round(now * 1e9)))
+        return requests
 
     @property
     def _request_dialect(self) -> RequestDialect:
@@ -215,19 +175,11 @@ class RequestScheduler:
         if not wrong or not self._rate_wait.due(now):
             return []
         self._rate_tries += 1
-        requests = [self._interval(name, fitting[name]) for name in wrong]
+        command, zeros = (*self._to, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0), (0, 0, 0, 0, 0)
+        requests = [
+            dialect.MAVLink_command_long_message(*command, _IDS[name], 1e6 / fitting[name], *zeros) for name in wrong
+        ]
         if self._rate_tries == RATE_TRIES and self._request_dialect.streams:
             groups = {STREAMS[name]: round(max(fitting[name], 1.0)) for name in reversed(wrong)}
             requests += [dialect.MAVLink_request_data_stream_message(*self._to, *pair, 1) for pair in groups.items()]
         return requests
-
-    def _interval(self, name: str, hz: float) -> Any:
-        command = dialect.MAV_CMD_SET_MESSAGE_INTERVAL
-        return dialect.MAVLink_command_long_message(*self._to, command, 0, _IDS[name], 1e6 / hz, 0, 0, 0, 0, 0)
-
-    def _time(self, now: float) -> list[Any]:
-        """Return a time request when due, to measure the round-trip time."""
-        if now - self._timesync_t < TIMESYNC_S:
-            return []
-        self._timesync_t = now
-        return [dialect.MAVLink_timesync_message(0, round(now * 1e9))]

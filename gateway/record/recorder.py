@@ -89,53 +89,17 @@ def cut(pieces, us, carry, carried, counts, extras, table):
     max_piece, total = 0, 0
     for i in range(len(start)):
         max_piece, total = max(max_piece, stop[i] - start[i]), total + stop[i] - start[i] + carried[slot[i]]
-    out, scratch, n = (
-        np.empty(2 * total, np.uint8),
-        np.empty(CARRY_BYTES + max_piece, np.uint8),
-        0,
-    )  # no frame is shorter than 8 bytes
+    out, n = np.empty(2 * total, np.uint8), 0  # no frame is shorter than 8 bytes
+    scratch = np.empty(CARRY_BYTES + max_piece, np.uint8)
     for i in range(len(start)):
-        owner, size = slot[i], stop[i] - start[i]
-        carried_bytes = carried[owner]
-        _copy(carry, owner * CARRY_BYTES, carried_bytes, scratch, 0)
-        _copy(buf, start[i], size, scratch, carried_bytes)
-        end = carried_bytes + size
+        owner, size, before = slot[i], stop[i] - start[i], carried[slot[i]]
+        _copy(carry, owner * CARRY_BYTES, before, scratch, 0)
+        _copy(buf, start[i], size, scratch, before)
+        end = before + size
         n, consumed = _copy_frames(scratch, end, us[i], (out, n), counts, extras, table)
         carried[owner] = end - consumed
         _copy(scratch, consumed, end - consumed, carry, owner * CARRY_BYTES)
     return out[:n]
-
-
-class FrameCutter:
-    """Split of the bytes of one link; stores the incomplete frame of every sender."""
-
-    def __init__(self, max_senders: int = 4096) -> None:
-        self.counts = np.zeros(2, np.int64)
-        self._slots: dict[object, int] = {}
-        self._carry, self._carried = np.empty(max_senders * CARRY_BYTES, np.uint8), np.zeros(max_senders, np.int64)
-
-    @property
-    def carried_bytes(self) -> int:
-        """Return the number of bytes of incomplete frames."""
-        return int(self._carried.sum())
-
-    def feed(self, received: ReceivedBytes) -> bytes:
-        """Return the records completed by these pieces."""
-        slots = np.array([self._slot(sender) for sender in received.senders], np.int64)
-        pieces = (received.buf, received.start, received.stop, slots[received.sender])
-        us = np.round(received.arrival * 1e6).astype(np.int64)
-        return cut(pieces, us, self._carry, self._carried, self.counts, EXTRA, CRC).tobytes()
-
-    def _slot(self, sender: object) -> int:
-        """Return the slot of a sender; if all are in use, free the oldest one and count its bytes as noise."""
-        if sender not in self._slots:
-            free = len(self._slots)
-            if free == len(self._carried):
-                free = self._slots.pop(next(iter(self._slots)))
-                self.counts[NOISE] += self._carried[free]
-                self._carried[free] = 0
-            self._slots[sender] = free
-        return self._slots[sender]
 
 
 MOST = 64 << 20  # bytes waiting for the disk; beyond, they are dropped and counted
@@ -158,23 +122,44 @@ class RecordingCounters(NamedTuple):
 
 
 class _LinkRecording:
-    """Recording of one link: writer and counters [bytes]."""
+    """Recording of one link: its file, the incomplete frame of every sender, and counters [bytes]."""
 
-    def __init__(self, tape: TlogWriter) -> None:
-        self.writer, self.cutter = tape, FrameCutter()
+    def __init__(self, writer: TlogWriter, max_senders: int = 4096) -> None:
+        self.writer = writer
         self.received = self.recorded = self.lost = self.dropped = 0
+        self._counts = np.zeros(2, np.int64)
+        self._slots: dict[object, int] = {}
+        self._carry, self._carried = np.empty(max_senders * CARRY_BYTES, np.uint8), np.zeros(max_senders, np.int64)
 
-    def write(self, pieces: Sequence[ReceivedBytes]) -> None:
-        before = int(self.cutter.counts[FRAMES])
-        records = b"".join(map(self.cutter.feed, pieces))
-        size = len(records) - STAMP_SIZE * (int(self.cutter.counts[FRAMES]) - before)
+    def write(self, batches: Sequence[ReceivedBytes]) -> None:
+        """Write the frames completed by received bytes."""
+        before = int(self._counts[FRAMES])
+        records = b"".join(map(self._cut, batches))
+        size = len(records) - STAMP_SIZE * (int(self._counts[FRAMES]) - before)
         if self.writer.write(records, time.monotonic()):
             self.lost += size
         else:
             self.recorded += size
 
+    def _cut(self, received: ReceivedBytes) -> bytes:
+        slots = np.array([self._slot(sender) for sender in received.senders], np.int64)
+        pieces = (received.buf, received.start, received.stop, slots[received.sender])
+        us = np.round(received.arrival * 1e6).astype(np.int64)
+        return cut(pieces, us, self._carry, self._carried, self._counts, EXTRA, CRC).tobytes()
+
+    def _slot(self, sender: object) -> int:
+        """Return the slot of a sender; if all are in use, free the oldest one and count its bytes as noise."""
+        if sender not in self._slots:
+            free = len(self._slots)
+            if free == len(self._carried):
+                free = self._slots.pop(next(iter(self._slots)))
+                self._counts[NOISE] += self._carried[free]
+                self._carried[free] = 0
+            self._slots[sender] = free
+        return self._slots[sender]
+
     def counters(self) -> RecordingCounters:
-        frames, noise = self.cutter.counts.tolist()
+        frames, noise = self._counts.tolist()
         accounted = (self.recorded, noise, self.lost, self.dropped)
         return RecordingCounters(self.received, *accounted, self.received - sum(accounted), frames, self.writer.fault)
 
@@ -235,8 +220,8 @@ class LinkRecorder(AbstractContextManager):
         with self._lock:
             waiting, self._waiting, self._size = self._waiting, [], 0
         for number, recording in enumerate(self._recordings):
-            if pieces := [received for link, received in waiting if link == number]:
-                recording.write(pieces)
+            if batches := [received for link, received in waiting if link == number]:
+                recording.write(batches)
             if (fault := recording.writer.fault) and fault not in self._logged:
                 self._logged.add(fault)
                 _log.warning("%s", fault)

@@ -55,16 +55,13 @@ class DiskBudget:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise OSError(
-                f"--record: {str(folder)!r} cannot be created ({error.strerror}); name another folder"
-            ) from None
+            reason = f"cannot be created ({error.strerror})"
+            raise OSError(f"--record: {str(folder)!r} {reason}; name another folder") from None
         if not os.access(folder, os.W_OK | os.X_OK):
             raise OSError(f"--record: {str(folder)!r} is not writable; name another folder")
-        self._sizes = {
-            path: path.stat().st_size
-            for path in sorted(folder.iterdir(), key=_age_key)
-            if FILE_PATTERN.match(path.name)
-        }
+        recordings = [path for path in folder.iterdir() if FILE_PATTERN.match(path.name)]
+        recordings.sort(key=lambda path: (path.stat().st_mtime, path.name))
+        self._sizes = {path: path.stat().st_size for path in recordings}
 
     @property
     def used(self) -> int:
@@ -89,7 +86,7 @@ class DiskBudget:
 
 
 class TlogWriter(contextlib.AbstractContextManager):
-    """Writer of the recording of one link; after a write error it counts lost bytes and later tries a new file.
+    """Writer of the recording of one link; after a write error it later tries a new file.
 
     Args:
         name: name of the link
@@ -98,8 +95,6 @@ class TlogWriter(contextlib.AbstractContextManager):
     """
 
     def __init__(self, name: str, budget: DiskBudget, links: int = 1) -> None:
-        self.written = 0  # bytes
-        self.lost = 0  # bytes not written
         self.fault = ""  # error message while writing fails
         self._slug = re.sub(r"[^\w.-]+", "-", name).strip("-")
         self._budget = budget
@@ -113,15 +108,16 @@ class TlogWriter(contextlib.AbstractContextManager):
         if not records:
             return 0
         if self._file is None and now < self._retry_t:
-            self.lost += len(records)
             return len(records)
         try:
-            self._rotate(len(records), now)
-            self._put(records)
+            file, remaining = self._rotated(len(records), now), memoryview(records)
+            while remaining:
+                remaining = remaining[file.write(remaining) :]
         except OSError as error:
             self._fail(error, now)
-            self.lost += len(records)
             return len(records)
+        self._size += len(records)
+        self._budget.update_size(self._path, self._size)
         self.fault = ""
         return 0
 
@@ -136,7 +132,8 @@ class TlogWriter(contextlib.AbstractContextManager):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _rotate(self, added: int, now: float) -> None:
+    def _rotated(self, added: int, now: float) -> IO[bytes]:
+        """Return the file to write to: the open one, or a new one if it is full, old or closed."""
         if self._file is not None and (self._size + added > self._max_file or now - self._opened_t > MAX_FILE_S):
             self.close()
         if self._file is None:
@@ -144,15 +141,7 @@ class TlogWriter(contextlib.AbstractContextManager):
             names = [f"{stem}.tlog", *(f"{stem}-{k}.tlog" for k in range(2, 1000))]
             self._path = next(candidate for name in names if not (candidate := self._budget.folder / name).exists())
             self._file, self._size, self._opened_t = self._path.open("xb", buffering=0), 0, now
-
-    def _put(self, records: bytes) -> None:
-        assert self._file is not None
-        remaining = memoryview(records)
-        while remaining:
-            remaining = remaining[self._file.write(remaining) :]
-        self._size += len(records)
-        self.written += len(records)
-        self._budget.update_size(self._path, self._size)
+        return self._file
 
     def _fail(self, error: OSError, now: float) -> None:
         """Truncate the file to its size before this write, delete it if empty, and pause writing."""
@@ -167,7 +156,3 @@ class TlogWriter(contextlib.AbstractContextManager):
                     self._path.unlink()
         self.close()
         self._retry_t = now + RETRY_S
-
-
-def _age_key(path: Path) -> tuple[float, str]:
-    return path.stat().st_mtime, path.name

@@ -10,9 +10,9 @@ from fleet.simulator.flight.mavlink import MavlinkEndpoint
 from fleet.simulator.flight.mavlink_messages import DIALECTS
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
 from gateway.link_spec import read_spec
-from gateway.onboard import RequestSender
+from gateway.onboard import MIN_SHARE, WANTED_BYTES_S, RequestSender
 from gateway.onboard.parameter_cache_check import Cache
-from gateway.onboard.questions import MIN_SHARE, WANTED_BYTES_S, WANTED_HZ, budget_of
+from gateway.onboard.questions import WANTED_HZ, budget_of
 from tests.support.talker import ITEMS, T0, Aircraft, of
 
 VALUES = {"NAVL1_PERIOD": 17.0, "STAT_RUNTIME": 1.0, **{f"P{k:03d}": k / 7 for k in range(300)}}
@@ -146,7 +146,7 @@ def test_a_mission_recalled_is_proven_item_by_item_soon_after(tmp_path):
 
 
 def rates_asked(count, budget):
-    """Let aircraft that send nothing but heartbeats be asked for rates; give rates by message, and the share."""
+    """Let aircraft that send nothing but heartbeats be asked for rates; give rates by message, and who asked."""
     intake, onboard, asked = MavlinkReceiver(), RequestSender(budget), {}
     crowd = [Aircraft(0.0, (), system) for system in range(1, count + 1)]
     for step in range(80):
@@ -161,20 +161,20 @@ def rates_asked(count, budget):
         for _, question in aircraft.asked:
             if question.get_type() == "COMMAND_LONG":
                 asked.setdefault(int(question.param1), set()).add(round(1e6 / question.param2, 3))
-    return asked, onboard.share
+    return asked, onboard
 
 
 def test_what_does_not_fit_is_asked_for_in_proportion_and_that_is_said():
-    asked, share = rates_asked(1, WANTED_BYTES_S * 2)
-    assert asked[30] == {WANTED_HZ["ATTITUDE"]} and share.sentence == ""
-    asked, share = rates_asked(4, WANTED_BYTES_S)
-    assert share.value == pytest.approx(0.25, abs=0.02)  # heartbeats count too
+    asked, told = rates_asked(1, WANTED_BYTES_S * 2)
+    assert asked[30] == {WANTED_HZ["ATTITUDE"]} and told.sentence == ""
+    asked, told = rates_asked(4, WANTED_BYTES_S)
+    assert told.share == pytest.approx(0.25, abs=0.02)  # heartbeats count too
     assert {name: list(hz) for name, hz in asked.items() if name in (30, 42)} == {
-        30: [pytest.approx(25 * share.value, abs=0.01)],
-        42: [pytest.approx(share.value, abs=0.01)],
+        30: [pytest.approx(25 * told.share, abs=0.01)],
+        42: [pytest.approx(told.share, abs=0.01)],
     }
-    assert share.sentence.startswith("4 aircraft would send ") and share.sentence.endswith("link has more capacity")
-    assert rates_asked(4, 10.0)[1].value == MIN_SHARE
+    assert told.sentence.startswith("4 aircraft would send ") and told.sentence.endswith("link has more capacity")
+    assert rates_asked(4, 10.0)[1].share == MIN_SHARE
 
 
 def test_the_budget_suits_the_link_or_is_as_asked_for():

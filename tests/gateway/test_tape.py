@@ -93,17 +93,18 @@ def test_noise_is_counted_and_messages_unknown_here_are_kept(tmp_path):
 def test_links_have_files_of_their_own_and_the_oldest_make_room(tmp_path):
     foreign, budget = tmp_path / "monday.tlog", 1_000_000
     foreign.write_bytes(bytes(2_000_000))
-    frame = frames(2)[1]
+    frame, written = frames(2)[1], 0
     shelf = DiskBudget(tmp_path, budget)
     with TlogWriter("a:1", shelf, 2) as one, TlogWriter("b:2", shelf, 2) as other:
         for k in range(400):
             for tape in (one,) if k % 10 else (one, other):  # the other hears little and keeps its file for long
                 assert tape.write(frame * 100, float(k)) == 0
+                written += 100 * len(frame)
                 ours = [path for path in tmp_path.glob("*.tlog") if path != foreign]
                 assert sum(path.stat().st_size for path in ours) == shelf.used <= budget
     assert foreign.stat().st_size == 2_000_000
     assert shelf.removed >= 1 and {path.name[0] for path in ours} == {"a", "b"}
-    assert one.written + other.written > budget
+    assert written > budget
     assert DiskBudget(tmp_path, budget).used == shelf.used  # the next run goes on from there
 
 
@@ -129,7 +130,7 @@ def test_a_disk_that_takes_no_more_is_said_and_counted_and_later_tried_again(tmp
     with TlogWriter("a", DiskBudget(tmp_path, MORE)) as tape:
         with files_no_longer_than(10_500):
             fates = [tape.write(records, 0.0) for _ in range(20)]
-        assert fates == [0] * 10 + [1000] * 10 and (tape.written, tape.lost) == (10_000, 10_000)
+        assert fates == [0] * 10 + [1000] * 10
         assert "File too large" in tape.fault and "free space" in tape.fault
         (path,) = tmp_path.glob("*.tlog")
         assert path.stat().st_size == 10_000  # no half of a record stays

@@ -3,11 +3,13 @@
 The limits equal those of the twin; a test compares both.
 """
 
-from typing import NamedTuple
+from typing import Annotated
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
-from fleet.airframes.airframe import ServoMap, servo_map
+from fleet.airframes.airframe import servo_map
 from fleet.contract import COLUMNS
 from fleet.mission import FIRST_ITEM, unroll_route
 from fleet.process.sanitise import format_below
@@ -36,10 +38,11 @@ MIN_DIAGNOSE_S, MIN_DIAGNOSE_ROWS = 25.0, 50  # gap-free flight, and rows of eac
 MIN_OWN_PAST_S = 50.0  # gap-free flight for a comparison with earlier flight data [s]
 GUST_SENSING_HZ = 18.0  # accelerometer rate for gust estimation [Hz]
 _SKIP_BEGIN_S, _SKIP_END_S = 5.0, 1.5  # start and end of a recording excluded from a diagnosis [s]
+_DATAFLASH_REMEDY = "the autopilot logs them as CMD messages (ArduPilot); keep the log from its beginning"
 _ITEMS_REMEDY = {  # how to record mission items, by kind of recording
     "ULog": "PX4 logs no mission items; record telemetry instead (.tlog), with the mission downloaded while recording",
-    "DataFlash log": "the autopilot logs them as CMD messages (ArduPilot); keep the log from its beginning",
-    "DataFlash text log": "the autopilot logs them as CMD messages (ArduPilot); keep the log from its beginning",
+    "DataFlash log": _DATAFLASH_REMEDY,
+    "DataFlash text log": _DATAFLASH_REMEDY,
     "fleet recording": "the gateway downloads it unless --listen-only is set; record with it connected",
 }
 _GOOD_HZ = 10.0  # below this rate fast motion is poorly resolved [Hz]
@@ -47,43 +50,35 @@ _MIN_INPUT_STD = 0.005  # standard deviation below which an input is constant, f
 _SURFACE_NAME = {"delta_a": "aileron", "delta_e": "elevator", "delta_r": "rudder", "delta_t": "throttle"}
 
 
-class AbilityCheck(NamedTuple):
-    """One function of the twin, whether this recording supports it, and the reason with values found and required."""
+class AbilityResult(msgspec.Struct, frozen=True):
+    """One function of the twin and whether this recording supports it."""
 
     name: str
     can: bool
-    why: str
+    why: Annotated[str, Meta(description="values found and required")]
 
 
-def abilities(survey: Survey) -> list[AbilityCheck]:
+def abilities(survey: Survey) -> list[AbilityResult]:
     """Check all functions of the twin in processing order."""
     in_air = airborne(survey)
     complete = complete_spans(survey)
-    obstacle = _model_obstacle(survey) or _data_obstacle(survey, in_air, complete)
+    obstacle = _obstacle(survey, in_air, complete)
     input_std = input_variation(survey, overlap(complete, in_air))
-    axes = (
-        _identify_axis("identify longitudinal", survey, obstacle, input_std, ("delta_e", "delta_t")),
-        _identify_axis("identify lateral", survey, obstacle, input_std, ("delta_a", "delta_r")),
-    )
-    unidentified = _unidentified(axes)
-    verified = _check_verify(survey, unidentified, overlap(complete, in_air))
-    wind = _check_wind(survey)
-    return [
-        *axes,
-        verified,
-        _check_route(survey, unidentified, in_air),
-        _check_turn_rate(survey, complete),
-        wind,
-        _check_diagnose(survey, in_air),
-    ]
-
-
-def _unidentified(axes: tuple[AbilityCheck, AbilityCheck]) -> str:
-    """Return which axis cannot be identified, or an empty string."""
-    failed = [axis.name.split()[-1] for axis in axes if not axis.can]
-    if not failed:
-        return ""
-    return "neither axis can be identified" if len(failed) == 2 else f"the {failed[0]} axis cannot be identified"
+    longitudinal = _identify_axis(survey, obstacle, input_std, ("delta_e", "delta_t"))
+    lateral = _identify_axis(survey, obstacle, input_std, ("delta_a", "delta_r"))
+    failed = [name for name, axis in (("longitudinal", longitudinal), ("lateral", lateral)) if not axis[0]]
+    unidentified = f"the {failed[0]} axis cannot be identified" if failed else ""
+    unidentified = "neither axis can be identified" if len(failed) == 2 else unidentified
+    checks = {
+        "identify longitudinal": longitudinal,
+        "identify lateral": lateral,
+        "verify": _check_verify(survey, unidentified, overlap(complete, in_air)),
+        "predict on the route": _check_route(survey, unidentified, in_air),
+        "predict by turn rate": _check_turn_rate(survey, complete),
+        "estimate wind": _check_wind(survey),
+        "diagnose": _check_diagnose(survey, in_air),
+    }
+    return [AbilityResult(name, can, why) for name, (can, why) in checks.items()]
 
 
 def complete_spans(survey: Survey) -> list[TimeInterval]:
@@ -106,21 +101,14 @@ def input_variation(survey: Survey, spans: list[TimeInterval]) -> dict[str, floa
 
 def max_coverage(spans: list[TimeInterval], window_s: float) -> float:
     """Return the maximum coverage by the intervals of any window of `window_s` [s]."""
-    best = 0.0
-    for last in spans:
-        start = last.stop - window_s
-        best = max(best, seconds(overlap(spans, [TimeInterval(start, last.stop)])))
-    return best
+    windows = [TimeInterval(last.stop - window_s, last.stop) for last in spans]
+    return max((seconds(overlap(spans, [window])) for window in windows), default=0.0)
 
 
-def _model_obstacle(survey: Survey) -> str:
-    return (
-        f"a {survey.vehicle} is not modelled, turn-rate prediction only" if survey.vehicle_class.is_rotorcraft else ""
-    )
-
-
-def _data_obstacle(survey: Survey, in_air: list[TimeInterval], complete: list[TimeInterval]) -> str:
+def _obstacle(survey: Survey, in_air: list[TimeInterval], complete: list[TimeInterval]) -> str:
     """Return what prevents an identification, or an empty string."""
+    if survey.vehicle_class.is_rotorcraft:
+        return f"a {survey.vehicle} is not modelled, turn-rate prediction only"
     if missing := _missing_fields(survey):
         return missing
     if not in_air:
@@ -136,10 +124,8 @@ def _data_obstacle(survey: Survey, in_air: list[TimeInterval], complete: list[Ti
     parts = overlap(complete, in_air)
     available_s = max_coverage(parts, MAX_IDENTIFY_S)
     if available_s < MIN_IDENTIFY_S:
-        return (
-            f"{format_below(available_s, MIN_IDENTIFY_S)} s of complete data in flight, {MIN_IDENTIFY_S:.0f} s "
-            "are required"
-        )
+        available = format_below(available_s, MIN_IDENTIFY_S)
+        return f"{available} s of complete data in flight, {MIN_IDENTIFY_S:.0f} s are required"
     longest = max(part.seconds for part in parts)
     if longest < MIN_STRETCH_S:
         return f"the longest continuous stretch is {longest:.1f} s, {MIN_STRETCH_S:.0f} s are required"
@@ -153,14 +139,14 @@ def _missing_fields(survey: Survey) -> str:
 
 
 def _identify_axis(
-    name: str, survey: Survey, obstacle: str, input_std: dict[str, float], inputs: tuple[str, ...]
-) -> AbilityCheck:
+    survey: Survey, obstacle: str, input_std: dict[str, float], inputs: tuple[str, ...]
+) -> tuple[bool, str]:
     if obstacle:
-        return AbilityCheck(name, False, obstacle)
+        return False, obstacle
     constant = [_SURFACE_NAME[channel] for channel in inputs if input_std[channel] < _MIN_INPUT_STD]
-    servos = servo_map(survey.values)
+    assumption = " (servo map assumed)" if servo_map(survey.values).sentence else ""
     if len(constant) == len(inputs):
-        return AbilityCheck(name, False, f"{' and '.join(constant)} constant in flight{_assumption_note(servos)}")
+        return False, f"{' and '.join(constant)} constant in flight{assumption}"
     reason = ", ".join(
         f"{_SURFACE_NAME[each]} varies by {input_std[each]:.0%} of its range"
         for each in inputs
@@ -172,16 +158,12 @@ def _identify_axis(
         reason += f"; {' and '.join(slow)} resolves fast motion poorly, {_GOOD_HZ:.0f} Hz or more is recommended"
     if survey.rows["air"].count == 0:
         reason += "; no airspeed rows: zero wind assumed"
-    return AbilityCheck(name, True, reason + _assumption_note(servos))
+    return True, reason + assumption
 
 
-def _assumption_note(servos: ServoMap) -> str:
-    return " (servo map assumed)" if servos.sentence else ""
-
-
-def _check_verify(survey: Survey, unidentified: str, spans: list[TimeInterval]) -> AbilityCheck:
+def _check_verify(survey: Survey, unidentified: str, spans: list[TimeInterval]) -> tuple[bool, str]:
     if unidentified:
-        return AbilityCheck("verify", False, unidentified)
+        return False, unidentified
     t, x = survey.rows["attitude"].rows()
     selected = x[inside(t, spans)]
     columns = [name for name, _ in COLUMNS["attitude"]]
@@ -189,77 +171,64 @@ def _check_verify(survey: Survey, unidentified: str, spans: list[TimeInterval]) 
     phi, theta, q = np.degrees(list(std.values()))
     variation = f"bank varies by {phi:.1f} deg, pitch by {theta:.1f} deg, pitch rate by {q:.1f} deg/s"
     if all(std[name] < limit for name, limit in MIN_EXCITATION.items()):
-        required = "{:.1f} deg, {:.1f} deg or {:.1f} deg/s are required".format(
-            *np.degrees(list(MIN_EXCITATION.values()))
-        )
-        return AbilityCheck("verify", False, f"steady flight, too little excitation: {variation}, {required}")
-    return AbilityCheck("verify", True, variation)
+        phi, theta, q = np.degrees(list(MIN_EXCITATION.values()))
+        required = f"{phi:.1f} deg, {theta:.1f} deg or {q:.1f} deg/s are required"
+        return False, f"steady flight, too little excitation: {variation}, {required}"
+    return True, variation
 
 
-def _check_route(survey: Survey, unidentified: str, in_air: list[TimeInterval]) -> AbilityCheck:
+def _check_route(survey: Survey, unidentified: str, in_air: list[TimeInterval]) -> tuple[bool, str]:
     """Check route prediction with an identified model, else with the kinematic model of the vehicle type."""
-    name = "predict on the route"
     if unidentified and not (survey.vehicle_class.has_wings or survey.vehicle_class.can_hover):
-        return AbilityCheck(
-            name, False, f"{unidentified}, and a vehicle of kind {survey.vehicle} has no kinematic model"
-        )
+        return False, f"{unidentified}, and a vehicle of kind {survey.vehicle} has no kinematic model"
     if missing := [kind for kind in ("attitude", "velocity", "position") if survey.rows[kind].count < 8]:
-        return AbilityCheck(name, False, f"no {', '.join(missing)} rows in the recording")
-    following = overlap([span for span, mode in mode_spans(survey) if mode in ROUTE_MODES], in_air)
-    on_route_s = seconds(following)
+        return False, f"no {', '.join(missing)} rows in the recording"
+    on_route_s = seconds(overlap([span for span, mode in mode_spans(survey) if mode in ROUTE_MODES], in_air))
     if on_route_s < MIN_ROUTE_S:
         modes = ", ".join(dict.fromkeys(mode for _, mode in mode_spans(survey))) or "no mode"
-        return AbilityCheck(
-            name,
-            False,
-            f"{format_below(on_route_s, MIN_ROUTE_S)} s in a mode that follows a mission, {MIN_ROUTE_S:.0f} s "
-            f"are required ({modes})",
-        )
-    origin = survey.origin()
+        available = f"{format_below(on_route_s, MIN_ROUTE_S)} s in a mode that follows a mission"
+        return False, f"{available}, {MIN_ROUTE_S:.0f} s are required ({modes})"
+    autopilot = survey.status.autopilot if survey.status else "unknown"
+    if obstacle := _route_obstacle(survey, autopilot):
+        return False, obstacle
+    reason = f"{on_route_s:.0f} s on the route, {len(survey.items)} mission items"
+    reason += "; " if survey.mission and survey.mission.complete else ", not all; "
+    if survey.vehicle_class.is_rotorcraft:
+        return True, f"{reason}from speed and acceleration limits"
+    kinematic = f"kinematic fixed-wing model, since {unidentified}"
+    reason += kinematic if unidentified else "take-off and landing not modelled"
+    if autopilot not in ("ardupilot", "px4"):
+        reason += f"; guidance law of autopilot {autopilot} is identified from its bank commands, if any"
+    return True, reason
+
+
+def _route_obstacle(survey: Survey, autopilot: str) -> str:
+    """Return what is missing of the route, or an empty string."""
+    origin, first = survey.origin(), FIRST_ITEM.get(autopilot, 1)
     if not survey.items or origin is None:
         remedy = _ITEMS_REMEDY.get(survey.kind, "let the ground station download it while recording")
-        return AbilityCheck(name, False, f"no mission list in the recording; {remedy}")
-    autopilot = survey.status.autopilot if survey.status else "unknown"
-    first = FIRST_ITEM.get(autopilot, 1)
+        return f"no mission list in the recording; {remedy}"
     if not len(unroll_route(survey.items, seq=first, origin=origin, params=survey.values, first=first).legs):
-        return AbilityCheck(name, False, f"the mission of {len(survey.items)} items has no legs")
+        return f"the mission of {len(survey.items)} items has no legs"
     if not survey.rows["leg"].count:
-        return AbilityCheck(name, False, "the current mission item is not in the recording (MISSION_CURRENT)")
-    supported = autopilot in ("ardupilot", "px4")
-    law_note = (
-        "" if supported else f"; guidance law of autopilot {autopilot} is identified from its bank commands, if any"
-    )
-    items = f"{len(survey.items)} mission items" + ("" if survey.mission and survey.mission.complete else ", not all")
-    if survey.vehicle_class.is_rotorcraft:
-        return AbilityCheck(name, True, f"{on_route_s:.0f} s on the route, {items}; from speed and acceleration limits")
-    method = (
-        f"kinematic fixed-wing model, since {unidentified}" if unidentified else "take-off and landing not modelled"
-    )
-    return AbilityCheck(name, True, f"{on_route_s:.0f} s on the route, {items}; {method}{law_note}")
+        return "the current mission item is not in the recording (MISSION_CURRENT)"
+    return ""
 
 
-def _check_turn_rate(survey: Survey, complete: list[TimeInterval]) -> AbilityCheck:
-    name = "predict by turn rate"
+def _check_turn_rate(survey: Survey, complete: list[TimeInterval]) -> tuple[bool, str]:
     if missing := _missing_fields(survey):
-        return AbilityCheck(name, False, missing)
-    longest = max((span.seconds for span in complete), default=0.0)
-    if longest < TURN_RATE_S:
+        return False, missing
+    long_enough = [span for span in complete if span.seconds >= TURN_RATE_S]
+    if not long_enough:
         rates = ", ".join(f"{kind} {survey.rows[kind].rate_hz:.1f} Hz" for kind in REQUIRED_FIELDS)
-        return AbilityCheck(
-            name, False, f"never {TURN_RATE_S:.0f} s of complete data: {rates}; 2 Hz without gaps is required"
-        )
-    return AbilityCheck(
-        name,
-        True,
-        f"{seconds([stretch for stretch in complete if stretch.seconds >= TURN_RATE_S]):.0f} s of complete data",
-    )
+        return False, f"never {TURN_RATE_S:.0f} s of complete data: {rates}; 2 Hz without gaps is required"
+    return True, f"{seconds(long_enough):.0f} s of complete data"
 
 
-def _check_wind(survey: Survey) -> AbilityCheck:
-    name = "estimate wind"
+def _check_wind(survey: Survey) -> tuple[bool, str]:
     missing = [kind for kind in ("velocity", "air", "attitude") if not survey.rows[kind].count]
     if missing:
-        return AbilityCheck(name, False, f"no {', '.join(missing)} rows in the recording")
+        return False, f"no {', '.join(missing)} rows in the recording"
     t, fresh = survey.rows["velocity"].rows()[0], []
     air_t, air = survey.rows["air"].rows()
     for kind in ("air", "attitude"):
@@ -271,46 +240,32 @@ def _check_wind(survey: Survey) -> AbilityCheck:
     fast = air[np.clip(np.searchsorted(air_t, t) - 1, 0, None), 0] >= MIN_AIRSPEED
     pairs = int((fresh[0] & fresh[1] & fast).sum())
     if pairs < MIN_WIND_TRIANGLES:
-        max_airspeed = float(air[:, 0].max())
-        return AbilityCheck(
-            name,
-            False,
-            f"{pairs} wind triangles, {MIN_WIND_TRIANGLES} are required; airspeed reaches {max_airspeed:.1f} m/s",
-        )
-    return AbilityCheck(name, True, f"{pairs} wind triangles of ground velocity, airspeed and heading")
+        reached = f"airspeed reaches {float(air[:, 0].max()):.1f} m/s"
+        return False, f"{pairs} wind triangles, {MIN_WIND_TRIANGLES} are required; {reached}"
+    return True, f"{pairs} wind triangles of ground velocity, airspeed and heading"
 
 
-def _check_diagnose(survey: Survey, in_air: list[TimeInterval]) -> AbilityCheck:
-    """Check the requirements of `fleet diagnose`."""
-    name = "diagnose"
+def _check_diagnose(survey: Survey, in_air: list[TimeInterval]) -> tuple[bool, str]:
     if survey.vehicle_class.is_rotorcraft:
-        return AbilityCheck(
-            name, False, f"no diagnosis of a {survey.vehicle}: the reference simulation is a fixed wing"
-        )
+        return False, f"no diagnosis of a {survey.vehicle}: the reference simulation is a fixed wing"
     if sparse := [kind for kind in REQUIRED_FIELDS if survey.rows[kind].count < MIN_DIAGNOSE_ROWS]:
-        return AbilityCheck(name, False, f"fewer than {MIN_DIAGNOSE_ROWS} {', '.join(sparse)} rows in the recording")
+        return False, f"fewer than {MIN_DIAGNOSE_ROWS} {', '.join(sparse)} rows in the recording"
     gap_free_s = seconds(_gap_free_spans(survey, in_air))
     if gap_free_s < MIN_DIAGNOSE_S:
         available = format_below(gap_free_s, MIN_DIAGNOSE_S)
-        return AbilityCheck(name, False, f"{available} s in flight without gaps, {MIN_DIAGNOSE_S:.0f} s are required")
+        return False, f"{available} s in flight without gaps, {MIN_DIAGNOSE_S:.0f} s are required"
+    has_past = gap_free_s >= MIN_OWN_PAST_S
     reason = f"{gap_free_s:.0f} s in flight without gaps, compared with a model of `fleet calibrate`"
-    reason += (
-        " or earlier flight data"
-        if gap_free_s >= MIN_OWN_PAST_S
-        else f"; {MIN_OWN_PAST_S:.0f} s for earlier flight data"
-    )
+    reason += " or earlier flight data" if has_past else f"; {MIN_OWN_PAST_S:.0f} s for earlier flight data"
     missing = [] if survey.rows["imu"].rate_hz >= GUST_SENSING_HZ else [f"accelerometer at {GUST_SENSING_HZ:.0f} Hz"]
     missing += [label for kind, label in (("air", "airspeed"), ("pressure", "pressure")) if not survey.rows[kind].count]
-    return AbilityCheck(name, True, reason + (f"; reduced sensitivity without {', '.join(missing)}" if missing else ""))
+    return True, reason + (f"; reduced sensitivity without {', '.join(missing)}" if missing else "")
 
 
 def _gap_free_spans(survey: Survey, in_air: list[TimeInterval]) -> list[TimeInterval]:
     """Return the flight intervals without gaps in required fields, start and end of the rows excluded."""
-    ends = [survey.rows[kind].rows()[0][[0, -1]] for kind in REQUIRED_FIELDS]
-    parts = overlap(
-        in_air,
-        [TimeInterval(max(start for start, _ in ends) + _SKIP_BEGIN_S, min(stop for _, stop in ends) - _SKIP_END_S)],
-    )
+    starts, stops = np.transpose([survey.rows[kind].rows()[0][[0, -1]] for kind in REQUIRED_FIELDS]).tolist()
+    parts = overlap(in_air, [TimeInterval(max(starts) + _SKIP_BEGIN_S, min(stops) - _SKIP_END_S)])
     for kind in REQUIRED_FIELDS:
         gaps = survey.rows[kind].gaps()
         starts, stops = [-np.inf, *(gap.stop for gap in gaps)], [*(gap.start for gap in gaps), np.inf]

@@ -10,7 +10,7 @@ from msgspec import Meta
 from fleet.airframes.airframe import servo_map
 from fleet.contract import COLUMNS
 from fleet.frames import to_ned
-from fleet.telemetry.inspection.abilities import abilities
+from fleet.telemetry.inspection.abilities import AbilityResult, abilities
 from fleet.telemetry.inspection.survey import Survey, SurveyEvent, airborne, mode_spans
 from fleet.telemetry.inspection.thinned import inside, seconds
 
@@ -105,14 +105,6 @@ class TimedEvent(msgspec.Struct, frozen=True):
     text: str
 
 
-class AbilityResult(msgspec.Struct, frozen=True):
-    """One function of the twin and whether this recording supports it."""
-
-    name: str
-    can: bool
-    why: Annotated[str, Meta(description="values found and required")]
-
-
 class AircraftFindings(msgspec.Struct, frozen=True, kw_only=True):
     """One aircraft of one recording; fields may be added, existing fields keep their meaning."""
 
@@ -189,17 +181,16 @@ def compute_findings(survey: Survey, link_texts: LinkTexts) -> AircraftFindings:
             for event in merged_events(survey, link_texts)
         ),
         events_lost=survey.dropped_events,
-        abilities=tuple(AbilityResult(*check) for check in abilities(survey)),
+        abilities=tuple(abilities(survey)),
     )
 
 
 def merged_events(survey: Survey, link_texts: LinkTexts) -> list[SurveyEvent]:
     """Return the events and severe texts in time order, without duplicate texts."""
-    severe_texts = {text.strip(): t for t, severity, text in reversed(link_texts.texts) if severity <= _MAX_SEVERITY}
-    other = [event for event in survey.events if event.kind != "text" or event.text.strip() not in severe_texts]
-    severe = [
-        SurveyEvent(t, "text", text.strip()) for t, severity, text in link_texts.texts if severity <= _MAX_SEVERITY
-    ]
+    shown = [(t, text.strip()) for t, severity, text in link_texts.texts if severity <= _MAX_SEVERITY]
+    severe = [SurveyEvent(t, "text", text) for t, text in shown]
+    texts = {event.text for event in severe}
+    other = [event for event in survey.events if event.kind != "text" or event.text.strip() not in texts]
     return sorted(other + severe)
 
 
@@ -232,24 +223,19 @@ def _altitude(survey: Survey) -> tuple[float, float] | None:
 def _row_statistics(survey: Survey, name: str) -> RowStatistics:
     rows = survey.rows[name]
     gaps = rows.gaps()
-    longest_span = max(gaps, key=lambda gap: gap.seconds, default=None)
-    longest_gap = (
-        GapInterval(_relative_s(survey, longest_span.start), round(longest_span.seconds, 2)) if longest_span else None
-    )
-    return RowStatistics(rows.count, round(rows.rate_hz, 2), len(gaps), round(seconds(gaps), 1), longest_gap)
+    longest = None
+    if gaps:
+        span = max(gaps, key=lambda gap: gap.seconds)
+        longest = GapInterval(_relative_s(survey, span.start), round(span.seconds, 2))
+    return RowStatistics(rows.count, round(rows.rate_hz, 2), len(gaps), round(seconds(gaps), 1), longest)
 
 
 def _mission(survey: Survey) -> MissionStatistics:
-    if survey.mission is None:
-        return MissionStatistics(sentence="no mission list in the recording", flown=_executed_items(survey))
-    problem = survey.mission.sentence
-    return MissionStatistics(
-        len(survey.items), survey.mission.complete, survey.mission_count, _executed_items(survey), problem
-    )
-
-
-def _executed_items(survey: Survey) -> tuple[int, ...]:
-    return tuple(int(event.text.split()[1]) for event in survey.events if event.kind == "item")
+    flown = tuple(int(event.text.split()[1]) for event in survey.events if event.kind == "item")
+    mission = survey.mission
+    if mission is None:
+        return MissionStatistics(sentence="no mission list in the recording", flown=flown)
+    return MissionStatistics(len(mission.items), mission.complete, survey.mission_count, flown, mission.sentence)
 
 
 def _surface(survey: Survey, channel: int) -> str:
@@ -265,7 +251,6 @@ def _servo_map_text(survey: Survey) -> str:
 
 
 def _servos(survey: Survey) -> tuple[ServoStatistics, ...]:
-    """Describe the channels that carry pulses."""
     pulses = _rows_in_air(survey, "servo")
     servos = []
     for n in range(1, pulses.shape[1] + 1 if len(pulses) else 1):
@@ -281,16 +266,13 @@ def _servos(survey: Survey) -> tuple[ServoStatistics, ...]:
 
 
 def _sensor(survey: Survey) -> tuple[str, str]:
-    """Return whether there is an airspeed sensor, and the evidence."""
     for name in _SENSOR_PARAMS:
         if name in survey.values:
             return "yes" if survey.values[name] > 0 else "no", f"{name} is {survey.values[name]:g}"
     sensor_messages = [name for name in _SENSOR_MESSAGES if survey.status and name in survey.status.rates_hz]
-    return (
-        ("yes", f"{sensor_messages[0]} is sent")
-        if sensor_messages
-        else ("unknown", "no evidence in parameters or messages")
-    )
+    if sensor_messages:
+        return "yes", f"{sensor_messages[0]} is sent"
+    return "unknown", "no evidence in parameters or messages"
 
 
 def _airspeed(survey: Survey) -> AirspeedStatistics:

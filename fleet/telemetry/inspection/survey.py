@@ -11,12 +11,7 @@ from fleet.frames import Origin
 from fleet.telemetry.inspection.thinned import MAX_ROWS, DecimatedRows, TimeInterval, inside
 from fleet.vehicles import UNKNOWN, VehicleClass, vehicle_class
 
-MAX_INTERVAL_S = {
-    "attitude": 0.5,
-    "velocity": 1.0,
-    "servo": 0.5,
-    "position": 1.0,
-}  # longest interval that the twin interpolates [s]
+MAX_INTERVAL_S = {"attitude": 0.5, "velocity": 1.0, "servo": 0.5, "position": 1.0}  # that the twin interpolates [s]
 LINK_GAP_S = 3.0  # interval without any row that counts as a link gap [s]
 MAX_EVENTS = 2_000
 ROW_BUDGET = 5_000_000  # rows stored for all aircraft and fields
@@ -36,9 +31,8 @@ class SurveyEvent(NamedTuple):
 
 
 def _decimated_rows(name: str) -> DecimatedRows:
-    return DecimatedRows(
-        MAX_INTERVAL_S.get(name, 1.0), MAX_ROWS, "<f8" if name in ("position", "target", "gnss") else "<f4"
-    )
+    dtype = "<f8" if name in ("position", "target", "gnss") else "<f4"
+    return DecimatedRows(MAX_INTERVAL_S.get(name, 1.0), MAX_ROWS, dtype)
 
 
 @dataclass
@@ -142,9 +136,8 @@ def update(survey: Survey, message: Message) -> None:
     elif isinstance(message, Mission):
         if _mission_path(message) != _mission_path(survey.mission) or not survey.mission_count:
             survey.mission_count += bool(message.items)
-            survey.add_event(
-                message.t, "mission", f"{len(message.items)} items" + ("" if message.complete else ", not all")
-            )
+            text = f"{len(message.items)} items" + ("" if message.complete else ", not all")
+            survey.add_event(message.t, "mission", text)
         survey.mission = message
     elif isinstance(message, Params):
         _update_params(survey, message)
@@ -156,7 +149,6 @@ def _mission_path(mission: Mission | None) -> list[tuple[int, int, int, float]]:
 
 
 def _distribute_budget(surveys: dict[int, Survey]) -> None:
-    """Distribute the row budget equally over the aircraft."""
     max_rows = max(min(MAX_ROWS, ROW_BUDGET // (len(COLUMNS) * len(surveys))), 1_000)
     for survey in surveys.values():
         for rows in survey.rows.values():
@@ -173,10 +165,10 @@ def _update_samples(survey: Survey, sample: Sample) -> None:
             continue
         try:
             t, x = rows.t.numpy(), rows.x.numpy()
+            valid = t.ndim == 1 and x.shape == (len(t), len(COLUMNS[name]))
         except ValueError:
-            survey.rejected_fields += 1
-            continue
-        if x.ndim != 2 or t.shape != x.shape[:1] or x.shape[1] != len(COLUMNS[name]):
+            valid = False
+        if not valid:
             survey.rejected_fields += 1
             continue
         decimated.add(t, x)
@@ -198,7 +190,8 @@ def _update_status(survey: Survey, status: Status) -> None:
         survey.add_event(status.t, "mode", status.mode)
     if not survey.arming_changes or survey.arming_changes[-1][1] != status.armed:
         if survey.arming_changes or status.armed:
-            survey.add_event(status.t, "armed" if status.armed else "disarmed", "armed" if status.armed else "disarmed")
+            kind = "armed" if status.armed else "disarmed"
+            survey.add_event(status.t, kind, kind)
         survey.arming_changes.append((status.t, status.armed))
     if status.clock_jumps > (previous.clock_jumps if previous else 0):
         survey.add_event(status.t, "clock", "the aircraft's clock jumped")
@@ -212,15 +205,14 @@ def _update_status(survey: Survey, status: Status) -> None:
 
 def _update_params(survey: Survey, params: Params) -> None:
     previous = survey.values
-    changed = {
-        key: new_value
-        for key, new_value in params.values.items()
-        if previous.get(key, new_value) != new_value and not key.startswith(_AUTOMATIC_PARAMS)
-    }
+    changed = [
+        f"{name} {previous[name]:g} to {value:g}"
+        for name, value in params.values.items()
+        if name in previous and previous[name] != value and not name.startswith(_AUTOMATIC_PARAMS)
+    ]
     if changed and survey.arming_changes and survey.arming_changes[-1][1]:
-        changes = [f"{name} {previous[name]:g} to {value:g}" for name, value in list(changed.items())[:3]]
         remainder = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
-        survey.add_event(params.t, "parameter", ", ".join(changes) + remainder)
+        survey.add_event(params.t, "parameter", ", ".join(changed[:3]) + remainder)
     survey.params = params
 
 
@@ -239,9 +231,8 @@ def airborne(survey: Survey) -> list[TimeInterval]:
     if not len(velocity_t) or not len(position_t):
         return []
     vertical_takeoff = survey.vehicle_class.can_hover
-    min_speed, min_height = (
-        (ROTOR_AIRBORNE_SPEED, ROTOR_AIRBORNE_HEIGHT) if vertical_takeoff else (AIRBORNE_SPEED, _AIRBORNE_HEIGHT)
-    )
+    min_speed = ROTOR_AIRBORNE_SPEED if vertical_takeoff else AIRBORNE_SPEED
+    min_height = ROTOR_AIRBORNE_HEIGHT if vertical_takeoff else _AIRBORNE_HEIGHT
     armed = inside(velocity_t, armed_spans(survey))
     flying = armed & (np.linalg.norm(velocity, axis=1) > min_speed)
     if armed.any() and any(is_armed for _, is_armed in survey.arming_changes):

@@ -57,9 +57,7 @@ class DecimatedRows:
         if not self._stored:
             return np.zeros(0), np.zeros((0, 0), self.dtype)
         if len(self._stored) > 1:
-            self._stored = [
-                (np.concatenate([t for t, _ in self._stored]), np.concatenate([x for _, x in self._stored]))
-            ]
+            self._stored = [_joined(self._stored)]
         return self._stored[0]
 
     @property
@@ -106,8 +104,7 @@ class DecimatedRows:
     def _process_pending(self) -> None:
         if not self._pending:
             return
-        t = np.concatenate([t for t, _ in self._pending])
-        x = np.concatenate([x for _, x in self._pending])
+        t, x = _joined(self._pending)
         self._pending, self._pending_count = [], 0
         good = np.isfinite(t) & np.isfinite(x).all(axis=1)
         t, x = t[good], x[good].astype(self.dtype)
@@ -142,9 +139,13 @@ class DecimatedRows:
         self._stored.append((t[selection].copy(), x[selection].copy()))  # a view would hold the full array in memory
         self._count += len(t)
         while sum(len(stored_t) for stored_t, _ in self._stored) > self.max_rows:
-            all_t, all_x = (np.concatenate([pair[i] for pair in self._stored]) for i in (0, 1))
-            self._stored = [(all_t[::2].copy(), all_x[::2].copy())]
+            t, x = _joined(self._stored)
+            self._stored = [(t[::2].copy(), x[::2].copy())]
             self._stride *= 2
+
+
+def _joined(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    return np.concatenate([t for t, _ in parts]), np.concatenate([x for _, x in parts])
 
 
 def _edges() -> np.ndarray:

@@ -13,13 +13,13 @@ from fleet.telemetry.mavlink.microservices.params import ParamCollector
 from fleet.telemetry.mavlink.microservices.route import MISSION_MESSAGES, MissionCollector
 from fleet.telemetry.mavlink.onboard_log import OnboardEvent
 from fleet.telemetry.mavlink.timing import LinkTiming
-from fleet.telemetry.tables import clock
 
 LINK_LOST_S = 3.0  # silence after which the link is lost [s]
 STATUS_PERIOD_S = 0.95  # period of status messages; below 1 s because it is checked every 0.1 s [s]
 TEXT_LIFETIME_S = 30.0  # display time of an operator text [s]
 MAX_ERROR_SEVERITY = 3  # texts up to this severity are shown to the operator (MAV_SEVERITY_ERROR)
 MAX_TEXTS = 2_000
+_FIRMWARE_TEXTS = ("ArduPlane V", "ArduCopter V", "APM:", "PX4 v", "Blimp V", "ArduRover V")  # autopilot and version
 
 
 class AircraftLink:
@@ -73,18 +73,6 @@ class AircraftLink:
     def last_arrival(self) -> float:
         """Return the arrival of the last message, fleet time [s since 1970]."""
         return float(self.arrays.counts.state[self.number, LAST_ARRIVAL])
-
-    def queue_clock_jump(self, arrival: float) -> None:
-        """Queue a jump of the aircraft's clock."""
-        self.queue(arrival, self._apply_clock_jump, clock.jumps(self.arrays.clocks[self.number]))
-
-    def queue_reanchor(self, arrival: float, step_s: float) -> None:
-        """Queue a forward re-anchoring of the telemetry times by `step_s`."""
-        self.queue(arrival, self._apply_reanchor, step_s)
-
-    def queue_rejected(self, arrival: float, count: int) -> None:
-        """Queue a number of rejected rows."""
-        self.queue(arrival, self._count_rejected, count)
 
     def queue(self, arrival: float, callback: Callable[..., None], *arguments: Any) -> None:
         """Call `callback` with `arrival` as its last argument when `collect` reaches that time."""
@@ -175,16 +163,19 @@ class AircraftLink:
 
     def _process_text(self, severity: int, text: str, now: float) -> None:
         self.texts.append((now, severity, text))
-        self.firmware = self.firmware or (text if heartbeat.names_firmware(text) else "")
+        if text.startswith(_FIRMWARE_TEXTS):
+            self.firmware = self.firmware or text
         if severity <= MAX_ERROR_SEVERITY:
             self.set_operator_text(text, now)
 
-    def _apply_clock_jump(self, count: int, now: float) -> None:
+    def apply_clock_jump(self, count: int, now: float) -> None:
+        """Set the number of jumps of the aircraft's clock."""
         self._clock_jumps = count
         self.mission.needs_download = True  # the mission may differ after a restart
         self.set_operator_text(f"the aircraft's clock jumped ({count} times so far), time was re-anchored", now)
 
-    def _apply_reanchor(self, step_s: float, now: float) -> None:
+    def apply_reanchor(self, step_s: float, now: float) -> None:
+        """Add a forward re-anchoring of the telemetry times by `step_s`."""
         self._clock_advance_s += step_s
         self.set_operator_text(
             f"telemetry times were {step_s:.1f} s behind arrival for 15 to 30 s and were re-anchored; "
@@ -192,7 +183,8 @@ class AircraftLink:
             now,
         )
 
-    def _count_rejected(self, count: int, _: float) -> None:
+    def count_rejected(self, count: int, _: float) -> None:
+        """Count rejected rows."""
         self._rejected_values += count
 
     def _status(self, now: float) -> Status | None:
@@ -206,6 +198,7 @@ class AircraftLink:
             self.rates = self.arrays.counts.rates(self.number, elapsed)
             self._published_t = now
         self._published_state = state
+        overflow = int(self.arrays.pending.dropped[self.number])
         return Status(
             uav=self.uav,
             t=now,
@@ -217,16 +210,12 @@ class AircraftLink:
             rates_hz=self.rates,
             received=int(counters[RECEIVED]),
             missed=int(counters[MISSED]),
-            rejected=self._total_rejected(),
+            rejected=self._rejected_values + overflow + self.params.rejected + self.mission.rejected,
             **self.timing.status_fields(now),
             clock_jumps=self._clock_jumps,
             clock_advance_s=self._clock_advance_s,
             sentence=self._status_text(now),
         )
-
-    def _total_rejected(self) -> int:
-        overflow = int(self.arrays.pending.dropped[self.number])
-        return self._rejected_values + overflow + self.params.rejected + self.mission.rejected
 
     def _status_text(self, now: float) -> str:
         if self.link is Link.LOST:

@@ -6,10 +6,11 @@ import numpy as np
 
 from fleet.contract import COLUMNS
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
-from fleet.telemetry.mavlink.arrays.fleet_arrays import AircraftArrays, RowBatch
-from fleet.telemetry.mavlink.arrays.row_arbiter import FIELDS, NO_FIELD
+from fleet.telemetry.mavlink.arrays.fleet_arrays import AircraftArrays
+from fleet.telemetry.mavlink.arrays.row_arbiter import ACCEPTED, FIELDS, NO_FIELD, REJECTED, arbitrate_rows
 from fleet.telemetry.mavlink.arrays.rows import MAX_COLUMNS
 from fleet.telemetry.mavlink.parsing.decode import Fields, Frames, GroupedFrames
+from fleet.telemetry.tables import clock
 from fleet.telemetry.tables.mavlink import TABLE, own_seconds
 from fleet.telemetry.tables.row import FieldSource, is_plausible
 
@@ -30,73 +31,80 @@ def process_table_rows(
         aircraft: the aircraft on this link
         arrays: their state
     """
-    grouped, reader = GroupedFrames(frames), BatchReader(frames, owner, aircraft)
-    names = set(grouped.names())
-    rows = ((row_number, row) for row_number, row in enumerate(TABLE) if row.message in names)
-    results = [(number, *result) for number, row in rows if (result := reader.rows(row, *grouped.fields(row.message)))]
-    if not results:
+    read = _read(frames, owner, aircraft)
+    if read is None:
         return
-    frame_numbers, raw_s, values = (np.concatenate([result[k] for result in results]) for k in (1, 2, 3))
-    order = np.argsort(frame_numbers, kind="stable")
-    number, frame_numbers = (
-        np.repeat([result[0] for result in results], [len(result[1]) for result in results])[order],
-        frame_numbers[order],
-    )
-    codes = (_TICK[number], _FIELD[number], _RANK[number], _REQUIRES[number])
-    outcome = arrays.arbitrate(
-        RowBatch(owner[frame_numbers], frames.arrival[frame_numbers], raw_s[order], values[order], *codes)
-    )
-    for k in np.flatnonzero(~np.isnan(outcome.jumped)).tolist():
-        aircraft[k].queue_clock_jump(float(outcome.jumped[k]))
-    for i in np.flatnonzero(outcome.advanced).tolist():
-        aircraft[owner[frame_numbers[i]]].queue_reanchor(
-            float(frames.arrival[frame_numbers[i]]), float(outcome.advanced[i])
-        )
-    for k in np.flatnonzero(outcome.rejected).tolist():
-        aircraft[k].queue_rejected(float(outcome.newest[k]), int(outcome.rejected[k]))
+    row, frame_numbers, raw_s, values = read
+    field, owner, arrival = _FIELD[row], owner[frame_numbers], frames.arrival[frame_numbers]
+    n, count = len(row), len(aircraft)
+    t, decision, advanced, jumped = np.empty(n), np.empty(n, np.int8), np.empty(n), np.full(count, np.nan)
+    columns = (owner, _TICK[row], raw_s, arrival, field, _RANK[row], _REQUIRES[row])
+    arbitrate_rows(arrays.clocks, arrays.arbiter_state, *columns, t, decision, jumped, advanced)
+    accepted = np.flatnonzero(decision == ACCEPTED)
+    key = owner[accepted] * len(FIELDS) + field[accepted]
+    arrays.pending.add_rows(key, arrival[accepted], t[accepted], values[accepted])
+    for k in np.flatnonzero(~np.isnan(jumped)).tolist():
+        aircraft[k].queue(float(jumped[k]), aircraft[k].apply_clock_jump, clock.jumps(arrays.clocks[k]))
+    for i in np.flatnonzero(advanced).tolist():
+        link = aircraft[owner[i]]
+        link.queue(float(arrival[i]), link.apply_reanchor, float(advanced[i]))
+    rejected = np.bincount(owner[decision == REJECTED], minlength=count)
+    for k in np.flatnonzero(rejected).tolist():
+        newest = float(arrival[np.flatnonzero(owner == k)[-1]])
+        aircraft[k].queue(newest, aircraft[k].count_rejected, int(rejected[k]))
 
 
-class BatchReader:
-    """Read a batch of frames by the rows of the table."""
+def _read(frames: Frames, owner: np.ndarray, aircraft: Sequence[AircraftLink]) -> tuple[np.ndarray, ...] | None:
+    """Apply all table rows to the frames of their messages; None without valid frames.
 
-    def __init__(self, frames: Frames, owner: np.ndarray, aircraft: Sequence[AircraftLink]) -> None:
-        self._frames, self._owner, self._aircraft = frames, owner, aircraft
-        self._autopilot = np.array([link.autopilot for link in aircraft])
-
-    def rows(
-        self, row: FieldSource, frame_numbers: np.ndarray, fields: Fields
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Apply one table row: frame numbers (n,), time stamps (n,) [s], values (n, 8); None without valid frames.
-
-        Args:
-            row: table row
-            frame_numbers: frames of its message, (m,)
-            fields: fields of these frames
-        """
-        applicable = self._owner[frame_numbers] >= 0
-        if row.autopilots and applicable.any():
-            applicable[applicable] = np.isin(self._autopilot, row.autopilots)[self._owner[frame_numbers[applicable]]]
-        if row.when is not None:
-            with np.errstate(all="ignore"):
-                applicable &= row.when(fields)
-        if not applicable.all():
-            frame_numbers, fields = frame_numbers[applicable], Fields(fields.rows[applicable])
+    Returns:
+        number in `TABLE`, (n,); frame number, (n,), non-decreasing; time stamp of the message, (n,) [s]; values, (n, 8)
+    """
+    grouped, autopilots = GroupedFrames(frames), np.array([link.autopilot for link in aircraft])
+    names, parts = set(grouped.names()), []
+    for number, row in enumerate(TABLE):
+        if row.message not in names:
+            continue
+        frame_numbers, fields = grouped.fields(row.message)
+        applicable = _applicable(row, fields, owner[frame_numbers], autopilots)
+        frame_numbers, fields = frame_numbers[applicable], Fields(fields.rows[applicable])
         if not len(frame_numbers):
-            return None
-        values = np.zeros((len(frame_numbers), MAX_COLUMNS))
-        with np.errstate(all="ignore"):  # NaN propagates and is rejected below
-            for k, column in enumerate(row.columns(fields)):
-                values[:, k] = column
-            valid = is_plausible(row.field, values[:, : len(COLUMNS[row.field])])
+            continue
+        values, valid = _values(row, fields)
+        _reject(row.message, frames, frame_numbers[~valid], owner, aircraft)
         raw_s = np.broadcast_to(own_seconds(row, fields), len(frame_numbers))
-        if valid.all():
-            return frame_numbers, raw_s, values
-        self._reject(row.message, frame_numbers[~valid])
-        return frame_numbers[valid], raw_s[valid], values[valid]
+        parts.append((np.full(valid.sum(), number), frame_numbers[valid], raw_s[valid], values[valid]))
+    if not parts:
+        return None
+    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    order = np.argsort(columns[1], kind="stable")
+    return tuple(column[order] for column in columns)
 
-    def _reject(self, message: str, frame_numbers: np.ndarray) -> None:
-        """Report frames with implausible values to their aircraft."""
-        owner = self._owner[frame_numbers]
-        for number in np.unique(owner).tolist():
-            own_frames, link = frame_numbers[owner == number], self._aircraft[number]
-            link.queue(float(self._frames.arrival[own_frames[-1]]), link.reject_values, message, len(own_frames))
+
+def _applicable(row: FieldSource, fields: Fields, owner: np.ndarray, autopilots: np.ndarray) -> np.ndarray:
+    """Return a mask of the frames to which a table row applies, (n,)."""
+    applicable = owner >= 0
+    if row.autopilots and applicable.any():
+        applicable[applicable] = np.isin(autopilots, row.autopilots)[owner[applicable]]
+    if row.when is not None:
+        with np.errstate(all="ignore"):
+            applicable &= row.when(fields)
+    return applicable
+
+
+def _values(row: FieldSource, fields: Fields) -> tuple[np.ndarray, np.ndarray]:
+    """Apply a table row: values (n, 8), and a mask of the plausible ones (n,)."""
+    values = np.zeros((len(fields.rows), MAX_COLUMNS))
+    with np.errstate(all="ignore"):  # NaN propagates and is rejected
+        for k, column in enumerate(row.columns(fields)):
+            values[:, k] = column
+        return values, is_plausible(row.field, values[:, : len(COLUMNS[row.field])])
+
+
+def _reject(
+    message: str, frames: Frames, frame_numbers: np.ndarray, owner: np.ndarray, aircraft: Sequence[AircraftLink]
+) -> None:
+    """Report frames with implausible values to their aircraft."""
+    for number in np.unique(owner[frame_numbers]).tolist():
+        own_frames, link = frame_numbers[owner[frame_numbers] == number], aircraft[number]
+        link.queue(float(frames.arrival[own_frames[-1]]), link.reject_values, message, len(own_frames))

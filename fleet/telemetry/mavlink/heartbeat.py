@@ -67,11 +67,6 @@ def board_id(version: Any) -> str:
     return f"{number}-{version.flight_sw_version:08x}" if number else ""
 
 
-def names_firmware(text: str) -> bool:
-    """Return whether a text contains autopilot and version, e.g. ArduPlane V4.7.0-dev (d55cb382)."""
-    return text.startswith(("ArduPlane V", "ArduCopter V", "APM:", "PX4 v", "Blimp V", "ArduRover V"))
-
-
 CLEAR_AFTER_S = 10.0  # silence of the second sender after which the alert is cleared [s]
 
 

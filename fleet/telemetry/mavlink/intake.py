@@ -43,11 +43,6 @@ EARLY_MESSAGES = MISSION_MESSAGES | {"PARAM_VALUE", "HOME_POSITION"}  # sent onc
 IS_SINGLE = np.zeros(len(EXTRA), bool)  # by message id: processed individually, not as table rows
 IS_SINGLE[[IDS[name] for name in (*EARLY_MESSAGES, "HEARTBEAT", "STATUSTEXT", "AUTOPILOT_VERSION")]] = True
 IS_SINGLE[IDS["MISSION_CURRENT"]] = True  # also a table row
-_EARLY_ENCODER = msgspec.msgpack.Encoder(enc_hook=np.ndarray.tolist)
-IdOwners = dict[int, AircraftLink]
-"""Aircraft that owns a UAV id, over all links of a gateway."""
-AdmissionFilter = Callable[[Frames, Counter[str]], Frames]
-"""Remove frames that are not admitted, and count them by reason."""
 
 
 class MavlinkReceiver:
@@ -55,24 +50,24 @@ class MavlinkReceiver:
 
     Args:
         offset: UAV id = MAVLink system id + offset
-        id_owners: shared by the links of one gateway, to detect an id used on two links
+        id_owners: aircraft that owns a UAV id, shared by the links of a gateway to detect an id used on two links
         max_uavs: maximum number of UAVs over all these links
-        admit: admission filter; None: no filter
+        admit: removes frames that are not admitted, and counts them by reason; None: all are admitted
     """
 
     def __init__(
         self,
         offset: int = 0,
-        id_owners: IdOwners | None = None,
+        id_owners: dict[int, AircraftLink] | None = None,
         max_uavs: int = MAX_UAVS,
-        admit: AdmissionFilter | None = None,
+        admit: Callable[[Frames, Counter[str]], Frames] | None = None,
     ) -> None:
         self.offset = offset
         self.rejected: Counter[str] = Counter()  # valid frames rejected, by reason
         self.aircraft: dict[int, AircraftLink] = {}  # by MAVLink system id
         self.decoder = Decoder()
         self.arrays = AircraftArrays(MESSAGE_NAMES)
-        self._id_owners: IdOwners = {} if id_owners is None else id_owners
+        self._id_owners = {} if id_owners is None else id_owners
         self._number_by_address = np.full(1 << 16, -1)  # aircraft number by system and component
         self._max_uavs, self._admit = max_uavs, admit
         self._received: list[ReceivedBytes] = []
@@ -165,10 +160,8 @@ class MavlinkReceiver:
             self.rejected[NO_HEARTBEAT] += len(self._pop_early(system))
         removed = []
         for system, link in list(self.aircraft.items()):
-            is_transient = (
-                link.last_arrival - self._registered_t[system] < PROBATION_S
-                and now - link.last_arrival > SILENCE_LIMIT_S
-            )
+            is_silent = now - link.last_arrival > SILENCE_LIMIT_S
+            is_transient = is_silent and link.last_arrival - self._registered_t[system] < PROBATION_S
             if is_transient or self._id_owners.get(link.uav) is None:
                 self._remove(system, link)
                 removed.append(link.uav)
@@ -183,9 +176,8 @@ class MavlinkReceiver:
         self._conflicting_systems.discard(system)
         self._number_by_address[(system << 8) + link.component] = -1
         self.arrays.reset_aircraft(link.number)
-        self._aircraft_by_number[link.number] = AircraftLink(
-            self.arrays, link.uav, system, link.component, number=link.number
-        )
+        removed = AircraftLink(self.arrays, link.uav, system, link.component, number=link.number)
+        self._aircraft_by_number[link.number] = removed
 
     def collect(self, now: float) -> list[TelemetryMessage]:
         """Return the messages of processed frames that arrived up to `now` [s since 1970]."""
@@ -210,14 +202,8 @@ class MavlinkReceiver:
         if not len(frames.headers):
             return
         frame_numbers = np.flatnonzero(IS_SINGLE[frames.headers[:, ID]])
-        columns = (
-            frame_numbers.tolist(),
-            frames.arrival[frame_numbers].tolist(),
-            frames.messages(frame_numbers),
-            frames.sender[frame_numbers].tolist(),
-        )
-        for i, arrival, message, sender in zip(*columns, strict=True):
-            self._dispatch(i, arrival, message, frames.senders[sender])
+        for i, message in zip(frame_numbers.tolist(), frames.messages(frame_numbers), strict=True):
+            self._dispatch(i, float(frames.arrival[i]), message, frames.senders[frames.sender[i]])
         owner = self._frame_owners(frames)
         self._first_heartbeat.clear()
         owned = np.flatnonzero(owner >= 0)
@@ -261,9 +247,8 @@ class MavlinkReceiver:
         if link is not None and link.component == component:
             return link if self._accept_sender(link, source, arrival, row_count) else None
         if row_count:
-            self.rejected[
-                SECOND_SENDER if system in self._conflicting_systems else "not an autopilot" if link else NO_HEARTBEAT
-            ] += row_count
+            reason = "not an autopilot" if link else NO_HEARTBEAT
+            self.rejected[SECOND_SENDER if system in self._conflicting_systems else reason] += row_count
         return None
 
     def _dispatch(self, i: int, arrival: float, message: Any, source: Hashable) -> None:
@@ -358,7 +343,8 @@ class MavlinkReceiver:
         system = message.get_srcSystem()
         has_room = len(self._early.get(system, ())) < MAX_EARLY and self._early_count < MAX_EARLY_TOTAL
         if has_room and message.get_type() in EARLY_MESSAGES:
-            self._early.setdefault(system, []).append(_EARLY_ENCODER.encode((arrival, message.get_type(), *message)))
+            packed = msgspec.msgpack.encode((arrival, message.get_type(), *message))
+            self._early.setdefault(system, []).append(packed)
             self._early_count += 1
         else:
             self.rejected[NO_HEARTBEAT] += 1

@@ -67,7 +67,9 @@ class FleetLog:
                 data, position = rest + chunk, 0
                 budget.remaining += SEARCH_FACTOR * len(chunk)
                 for start, stop in find_records(data, not chunk, budget):
-                    self._skip(place + position, start - position)
+                    if start > position and self.first_damage is None:
+                        self.first_damage = place + position
+                    self.damaged_bytes += start - position
                     position = stop
                     if start < stop:
                         self.record_count += 1
@@ -76,11 +78,6 @@ class FleetLog:
                 self.search_aborted = budget.remaining < 0
                 if not chunk or self.search_aborted or (not self.record_count and place > MAX_UNRECOGNISED):
                     return
-
-    def _skip(self, place: int, count: int) -> None:
-        if count and self.first_damage is None:
-            self.first_damage = place
-        self.damaged_bytes += count
 
 
 class SearchBudget:
@@ -136,6 +133,5 @@ def _unpack(data: bytes) -> BusRecord:
     begin = _HEAD.size + _BODY.size
     encoding_name = data[begin : begin + name_size].decode("ascii", "replace")
     stamp = Stamp(epoch, writer) if epoch or writer else None
-    return BusRecord(
-        received_t if math.isfinite(received_t) else 0.0, _PREFIX + encoding_name, data[begin + name_size :], stamp
-    )
+    received_t = received_t if math.isfinite(received_t) else 0.0
+    return BusRecord(received_t, _PREFIX + encoding_name, data[begin + name_size :], stamp)

@@ -5,8 +5,8 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
-import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from fleet.bus.codec import Stamp, decode, encoding, is_plausible_epoch
 from fleet.contract import (
@@ -55,15 +55,14 @@ class BusMessageReader:
     @property
     def skipped(self) -> list[str]:
         """Return messages on unreadable parts and their positions."""
-        problems = [f"{count} messages rejected, {reason}, the first near byte {self._places[reason]}"
-                for reason, count in self._rejected.items()]  # fmt: skip
-        if self._log.damaged_bytes:
-            where = f"the first near byte {self._log.first_damage}"
-            problems.insert(
-                0, f"{self._log.damaged_bytes} damaged bytes skipped, {where}, {self._log.record_count} messages read"
-            )
-        if self._log.search_aborted:
-            problems.insert(0, "too many invalid record headers, the rest was not read; split it")
+        log, problems = self._log, []
+        if log.search_aborted:
+            problems.append("too many invalid record headers, the rest was not read; split it")
+        if log.damaged_bytes:
+            where = f"the first near byte {log.first_damage}"
+            problems.append(f"{log.damaged_bytes} damaged bytes skipped, {where}, {log.record_count} messages read")
+        for reason, count in self._rejected.items():
+            problems.append(f"{count} messages rejected, {reason}, the first near byte {self._places[reason]}")
         return problems
 
     def steps(self, results: bool = False) -> Iterator[tuple[float, list[Any]]]:
@@ -99,7 +98,9 @@ class BusMessageReader:
         try:
             message = self._read(kind, record)
         except ValueError as error:
-            self._reject(str(error), place)
+            reason = str(error) if str(error) in self._rejected or len(self._rejected) < 20 else "for other reasons"
+            self._rejected[reason] += 1
+            self._places.setdefault(reason, place)
             return None
         return message if kind in TELEMETRY_TYPES or self._is_owner(message, record) else None
 
@@ -113,11 +114,6 @@ class BusMessageReader:
         if self._offset and (message := renumbered(message, lambda uav: uav + self._offset)) is None:
             raise ValueError(f"{kind.__name__} of an id out of range")
         return message
-
-    def _reject(self, reason: str, place: int) -> None:
-        reason = reason if reason in self._rejected or len(self._rejected) < 20 else "for other reasons"
-        self._rejected[reason] += 1
-        self._places.setdefault(reason, place)
 
     def _is_owner(self, message: Any, record: BusRecord) -> bool:
         """Return whether the writer owned the aircraft: only the highest fencing token is valid."""
@@ -138,8 +134,10 @@ def renumbered(message: Any, new_id: Any) -> Any | None:
         new_id: returns the new id of a recorded id
     """
     if isinstance(message, FleetState):
-        rows = tuple(_renumber_row(row, new_id(row.uav)) for row in message.rows)
-        return msgspec.structs.replace(message, rows=tuple(row for row in rows if row.uav >= 0))
+        ids = [(row, new_id(row.uav)) for row in message.rows]
+        kept = [(row, uav, _renumber_text(row.verdict, row.uav, uav)) for row, uav in ids if uav >= 0]
+        rows = [replace(row, uav=uav, verdict=verdict) for row, uav, verdict in kept]
+        return replace(message, rows=tuple(rows))
     uav = new_id(message.uav)
     return with_uav(message, uav) if 0 <= uav <= MAX_UAV else None
 
@@ -147,22 +145,15 @@ def renumbered(message: Any, new_id: Any) -> Any | None:
 def with_uav(message: Any, uav: int, **changes: Any) -> Any:
     """Replace the UAV id of a message, its sentences included, and the given fields."""
     if getattr(message, "sentence", ""):
-        changes["sentence"] = message.sentence.replace(f"uav-{message.uav}:", f"uav-{uav}:")
-    if isinstance(message, Model):
-        changes |= {
-            name: _renumber_verdict(getattr(message, name), message.uav, uav) for name in ("verdict", "active_verdict")
-        }
-    return msgspec.structs.replace(message, uav=uav, **changes)
+        changes["sentence"] = _renumber_text(message.sentence, message.uav, uav)
+    for name in ("verdict", "active_verdict") if isinstance(message, Model) else ():
+        if (verdict := getattr(message, name)) is not None:
+            changes[name] = replace(verdict, sentence=_renumber_text(verdict.sentence, message.uav, uav))
+    return replace(message, uav=uav, **changes)
 
 
-def _renumber_verdict(verdict: Any, old_uav: int, uav: int) -> Any:
-    if verdict is None:
-        return None
-    return msgspec.structs.replace(verdict, sentence=verdict.sentence.replace(f"uav-{old_uav}:", f"uav-{uav}:"))
-
-
-def _renumber_row(row: Any, uav: int) -> Any:
-    return msgspec.structs.replace(row, uav=uav, verdict=row.verdict.replace(f"uav-{row.uav}:", f"uav-{uav}:"))
+def _renumber_text(text: str, old_uav: int, uav: int) -> str:
+    return text.replace(f"uav-{old_uav}:", f"uav-{uav}:")
 
 
 def _validate(message: Any) -> None:
@@ -183,27 +174,16 @@ def _validate(message: Any) -> None:
             rows: Rows | None = getattr(message, field)
             if rows is not None and not _rows_valid(rows, len(COLUMNS[field])):
                 raise ValueError(f"Sample with invalid rows of {field}")
-    if isinstance(message, Mission) and (
-        len(message.items) > MAX_ITEMS
-        or not all(
-            map(
-                math.isfinite,
-                (number for item in message.items for number in (item.param1, item.param2, item.param3, item.alt_m)),
-            )
-        )
-    ):
-        raise ValueError("Mission with invalid items")
+    if isinstance(message, Mission):
+        numbers = [n for item in message.items for n in (item.param1, item.param2, item.param3, item.alt_m)]
+        if len(message.items) > MAX_ITEMS or not all(map(math.isfinite, numbers)):
+            raise ValueError("Mission with invalid items")
     if isinstance(message, Params) and not all(map(math.isfinite, message.values.values())):
         raise ValueError("Params with a non-finite value")
 
 
 def _rows_valid(rows: Rows, width: int) -> bool:
     t, x = rows.t.numpy(), rows.x.numpy()
-    return bool(
-        t.ndim == 1
-        and x.shape == (len(t), width)
-        and len(t)
-        and np.isfinite(x).all()
-        and (t > 0).all()
-        and (t < _MAX_TIME_S).all()
-    )
+    if t.ndim != 1 or x.shape != (len(t), width) or not len(t):
+        return False
+    return bool(np.isfinite(x).all() and (t > 0).all() and (t < _MAX_TIME_S).all())

@@ -1,6 +1,7 @@
 """Allocate unique aircraft ids for several recordings and their copies."""
 
 from collections.abc import Hashable
+from itertools import chain
 
 
 class IdAllocator:
@@ -24,9 +25,8 @@ class IdAllocator:
         if key in self._by_key:
             return self._by_key[key]
         after = max(preferred, self._min)
-        free = next((candidate for candidate in range(after, self._max + 1) if candidate not in self._allocated), None)
-        if free is None:
-            free = next((i for i in range(self._min, after) if i not in self._allocated), None)
+        candidates = chain(range(after, self._max + 1), range(self._min, after))
+        free = next((candidate for candidate in candidates if candidate not in self._allocated), None)
         if free is None:
             count = self._max - self._min + 1
             raise ValueError(f"ids: found all {count} taken, expected a free one; replay fewer aircraft or copies")

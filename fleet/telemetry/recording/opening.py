@@ -63,9 +63,8 @@ class RecordingFile:
         opener = _OPENERS.get(self.path.suffix)
         if opener is None:
             return RecordingStream(self, self._raw)
-        return RecordingStream(
-            self, opener(self._raw), min(max(MIN_UNPACKED_LIMIT, MAX_RATIO * self.size), MAX_UNPACKED)
-        )
+        max_bytes = min(max(MIN_UNPACKED_LIMIT, MAX_RATIO * self.size), MAX_UNPACKED)
+        return RecordingStream(self, opener(self._raw), max_bytes)
 
 
 class RecordingStream(RawIOBase):

@@ -111,14 +111,11 @@ class Recording:
                 frames_at_once = 0
                 yield step
         if steps.gaps > MAX_GAPS:
-            self._notes.append(
-                f"{steps.gaps} silences of over {SILENT_STEPS * STEP_S:.0f} s, more than {MAX_GAPS}: "
-                "the later ones are skipped"
-            )
+            silences = f"{steps.gaps} silences of over {SILENT_STEPS * STEP_S:.0f} s"
+            self._notes.append(f"{silences}, more than {MAX_GAPS}: the later ones are skipped")
         if left_out:
-            self._notes.append(
-                f"{left_out} frames skipped: over {_MAX_AT_ONCE:,} in {STEP_S} s, more than any radio carries"
-            )
+            limit = f"over {_MAX_AT_ONCE:,} in {STEP_S} s, more than any radio carries"
+            self._notes.append(f"{left_out} frames skipped: {limit}")
         yield from steps.remaining()
 
     def _onboard(self) -> Iterator[tuple[float, list[TelemetryMessage]]]:
@@ -158,9 +155,9 @@ def _suffix_by_content(head: bytes) -> str:
         ".tlog": int((headers[:, STOP] - headers[:, START]).sum()) + STAMP_SIZE * len(headers),
         ".bin": 89 * head.count(b"\xa3\x95\x80"),
         ".parauav": sum(stop - start for start, stop in find_records(head)),
-        ".log": sum(map(len, [line for line in head.split(b"\n") if line.startswith((b"FMT,", b"PARM,"))])),
+        ".log": sum(len(line) for line in head.split(b"\n") if line.startswith((b"FMT,", b"PARM,"))),
     }
-    best = max(matched_bytes, key=lambda suffix: matched_bytes[suffix])
+    best = max(matched_bytes, key=matched_bytes.__getitem__)
     return best if matched_bytes[best] else ""
 
 

@@ -38,11 +38,8 @@ class Tlog:
     @property
     def share(self) -> float:
         """Return the read progress, 0..1, including the search for a backlog."""
-        return (
-            PRESCAN_SHARE * self._source.share
-            if self._prescanning
-            else PRESCAN_SHARE + (1 - PRESCAN_SHARE) * self._source.share
-        )
+        share = self._source.share
+        return PRESCAN_SHARE * share if self._prescanning else PRESCAN_SHARE + (1 - PRESCAN_SHARE) * share
 
     def batches(self) -> Iterator[Frames]:
         """Return the frames in flight time; boot time replaces the arrival of a backlog."""
@@ -64,12 +61,8 @@ class Tlog:
             self._prescanning = decoder is not self.decoder
             while True:
                 chunk = stream.read(CHUNK) or b""
-                data = rest + chunk
-                buf, parts, damaged_before = (
-                    np.frombuffer(data, np.uint8),
-                    np.array([[0, len(data), 0]]),
-                    int(counts[s.BAD_BYTES]),
-                )
+                data, damaged_before = rest + chunk, int(counts[s.BAD_BYTES])
+                buf, parts = np.frombuffer(data, np.uint8), np.array([[0, len(data), 0]])
                 headers, stamps, last_t = find_frames(buf, parts, counts, s.STAMP_SIZE, last_t)
                 done = int(parts[0, 0])
                 if chunk and len(headers) > 1:  # hold back the last frame: its successor is needed to check its stamp
@@ -123,10 +116,8 @@ def boot_times(frames: Frames) -> np.ndarray:
     boot_t = np.full(len(frames.headers), np.nan)
     for number in _BOOT_TIME_IDS:
         frame_numbers = np.flatnonzero((frames.headers[:, s.ID] == number) & (frames.headers[:, s.SIZE] >= 4))
-        payloads = collect_payloads(
-            frames.buf, frames.headers[frame_numbers, s.PAYLOAD], frames.headers[frame_numbers, s.SIZE], 4
-        )
-        boot_t[frame_numbers] = payloads.view("<u4")[:, 0] * 1e-3
+        starts, sizes = frames.headers[frame_numbers, s.PAYLOAD], frames.headers[frame_numbers, s.SIZE]
+        boot_t[frame_numbers] = collect_payloads(frames.buf, starts, sizes, 4).view("<u4")[:, 0] * 1e-3
     return boot_t
 
 

@@ -1,5 +1,6 @@
 """Send a `.tlog` as MAVLink datagrams on this machine: its aircraft and copies of them."""
 
+import contextlib
 import ctypes
 import ipaddress
 import socket
@@ -19,58 +20,52 @@ from fleet.telemetry.recording.ids import IdAllocator
 from fleet.telemetry.recording.opening import RecordingFile, ReplayPace
 from fleet.telemetry.recording.recordings import Recording
 from fleet.telemetry.recording.tlog import Tlog
-from fleet.telemetry.replay.offset_copies import GROUP_COUNT, FrameBlock, GridOffset, extract_frames, rewrite_frames
+from fleet.telemetry.replay.offset_copies import (
+    GROUP_COUNT,
+    FrameBlock,
+    GridOffset,
+    extract_frames,
+    group_offsets,
+    rewrite_frames,
+)
 
 MAX_BATCH = 1024  # datagrams per call, the system's limit
 _VECTOR = np.dtype([("base", "u8"), ("size", "u8")])
 _MESSAGE = np.dtype(
-    {
-        "names": ["vector", "vectors", "sent"],
-        "formats": ["u8", "u8", "u4"],
-        "offsets": [16, 24, 56],
-        "itemsize": 64,
-    }
+    {"names": ["vector", "vectors", "sent"], "formats": ["u8", "u8", "u4"], "offsets": [16, 24, 56], "itemsize": 64}
 )
 
 
-class DatagramSender:
-    """Sender of datagrams on one connected socket."""
+_SENDMMSG = getattr(ctypes.CDLL(None), "sendmmsg", None) if sys.platform.startswith("linux") else None
+if _SENDMMSG is not None:
+    _SENDMMSG.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int)
 
-    def __init__(self, connection: socket.socket) -> None:
-        self._socket = connection
-        self._call = getattr(ctypes.CDLL(None), "sendmmsg", None) if sys.platform.startswith("linux") else None
-        if self._call is not None:
-            self._call.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int)
 
-    def send(self, data: np.ndarray, start: np.ndarray, length: np.ndarray) -> int:
-        """Send datagrams; return the number accepted by the system.
+def send_datagrams(connection: socket.socket, data: np.ndarray, start: np.ndarray, length: np.ndarray) -> int:
+    """Send datagrams on a connected socket; return the number accepted by the system.
 
-        Args:
-            data: bytes of all datagrams, (b,) uint8
-            start, length: start and length of each datagram in them, (n,)
-        """
-        if self._call is None:
-            return sum(
-                self._send_single(data[begin : begin + size].tobytes())
-                for begin, size in zip(start.tolist(), length.tolist(), strict=True)
-            )
-        vectors, messages = np.zeros(len(start), _VECTOR), np.zeros(len(start), _MESSAGE)
-        vectors["base"], vectors["size"] = data.ctypes.data + start, length
-        messages["vector"], messages["vectors"] = vectors.ctypes.data + np.arange(len(start)) * _VECTOR.itemsize, 1
-        at = sent = 0
-        while at < len(start):
-            batch_address = messages.ctypes.data + at * _MESSAGE.itemsize
-            accepted = self._call(self._socket.fileno(), batch_address, min(MAX_BATCH, len(start) - at), 0)
-            # without receiver or buffer space the datagram is lost
-            at, sent = at + max(accepted, 1), sent + max(accepted, 0)
+    Args:
+        connection: the socket
+        data: bytes of all datagrams, (b,) uint8
+        start, length: start and length of each datagram in them, (n,)
+    """
+    sent = 0
+    if _SENDMMSG is None:
+        for begin, size in zip(start.tolist(), length.tolist(), strict=True):
+            with contextlib.suppress(OSError):
+                connection.send(data[begin : begin + size].tobytes())
+                sent += 1
         return sent
-
-    def _send_single(self, datagram: bytes) -> int:
-        try:
-            self._socket.send(datagram)
-        except OSError:
-            return 0
-        return 1
+    vectors, messages = np.zeros(len(start), _VECTOR), np.zeros(len(start), _MESSAGE)
+    vectors["base"], vectors["size"] = data.ctypes.data + start, length
+    messages["vector"], messages["vectors"] = vectors.ctypes.data + np.arange(len(start)) * _VECTOR.itemsize, 1
+    at = 0
+    while at < len(start):
+        batch_address = messages.ctypes.data + at * _MESSAGE.itemsize
+        accepted = _SENDMMSG(connection.fileno(), batch_address, min(MAX_BATCH, len(start) - at), 0)
+        # without receiver or buffer space the datagram is lost
+        at, sent = at + max(accepted, 1), sent + max(accepted, 0)
+    return sent
 
 
 SystemFrames = tuple[np.ndarray, FrameBlock]
@@ -151,14 +146,13 @@ class Broadcaster:
         try:
             with socket.socket(family, socket.SOCK_DGRAM) as connection:
                 connection.connect(destination)
-                sender = DatagramSender(connection)
                 for now, batches in self._rounds():
                     if self.pace.wait(now, stop):
                         return
                     for data, block in batches:
                         starts = np.arange(len(data))[:, None] * data.shape[1] + block.start
                         length = np.broadcast_to(block.payload - block.start + block.size + 2, starts.shape)
-                        self.sent += sender.send(data.ravel(), starts.ravel(), length.ravel())
+                        self.sent += send_datagrams(connection, data.ravel(), starts.ravel(), length.ravel())
         except (ValueError, OSError) as error:
             self.problem = str(error)
         if not self._systems and not self.problem and not stop.is_set():
@@ -215,6 +209,4 @@ class Broadcaster:
         if len(has_position):
             first = has_position[0]
             origin = Origin(int(fields.lat[first]), int(fields.lon[first]), int(fields.alt[first]))
-            self._offsets = [
-                GridOffset(self._numbers[lag::GROUP_COUNT], self._total, origin) for lag in range(GROUP_COUNT)
-            ]
+            self._offsets = group_offsets(self._numbers, self._total, origin)

@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterator, Sequence
+from itertools import chain
 from math import ceil, sqrt
 from typing import Any, NamedTuple
 
@@ -113,10 +114,8 @@ def _move_positions(out: np.ndarray, block: FrameBlock, name: str, offset: GridO
     (lat, _), (lon, _) = (fields[field][:2][::-1] for field in POSITION_FIELDS[name])
     frame_numbers = np.flatnonzero((block.message == IDS[name]) & (block.size >= max(lat, lon) + 4))
     if "frame" in fields and len(frame_numbers):
-        place, is_present = (
-            block.payload[frame_numbers] + fields["frame"][1],
-            block.size[frame_numbers] > fields["frame"][1],
-        )
+        place = block.payload[frame_numbers] + fields["frame"][1]
+        is_present = block.size[frame_numbers] > fields["frame"][1]
         frame = np.where(is_present, block.data[np.minimum(place, len(block.data) - 1)], 0)
         frame_numbers = frame_numbers[np.isin(frame, GLOBAL_FRAMES)]
     if not len(frame_numbers):
@@ -153,12 +152,9 @@ GROUP_COUNT = 10  # groups of copies delayed by 0, 1, 2 … steps, to spread the
 _PLACES = ("position", "target")
 
 
-class CopyGroup(NamedTuple):
-    """Copies of one aircraft with equal delay."""
-
-    ids: np.ndarray  # UAV ids, (n,)
-    offset: GridOffset | None  # None until the original has a position
-    lag_s: float  # delay behind the original [s]
+def group_offsets(numbers: np.ndarray, total: int, origin: Origin) -> list[GridOffset]:
+    """Return the position offset of each group of copies; arguments as for `GridOffset`."""
+    return [GridOffset(numbers[lag::GROUP_COUNT], total, origin) for lag in range(GROUP_COUNT)]
 
 
 class MessageTemplate:
@@ -191,16 +187,22 @@ class MessageTemplate:
             if field in _PLACES:
                 self._places.append((at - len(rows.x.data), rows.x.numpy()))
 
-    def copies(self, group: CopyGroup) -> list[bytes]:
-        """Return the bytes of every copy."""
-        out = np.tile(self._bytes, (len(group.ids), 1))
-        _write(out, self._uav, group.ids[:, None].astype(">u4"))
-        _write(out, self._t, np.full((len(out), 1), self.message.t + group.lag_s, ">f8"))
+    def copies(self, ids: np.ndarray, offset: GridOffset | None, lag_s: float) -> list[bytes]:
+        """Return the bytes of every copy.
+
+        Args:
+            ids: UAV ids, (n,)
+            offset: None until the original has a position
+            lag_s: delay behind the original [s]
+        """
+        out = np.tile(self._bytes, (len(ids), 1))
+        _write(out, self._uav, ids[:, None].astype(">u4"))
+        _write(out, self._t, np.full((len(out), 1), self.message.t + lag_s, ">f8"))
         for position, t in self._times:
-            _write(out, position, np.tile(t + group.lag_s, (len(out), 1)).astype(t.dtype))
-        for position, x in self._places if group.offset is not None else ():
+            _write(out, position, np.tile(t + lag_s, (len(out), 1)).astype(t.dtype))
+        for position, x in self._places if offset is not None else ():
             moved = np.tile(x, (len(out), 1, 1))
-            moved[..., 0], moved[..., 1] = group.offset.move(x[:, 0], x[:, 1])  # type: ignore[union-attr]
+            moved[..., 0], moved[..., 1] = offset.move(x[:, 0], x[:, 1])  # type: ignore[union-attr]
             _write(out, position, moved.reshape(len(out), -1))
         return [row.tobytes() for row in out]
 
@@ -221,7 +223,7 @@ class OffsetCopies:
         self.count = count
         self._ids: dict[int, np.ndarray] = {}  # ids of the copies, by id of the original
         self._past: deque[list[MessageTemplate]] = deque(maxlen=GROUP_COUNT)  # newest first
-        self._offsets: list[GridOffset | None] = [None] * GROUP_COUNT
+        self._offsets: Sequence[GridOffset | None] = [None] * GROUP_COUNT
         self._origin: Origin | None = None
         self._items: dict[int, tuple[tuple[Item, ...], dict[int, tuple[Item, ...]]]] = {}
         self._early_missions: dict[int, Mission] = {}  # missions before the first position of the original
@@ -239,12 +241,8 @@ class OffsetCopies:
             self._find_origin(messages)
             messages = [*self._early_missions.values(), *messages] if self._origin is not None else messages
         self._past.appendleft([MessageTemplate(message) for message in messages])
-        return [
-            wire
-            for lag, past in enumerate(self._past)
-            for template in past
-            for wire in self._copy_message(template, lag)
-        ]
+        copied = (self._copy_message(template, lag) for lag, past in enumerate(self._past) for template in past)
+        return list(chain.from_iterable(copied))
 
     def remaining(self) -> Iterator[list[EncodedMessage]]:
         """Return step by step the remaining messages of the copies after the end of the originals."""
@@ -260,41 +258,33 @@ class OffsetCopies:
         first = next((first_row for first_row in positions if first_row[:2].any()), None)
         if first is not None:
             self._origin = Origin(*(int(v) for v in first))
-            numbers = np.arange(1, self.count)
-            self._offsets = [
-                GridOffset(numbers[lag::GROUP_COUNT], self.count, self._origin) for lag in range(GROUP_COUNT)
-            ]
+            self._offsets = group_offsets(np.arange(1, self.count), self.count, self._origin)
 
     def _copy_message(self, template: MessageTemplate, lag: int) -> Iterator[EncodedMessage]:
-        message = template.message
+        message, offset, lag_s = template.message, self._offsets[lag], lag * STEP_S
         ids = self._ids[message.uav][lag::GROUP_COUNT]
         if not len(ids):
             return
-        group = CopyGroup(ids, self._offsets[lag], lag * STEP_S)
-        if isinstance(message, Mission) or bool(getattr(message, "sentence", "")):
-            payloads = self._encode_each(message, group)
+        if isinstance(message, Mission) or bool(getattr(message, "sentence", "")):  # rare: encode each copy
+            items = self._moved_missions(message, ids.tolist(), offset) if isinstance(message, Mission) else {}
+            changes: dict[int, dict[str, Any]] = {uav: {"items": moved} for uav, moved in items.items()}
+            t = message.t + lag_s
+            payloads = [encode(with_uav(message, uav, t=t, **changes.get(uav, {}))) for uav in ids.tolist()]
         else:
-            payloads = template.copies(group)
-        kind = type(message)
+            payloads = template.copies(ids, offset, lag_s)
         for uav, payload in zip(ids.tolist(), payloads, strict=True):
-            yield EncodedMessage(kind, uav, payload, message.t + group.lag_s)
+            yield EncodedMessage(type(message), uav, payload, message.t + lag_s)
 
-    def _encode_each(self, message: Message, group: CopyGroup) -> list[bytes]:
-        """Encode each copy separately: for missions, and for messages with a sentence; both are rare."""
-        items = self._moved_missions(message, group) if isinstance(message, Mission) else {}
-        t = message.t + group.lag_s
-        changes: dict[int, dict[str, Any]] = {uav: {"items": moved} for uav, moved in items.items()}
-        return [encode(with_uav(message, uav, t=t, **changes.get(uav, {}))) for uav in group.ids.tolist()]
-
-    def _moved_missions(self, mission: Mission, group: CopyGroup) -> dict[int, tuple[Item, ...]]:
+    def _moved_missions(
+        self, mission: Mission, ids: list[int], offset: GridOffset | None
+    ) -> dict[int, tuple[Item, ...]]:
         """Return the offset items of each copy, cached while the mission is unchanged."""
         previous, moved = self._items.get(mission.uav, ((), {}))
         if previous != mission.items:
             moved = {}
         self._items[mission.uav] = mission.items, moved
-        ids = group.ids.tolist()
-        if ids[0] not in moved and group.offset is not None:
-            moved.update(zip(ids, _moved(mission.items, group.offset, len(ids)), strict=True))
+        if ids[0] not in moved and offset is not None:
+            moved.update(zip(ids, _moved(mission.items, offset, len(ids)), strict=True))
         return {uav: moved.get(uav, mission.items) for uav in ids}
 
 

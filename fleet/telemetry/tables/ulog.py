@@ -111,55 +111,39 @@ def _is_driven(m: Any) -> Any:
 
 # --- command: set points of a fixed wing; errors are commanded minus actual ---------------------------------------
 
+
+def _setpoint_euler(m: Any) -> tuple[Any, ...]:
+    return euler(m.q_d)[:2]
+
+
+def _setpoint_angles(m: Any) -> tuple[Any, ...]:
+    return m.roll_body, m.pitch_body
+
+
+def _estimator_errors(m: Any) -> tuple[Any, ...]:
+    tecs = m.interpolated("tecs_status")
+    altitude_error = tecs.altitude_sp - m.interpolated("vehicle_global_position").alt
+    return altitude_error, tecs.true_airspeed_sp - tecs.true_airspeed_filtered
+
+
+def _tecs_errors(altitude_sp: str, airspeed_sp: str, airspeed: str) -> Columns:
+    def columns(m: Any) -> tuple[Any, ...]:
+        tecs = m.interpolated("tecs_status")
+        return getattr(tecs, altitude_sp) - tecs.altitude_filtered, getattr(tecs, airspeed_sp) - getattr(tecs, airspeed)
+
+    return columns
+
+
+_ERRORS_1_11 = _tecs_errors("altitude_sp", "true_airspeed_sp", "true_airspeed_filtered")
+_ERRORS_1_8 = _tecs_errors("altitude_sp", "airspeed_sp", "airspeed_filtered")
+_ERRORS_1_6 = _tecs_errors("altitudeSp", "airspeedSp", "airspeed_filtered")
 _COMMAND_SOURCES: tuple[tuple[Columns, str, Columns], ...] = (  # roll and pitch, path topic, errors
-    (
-        lambda m: euler(m.q_d)[:2],  # 1.16 has no roll_body
-        "position_controller_status",
-        lambda m: (
-            m.interpolated("tecs_status").altitude_sp - m.interpolated("vehicle_global_position").alt,
-            m.interpolated("tecs_status").true_airspeed_sp - m.interpolated("tecs_status").true_airspeed_filtered,
-        ),
-    ),
-    (
-        lambda m: (m.roll_body, m.pitch_body),  # 1.14, 1.15: TECS no longer logs its own altitude
-        "position_controller_status",
-        lambda m: (
-            m.interpolated("tecs_status").altitude_sp - m.interpolated("vehicle_global_position").alt,
-            m.interpolated("tecs_status").true_airspeed_sp - m.interpolated("tecs_status").true_airspeed_filtered,
-        ),
-    ),
-    (
-        lambda m: (m.roll_body, m.pitch_body),  # 1.11 to 1.13
-        "position_controller_status",
-        lambda m: (
-            m.interpolated("tecs_status").altitude_sp - m.interpolated("tecs_status").altitude_filtered,
-            m.interpolated("tecs_status").true_airspeed_sp - m.interpolated("tecs_status").true_airspeed_filtered,
-        ),
-    ),
-    (
-        lambda m: (m.roll_body, m.pitch_body),  # 1.9, 1.10
-        "position_controller_status",
-        lambda m: (
-            m.interpolated("tecs_status").altitude_sp - m.interpolated("tecs_status").altitude_filtered,
-            m.interpolated("tecs_status").airspeed_sp - m.interpolated("tecs_status").airspeed_filtered,
-        ),
-    ),
-    (
-        lambda m: (m.roll_body, m.pitch_body),  # 1.8
-        "fw_pos_ctrl_status",
-        lambda m: (
-            m.interpolated("tecs_status").altitude_sp - m.interpolated("tecs_status").altitude_filtered,
-            m.interpolated("tecs_status").airspeed_sp - m.interpolated("tecs_status").airspeed_filtered,
-        ),
-    ),
-    (
-        lambda m: (m.roll_body, m.pitch_body),  # 1.6, 1.7
-        "fw_pos_ctrl_status",
-        lambda m: (
-            m.interpolated("tecs_status").altitudeSp - m.interpolated("tecs_status").altitude_filtered,
-            m.interpolated("tecs_status").airspeedSp - m.interpolated("tecs_status").airspeed_filtered,
-        ),
-    ),
+    (_setpoint_euler, "position_controller_status", _estimator_errors),  # 1.16 has no roll_body
+    (_setpoint_angles, "position_controller_status", _estimator_errors),  # 1.14, 1.15: TECS logs no altitude
+    (_setpoint_angles, "position_controller_status", _ERRORS_1_11),  # 1.11 to 1.13
+    (_setpoint_angles, "position_controller_status", _ERRORS_1_8),  # 1.9, 1.10
+    (_setpoint_angles, "fw_pos_ctrl_status", _ERRORS_1_8),  # 1.8
+    (_setpoint_angles, "fw_pos_ctrl_status", _ERRORS_1_6),  # 1.6, 1.7
 )
 
 

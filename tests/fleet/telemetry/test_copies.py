@@ -25,7 +25,6 @@ from fleet.telemetry.replay.broadcaster import Broadcaster, loopback_address
 from fleet.telemetry.replay.offset_copies import (
     GROUP_COUNT,
     SPACING_M,
-    CopyGroup,
     GridOffset,
     MessageTemplate,
     OffsetCopies,
@@ -63,7 +62,7 @@ def test_patched_bytes_are_those_of_a_message_made_anew(dtype):
     ids, lag = np.array([8, 300, 70_000]), 0.4
     aside = GridOffset(np.array([1, 2, 3]), 4, HOME)
     there = aside.move(*message.position.x.numpy()[:, :2].T)
-    for k, payload in enumerate(MessageTemplate(message).copies(CopyGroup(ids, aside, lag))):
+    for k, payload in enumerate(MessageTemplate(message).copies(ids, aside, lag)):
         copy = decode(Sample, payload)
         assert (copy.uav, copy.t) == (ids[k], message.t + lag)
         assert (copy.attitude.t.numpy() == message.attitude.t.numpy() + lag).all()
@@ -77,7 +76,7 @@ def test_patched_bytes_are_those_of_a_message_made_anew(dtype):
 @pytest.mark.parametrize("kind", [Sample, Status, Params], ids=lambda kind: kind.__name__)
 def test_every_kind_keeps_everything_but_id_and_times(kind):
     message = EXAMPLES[kind]
-    (payload,) = MessageTemplate(message).copies(CopyGroup(np.array([123_456]), None, 0.0))
+    (payload,) = MessageTemplate(message).copies(np.array([123_456]), None, 0.0)
     assert encode(msgspec.structs.replace(decode(kind, payload), uav=message.uav)) == encode(message)
 
 

@@ -67,7 +67,7 @@ def known(laid: flights.Laid, *, vehicle: str = "fixed_wing", mode: str = "AUTO"
 
 
 def judged(of: Survey) -> dict[str, tuple[bool, str]]:
-    return {name: (can, why) for name, can, why in abilities(of)}
+    return {one.name: (one.can, one.why) for one in abilities(of)}
 
 
 # --- survey ----------------------------------------------------------------------------------------------------------

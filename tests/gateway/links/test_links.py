@@ -4,6 +4,7 @@ import contextlib
 import os
 import pty
 import queue
+import selectors
 import socket
 import threading
 import time
@@ -17,10 +18,10 @@ from fleet.contract import GatewayCounters
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
 from fleet.telemetry.recording.ids import IdAllocator
 from gateway.link_spec import read_spec
-from gateway.links import receive, tcp_listener
+from gateway.links import receive, stream, tcp_listener
 from gateway.links.link import Batch, wall
 from gateway.links.opening import open_link
-from gateway.links.stream import MAX_BYTES, SendQueue
+from gateway.links.stream import MAX_BYTES, Stream
 from gateway.onboard import RequestSender
 from gateway.pipeline import Pipeline
 from tests.support.fake_link import PATIENCE_S, pieces, until
@@ -230,24 +231,28 @@ def test_a_serial_line_is_read_written_and_missed():
         assert line.link.unsent == 1
 
 
-def test_a_slow_stream_takes_whole_messages_or_none():
+def test_a_slow_stream_takes_whole_messages_or_none(monkeypatch):
     taken, room = bytearray(), [10]
 
-    def write(data):
+    def write(_, data):
         n = min(room[0], len(data))
         room[0] -= n
         taken.extend(data[:n])
         return n
 
-    box = SendQueue(write)
+    monkeypatch.setattr(stream.os, "write", write)
+    far, near = socket.socketpair()
+    box = Stream(near)
     frames = [Talker().attitude(k * 0.1) for k in range(2000)]
     fits = sum(box.put(frame, 1) for frame in frames)
     assert 0 < fits < 2000 and fits * len(frames[0]) <= MAX_BYTES + 10
     room[0] = 10**9
-    box.flush()
+    box.serve(selectors.EVENT_WRITE)
     assert bytes(taken) == b"".join(frames)[: len(taken)] and len(taken) == fits * len(frames[0])
     room[0] = 0
     assert box.put(frames[0], 4) and box.close() == 4 and not box.put(frames[0], 1)
+    assert far.recv(1) == b""
+    far.close()
 
 
 # ---- datagrams

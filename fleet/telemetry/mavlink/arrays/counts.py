@@ -12,8 +12,6 @@ NO_SEQ = -1.0  # sequence number before any message
 LAST_ARRIVAL, LAST_COUNTED, RECEIVED, MISSED, MISSED_PENDING, LAST_SEQ, COLUMNS = range(7)
 """Columns per aircraft: arrival of the newest message; arrival of the newest counted message; counted messages; lost
 messages up to the counted one; lost messages up to the newest one; its sequence number."""
-
-
 _INITIAL = np.array([[-np.inf, -np.inf, 0.0, 0.0, 0.0, NO_SEQ]])
 
 
@@ -29,7 +27,6 @@ class MessageCounters:
         self._kind_counts = np.empty((0, len(names)), np.int64)  # since the last `rates`
         self._rates_hz = np.empty((0, len(names)))  # smoothed rate of each kind; nan: never received
         self._kind_index = {name: k for k, name in enumerate(names)}
-        self._names = list(names)
         self._pending = (np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0))
 
     def add_aircraft(self) -> None:
@@ -47,11 +44,8 @@ class MessageCounters:
         """Return the indices of message names, adding new names, (n,)."""
         indices = np.array([self._kind_index.setdefault(name, len(self._kind_index)) for name in names], np.int64)
         padding = ((0, 0), (0, len(self._kind_index) - self._kind_counts.shape[1]))
-        self._kind_counts, self._rates_hz = (
-            np.pad(self._kind_counts, padding),
-            np.pad(self._rates_hz, padding, constant_values=np.nan),
-        )
-        self._names = list(self._kind_index)
+        self._kind_counts = np.pad(self._kind_counts, padding)
+        self._rates_hz = np.pad(self._rates_hz, padding, constant_values=np.nan)
         return indices
 
     def add_messages(self, owner: np.ndarray, kind: np.ndarray, arrival: np.ndarray, seq: np.ndarray | None) -> None:
@@ -76,7 +70,8 @@ class MessageCounters:
     def rates(self, number: int, elapsed: float) -> dict[str, float]:
         """Return the smoothed message rates of one aircraft [Hz]; `elapsed` since the last call [s]."""
         indices, rates_hz = _smooth(self._kind_counts[number], self._rates_hz[number], elapsed)
-        return dict(zip(map(self._names.__getitem__, indices.tolist()), rates_hz.tolist(), strict=True))
+        names = list(self._kind_index)
+        return {names[k]: rate_hz for k, rate_hz in zip(indices.tolist(), rates_hz.tolist(), strict=True)}
 
 
 @nb.njit(cache=True, nogil=True)

@@ -1,7 +1,6 @@
 """Array state of the aircraft of one link or log: clocks, row arbitration, pending rows, counters."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -9,31 +8,9 @@ from fleet.bus.codec import EncodedMessage
 from fleet.contract import Sample
 from fleet.telemetry.mavlink.arrays.counts import MessageCounters
 from fleet.telemetry.mavlink.arrays.pack import FIELDS
-from fleet.telemetry.mavlink.arrays.row_arbiter import ACCEPTED, REJECTED, arbitrate_rows, new_arbiter_state
+from fleet.telemetry.mavlink.arrays.row_arbiter import new_arbiter_state
 from fleet.telemetry.mavlink.arrays.rows import MAX_COLUMNS, PendingRows
 from fleet.telemetry.tables import clock
-
-
-class RowBatch(NamedTuple):
-    """Rows of many aircraft in order of reception."""
-
-    owner: np.ndarray  # number of the aircraft, (n,)
-    arrival: np.ndarray  # fleet time, (n,) [s since 1970]
-    raw_s: np.ndarray  # time stamp of the message, (n,) [s]
-    values: np.ndarray  # columns, padded with zeros, (n, 8)
-    tick: np.ndarray  # time source, (n,)
-    field: np.ndarray  # number in `FIELDS`, (n,)
-    rank: np.ndarray  # rank of the source, (n,)
-    requires: np.ndarray  # number in `FIELDS` of the required active field, or `NO_FIELD`, (n,)
-
-
-class ArbitrationResult(NamedTuple):
-    """Result of the arbitration, by aircraft."""
-
-    jumped: np.ndarray  # arrival at the last jump of the clock; nan: none, (m,) [s since 1970]
-    rejected: np.ndarray  # number of rejected rows, (m,)
-    newest: np.ndarray  # arrival of the last row, (m,) [s since 1970]
-    advanced: np.ndarray  # by row: forward re-anchoring step of the clock, mostly 0, (n,) [s]
 
 
 class AircraftArrays:
@@ -47,7 +24,7 @@ class AircraftArrays:
         self.counts, self.pending = MessageCounters(names), PendingRows()
         self.clocks = np.empty((0, *clock.new_clocks().shape))
         self.next_due_t = np.empty(0)  # latest time of the next messages other than rows, (m,) [s since 1970]
-        self._arbiter_state = np.empty((0, *new_arbiter_state().shape))
+        self.arbiter_state = np.empty((0, *new_arbiter_state().shape))
 
     def add_aircraft(self, uav: int) -> int:
         """Add one aircraft; return its number."""
@@ -55,31 +32,15 @@ class AircraftArrays:
         self.pending.add_aircraft(uav)
         self.next_due_t = np.append(self.next_due_t, -np.inf)
         self.clocks = np.concatenate([self.clocks, clock.new_clocks()[None]])
-        self._arbiter_state = np.concatenate([self._arbiter_state, new_arbiter_state()[None]])
+        self.arbiter_state = np.concatenate([self.arbiter_state, new_arbiter_state()[None]])
         return len(self.clocks) - 1
 
     def reset_aircraft(self, number: int) -> None:
         """Reset one aircraft; it has no messages until data arrive."""
         self.counts.reset(number)
-        self.clocks[number], self._arbiter_state[number] = clock.new_clocks(), new_arbiter_state()
+        self.clocks[number], self.arbiter_state[number] = clock.new_clocks(), new_arbiter_state()
         self.pending.dropped[number] = 0
         self.next_due_t[number] = np.inf
-
-    def arbitrate(self, batch: RowBatch) -> ArbitrationResult:
-        """Assign fleet times to rows and store accepted rows; late, repeated and lower-ranked rows are skipped."""
-        n, count = len(batch.owner), len(self.clocks)
-        t, decision, jumped = np.empty(n), np.empty(n, np.int8), np.full(count, np.nan)
-        advanced = np.empty(n)
-        columns = (batch.owner, batch.tick, batch.raw_s, batch.arrival, batch.field, batch.rank, batch.requires)
-        arbitrate_rows(self.clocks, self._arbiter_state, *columns, t, decision, jumped, advanced)
-        accepted = np.flatnonzero(decision == ACCEPTED)
-        key = batch.owner[accepted] * len(FIELDS) + batch.field[accepted]
-        self.pending.add_rows(key, batch.arrival[accepted], t[accepted], batch.values[accepted])
-        newest = np.full(count, np.nan)
-        newest[batch.owner] = batch.arrival
-        return ArbitrationResult(
-            jumped, np.bincount(batch.owner[decision == REJECTED], minlength=count), newest, advanced
-        )
 
     def add_rows(self, number: int, field: str, t: np.ndarray, x: np.ndarray) -> None:
         """Add rows of one field that already have fleet times.

@@ -71,32 +71,20 @@ def _write_bin_header(out, at, size):
 @nb.njit(cache=True, nogil=True)
 def _write_field(out, at, times, values, columns, is_integer, fragments, offsets):
     """Write the rows of one field: times (n,), values (n, 8)."""
-    n, width = len(times), columns
+    n = len(times)
     as_double, as_float, as_int = np.empty(1), np.empty(1, np.float32), np.empty(1, np.int32)
     double_bytes, float_bytes, int_bytes = as_double.view(np.uint8), as_float.view(np.uint8), as_int.view(np.uint8)
-    at = _write_bin_header(
-        out,
-        _copy_bytes(
-            out,
-            _write_uint(out, _copy_bytes(out, at, fragments, offsets[1], offsets[2]), n),
-            fragments,
-            offsets[2],
-            offsets[3],
-        ),
-        8 * n,
-    )
+    at = _write_uint(out, _copy_bytes(out, at, fragments, offsets[1], offsets[2]), n)
+    at = _write_bin_header(out, _copy_bytes(out, at, fragments, offsets[2], offsets[3]), 8 * n)
     for i in range(n):
         as_double[0] = times[i]
         at = _copy_bytes(out, at, double_bytes, 0, 8)
-    at = (
-        _copy_bytes(out, at, fragments, offsets[4], offsets[5])
-        if is_integer
-        else _copy_bytes(out, at, fragments, offsets[3], offsets[4])
-    )
-    at = _copy_bytes(out, _write_uint(out, _write_uint(out, at, n), width), fragments, offsets[2], offsets[3])
-    at = _write_bin_header(out, at, 4 * width * n)
+    values_at = 4 if is_integer else 3
+    at = _copy_bytes(out, at, fragments, offsets[values_at], offsets[values_at + 1])
+    at = _write_uint(out, _write_uint(out, at, n), columns)
+    at = _write_bin_header(out, _copy_bytes(out, at, fragments, offsets[2], offsets[3]), 4 * columns * n)
     for i in range(n):
-        for k in range(width):
+        for k in range(columns):
             if is_integer:
                 as_int[0] = np.int32(values[i, k])
                 at = _copy_bytes(out, at, int_bytes, 0, 4)
@@ -122,30 +110,17 @@ def _write_samples(
                 newest[0] = max(newest[0], t[stop[owner, field] - 1])
         if newest[0] == -np.inf:
             continue
-        at = _copy_bytes(
-            out,
-            _write_uint(out, _copy_bytes(out, at, prefix, 0, len(prefix)), uavs[owner]),
-            fragments,
-            offsets[0],
-            offsets[1],
-        )
+        at = _write_uint(out, _copy_bytes(out, at, prefix, 0, len(prefix)), uavs[owner])
+        at = _copy_bytes(out, at, fragments, offsets[0], offsets[1])
         for k in range(8):
             out[at + k] = time_bytes[7 - k]
         at += 8
         for field in range(len(widths)):
             at = _copy_bytes(out, at, names, name_offsets[field], name_offsets[field + 1])
-            first_row, end_row = start[owner, field], stop[owner, field]
-            if first_row < end_row:
-                at = _write_field(
-                    out,
-                    at,
-                    t[first_row:end_row],
-                    values[first_row:end_row],
-                    widths[field],
-                    is_integer[field],
-                    fragments,
-                    offsets,
-                )
+            first, end = start[owner, field], stop[owner, field]
+            if first < end:
+                kind = (widths[field], is_integer[field])
+                at = _write_field(out, at, t[first:end], values[first:end], *kind, fragments, offsets)
             else:
                 out[at] = 0xC0
                 at += 1
@@ -166,9 +141,8 @@ def pack_samples(
         values: columns, (n, 8)
     """
     rows = stop - start
-    size = int((rows * (8 + 4 * WIDTHS)).sum()) + (64 + _MAX_FIELD_HEADER * len(FIELDS)) * int(
-        (rows > 0).any(axis=1).sum()
-    )
+    headers = int((rows > 0).any(axis=1).sum()) * (64 + _MAX_FIELD_HEADER * len(FIELDS))
+    size = int((rows * (8 + 4 * WIDTHS)).sum()) + headers
     out = np.empty(size, np.uint8)
     owners, ends, sample_t = _write_samples(
         out, uavs, start, stop, t, values, WIDTHS, IS_INTEGER, _PREFIX, *_FIELD_NAMES, *_FRAGMENTS

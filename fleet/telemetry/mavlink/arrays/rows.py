@@ -36,10 +36,8 @@ class PendingRows:
         """
         if len(self._row_keys):
             remaining = _remaining_rows(self._start, self._end, len(self._row_keys))
-            key, arrival = (
-                np.concatenate([self._row_keys[remaining], key]),
-                np.concatenate([self._arrival[remaining], arrival]),
-            )
+            key = np.concatenate([self._row_keys[remaining], key])
+            arrival = np.concatenate([self._arrival[remaining], arrival])
             t, x = np.concatenate([self._t[remaining], t]), np.concatenate([self._x[remaining], x])
         order = np.argsort(key, kind="stable")
         self._row_keys, self._arrival, self._t, self._x = key[order], arrival[order], t[order], x[order]
@@ -58,12 +56,8 @@ class PendingRows:
         start, self._start = self._start, stop
         packed = pack_samples(self.uavs, start, limited, self._t, self._x)
         if self._next_arrival == np.inf:
-            self._row_keys, self._arrival, self._t, self._x = (
-                self._row_keys[:0],
-                self._arrival[:0],
-                self._t[:0],
-                self._x[:0],
-            )
+            self._row_keys, self._arrival = self._row_keys[:0], self._arrival[:0]
+            self._t, self._x = self._t[:0], self._x[:0]
             self._start, self._end = np.zeros_like(stop), np.zeros_like(stop)
         return packed
 

@@ -78,17 +78,11 @@ class ParamCollector:
         """Return changed parameters, at most once per second."""
         if not self._changed or now - self._published_t < PUBLISH_PERIOD_S:
             return None
-        self._changed, self._published_t = False, now
-        return Params(
-            uav=self.uav, t=now, values=dict(self.values), complete=self.complete, sentence=self.problem_text()
-        )
-
-    def problem_text(self) -> str:
-        """Return a text that names the rejected parameters."""
-        if not self._rejected_names:
-            return ""
-        names = ", ".join(list(self._rejected_names)[:5])
-        return f"uav-{self.uav}: parameter {names} is not a number and was ignored; set it on the autopilot"
+        self._changed, self._published_t, sentence = False, now, ""
+        if self._rejected_names:
+            names = ", ".join(list(self._rejected_names)[:5])
+            sentence = f"uav-{self.uav}: parameter {names} is not a number and was ignored; set it on the autopilot"
+        return Params(uav=self.uav, t=now, values=dict(self.values), complete=self.complete, sentence=sentence)
 
 
 def as_number(message: Any, autopilot: str) -> float:

@@ -103,12 +103,7 @@ class MissionCollector:
         upload, download = self._transfers[True], self._transfers[False]
         if upload is not None and upload.is_complete() and now - upload.last_arrival > ACCEPT_S:
             self._finish_upload(accepted=True)
-        if (
-            download is not None
-            and not self.complete
-            and download.items
-            and now - download.last_arrival > PARTIAL_AFTER_S
-        ):
+        if download is not None and now - download.last_arrival > PARTIAL_AFTER_S and not self.complete:
             self._publish_partial(download)
         if not self._changed:
             return None
@@ -187,7 +182,7 @@ class MissionCollector:
 
     def _publish_partial(self, transfer: _MissionTransfer) -> None:
         items = tuple(transfer.items[seq] for seq in sorted(transfer.items))
-        if items != self.items:
+        if items and items != self.items:
             self.items = items
             total = "an unknown number of" if transfer.count is None else transfer.count
             self._set_text(f"{len(items)} of {total} mission items arrived; request the mission again")
@@ -236,9 +231,7 @@ def mission_problems(items: tuple[Item, ...]) -> list[str]:
     """Return the problems of a mission: no items, endless jumps, legs of zero length."""
     if not items:
         return ["the mission has no items; upload one"]
-    problems = [
-        f"jump of item {item.seq} never reaches a waypoint; upload another target" for item in _endless_jumps(items)
-    ]
+    problems = [f"jump of item {n} never reaches a waypoint; upload another target" for n in _endless_jumps(items)]
     waypoints = [item for item in items[1:] if item.command == WAYPOINT and (item.lat_e7 or item.lon_e7)]
     for start, end in pairwise(waypoints):
         if (start.lat_e7, start.lon_e7, start.alt_m) == (end.lat_e7, end.lon_e7, end.alt_m):
@@ -246,8 +239,8 @@ def mission_problems(items: tuple[Item, ...]) -> list[str]:
     return problems
 
 
-def _endless_jumps(items: tuple[Item, ...]) -> list[Item]:
-    """Return the jumps that never reach a waypoint: a loop, or a target that does not exist."""
+def _endless_jumps(items: tuple[Item, ...]) -> list[int]:
+    """Return the sequence numbers of jumps that never reach a waypoint: a loop, or a target that does not exist."""
     by_seq = {item.seq: item for item in items}
     endless = []
     for jump in (item for item in items if item.command == DO_JUMP):
@@ -256,5 +249,5 @@ def _endless_jumps(items: tuple[Item, ...]) -> list[Item]:
             visited.add(seq)
             seq = int(item.param1) if item.command == DO_JUMP else seq + 1
         if item is None or seq in visited:
-            endless.append(jump)
+            endless.append(jump.seq)
     return endless

@@ -10,7 +10,14 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from fleet.telemetry.mavlink.parsing import scan as s
-from fleet.telemetry.mavlink.parsing.received import ReceivedBytes, collect_payloads, compact, group_payloads, read_only
+from fleet.telemetry.mavlink.parsing.received import (
+    ReceivedBytes,
+    collect_payloads,
+    compact,
+    group_payloads,
+    joined_senders,
+    read_only,
+)
 
 
 class _MessageBase:
@@ -48,27 +55,17 @@ def message_objects(name: str, rows: np.ndarray, systems: Sequence[int], compone
         systems, components: MAVLink ids of the senders, n numbers
     """
     names = rows.dtype.names or ()
-    kind, text_columns = (
-        message_class(name, names),
-        [column for column, field in enumerate(names) if rows.dtype[field].kind == "S"],
-    )
-    values = rows.tolist()
-    if text_columns:
-        values = [_decode_texts(row, text_columns) for row in values]
-    return [kind(*row, *address) for row, *address in zip(values, systems, components, strict=True)]
-
-
-def _decode_texts(row: tuple[Any, ...], text_columns: list[int]) -> list[Any]:
-    fields = list(row)
-    for column in text_columns:
-        fields[column] = fields[column].split(b"\0", 1)[0].decode("ascii", errors="replace")
-    return fields
+    columns = [rows[field].tolist() for field in names]
+    for k, field in enumerate(names):
+        if rows.dtype[field].kind == "S":
+            columns[k] = [text.split(b"\0", 1)[0].decode("ascii", errors="replace") for text in columns[k]]
+    return list(map(message_class(name, names), *columns, systems, components))
 
 
 MAX_SENDERS = 512  # senders of one link whose incomplete frames are stored
 _NAMES = {number: kind.msgname for number, kind in dialect.mavlink_map.items()}
 IDS = {name: number for number, name in _NAMES.items()}
-_NUMPY_TYPE = {"c": "S", "b": "i1", "B": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4"}
+_NUMPY_TYPE = {"b": "i1", "B": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4"}
 _NUMPY_TYPE |= {"q": "<i8", "Q": "<u8", "f": "<f4", "d": "<f8"}
 
 
@@ -89,9 +86,8 @@ class Frames(NamedTuple):
             positions = np.flatnonzero(ids == message_id)
             selected, name = frame_numbers[positions], _NAMES[message_id]
             addresses = self.headers[selected][:, [s.SYSTEM, s.COMPONENT]].T.tolist()
-            for k, message in zip(
-                positions.tolist(), message_objects(name, self.fields(selected, name).rows, *addresses), strict=True
-            ):
+            objects = message_objects(name, self.fields(selected, name).rows, *addresses)
+            for k, message in zip(positions.tolist(), objects, strict=True):
                 messages[k] = message
         return messages
 
@@ -104,32 +100,21 @@ class Frames(NamedTuple):
     def fields(self, frame_numbers: np.ndarray, name: str) -> "Fields":
         """Return the fields of frames of one message as arrays."""
         dtype = layout(name)
-        payloads = collect_payloads(
-            self.buf, self.headers[frame_numbers, s.PAYLOAD], self.headers[frame_numbers, s.SIZE], dtype.itemsize
-        )
-        return Fields(payloads.view(dtype)[:, 0])
+        starts, sizes = self.headers[frame_numbers, s.PAYLOAD], self.headers[frame_numbers, s.SIZE]
+        return Fields(collect_payloads(self.buf, starts, sizes, dtype.itemsize).view(dtype)[:, 0])
 
-    def grouped(self) -> "GroupedFrames":
-        """Group all frames by message."""
-        return GroupedFrames(self)
+
+_POSITIONS = np.isin(np.arange(s.COLUMNS), [s.START, s.STOP, s.PAYLOAD])  # columns with positions in `Frames.buf`
 
 
 def joined_frames(parts: Sequence[Frames]) -> Frames:
     """Join several batches in order."""
     if len(parts) == 1:
         return parts[0]
-    headers, senders = [], []
-    sender_index: dict[Hashable, int] = {}
-    offset = 0
-    for part in parts:
-        part_headers = part.headers.copy()
-        part_headers[:, [s.START, s.STOP, s.PAYLOAD]] += offset
-        headers.append(part_headers)
-        new_index = [sender_index.setdefault(sender, len(sender_index)) for sender in part.senders]
-        senders.append(np.array(new_index, np.int64)[part.sender])
-        offset += len(part.buf)
+    offsets = np.cumsum([0, *(len(part.buf) for part in parts)])
+    headers = [part.headers + offset * _POSITIONS for part, offset in zip(parts, offsets, strict=False)]
     buf, arrival = np.concatenate([part.buf for part in parts]), np.concatenate([part.arrival for part in parts])
-    return Frames(read_only(buf), np.concatenate(headers), arrival, np.concatenate(senders), tuple(sender_index))
+    return Frames(read_only(buf), np.concatenate(headers), arrival, *joined_senders(parts))
 
 
 class Fields:
@@ -154,10 +139,9 @@ def layout(name: str) -> np.dtype:
         tokens = re.findall(r"(\d*)([a-zA-Z])", message_class.unpacker.format.lstrip("<"))
         dtype_fields: list[Any] = []
         for field, (count, letter) in zip(message_class.ordered_fieldnames, tokens, strict=True):
-            dtype_fields.append(
-                (field, f"S{count or 1}") if letter in "cs" else (field, _NUMPY_TYPE[letter], (int(count or 1),))
-            )
-        _DTYPES[name] = np.dtype([(f[0], f[1]) if len(f) == 2 or f[2] == (1,) else f for f in dtype_fields])
+            shape = () if letter in "cs" or int(count or 1) == 1 else (int(count),)
+            dtype_fields.append((field, f"S{count or 1}" if letter in "cs" else _NUMPY_TYPE[letter], shape))
+        _DTYPES[name] = np.dtype(dtype_fields)
     return _DTYPES[name]
 
 
@@ -195,9 +179,8 @@ class GroupedFrames:
         """Return the frames of one message: frame numbers, (k,), and field arrays."""
         kind = _KIND_BY_NAME[name]
         payload = self._payloads[self._payload_start[kind] : self._payload_start[kind + 1]]
-        return self._frame_numbers[self._frame_start[kind] : self._frame_start[kind + 1]], Fields(
-            payload.view(_LAYOUTS[kind])
-        )
+        frame_numbers = self._frame_numbers[self._frame_start[kind] : self._frame_start[kind + 1]]
+        return frame_numbers, Fields(payload.view(_LAYOUTS[kind]))
 
     def names(self) -> list[str]:
         """Return the names of the received messages."""

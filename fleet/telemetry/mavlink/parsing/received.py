@@ -1,29 +1,18 @@
 """Received bytes of a link: the interface between receiving and decoding.
 
-A receiving thread copies the available datagrams (or pieces of a stream) into one buffer, with start, end, arrival and
-sender of each, and queues them as one `gateway.links.link.Batch(number, received=ReceivedBytes(...))`:
-
-    slots: (1024, 2048) uint8 as `recvmmsg` filled them, lengths: (n,), addresses: a bytes-like per slot
-    buf, stop = compact(slots.ravel(), np.arange(n) * 2048, lengths)          # a copy: the slots can be reused
-    ReceivedBytes(buf, stop - lengths, stop, np.full(n, wall()), sender, senders)  # sender: np.unique of the addresses
-
 Pieces may be anywhere in `buf`, in any order and with gaps; the arrays are in order of arrival. A piece may end inside
-a frame: the decoder joins the rest with the next piece of that sender. `senders` are the addresses for `Link.send`;
-`None` on a stream with a single remote end. A sender must be an equal object every time. Collect data every few
-milliseconds, not per datagram: a batch costs about 20 us, an additional datagram almost nothing.
-`ReceivedBytes.from_pieces` converts a list of (arrival, sender, bytes).
+a frame: the decoder joins the rest with the next piece of that sender. `senders` are the addresses for
+`Endpoint.send`; `None` on a stream with a single remote end. A sender must be an equal object every time. Collect data
+every few milliseconds, not per datagram: a batch costs about 20 us, an additional datagram almost nothing.
 """
 
 from collections.abc import Hashable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
 
 from fleet.telemetry.mavlink.parsing.scan import ID, PAYLOAD, SIZE
-
-Piece = tuple[float, Hashable, bytes]
-"""(arrival, fleet time [s since 1970]; sender; received bytes)."""
 
 
 class ReceivedBytes(NamedTuple):
@@ -37,8 +26,8 @@ class ReceivedBytes(NamedTuple):
     senders: tuple[Hashable, ...] = (None,)
 
     @classmethod
-    def from_pieces(cls, pieces: Sequence[Piece]) -> "ReceivedBytes":
-        """Concatenate pieces."""
+    def from_pieces(cls, pieces: Sequence[tuple[float, Hashable, bytes]]) -> "ReceivedBytes":
+        """Concatenate pieces: arrival, fleet time [s since 1970]; sender; received bytes."""
         sender_index: dict[Hashable, int] = {}
         sender = np.array([sender_index.setdefault(source, len(sender_index)) for _, source, _ in pieces], np.int64)
         stop = np.cumsum(np.array([len(data) for _, _, data in pieces], np.int64))
@@ -47,24 +36,24 @@ class ReceivedBytes(NamedTuple):
         return cls(buf, start, stop, np.array([t for t, _, _ in pieces], float), sender, tuple(sender_index))
 
 
+def joined_senders(parts: Sequence[Any]) -> tuple[np.ndarray, tuple[Hashable, ...]]:
+    """Number the senders of several batches jointly: `sender` of all rows, (n,), and `senders`."""
+    index: dict[Hashable, int] = {}
+    numbers = [
+        np.array([index.setdefault(one, len(index)) for one in part.senders], np.int64)[part.sender] for part in parts
+    ]
+    return np.concatenate(numbers), tuple(index)
+
+
 def merge_received(parts: Sequence[ReceivedBytes]) -> ReceivedBytes:
     """Concatenate several batches of received bytes."""
     if len(parts) == 1:
         return parts[0]
-    sender_index: dict[Hashable, int] = {}
-    buf, start, stop, sender, offset = [], [], [], [], 0
-    for part in parts:
-        new_index = np.array(
-            [sender_index.setdefault(merged_sender, len(sender_index)) for merged_sender in part.senders], np.int64
-        )
-        buf.append(part.buf)
-        start.append(part.start + offset)
-        stop.append(part.stop + offset)
-        sender.append(new_index[part.sender])
-        offset += len(part.buf)
-    arrival = np.concatenate([part.arrival for part in parts])
-    merged_buf, merged_start, merged_stop, who = map(np.concatenate, (buf, start, stop, sender))
-    return ReceivedBytes(merged_buf, merged_start, merged_stop, arrival, who, tuple(sender_index))
+    offsets = np.cumsum([0, *(len(part.buf) for part in parts)])
+    start = np.concatenate([part.start + offset for part, offset in zip(parts, offsets, strict=False)])
+    stop = np.concatenate([part.stop + offset for part, offset in zip(parts, offsets, strict=False)])
+    buf, arrival = np.concatenate([part.buf for part in parts]), np.concatenate([part.arrival for part in parts])
+    return ReceivedBytes(buf, start, stop, arrival, *joined_senders(parts))
 
 
 def read_only(buf: np.ndarray) -> np.ndarray:
@@ -119,11 +108,8 @@ def group_payloads(buf, headers, kinds, widths):
     for kind in range(len(widths)):
         payload_start[kind + 1] = payload_start[kind] + frame_start[kind + 1] * widths[kind]
         frame_start[kind + 1] += frame_start[kind]
-    out, frame_numbers, next_slot = (
-        np.empty(payload_start[-1], np.uint8),
-        np.empty(len(headers), np.int64),
-        frame_start.copy(),
-    )
+    out, frame_numbers = np.empty(payload_start[-1], np.uint8), np.empty(len(headers), np.int64)
+    next_slot = frame_start.copy()
     for i in range(len(headers)):
         kind = kinds[headers[i, ID]]
         width, start = widths[kind], headers[i, PAYLOAD]

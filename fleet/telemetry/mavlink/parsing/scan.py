@@ -13,7 +13,6 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 V1, V2 = 0xFE, 0xFD
 SIGNED = 0x01  # incompatibility flag of MAVLink 2
-MAX_FRAME = 280  # bytes of the longest frame, signature included
 STAMP_SIZE = 8  # bytes of the time stamp before a frame in a .tlog
 START, STOP, PAYLOAD, SIZE, ID, SYSTEM, COMPONENT, SEQ, PIECE, COLUMNS = range(10)  # columns of a frame header
 MESSAGES, BAD_BYTES, BAD_FRAMES, UNKNOWN_FRAMES, COUNTER_COUNT = range(5)  # counters of `scan`

@@ -151,7 +151,7 @@ def test_the_bus_is_no_longer_told_of_who_was_forgotten(monkeypatch):
     monkeypatch.setattr(pump_module, "wall", lambda: now + SILENCE_LIMIT_S + 1)
     pump._publish_statistics()
     assert publisher.newest_account.uavs == () and not bus.get(Status, 3) and not bus.get(Params, 3)
-    assert publisher.history.size == 0 and not publisher._repeated_wires
+    assert publisher.history.size == 0 and not any(publisher._latest.values())
 
 
 def test_what_is_remembered_of_others_stays():
@@ -167,7 +167,7 @@ def test_what_is_remembered_of_others_stays():
     publisher.remove([1])
     assert 0 < publisher.history.size < size
     assert [status.uav for status in publisher.snapshot()[1]] == [2]
-    assert {uav for _, uav in publisher._repeated_wires} == {2}
+    assert {uav for latest in publisher._latest.values() for uav, _ in latest} == {2}
 
 
 def test_a_flood_is_worked_through_in_portions():
