@@ -137,7 +137,6 @@ class FrameForwarder:
         self._stations.remove_silent(now)
 
     def _to_stations(self, link: int, frames: Frames) -> None:
-        """Forward frames of aircraft to the stations."""
         owned = self._aircraft.update(link, frames)
         if not owned.all():
             self.refused[DUPLICATE_SENDER] += int((~owned).sum())
@@ -156,7 +155,6 @@ class FrameForwarder:
                 self._send(Port(number, where), frames, np.flatnonzero(selected))
 
     def _to_aircraft(self, link: int, frames: Frames) -> list[tuple[int, Frames]]:
-        """Forward frames of stations to the aircraft."""
         self._stations.update(link, frames)
         if self._listen_only:
             return []

@@ -228,7 +228,7 @@ class StatisticsCollector:
     def _link(
         self, t: float, number: int, intake: MavlinkReceiver, recording: RecordingCounters, requester: RequestSender
     ) -> LinkCounters:
-        flow, link, counts = self._flows[number], self._links[number], intake.counters()
+        flow, link, counts = self._flows[number], self._links[number], intake.decoder.counters()
         flow.measure(t, counts["messages"])
         return LinkCounters(
             link=link.spec.text,

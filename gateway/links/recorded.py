@@ -150,7 +150,6 @@ class ReplayLink(Endpoint):
                 return self._out.put(batch, timeout=POLL_S)
 
     def _renumber(self, messages: Sequence[Any]) -> list[Any]:
-        """Return the messages with the assigned UAV ids."""
         if all(uav == assigned for uav, assigned in self._uav_ids.items()):
             return list(messages)
         renamed = (renumbered(message, lambda uav: self._uav_ids.get(uav, uav)) for message in messages)

@@ -8,7 +8,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
-from fleet.telemetry.mavlink.parsing.decode import layout
+from fleet.telemetry.mavlink.parsing.decode import IDS, layout
 from gateway.link_spec import LinkSpec
 from gateway.onboard.parameter_cache_check import ANY, DIALECTS, STREAMS, Cache, CacheCheck, RequestDialect
 from gateway.record.tape import read_size
@@ -76,7 +76,6 @@ MAX_SINGLE_PARAMS = 200  # if more parameters are missing, the list is requested
 RATES_AFTER_S = 5.0  # before the first check of rates [s]
 RATE_TRIES = 3
 TOO_LOW, TOO_HIGH = 0.4, 1.6  # bounds of received over fitting rate; the upper one applies only on a full link [-]
-_IDS = {kind.msgname: number for number, kind in dialect.mavlink_map.items()}
 
 
 class RequestScheduler:
@@ -177,7 +176,7 @@ class RequestScheduler:
         self._rate_tries += 1
         command, zeros = (*self._to, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0), (0, 0, 0, 0, 0)
         requests = [
-            dialect.MAVLink_command_long_message(*command, _IDS[name], 1e6 / fitting[name], *zeros) for name in wrong
+            dialect.MAVLink_command_long_message(*command, IDS[name], 1e6 / fitting[name], *zeros) for name in wrong
         ]
         if self._rate_tries == RATE_TRIES and self._request_dialect.streams:
             groups = {STREAMS[name]: round(max(fitting[name], 1.0)) for name in reversed(wrong)}

@@ -4,6 +4,8 @@ from collections import deque
 from collections.abc import Callable, Hashable
 from typing import Any
 
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
 from fleet import vehicles
 from fleet.contract import Link, Mission, Params, Status
 from fleet.telemetry.mavlink import heartbeat
@@ -122,7 +124,8 @@ class AircraftLink:
         name = message.get_type()
         if name == "HEARTBEAT":
             self.update_identity(message)
-            self.mode, self.armed = heartbeat.mode(message), heartbeat.armed(message)
+            self.mode = heartbeat.mode(message)
+            self.armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
         elif name == "PARAM_VALUE":
             self.params.process(message, self.autopilot, now)
         elif name in MISSION_MESSAGES:

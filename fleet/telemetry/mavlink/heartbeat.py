@@ -50,11 +50,6 @@ def mode(heartbeat: Any) -> str:
     return str(mavutil.mode_string_v10(heartbeat))
 
 
-def armed(heartbeat: Any) -> bool:
-    """Return whether the aircraft is armed."""
-    return bool(heartbeat.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
-
-
 def firmware(version: Any) -> str:
     """Return the firmware version of AUTOPILOT_VERSION, e.g. 4.7.0."""
     number = version.flight_sw_version

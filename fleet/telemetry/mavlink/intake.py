@@ -187,9 +187,9 @@ class MavlinkReceiver:
         messages: list[TelemetryMessage | EncodedMessage] = [
             alert for conflict in self._conflicts.values() for alert in conflict.take_alerts(now)
         ]
-        samples, links, due = self.arrays.take_samples(now), self._aircraft_by_number, set(self.arrays.due(now))
+        samples, due = self.arrays.take_samples(now), set(np.flatnonzero(self.arrays.next_due_t <= now).tolist())
         for number in sorted(due.union(samples)):
-            link = links[number]
+            link = self._aircraft_by_number[number]
             if self._id_owners.get(link.uav) is link:
                 if number in samples:
                     messages.append(samples[number])
@@ -233,10 +233,6 @@ class MavlinkReceiver:
         for system, i in self._first_heartbeat.items():
             owner[:i][frames.headers[:i, SYSTEM] == system] = -1
         return owner
-
-    def counters(self) -> Counter[str]:
-        """Return messages, bad_bytes and bad_frames over all senders."""
-        return self.decoder.counters()
 
     def _group_owner(self, frames: Frames, frame_numbers: np.ndarray) -> AircraftLink | None:
         """Return the owner of frames from one component of one sender; count them as rejected without owner."""
@@ -339,7 +335,6 @@ class MavlinkReceiver:
             self._buffer_early(arrival, message)
 
     def _buffer_early(self, arrival: float, message: Any) -> None:
-        """Buffer messages of a system until its heartbeat identifies it."""
         system = message.get_srcSystem()
         has_room = len(self._early.get(system, ())) < MAX_EARLY and self._early_count < MAX_EARLY_TOTAL
         if has_room and message.get_type() in EARLY_MESSAGES:

@@ -16,13 +16,10 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from fleet.bus.codec import Stamp
-from fleet.telemetry.recording.opening import RecordingFile
 
 MAGIC = b"\xc1UV1"  # msgpack never uses the byte C1
 MAX_BODY = 1 << 22  # maximum body size [bytes]; the longest message, a mission of 1,000 items, has 200 kB
-CHUNK = 1 << 20
 MAX_UNRECOGNISED = 1 << 26  # bytes without a record after which reading ends
-SEARCH_FACTOR = 8  # search budget [bytes summed]: this times the bytes read, plus `MAX_UNRECOGNISED`
 _PREFIX = "application/msgpack;"
 _HEAD = struct.Struct("<4sII")
 _BODY = struct.Struct("<dQQB")
@@ -43,41 +40,15 @@ class BusRecord(NamedTuple):
         body = _BODY.pack(self.received_t, epoch, writer, len(encoding_name)) + encoding_name + self.payload
         return _HEAD.pack(MAGIC, len(body), zlib.crc32(body)) + body
 
-
-class FleetLog:
-    """Reader of the records of a file, tolerant of truncation and damage.
-
-    Args:
-        source: the file
-    """
-
-    def __init__(self, source: RecordingFile) -> None:
-        self._source = source
-        self.record_count = 0  # number of records read
-        self.damaged_bytes = 0  # bytes outside valid records
-        self.first_damage: int | None = None  # position of the first of them
-        self.search_aborted = False  # reading ended: too many invalid record headers
-
-    def records(self) -> Iterator[tuple[int, BusRecord]]:
-        """Return the valid records: (file offset [bytes], record)."""
-        rest, place, budget = b"", 0, SearchBudget(MAX_UNRECOGNISED)
-        with self._source.open() as stream:
-            while True:
-                chunk = stream.read(CHUNK) or b""
-                data, position = rest + chunk, 0
-                budget.remaining += SEARCH_FACTOR * len(chunk)
-                for start, stop in find_records(data, not chunk, budget):
-                    if start > position and self.first_damage is None:
-                        self.first_damage = place + position
-                    self.damaged_bytes += start - position
-                    position = stop
-                    if start < stop:
-                        self.record_count += 1
-                        yield place + start, _unpack(data[start:stop])
-                rest, place = data[position:], place + position
-                self.search_aborted = budget.remaining < 0
-                if not chunk or self.search_aborted or (not self.record_count and place > MAX_UNRECOGNISED):
-                    return
+    @classmethod
+    def unpack(cls, data: bytes) -> "BusRecord":
+        """Decode a valid record of a file."""
+        received_t, epoch, writer, name_size = _BODY.unpack_from(data, _HEAD.size)
+        begin = _HEAD.size + _BODY.size
+        encoding_name = data[begin : begin + name_size].decode("ascii", "replace")
+        stamp = Stamp(epoch, writer) if epoch or writer else None
+        received_t = received_t if math.isfinite(received_t) else 0.0
+        return cls(received_t, _PREFIX + encoding_name, data[begin + name_size :], stamp)
 
 
 class SearchBudget:
@@ -126,12 +97,3 @@ def _record_end(data: bytes, start: int) -> int:
     if stop <= len(data) and zlib.crc32(memoryview(data)[after:stop]) != crc:
         return after - stop
     return stop
-
-
-def _unpack(data: bytes) -> BusRecord:
-    received_t, epoch, writer, name_size = _BODY.unpack_from(data, _HEAD.size)
-    begin = _HEAD.size + _BODY.size
-    encoding_name = data[begin : begin + name_size].decode("ascii", "replace")
-    stamp = Stamp(epoch, writer) if epoch or writer else None
-    received_t = received_t if math.isfinite(received_t) else 0.0
-    return BusRecord(received_t, _PREFIX + encoding_name, data[begin + name_size :], stamp)

@@ -26,11 +26,13 @@ from fleet.contract import (
     Status,
 )
 from fleet.telemetry.mavlink.steps import STEP_S
-from fleet.telemetry.recording.fleet_log import BusRecord, FleetLog
+from fleet.telemetry.recording.fleet_log import MAX_UNRECOGNISED, BusRecord, SearchBudget, find_records
 from fleet.telemetry.recording.opening import RecordingFile
 
 TELEMETRY_TYPES = (Sample, Status, Mission, Params)
 RESULT_TYPES = (Model, Prediction, Mismatch, Alert, FleetState)
+CHUNK = 1 << 20
+SEARCH_FACTOR = 8  # search budget [bytes summed]: this times the bytes read, plus `MAX_UNRECOGNISED`
 MAX_UAV = 999_999
 _MAX_PAUSE_S = 86_400.0  # a longer pause separates two recordings in one file [s]
 _MAX_TIME_S = 4e9  # latest plausible fleet time [s since 1970]
@@ -46,8 +48,11 @@ class BusMessageReader:
     """
 
     def __init__(self, source: RecordingFile, offset: int = 0) -> None:
-        self._log = FleetLog(source)
-        self._offset = offset
+        self._source, self._offset = source, offset
+        self._record_count = 0  # records read
+        self._damaged_bytes = 0  # bytes outside valid records
+        self._first_damage: int | None = None  # position of the first of them
+        self._search_aborted = False  # reading ended: too many invalid record headers
         self._rejected: Counter[str] = Counter()
         self._places: dict[str, int] = {}  # position of the first message rejected, by reason
         self._highest_stamps: dict[int, Stamp] = {}  # highest stamp so far, by UAV id
@@ -55,12 +60,12 @@ class BusMessageReader:
     @property
     def skipped(self) -> list[str]:
         """Return messages on unreadable parts and their positions."""
-        log, problems = self._log, []
-        if log.search_aborted:
+        problems = []
+        if self._search_aborted:
             problems.append("too many invalid record headers, the rest was not read; split it")
-        if log.damaged_bytes:
-            where = f"the first near byte {log.first_damage}"
-            problems.append(f"{log.damaged_bytes} damaged bytes skipped, {where}, {log.record_count} messages read")
+        if self._damaged_bytes:
+            details = f"the first near byte {self._first_damage}, {self._record_count} messages read"
+            problems.append(f"{self._damaged_bytes} damaged bytes skipped, {details}")
         for reason, count in self._rejected.items():
             problems.append(f"{count} messages rejected, {reason}, the first near byte {self._places[reason]}")
         return problems
@@ -73,7 +78,7 @@ class BusMessageReader:
         """
         first, stream_t, left_out, step = math.nan, 0.0, 0.0, 0
         messages: list[Any] = []
-        for place, record in self._log.records():
+        for place, record in self._records():
             message = self._message(place, record, results)
             if message is None:
                 continue
@@ -89,6 +94,27 @@ class BusMessageReader:
             messages.append(message)
         if messages:
             yield first + (step + 1) * STEP_S, messages
+
+    def _records(self) -> Iterator[tuple[int, BusRecord]]:
+        """Return the valid records: (file offset [bytes], record)."""
+        rest, place, budget = b"", 0, SearchBudget(MAX_UNRECOGNISED)
+        with self._source.open() as stream:
+            while True:
+                chunk = stream.read(CHUNK) or b""
+                data, position = rest + chunk, 0
+                budget.remaining += SEARCH_FACTOR * len(chunk)
+                for start, stop in find_records(data, not chunk, budget):
+                    if start > position and self._first_damage is None:
+                        self._first_damage = place + position
+                    self._damaged_bytes += start - position
+                    position = stop
+                    if start < stop:
+                        self._record_count += 1
+                        yield place + start, BusRecord.unpack(data[start:stop])
+                rest, place = data[position:], place + position
+                self._search_aborted = budget.remaining < 0
+                if not chunk or self._search_aborted or (not self._record_count and place > MAX_UNRECOGNISED):
+                    return
 
     def _message(self, place: int, record: BusRecord, results: bool) -> Any | None:
         """Decode a record; None if it is not wanted or rejected."""
@@ -135,8 +161,8 @@ def renumbered(message: Any, new_id: Any) -> Any | None:
     """
     if isinstance(message, FleetState):
         ids = [(row, new_id(row.uav)) for row in message.rows]
-        kept = [(row, uav, _renumber_text(row.verdict, row.uav, uav)) for row, uav in ids if uav >= 0]
-        rows = [replace(row, uav=uav, verdict=verdict) for row, uav, verdict in kept]
+        renumbered_rows = [(row, uav, _renumber_text(row.verdict, row.uav, uav)) for row, uav in ids if uav >= 0]
+        rows = [replace(row, uav=uav, verdict=verdict) for row, uav, verdict in renumbered_rows]
         return replace(message, rows=tuple(rows))
     uav = new_id(message.uav)
     return with_uav(message, uav) if 0 <= uav <= MAX_UAV else None

@@ -127,7 +127,6 @@ class Recording:
         yield from log_steps(log, link)
 
     def _detect_suffix(self) -> str:
-        """Detect the kind by the content, else by the file name."""
         with self.source.open() as stream:
             head = stream.read(_HEAD_BYTES) or b""
         path = self.source.path

@@ -74,7 +74,7 @@ def run(seed: int, total: int) -> dict[str, Any]:
             early = peak_mb()
     return {
         "bytes": fed,
-        "counters": dict(intake.counters()),
+        "counters": dict(intake.decoder.counters()),
         "refused": dict(intake.rejected),
         "blocks": k + 1,
         "blocks_with_the_good_aircraft": heard,

@@ -41,7 +41,7 @@ def test_a_megabyte_of_random_bytes_disturbs_nobody():
     for start in range(0, len(junk), 5000):
         air.hear(junk[start : start + 5000], source=("10.0.0.9", start))  # every time another sender
     assert {m.uav for m in air.news} == {7, 8}
-    assert air.intake.counters()["bad_bytes"] > 950_000
+    assert air.intake.decoder.counters()["bad_bytes"] > 950_000
     assert of(Status, air.news, 8)[-1].rejected == 0
     assert of(Status, air.news, 8)[-1].missed == 0
 

@@ -271,7 +271,7 @@ def test_a_gateway_that_hears_them_tells_them_apart(tmp_path):
         intake.receive(T0 + k * 0.01, datagram, "one socket")
     news = intake.flush(T0 + 100)
     assert {m.uav for m in of(Sample, news)} == {7, 8, 9, 10, 11}
-    assert intake.counters()["bad_bytes"] == intake.counters()["bad_frames"] == 0
+    assert intake.decoder.counters()["bad_bytes"] == intake.decoder.counters()["bad_frames"] == 0
 
 
 def test_signatures_are_left_out_for_whoever_signed_did_not_sign_this(tmp_path):

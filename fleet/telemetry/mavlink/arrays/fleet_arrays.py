@@ -54,10 +54,6 @@ class AircraftArrays:
         padded = np.pad(x, ((0, 0), (0, MAX_COLUMNS - x.shape[1])))
         self.pending.add_rows(np.full(len(t), number * len(FIELDS) + FIELDS.index(field)), t, t, padded)
 
-    def due(self, now: float) -> list[int]:
-        """Return the numbers of aircraft with messages other than rows at `now` [s since 1970]."""
-        return np.flatnonzero(self.next_due_t <= now).tolist()
-
     def take_samples(self, now: float) -> dict[int, EncodedMessage]:
         """Return the samples of rows received up to `now` [s since 1970], by aircraft number."""
         self.counts.count_until(now)

@@ -60,7 +60,6 @@ def _write_uint(out, at, value):
 
 @nb.njit(cache=True, nogil=True)
 def _write_bin_header(out, at, size):
-    """Write the msgpack header of a byte string."""
     if size < 0x100:
         out[at], out[at + 1] = 0xC4, size
         return at + 2

@@ -79,7 +79,6 @@ def _find_arrived(start, end, arrival, now, stop):
 
 @nb.njit(cache=True, nogil=True)
 def _remaining_rows(start, end, row_count):
-    """Return a mask of the pending rows, (n,) bool."""
     remaining = np.zeros(row_count, np.bool_)
     for owner in range(len(start)):
         for field in range(start.shape[1]):

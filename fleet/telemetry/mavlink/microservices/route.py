@@ -193,7 +193,6 @@ class MissionCollector:
 
 
 def _absolute(item: Item, home_m: float) -> Item:
-    """Convert an altitude relative to home to altitude above sea level."""
     if item.frame not in _ABSOLUTE:
         return item
     return msgspec.structs.replace(item, frame=_ABSOLUTE[item.frame], alt_m=item.alt_m + home_m)
