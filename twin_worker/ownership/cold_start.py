@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import msgspec
 import numpy as np
 
-from fleet.bus.bus_protocol import Bus
+from fleet.bus.session import Bus
 from fleet.contract import (
     COLUMNS,
     Array,

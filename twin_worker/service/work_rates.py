@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
-from fleet.bus.bus_protocol import Bus
+from fleet.bus.session import Bus
 from fleet.contract import FleetRow, FleetState, TwinState
 from fleet.metrics import Families, MetricNaming, families
 from twin_worker.twin.state.budget import Schedule, Work
