@@ -388,7 +388,9 @@ class Prediction(Message, frozen=True, kw_only=True):
             "dynamics (identified coupled model and controller twin in closed loop on the mission), "
             "paper (the same with two linear axes), "
             "copter (multirotor: the route at limited speed, acceleration and jerk behind a lag, or position hold), "
-            "greybox (fixed wing without a model: L1 guidance and lags on the route) or imm (no route: turn rate only)"
+            "greybox (fixed wing without a model: L1 guidance and lags on the route), "
+            "route_wind (the route at the commanded airspeed in the estimated wind), "
+            "route_speed (the route at the present ground speed) or imm (no route: turn rate only)"
         ),
     ]
     law: Annotated[str, about("active controller twin, e.g. arduplane: L1 + TECS")] = ""

@@ -9,151 +9,19 @@ paper       two linear axes, identified and refined, in closed loop with the con
 dynamics    the identified derivatives model in closed loop with the controller twin, independent of model selection
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from math import acos, atan2, cos, hypot, pi, sin
 
 import numpy as np
 
-from fleet.autopilots import arduplane
-from fleet.autopilots.arduplane import params as P
-from fleet.mission import (
-    KIND,
-    LOITER_TIME,
-    LOITER_TO_ALT,
-    LOITER_TURNS,
-    LOITER_UNLIMITED,
-    P_D,
-    P_N,
-    RADIUS,
-    TURNS,
-    VA_C,
-    Route,
-    unroll_route,
-)
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
 from twin_worker.prediction.closed_loop import fly_ahead
-from twin_worker.prediction.kinematic import wind_and_airspeed
 from twin_worker.prediction.method_selection import constant_turn_prediction
-from twin_worker.prediction.multirotor.rollout import items_in_force
 from twin_worker.telemetry.track import STEP, Track
 from twin_worker.twin.state.state import Twin
+from twin_worker.twin.steps.route_lines import ROUTE_SPEED, ROUTE_WIND, present_velocity, route_lines
 
-_CIRCLES = (LOITER_TURNS, LOITER_UNLIMITED, LOITER_TIME, LOITER_TO_ALT)
-_STEP = 5.0  # between points [m]
-_CIRCLE_RADII = 1.3  # an aircraft within this many radii is on the circle [-]
-_EXIT_TOLERANCE = 0.6  # a circle is left at once if the exit direction was passed by less than this [rad]
-_CLIMB_RATE = 2.5  # climb while circling to an altitude [m/s]
-
-
-@dataclass(frozen=True)
-class LineInputs:
-    """Inputs of the line besides the route.
-
-    Attributes:
-        position: of the aircraft, NED, (3,) [m]
-        on_item: positions since the active item began, NED, oldest first, (n, 3) [m]
-        speed: usual ground speed [m/s]
-        params: autopilot parameters
-        length: required length of the line [m]
-    """
-
-    position: np.ndarray
-    on_item: np.ndarray
-    speed: float
-    params: np.ndarray
-    length: float
-
-
-def route_line(route: Route, inputs: LineInputs) -> np.ndarray:
-    """Return the route from the point abeam the aircraft on, points every few metres, (n, 4)."""
-    parts, remaining = [], inputs.length
-    start = route.start if np.isfinite(route.start).all() else inputs.on_item[0]
-    # begin at the point of the first leg, as a straight one, horizontally nearest to the aircraft
-    leg_vector = route.legs[0, P_N : P_D + 1] - start
-    share = (inputs.position[:2] - start[:2]) @ leg_vector[:2] / max(float(leg_vector[:2] @ leg_vector[:2]), 1e-6)
-    start = start + np.clip(share, 0.0, 1.0) * leg_vector
-    for k, leg in enumerate(route.legs):
-        next_target = route.legs[k + 1, P_N : P_N + 2] if k + 1 < len(route.legs) else None
-        for part in _leg_points(leg, start, next_target, inputs, first=k == 0):
-            parts.append(np.column_stack([part, np.full(len(part), leg[VA_C])]))
-            remaining -= float(np.linalg.norm(np.diff(part[:, :2], axis=0), axis=1).sum())
-        start = parts[-1][-1, :3]
-        if remaining < 0:
-            break
-    return np.vstack(parts)
-
-
-def _leg_points(
-    leg: np.ndarray, start: np.ndarray, next_target: np.ndarray | None, inputs: LineInputs, *, first: bool
-) -> Iterator[np.ndarray]:
-    """Yield the points of one leg, (n, 3) each part: the straight part, then the circle."""
-    target = leg[P_N : P_D + 1]
-    if int(leg[KIND]) not in _CIRCLES:
-        yield _straight_points(start, target, inputs.length)
-        return
-    signed_radius = leg[RADIUS] or inputs.params[P.LOITER_RAD]
-    R, side = max(abs(signed_radius), 1.0), 1.0 if signed_radius >= 0 else -1.0
-    start = inputs.position if first else start
-    radial = start[:2] - target[:2]
-    D, angle = hypot(*radial), atan2(radial[1], radial[0])
-    if first and _CIRCLE_RADII * R > D:
-        traversed_angle = _traversed_angle(inputs.on_item, target, _CIRCLE_RADII * R)
-    else:
-        traversed_angle = 0.0
-        angle += side * acos(min(R / max(D, R), 1.0))
-        edge = np.array([*(target[:2] + R * np.array([cos(angle), sin(angle)])), target[2]])
-        yield _straight_points(start, edge, inputs.length)
-    arc = max(_commanded_angle(leg, R, start, inputs) - traversed_angle, 0.0)
-    if next_target is not None and int(leg[KIND]) != LOITER_UNLIMITED:
-        arc += _angle_to_exit(angle + side * arc, target, next_target, (R, side))
-    arc = min(arc, inputs.length / R + 2 * pi)
-    sweep = angle + side * np.linspace(0.0, arc, int(arc * R / _STEP) + 2)
-    yield target + R * np.column_stack([np.cos(sweep), np.sin(sweep), np.zeros(len(sweep))])
-
-
-def _straight_points(start: np.ndarray, end: np.ndarray, max_length: float) -> np.ndarray:
-    """Return points from start towards end, up to a maximum length, (n, 3) [m]."""
-    length = hypot(*(end - start)[:2])
-    share = min(max_length / max(length, 1e-6), 1.0)
-    along = np.linspace(0.0, share, int(share * length / _STEP) + 2)[:, None]
-    return start + along * (end - start)
-
-
-def _traversed_angle(track: np.ndarray, centre: np.ndarray, max_radius: float) -> float:
-    """Return the angle flown around a centre since the circle was reached [rad]."""
-    radial = track[:, :2] - centre[:2]
-    inside = np.hypot(*radial.T) < max_radius
-    on_circle = radial[int(np.argmax(inside)) :] if inside.any() else radial[:0]
-    around = np.unwrap(np.arctan2(on_circle[:, 1], on_circle[:, 0]))
-    return float(abs(around[-1] - around[0])) if len(around) else 0.0
-
-
-def _commanded_angle(leg: np.ndarray, R: float, start: np.ndarray, inputs: LineInputs) -> float:
-    """Return the angle to circle according to the item: turns, time or altitude [rad]."""
-    kind = int(leg[KIND])
-    if kind == LOITER_TURNS:
-        return 2 * pi * leg[TURNS]
-    if kind == LOITER_TIME:
-        return leg[TURNS] * inputs.speed / R
-    if kind == LOITER_TO_ALT:
-        return abs(leg[P_D] - start[2]) / _CLIMB_RATE * inputs.speed / R
-    return inputs.length / R + 2 * pi  # unlimited
-
-
-def _angle_to_exit(angle: float, centre: np.ndarray, next_target: np.ndarray, circle: tuple[float, float]) -> float:
-    """Return the further angle to circle until the course points at the next target [rad]."""
-    R, side = circle
-    radial = next_target - centre[:2]
-    exit_angle = atan2(radial[1], radial[0]) - side * acos(R / max(hypot(*radial), R))
-    return max((((exit_angle - angle) * side) + _EXIT_TOLERANCE) % (2 * pi) - _EXIT_TOLERANCE, 0.0)
-
-
-_VELOCITY_S = 0.3  # averaging time of the present velocity [s]
 _TURN_S = 1.5  # window of the turn rate fit [s]
-_OFFSET_S, _REJOIN_S = 6.0, 4.0  # time constants with which cross-track offset and speed decay [s]
-_ACCELERATION_S = 4.0  # time constant of the approach to the commanded speed [s]
-_MIN_SPEED = 1.0  # minimum speed along the route [m/s]
 _HISTORY_S = 62.0  # telemetry before a closed-loop prediction [s]
 
 
@@ -179,7 +47,7 @@ class BaselineInput:
     @property
     def velocity(self) -> np.ndarray:
         """Return the present velocity, NED, (3,) [m/s]."""
-        return self.track.v[-round(_VELOCITY_S / STEP) :].mean(axis=0)
+        return present_velocity(self.track)
 
 
 def constant_velocity(inputs: BaselineInput) -> np.ndarray:
@@ -200,78 +68,9 @@ def constant_turn(inputs: BaselineInput) -> np.ndarray:
     )
 
 
-def route_at_ground_speed(inputs: BaselineInput) -> np.ndarray | None:
-    """Predict along the mission at the present ground speed, (k, 3) [m]; None without a mission."""
-    return _follow_route(inputs, lambda points: np.full(len(points) - 1, np.hypot(*inputs.velocity[:2])))
-
-
-def route_in_wind(inputs: BaselineInput) -> np.ndarray | None:
-    """Predict along the mission at the commanded airspeed in the estimated wind, (k, 3) [m]; None without a mission."""
-    if inputs.twin.vehicle_class.is_rotorcraft:  # as commanded, else the present speed
-        speed = np.hypot(*inputs.velocity[:2])
-        return _follow_route(inputs, lambda points: np.where(points[1:, 3] > 0, points[1:, 3], speed))
-    wind = inputs.twin.environment.wind.wind if np.isfinite(inputs.twin.environment.wind.t) else None
-    wind_ne, airspeed = wind_and_airspeed(inputs.track, wind)
-    params = inputs.twin.onboard.params.values if inputs.twin.onboard.params else {}
-    values, absent = arduplane.parameters(params)
-    scale = inputs.twin.environment.wind.scale if wind is not None else 1.0
-
-    def ground_speed(points: np.ndarray) -> np.ndarray:
-        commanded = points[1:, 3]
-        # a leg without commanded airspeed keeps the present one: after a jump back it is seldom the cruise parameter
-        keep_speed = commanded[0] <= 0 or "AIRSPEED_CRUISE" in absent
-        cruise = airspeed if keep_speed else values[P.VA_CRUISE] * scale
-        Va = np.where(commanded > 0, commanded * scale, cruise)
-        legs = np.diff(points[:, :2], axis=0)
-        direction = legs / np.maximum(np.linalg.norm(legs, axis=1, keepdims=True), 1e-9)
-        cross_wind = direction[:, 0] * wind_ne[1] - direction[:, 1] * wind_ne[0]
-        return np.sqrt(np.maximum(Va**2 - cross_wind**2, 1.0)) + direction @ wind_ne
-
-    return _follow_route(inputs, ground_speed)
-
-
-def _follow_route(inputs: BaselineInput, ground_speed: Callable[[np.ndarray], np.ndarray]) -> np.ndarray | None:
-    """Predict along the route at the ground speed of each point, from the present position and velocity.
-
-    Speed starts at the along-track component of the velocity and approaches the commanded speed with time constant
-    `_ACCELERATION_S`, which models the time lost in a turn onto the route; cross-track position and velocity decay.
-    """
-    points = _route_points(inputs)
-    if points is None:
-        return None
-    step = np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1)
-    points, step = points[np.concatenate([[True], step > 1e-6])], step[step > 1e-6]
-    if not len(step):
-        return None
-    speed = np.maximum(ground_speed(points), _MIN_SPEED)
-    length, time = (np.concatenate([[0.0], np.cumsum(part)]) for part in (step, step / speed))
-    ahead, direction = np.maximum(inputs.ahead, 0.0), (points[1, :3] - points[0, :3]) / step[0]
-    lag = (speed[0] - inputs.velocity[:2] @ direction[:2]) * _ACCELERATION_S * (1 - np.exp(-ahead / _ACCELERATION_S))
-    progress = np.maximum(np.interp(ahead, time, length) - lag, 0.0)
-    path = np.column_stack([np.interp(progress, length, column) for column in points[:, :3].T])
-    offset, drift = inputs.position - points[0, :3], inputs.velocity - (inputs.velocity[:2] @ direction[:2]) * direction
-    residual = np.outer(np.exp(-ahead / _OFFSET_S), offset)
-    return path + residual + np.outer(ahead * np.exp(-ahead / _REJOIN_S), drift + offset / _OFFSET_S)
-
-
-def _route_points(inputs: BaselineInput) -> np.ndarray | None:
-    """Return the route ahead as points; None without a route or without a known active item."""
-    twin = inputs.twin
-    if twin.no_route_reason() or twin.onboard.mission is None or twin.telemetry.origin is None:
-        return None
-    seq = items_in_force(inputs.track.t, twin.telemetry.history.rows("leg"), twin.onboard.mission)
-    if not np.isfinite(seq[-1]):
-        return None
-    params = twin.onboard.params.values if twin.onboard.params else {}
-    items, origin = twin.onboard.mission.items, twin.telemetry.origin
-    remaining = unroll_route(items, seq=int(seq[-1]), origin=origin, params=params, first=twin.first_item)
-    if not len(remaining.legs):
-        return None
-    other_item = np.flatnonzero(seq != seq[-1])
-    on_item = inputs.track.p[int(other_item[-1]) + 1 if len(other_item) else 0 :]
-    speed = max(float(np.mean(np.hypot(*inputs.track.v[-200:, :2].T))), _MIN_SPEED)
-    length = (2.0 * speed + 10.0) * max(float(inputs.ahead[-1]), 1.0)
-    return route_line(remaining, LineInputs(inputs.position, on_item, speed, arduplane.parameters(params)[0], length))
+def _route_line(method: str) -> Callable[[BaselineInput], np.ndarray | None]:
+    """Return the baseline of one route line; it predicts None without a mission."""
+    return lambda inputs: route_lines(inputs.twin, inputs.track, inputs.ahead).get(method)
 
 
 def closed_loop_dynamics(inputs: BaselineInput) -> np.ndarray | None:
@@ -288,7 +87,7 @@ BASELINES: dict[str, Callable[[BaselineInput], np.ndarray | None]] = {
     "cv": constant_velocity,
     "ct": constant_turn,
     "imm": lambda now: constant_turn_prediction(now.track, now.ahead),
-    "route": route_at_ground_speed,
-    "route_wind": route_in_wind,
+    "route": _route_line(ROUTE_SPEED),
+    "route_wind": _route_line(ROUTE_WIND),
     "dynamics": closed_loop_dynamics,
 }

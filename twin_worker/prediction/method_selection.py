@@ -17,7 +17,11 @@ from twin_worker.telemetry.track import Track
 
 SCORE_AHEAD = np.arange(0.0, 61.0, 5.0)  # look-ahead of the scores [s]
 SCORE_INTERVAL_S = 5.0  # interval of scored predictions [s]
-PREFERENCE = ("both", "hybrid", "dynamics", "paper")  # preference before any score
+PREFERENCE = (
+    *("both", "hybrid", "dynamics", "paper", "greybox", "copter"),  # closed loop: best on the calibration flights
+    *("route_wind", "route_speed"),
+)
+"""Preference before any score, in the order of the median error on the calibration flights."""
 _SMOOTHING = 0.1  # smoothing weight of the newest score
 _SWITCH_RATIO = 0.85  # another method replaces the preferred one below this ratio of errors [-]
 _MIN_SCORED = 4  # minimum scored predictions
@@ -79,9 +83,9 @@ class MethodSelector:
     def best(self, methods: tuple[str, ...]) -> str:
         """Return the first of `PREFERENCE` among methods, unless another has a clearly smaller error."""
         scored = [method for method in methods if self.n_scored.get(method, 0) >= _MIN_SCORED]
-        if len(scored) < len(methods):
-            return min(methods, key=PREFERENCE.index)
         preferred = min(methods, key=PREFERENCE.index)
+        if preferred not in scored:
+            return preferred
         best_scored = min(scored, key=lambda method: self.mean_error[method])
         return best_scored if self.mean_error[best_scored] < _SWITCH_RATIO * self.mean_error[preferred] else preferred
 

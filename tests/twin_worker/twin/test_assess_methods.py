@@ -6,10 +6,12 @@ import pytest
 from fleet.contract import Message, Mission, Params, Status
 from fleet.mission import unroll_route
 from tests.support.flights import HERE, T0, item, messages, turn
-from twin_worker.evaluation.baselines import BASELINES, BaselineInput, LineInputs, route_line
+from twin_worker.evaluation.baselines import BASELINES, BaselineInput
 from twin_worker.twin.state.state import Twin, ingest
 from twin_worker.twin.step import advance
-from twin_worker.twin.steps.kinematic_prediction import recent_track
+from twin_worker.twin.steps.kinematic_prediction import PathForecast, recent_track
+from twin_worker.twin.steps.rollouts import select_method
+from twin_worker.twin.steps.route_lines import LineInputs, route_line
 
 AHEAD = np.arange(0.0, 61.0)
 VA = 20.0
@@ -159,3 +161,39 @@ def test_an_aircraft_that_says_not_which_item_it_flies_has_no_route():
         ingest(twin, message)
     flown = recent_track(twin, 40.0)
     assert flown is not None and BASELINES["route"](BaselineInput(twin, flown, AHEAD)) is None
+
+
+# --- the lines among the methods of the twin ----------------------------------------------------------------------
+
+
+def scored(twin: Twin, **error: float) -> None:
+    """Set the mean error of past predictions by method."""
+    for name, value in error.items():
+        twin.prediction.selector.mean_error[name], twin.prediction.selector.n_scored[name] = value, 9
+
+
+@pytest.mark.parametrize(
+    "error, chosen",
+    [
+        ({"greybox": 0.2, "route_wind": 0.1, "route_speed": 0.3}, "route_wind"),
+        ({"greybox": 0.2, "route_wind": 0.3, "route_speed": 0.1}, "route_speed"),
+        ({"greybox": 0.1, "route_wind": 0.09, "route_speed": 0.3}, "greybox"),  # not clearly better
+        ({"greybox": 0.1}, "greybox"),
+    ],
+)
+def test_a_route_line_with_the_smaller_past_error_is_used(error, chosen):
+    now = told(*mission(item(1, north=9000.0)), rate=0.0, psi=0.0)
+    scored(now.twin, **error)
+    t = float(now.track.t[-1])
+    wrong = PathForecast(now.position + np.outer(AHEAD, [0.0, VA, 0.0]), "greybox", "law", 1, "east")
+    forecast = select_method(now.twin, t, {"greybox": wrong}, now.track, AHEAD)
+    assert forecast.method == chosen
+    assert forecast.path is not None and (forecast.path[60, 0] > now.position[0] + 1000.0) == (chosen != "greybox")
+    assert {"greybox", "route_wind", "route_speed"} == set(now.twin.prediction.selector.pending[-1][2])
+
+
+def test_no_route_line_competes_without_a_route():
+    now = told(rate=0.0)
+    path = PathForecast(now.position + np.outer(AHEAD, [0.0, VA, 0.0]), "copter", "law", -1, "holds")
+    assert select_method(now.twin, float(now.track.t[-1]), {"copter": path}, now.track, AHEAD).method == "copter"
+    assert not now.twin.prediction.selector.pending

@@ -23,7 +23,7 @@ from twin_worker.twin.steps.kinematic_prediction import (
     predict_without_model,
     recent_track,
 )
-from twin_worker.twin.steps.rollouts import BOTH, HYBRID, ensemble_spread, predict_route
+from twin_worker.twin.steps.rollouts import BOTH, HYBRID, ensemble_spread, predict_route, select_method
 
 LOOK_BACK_S = 62.0  # telemetry used for a prediction [s]
 _REPORT_PERIOD_S = 10.0  # between reports of unchanged law and parameters [s]
@@ -169,7 +169,7 @@ def _best_forecast(twin: Twin, recent: Track, ahead: np.ndarray) -> tuple[PathFo
     if (twin.models.active_model is not None or twin.models.point_mass is not None) and not is_hovering(twin):
         model_forecast = no_prediction(twin.no_route_reason() or "telemetry has gaps: no initial state for the model")
         if window is not None and usable and not twin.no_route_reason():
-            model_forecast = predict_route(twin, window, ahead)
+            model_forecast = predict_route(twin, window, recent, ahead)
         if _is_usable(model_forecast):
             _set_state(twin, TwinState.PREDICTING)
             return model_forecast, float(window.t[-1])  # type: ignore[union-attr]
@@ -178,7 +178,8 @@ def _best_forecast(twin: Twin, recent: Track, ahead: np.ndarray) -> tuple[PathFo
     if _is_usable(kinematic):
         _set_state(twin, TwinState.PREDICTING)
         text = kinematic.sentence if is_hovering(twin) else f"{kinematic.sentence}; {reason}"
-        return replace(kinematic, sentence=text), float(recent.t[-1])
+        forecasts = {kinematic.method: replace(kinematic, sentence=text)}
+        return select_method(twin, float(recent.t[-1]), forecasts, recent, ahead), float(recent.t[-1])
     _set_state(
         twin, TwinState.VERIFIED if twin.models.active_model else TwinState.IDENTIFYING if usable else TwinState.WAITING
     )

@@ -1,5 +1,7 @@
 """Predict the route with every available method, and select the method used."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from fleet.window import Window
@@ -16,20 +18,23 @@ from twin_worker.prediction.closed_loop import (
 )
 from twin_worker.prediction.fixed_wing import ensemble
 from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_point_mass
+from twin_worker.telemetry.track import Track
 from twin_worker.twin.state.budget import EARLY_FRACTION, Work
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.kinematic_prediction import PathForecast, no_prediction
+from twin_worker.twin.steps.route_lines import LAW, LINES, route_lines
 
 HYBRID, BOTH = "hybrid", "both"
 _DYNAMICS_SPAN_S = 60.0  # look-ahead of the identified dynamics; beyond it the point-mass path continues [s]
 
 
-def predict_route(twin: Twin, window: Window, ahead: np.ndarray) -> PathForecast:
+def predict_route(twin: Twin, window: Window, recent: Track, ahead: np.ndarray) -> PathForecast:
     """Predict the route, or return the reason why this is not possible.
 
     Args:
         twin: source of the models; its method selection and ensemble are updated
         window: newest telemetry
+        recent: positions and velocities of the last minute
         ahead: look-ahead times from the end of `window`, rising, (k,) [s]
     """
     situation = twin.situation(window)
@@ -41,12 +46,37 @@ def predict_route(twin: Twin, window: Window, ahead: np.ndarray) -> PathForecast
     candidates, reason = method_paths(twin, (situation, initial), ahead, due)
     if not candidates:
         return no_prediction(reason or "no verified model yet", initial.seq)
-    if due and len(candidates) > 1 and not twin.telemetry.link_lost:
-        twin.prediction.selector.add(t, float(np.linalg.norm(initial.window.v[-1])), ahead, candidates)
     _update_ensemble(twin, (situation, initial))
-    chosen = twin.prediction.selector.best(tuple(candidates))
-    sentence = " ".join(filter(None, (twin.prediction.selector.describe(chosen), initial.sentence)))
-    return PathForecast(candidates[chosen], chosen, initial.controller.law, initial.seq, sentence, initial.controller)
+    sentence, control = initial.sentence, initial.controller
+    forecasts = {
+        name: PathForecast(path, name, control.law, initial.seq, sentence, control) for name, path in candidates.items()
+    }
+    return select_method(twin, t, forecasts, recent, ahead)
+
+
+def select_method(
+    twin: Twin, t: float, forecasts: dict[str, PathForecast], recent: Track, ahead: np.ndarray
+) -> PathForecast:
+    """Return the forecast of the method with the smallest past error; the route lines compete where there is a route.
+
+    Args:
+        twin: its method selection is updated
+        t: start of the forecasts [s since 1970]
+        forecasts: usable forecasts by method
+        recent: positions and velocities of the last minute
+        ahead: look-ahead times from `t`, rising, (k,) [s]
+    """
+    selector, newest = twin.prediction.selector, next(iter(forecasts.values()))
+    due = not twin.telemetry.link_lost and selector.is_due(t)
+    follows_mission = not twin.telemetry.link_lost and twin.prediction.override is None and newest.seq >= 0
+    if follows_mission and (due or selector.best((*forecasts, *LINES)) in LINES):
+        lines = route_lines(twin, recent.unbroken_tail(), ahead + (t - recent.t[-1]))
+        forecasts = forecasts | {name: PathForecast(path, name, LAW, newest.seq, "") for name, path in lines.items()}
+    paths = {name: forecast.path for name, forecast in forecasts.items() if forecast.path is not None}
+    if due and len(paths) > 1:
+        selector.add(t, float(np.linalg.norm(recent.v[-1])), ahead, paths)
+    chosen = forecasts[selector.best(tuple(forecasts))]
+    return replace(chosen, sentence=" ".join(filter(None, (selector.describe(chosen.method), chosen.sentence))))
 
 
 def method_paths(
