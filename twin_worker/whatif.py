@@ -186,7 +186,8 @@ def _override(twin: Twin, query: WhatIf) -> RouteOverride:
     if seq is None:
         seq = _first_item(items, twin) if query.items is not None else _active_seq(twin)
     restart = (query.seq is not None and query.seq != _active_seq(twin)) or query.start is not None
-    return RouteOverride(items, seq, params, restart, query.start.speed if query.start else None, twin.first_item)
+    speed, jumps = query.start.speed if query.start else None, twin.onboard.jumps_taken if query.items is None else {}
+    return RouteOverride(items, seq, params, restart, speed, twin.first_item, jumps)
 
 
 def _with_speed(item: Item, speed: float) -> Item:
@@ -210,7 +211,8 @@ def _fill_leg_history(twin: Twin, override: RouteOverride) -> None:
     now = twin.telemetry.history.newest
     twin.onboard.plan_changed(now - _REPLAY_S)
     items = override.items
-    twin.onboard.set_mission(Mission(uav=twin.config.uav, t=now, items=items, seq=override.seq, complete=True))
+    mission = Mission(uav=twin.config.uav, t=now, items=items, seq=override.seq, complete=True)
+    twin.onboard.set_mission(mission, twin.first_item)
     t = np.arange(now - 2 * _REPLAY_S, now + 0.5, 1.0)
     twin.telemetry.history.replace_rows("leg", t, np.full((len(t), 1), float(override.seq)))
 
