@@ -77,7 +77,8 @@ def replay_controller(
     ctl = np.zeros(S.N_CTL)
     residual = np.full((n, 6), nan)  # reported minus replayed: theta_c, delta_t, delta_a, delta_e, delta_r, phi_c
     last = -1
-    reported_ctl, switched, confirmed = ctl, -1, -1  # state on the reported leg; row of a switch without report
+    reported_ctl, switched = ctl, -1  # state on the reported leg, and row of the switch that waits for its report
+    refuted = False  # the law's condition to switch, as it still holds, was not followed by a report
     k = -1
     while k < n - 1:
         k += 1
@@ -87,7 +88,7 @@ def replay_controller(
             ctl = engage(par, legs, start, p[k], v[k], euler[k], Va[k], theta_c[k], delta[k, 3])
             last = k
         if switched >= 0 and seq[k] == seq[switched] and t[k] - t[switched] > _REPORT_DELAY:
-            ctl, confirmed = reported_ctl, k
+            ctl, refuted = reported_ctl, True
             last, k, switched = switched, switched, -1
             continue
         dt = min(max(t[k] - t[last], 0.0), _MAX_STEP)
@@ -113,7 +114,8 @@ def replay_controller(
                 delta[k, 2] - delta_r,
             )
         leg = int(ctl[S.LEG])
-        if leg_done and switched < 0 and k > confirmed and leg + 1 < legs.shape[0] and legs[leg, SEQ] == seq[k]:
+        refuted = refuted and leg_done
+        if leg_done and not refuted and switched < 0 and leg + 1 < legs.shape[0] and legs[leg, SEQ] == seq[k]:
             reported_ctl, switched = ctl.copy(), k
             begin(ctl, par, legs, leg + 1, p[k])
     if last >= 0:

@@ -93,8 +93,8 @@ def is_return(leg: np.ndarray) -> bool:
 
 @kernel
 def _has_line(legs: np.ndarray, i: int, k: int) -> bool:
-    """Return whether the leg `k` is flown along a line after leg `i`."""
-    if i < 0 or k != i + 1 or is_return(legs[k]):
+    """Return whether the leg `k` is flown along a line after leg `i`, also where the operator selected it."""
+    if i < 0 or k == i or is_return(legs[k]):
         return False
     return int(legs[i, KIND]) != TAKEOFF and int(legs[i, KIND]) != LOITER_UNLIMITED
 
@@ -109,9 +109,10 @@ def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndar
     course, (end_n, end_e) = _course(ctl, legs, i, p), _extended_line(ctl, p)[2:]
     if not _has_line(legs, i, k):
         set_leg(ctl, par, legs, k, p)
-        ctl[S.COURSE] = course
+        ctl[S.FOLLOW_LINE], ctl[S.COURSE] = -1.0, course
         return
-    from_exit = int(legs[i, KIND]) in (LOITER_TURNS, LOITER_TIME, LOITER_TO_ALT) and legs[i, ACCEPT_RADIUS] > 0.0
+    circle = int(legs[i, KIND]) in (LOITER_TURNS, LOITER_TIME, LOITER_TO_ALT)
+    from_exit = circle and legs[i, ACCEPT_RADIUS] > 0.0 and k == i + 1
     set_leg(ctl, par, legs, k, p if from_exit else legs[i, P_N : P_D + 1])
     ctl[S.FOLLOW_LINE], ctl[S.COURSE] = 1.0, course
     if int(legs[i, KIND]) == CHANGE_ALTITUDE:
@@ -173,7 +174,7 @@ def steer(
     if kind in (WAYPOINT, LAND):
         if hypot(leg[P_N] - ctl[S.PREV_N], leg[P_E] - ctl[S.PREV_E]) < 0.1:  # no line: start one here
             ctl[S.PREV_N], ctl[S.PREV_E] = p[0], p[1]
-        if ctl[S.FOLLOW_LINE] == 0.0:
+        if ctl[S.FOLLOW_LINE] < 0.0:
             line = (p[0], p[1], leg[P_N], leg[P_E])
         a_lat = l1.follow_line(ctl, par, line, p, v, euler[2], dt)
         return a_lat, kind == WAYPOINT and _arrived(ctl, par, leg, p, v, euler[2])
