@@ -99,11 +99,8 @@ def replay_controller(
         if not dt > 0.0:
             continue
         phi_k, theta_k, thr_k, leg_done = fly(ctl, par, legs, p[k], v[k], euler[k], Va[k], nan, dt)
-        residual[k, 0], residual[k, 1], residual[k, 5] = (
-            theta_c[k] - theta_k,
-            delta[k, 3] - thr_k,
-            wrap(phi_c[k] - phi_k),
-        )
+        residual[k, 0], residual[k, 1] = theta_c[k] - theta_k, delta[k, 3] - thr_k
+        residual[k, 5] = wrap(phi_c[k] - phi_k) if switched < 0 else nan  # which leg is flown is not known yet
         if _is_finite(rates[k]):
             roll = phi_c[k] if np.isfinite(phi_c[k]) else phi_k
             pitch = theta_c[k] if np.isfinite(theta_c[k]) else theta_k
