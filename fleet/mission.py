@@ -1,6 +1,6 @@
 """Route: convert MAVLink mission items to the legs that a compiled controller reads.
 
-A leg is one row of float64; the columns are named below, the first one is the leg type:
+A leg is one row of float64 with the columns of `fleet.mission_legs`; the first one is the leg type:
 
     WAYPOINT         fly the line from the previous point to here, then continue
     LOITER_TURNS     circle `TURNS` times, exit towards the next leg
@@ -9,49 +9,97 @@ A leg is one row of float64; the columns are named below, the first one is the l
     LOITER_TO_ALT    circle until the altitude is reached
     TAKEOFF          climb wings level to the altitude
     LAND             fly to the point; no leg follows automatically
+    CHANGE_ALTITUDE  continue on the line of the previous leg until the altitude is reached
 
 Item 0 is home (ArduPilot), or the first to fly (PX4, whose mission does not contain home). MAVLink does not report how
-often a DO_JUMP was already taken: the count starts at zero.
-Source: MAVLink mission protocol, MAV_CMD and MAV_FRAME; ArduPlane mission command list.
+often a DO_JUMP was already taken; `fleet.mission_jumps` counts it from the reported items.
+Source: MAVLink mission protocol, MAV_CMD and MAV_FRAME; ArduPlane mission command list. Every command and how it is
+flown is listed in `docs/mission-commands.md`.
 """
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from math import hypot, isfinite
+from math import hypot
 
 import numpy as np
 
 from fleet.contract import MAX_ITEMS, Item
 from fleet.frames import Origin, to_ned
-
-WAYPOINT, LOITER_TURNS, LOITER_UNLIMITED, LOITER_TIME, LOITER_TO_ALT, TAKEOFF, LAND = range(7)
-KIND = 0  # leg type, one of the seven above
-P_N, P_E, P_D = 1, 2, 3  # target, or centre of the circle, NED from the route's origin [m]
-RADIUS = 4  # radius of the circle, positive clockwise; 0: the autopilot's WP_LOITER_RAD [m]
-TURNS = 5  # turns; seconds for LOITER_TIME
-VA_C = 6  # commanded airspeed; <= 0: cruise [m/s]
-ACCEPT_RADIUS = (
-    7  # acceptance radius; 0: from the parameters; negative: pass by at that distance [m]; of a circle: 1: exit
+from fleet.mission_jumps import JUMPS, jump_target, nearest_landing, repetitions, resets_counters
+from fleet.mission_legs import (
+    ABSOLUTE,
+    ACCEPT_RADIUS,
+    CHANGE_ALTITUDE,
+    GLOBAL_FRAMES,
+    KIND,
+    KINDS,
+    LAND,
+    LEG_NAMES,
+    LOITER_TIME,
+    LOITER_TO_ALT,
+    LOITER_TURNS,
+    LOITER_UNLIMITED,
+    N_COLUMNS,
+    P_D,
+    P_E,
+    P_N,
+    RADIUS,
+    SEQ,
+    TAKEOFF,
+    TERRAIN,
+    TURNS,
+    VA_C,
+    WAYPOINT,
+    commanded_airspeed,
+    finite,
+    is_zero_position,
+    line_starts_at_target,
+    make_leg,
+    position_error,
 )
-# only towards the next leg (PX4; ArduPlane always does)
-SEQ = 8  # mission item of this leg; -1: return to launch after the last one
-N_COLUMNS = 9
 
-LEG_NAMES = ("waypoint", "loiter turns", "loiter", "loiter time", "loiter to altitude", "takeoff", "land")
-_KINDS = {16: WAYPOINT, 17: LOITER_UNLIMITED, 18: LOITER_TURNS, 19: LOITER_TIME, 20: LOITER_UNLIMITED}
-_KINDS |= {21: LAND, 22: TAKEOFF, 31: LOITER_TO_ALT, 82: WAYPOINT, 84: TAKEOFF, 85: LAND}
-_RETURN, _LAST_NAV, _JUMP, SPEED = 20, 95, 177, 178  # MAV_CMD: RETURN_TO_LAUNCH, NAV_LAST, DO_JUMP, DO_CHANGE_SPEED
-_ABSOLUTE, _RELATIVE, _TERRAIN = (0, 5), (3, 6), (10, 11)  # MAV_FRAME
-GLOBAL_FRAMES = _ABSOLUTE + _RELATIVE + _TERRAIN
+__all__ = [
+    "ACCEPT_RADIUS",
+    "CHANGE_ALTITUDE",
+    "FIRST_ITEM",
+    "GLOBAL_FRAMES",
+    "KIND",
+    "KINDS",
+    "LAND",
+    "LEG_NAMES",
+    "LOITER_TIME",
+    "LOITER_TO_ALT",
+    "LOITER_TURNS",
+    "LOITER_UNLIMITED",
+    "N_COLUMNS",
+    "P_D",
+    "P_E",
+    "P_N",
+    "RADIUS",
+    "ROUTE_PARAMS",
+    "SEQ",
+    "SPEED",
+    "TAKEOFF",
+    "TURNS",
+    "VA_C",
+    "WAYPOINT",
+    "Route",
+    "join_remarks",
+    "unroll_route",
+]
+
+# MAV_CMD: RETURN_TO_LAUNCH, NAV_CONTINUE_AND_CHANGE_ALT, NAV_DELAY, NAV_LAST, DO_CHANGE_SPEED, DO_SET_HOME
+_RETURN, _CHANGE_ALTITUDE, _DELAY, _LAST_NAV, SPEED, _SET_HOME = 20, 30, 93, 95, 178, 179
 _MIN_LEG = 1.0  # a shorter leg has no usable direction [m]
 FIRST_ITEM = {"px4": 0}  # number of the first item to fly, by autopilot; 1 elsewhere
-ROUTE_PARAMS = ("RTL_ALTITUDE", "ALT_HOLD_RTL", "RTL_RADIUS", "WP_LOITER_RAD")
+ROUTE_PARAMS = (
+    *("RTL_ALTITUDE", "ALT_HOLD_RTL", "RTL_RADIUS", "RTL_AUTOLAND", "WP_LOITER_RAD", "MIS_OPTIONS"),
+    *("AIRSPEED_MIN", "ARSPD_FBW_MIN", "AIRSPEED_MAX", "ARSPD_FBW_MAX"),
+)
 """Autopilot parameters that shape a route."""
 _MAX_REMARKS = 3  # remarks reported of one mission
 _MAX_LEG = 500e3  # a longer leg is an input error, and flat earth does not give its direction [m]
-_MAX_SPEED = 300.0  # higher commanded speeds are input errors [m/s]
-_MAX_ALTITUDE = 1e5  # higher altitudes are input errors [m]
 _RTL_ALTITUDE = 100.0  # ArduPlane's default RTL_ALTITUDE [m]
 
 
@@ -88,7 +136,8 @@ class _RouteBuilder:
     home: np.ndarray  # (3,) NED [m]
     last_point: np.ndarray  # (3,) the last navigation point passed, NED [m]
     positions: dict[int, np.ndarray] = field(default_factory=dict)  # of every item, NED except the height, (3,) [m]
-    last_kind: int = TAKEOFF  # type of the leg that ended there; no line starts at home
+    last_leg: np.ndarray | None = None  # the leg that ended there; None: no line starts at home
+    return_from: np.ndarray = field(default_factory=lambda: np.zeros(3))  # start of the last return, NED (3,) [m]
     speed: float = 0.0  # commanded airspeed; 0: cruise [m/s]
     jumps_left: dict[int, float] = field(default_factory=dict)  # jumps left at each DO_JUMP
     jumps_taken: set[int] = field(default_factory=set)  # jumps taken since the last leg
@@ -107,7 +156,14 @@ def join_remarks(sentences: Sequence[str]) -> str:
 
 
 def unroll_route(
-    items: Sequence[Item], *, seq: int, origin: Origin, params: Mapping[str, float], limit: int = 64, first: int = 1
+    items: Sequence[Item],
+    *,
+    seq: int,
+    origin: Origin,
+    params: Mapping[str, float],
+    limit: int = 64,
+    first: int = 1,
+    jumps_taken: Mapping[int, int] | None = None,
 ) -> Route:
     """Unroll the legs from item `seq` on: jumps, speeds and altitude frames resolved. Never raises on a bad mission.
 
@@ -118,13 +174,17 @@ def unroll_route(
         params: autopilot parameters, of which those in `ROUTE_PARAMS` are used
         limit: maximum number of legs
         first: 1 where item 0 is home, 0 where it is the first to fly; home is the origin then. See `FIRST_ITEM`
+        jumps_taken: jumps taken so far at each jump, as of `fleet.mission_jumps`; unknown jumps: the fewest
     Returns:
         legs, the point before them, and one remark per error
     """
     builder = _make_builder(items, origin, params, first)
     item_seq = _advance_to(builder, _first_seq(builder, seq))
-    # after a circle or a takeoff ArduPlane starts the line at the aircraft's position
-    start = builder.last_point.copy() if builder.last_kind in (WAYPOINT, LAND) else np.full(3, np.nan)
+    for number, count in (jumps_taken or {}).items():
+        times = repetitions(builder.items[number]) if number in builder.items else 0.0
+        builder.jumps_left[number] = max(times - count, 0.0) if times > 0 else times
+    on_line = line_starts_at_target(builder.last_leg, home_first=first > 0)
+    start = builder.last_point.copy() if on_line else np.full(3, np.nan)
     builder.legs = []
     if builder.last >= builder.first and builder.items:
         _append_legs(builder, item_seq, limit)
@@ -154,7 +214,7 @@ def _make_builder(items: Sequence[Item], origin: Origin, params: Mapping[str, fl
 
 def _home(builder: _RouteBuilder) -> np.ndarray:
     item = builder.items.get(0)
-    if item is None or _position_error(item) or _is_zero_position(item):
+    if item is None or position_error(item) or is_zero_position(item):
         builder.remark(
             "mission item 0: found no usable position, expected home; used the origin, set home and upload again"
         )
@@ -164,27 +224,6 @@ def _home(builder: _RouteBuilder) -> np.ndarray:
 
 def _ned(origin: Origin, item: Item, altitude: float) -> np.ndarray:
     return to_ned(origin, np.array([item.lat_e7]), np.array([item.lon_e7]), np.array([altitude * 1e3]))[0]
-
-
-def _position_error(item: Item) -> str:
-    """Describe the error in a position; empty for a valid one. A nan fails every comparison."""
-    if not abs(item.lat_e7) <= 9e8:
-        return f"latitude {item.lat_e7} (1e-7 deg), expected within 90 deg"
-    if not abs(item.lon_e7) <= 1.8e9:
-        return f"longitude {item.lon_e7} (1e-7 deg), expected within 180 deg"
-    if not abs(item.alt_m) <= _MAX_ALTITUDE:
-        return f"altitude {item.alt_m}, expected within {_MAX_ALTITUDE:.0f} m"
-    if item.frame not in GLOBAL_FRAMES:
-        return f"frame {item.frame}, expected one of {GLOBAL_FRAMES}"
-    return ""
-
-
-def _is_zero_position(item: Item) -> bool:
-    return item.lat_e7 == 0 and item.lon_e7 == 0
-
-
-def _finite(value: float, default: float = 0.0) -> float:
-    return value if isfinite(value) else default
 
 
 def _first_seq(builder: _RouteBuilder, seq: int) -> int:
@@ -200,14 +239,14 @@ def _advance_to(builder: _RouteBuilder, seq: int) -> int:
     item_seq = builder.first
     while item_seq < seq:
         item = builder.items.get(item_seq)
-        if item is not None and item.command == _JUMP:
+        if item is not None and item.command in JUMPS:
             target = _jump_target(builder, item)
-            count = _finite(item.param2)
+            count = repetitions(item)
             if item_seq < target <= seq and count != 0:
                 builder.jumps_left[item_seq] = count - 1 if count > 0 else count
                 item_seq = target
                 continue
-            if count > 0:
+            if count > 0 and not resets_counters(builder.params, builder.first):
                 builder.jumps_left[item_seq] = 0.0  # the aircraft has passed it
         elif item is not None:
             _apply_item(builder, item)
@@ -219,12 +258,14 @@ def _append_legs(builder: _RouteBuilder, item_seq: int, limit: int) -> None:
     """Append the legs from item `item_seq` on; return to launch follows the last item."""
     while item_seq <= builder.last and len(builder.legs) < limit:
         item = builder.items.get(item_seq)
-        is_jump = item is not None and item.command == _JUMP
+        is_jump = item is not None and item.command in JUMPS
         if item is not None and not is_jump:
             _apply_item(builder, item)
         item_seq = _seq_after_jump(builder, item) if item is not None and is_jump else item_seq + 1
-    if len(builder.legs) < limit and not _is_final(builder):
-        builder.legs.append(_return_leg(builder))
+        if item_seq > builder.last and not _is_final(builder):
+            builder.legs.append(_return_leg(builder))
+        if item_seq > builder.last or (item is not None and item.command == _RETURN):
+            item_seq = _seq_after_return(builder)
 
 
 def _is_final(builder: _RouteBuilder) -> bool:
@@ -232,20 +273,37 @@ def _is_final(builder: _RouteBuilder) -> bool:
     return bool(builder.legs) and int(builder.legs[-1][KIND]) in (LAND, LOITER_UNLIMITED)
 
 
+def _seq_after_return(builder: _RouteBuilder) -> int:
+    """Return the item that follows the return in the last leg: the nearest landing sequence, if RTL_AUTOLAND asks."""
+    after_end = builder.last + 1
+    leg = builder.legs[-1] if builder.legs else None
+    if leg is None or int(leg[KIND]) != LOITER_UNLIMITED or leg[TURNS] <= 0.0:
+        return after_end
+    landing = nearest_landing(builder.items, builder.positions, builder.return_from, builder.first)
+    if landing < 0:
+        leg[TURNS] = 0.0
+        return after_end
+    builder.speed = 0.0  # a change of mode clears the commanded airspeed
+    return landing + 1
+
+
 def _jump_target(builder: _RouteBuilder, item: Item) -> int:
-    """Return the target item of a DO_JUMP; -1 when it is invalid."""
-    if builder.first <= item.param1 <= builder.last:
-        return int(item.param1)
+    """Return the target item of a jump; -1 when it is invalid."""
+    target = jump_target(builder.items, item, builder.first, builder.last)
+    if target >= 0:
+        return target
     expected = f"expected {builder.first}..{builder.last}"
     builder.remark(f"mission item {item.seq}: found jump to {item.param1}, {expected}; skipped, upload again")
     return -1
 
 
 def _seq_after_jump(builder: _RouteBuilder, item: Item) -> int:
-    """Take a DO_JUMP while jumps remain, and return the next sequence number."""
+    """Take a jump while jumps remain, and return the next sequence number."""
     target = _jump_target(builder, item)
-    remaining = builder.jumps_left.get(item.seq, _finite(item.param2))
+    remaining = builder.jumps_left.get(item.seq, repetitions(item))
     if target < 0 or remaining == 0:
+        if resets_counters(builder.params, builder.first):
+            builder.jumps_left.pop(item.seq, None)
         return item.seq + 1
     if item.seq in builder.jumps_taken:
         builder.remark(
@@ -261,26 +319,19 @@ def _apply_item(builder: _RouteBuilder, item: Item) -> None:
     """Apply one item other than DO_JUMP: change the speed, add a leg, or add a remark."""
     if item.command == SPEED:
         _change_speed(builder, item)
-    elif item.command in _KINDS:
+    elif item.command == _SET_HOME and item.param1 != 1 and not (position_error(item) or is_zero_position(item)):
+        builder.home = _item_position(builder, item)
+    elif item.command in KINDS and (builder.first or item.command != _CHANGE_ALTITUDE):
         _add_leg(builder, item)
-    elif item.command < _LAST_NAV:
+    elif item.command < _LAST_NAV and not (item.command == _DELAY and builder.first):  # ends at once in flight
         builder.remark(f"mission item {item.seq}: found unsupported command {item.command}; skipped, use another item")
 
 
 def _change_speed(builder: _RouteBuilder, item: Item) -> None:
-    if item.param2 == -2:  # MAVLink: return to the default
-        builder.speed = 0.0
-    if not (isfinite(item.param2) and item.param2 > 0):
-        return
-    if item.param2 > _MAX_SPEED:
-        problem = f"found a speed of {item.param2:g} m/s, expected at most {_MAX_SPEED:.0f}"
-        builder.remark(f"mission item {item.seq}: {problem}; used the previous speed, correct it")
-        return
-    builder.speed = item.param2
-    if item.param1 == 1:
-        builder.remark(
-            f"mission item {item.seq}: found a ground speed, expected an airspeed; used as airspeed, set type 0"
-        )
+    speed, problem = commanded_airspeed(item, builder.params, home_first=builder.first > 0)
+    if problem:
+        builder.remark(f"mission item {item.seq}: {problem}")
+    builder.speed = builder.speed if speed is None else speed
 
 
 def _add_leg(builder: _RouteBuilder, item: Item) -> None:
@@ -288,77 +339,61 @@ def _add_leg(builder: _RouteBuilder, item: Item) -> None:
     if item.command == _RETURN:
         builder.legs.append(_return_leg(builder))
         builder.legs[-1][SEQ] = item.seq
-        builder.last_point, builder.last_kind = builder.legs[-1][P_N : P_D + 1], LOITER_UNLIMITED
+        builder.last_point, builder.last_leg = builder.legs[-1][P_N : P_D + 1], builder.legs[-1]
         builder.jumps_taken.clear()
         return
-    error = _position_error(item)
+    error = position_error(item)
     if error:
         builder.remark(f"mission item {item.seq}: found {error}; skipped, upload a corrected mission")
         return
-    kind = _KINDS[item.command]
+    kind = KINDS[item.command]
     target = _item_position(builder, item)
+    if kind == CHANGE_ALTITUDE:
+        target[:2] = builder.last_point[:2]
     length = hypot(*(target - builder.last_point)[:2])
     if length > _MAX_LEG:
         problem = f"found {length * 1e-3:,.0f} km from the previous point, expected {_MAX_LEG * 1e-3:.0f} km at most"
         builder.remark(f"mission item {item.seq}: {problem}; used as it is, check its position")
     is_short = length < _MIN_LEG
-    if is_short and kind == WAYPOINT == builder.last_kind and (builder.legs or not _is_zero_position(item)):
+    last_kind = TAKEOFF if builder.last_leg is None else int(builder.last_leg[KIND])
+    if is_short and kind == WAYPOINT == last_kind and (builder.legs or not is_zero_position(item)):
         builder.remark(
             f"mission item {item.seq}: found a leg of zero length, expected {_MIN_LEG:.0f} m; skipped, remove it"
         )
         return
-    builder.legs.append(_make_leg(builder, item, kind, target))
-    builder.last_point, builder.last_kind = target, kind
+    builder.legs.append(make_leg(item, target, builder.speed, builder.params, home_first=builder.first > 0))
+    builder.last_point, builder.last_leg = target, builder.legs[-1]
     builder.jumps_taken.clear()
 
 
 def _item_position(builder: _RouteBuilder, item: Item) -> np.ndarray:
     """Return the position of an item, NED (3,) [m]; zero latitude and longitude mean the current position."""
-    if item.frame in _TERRAIN:
+    if item.frame in TERRAIN:
         builder.remark(
             f"mission item {item.seq}: found altitude above terrain; used as above home, specify it relative to home"
         )
-    absolute = item.frame in _ABSOLUTE
+    absolute = item.frame in ABSOLUTE
     altitude = item.alt_m + (0.0 if absolute else builder.origin.alt_mm * 1e-3 - builder.home[2])
     point = builder.positions[item.seq].copy()
     point[2] = builder.origin.alt_mm * 1e-3 - altitude
-    if _is_zero_position(item):
+    if is_zero_position(item):
         point[:2] = builder.last_point[:2]
     return point
-
-
-def _make_leg(builder: _RouteBuilder, item: Item, kind: int, target: np.ndarray) -> np.ndarray:
-    leg = np.zeros(N_COLUMNS)
-    leg[KIND], leg[P_N : P_D + 1], leg[VA_C], leg[SEQ] = kind, target, builder.speed, item.seq
-    if kind == WAYPOINT:
-        pass_by = _finite(item.param3)
-        leg[ACCEPT_RADIUS] = -pass_by if pass_by > 0 else max(_finite(item.param2), 0.0)
-    elif kind in (LOITER_TURNS, LOITER_TIME):
-        leg[TURNS] = max(_finite(item.param1), 0.0)
-    if kind in (LOITER_TURNS, LOITER_UNLIMITED):
-        leg[RADIUS] = _finite(item.param3)
-    elif kind == LOITER_TO_ALT:
-        leg[RADIUS] = _finite(item.param2)
-    elif kind == LOITER_TIME and not builder.first:
-        leg[RADIUS] = _finite(item.param3)
-    elif kind == LOITER_TIME and _finite(item.param3) < 0:  # ArduPlane reads the direction only
-        leg[RADIUS] = -abs(_finite(builder.params.get("WP_LOITER_RAD", 60.0), 60.0))
-    if not builder.first and kind in (LOITER_TIME, LOITER_TO_ALT):
-        heading = item.param2 if kind == LOITER_TIME else item.param1
-        leg[ACCEPT_RADIUS] = float(_finite(heading) > 0)
-    return leg
 
 
 def _return_leg(builder: _RouteBuilder) -> np.ndarray:
     """Return the leg after the last item: ArduPlane circles over home at RTL_ALTITUDE, PX4 at its position."""
     leg = np.zeros(N_COLUMNS)
+    leg[KIND], leg[SEQ], leg[ACCEPT_RADIUS] = LOITER_UNLIMITED, -1, float(builder.first > 0)
+    builder.return_from = builder.last_point
     if not builder.first:
-        leg[KIND], leg[SEQ], leg[P_N : P_D + 1] = LOITER_UNLIMITED, -1, builder.last_point
+        leg[P_N : P_D + 1] = builder.last_point
         return leg
     height = builder.params.get("RTL_ALTITUDE", builder.params.get("ALT_HOLD_RTL", 100.0 * _RTL_ALTITUDE) / 100.0)
-    height = _finite(height, _RTL_ALTITUDE)
-    leg[KIND], leg[SEQ] = LOITER_UNLIMITED, -1
+    height = finite(height, _RTL_ALTITUDE)
     leg[P_N : P_D + 1] = builder.home
     leg[P_D] = builder.home[2] - height if height >= 0 else builder.last_point[2]  # negative: stay at this altitude
-    leg[RADIUS] = _finite(builder.params.get("RTL_RADIUS", 0.0))
+    leg[RADIUS] = finite(builder.params.get("RTL_RADIUS", 0.0))
+    autoland = finite(builder.params.get("RTL_AUTOLAND", 0.0))
+    leg[TURNS] = autoland if autoland in (1.0, 2.0) else 0.0
     return leg

@@ -15,6 +15,7 @@ ORDER = (  # a folder, or a module in the root of a package, imports only from i
     ("fleet.process",),
     ("fleet", "fleet.frames", "fleet.vehicles", "fleet.commands"),
     ("fleet.contract",),
+    ("fleet.mission_jumps", "fleet.mission_legs"),
     ("fleet.metrics", "fleet.mission", "fleet.window", "fleet.access"),
     ("fleet.config", "fleet.bus", "fleet.cli"),
     ("fleet.airframes",),

@@ -194,7 +194,8 @@ def _override(twin: Twin, query: WhatIf) -> RouteOverride:
     else:
         seq = min((item.seq for item in items if item.seq >= twin.first_item), default=twin.first_item)
     restart = (query.seq is not None and query.seq != _active_seq(twin)) or query.start is not None
-    return RouteOverride(items, seq, params, restart, query.start.speed if query.start else None, twin.first_item)
+    speed, jumps = query.start.speed if query.start else None, twin.onboard.jumps_taken if query.items is None else {}
+    return RouteOverride(items, seq, params, restart, speed, twin.first_item, jumps)
 
 
 def _active_seq(twin: Twin) -> int:
@@ -208,7 +209,8 @@ def _fill_leg_history(twin: Twin, override: RouteOverride) -> None:
     now = twin.telemetry.history.newest
     twin.onboard.plan_changed(now - _REPLAY_S)
     items = override.items
-    twin.onboard.set_mission(Mission(uav=twin.config.uav, t=now, items=items, seq=override.seq, complete=True))
+    mission = Mission(uav=twin.config.uav, t=now, items=items, seq=override.seq, complete=True)
+    twin.onboard.set_mission(mission, twin.first_item)
     t = np.arange(now - 2 * _REPLAY_S, now + 0.5, 1.0)
     twin.telemetry.history.replace_rows("leg", t, np.full((len(t), 1), float(override.seq)))
 

@@ -16,10 +16,10 @@ PREV_N, PREV_E, PREV_D = 1, 2, 3  # start of its line, NED [m]
 FROM = slice(1, 4)  # slice of the three above
 TURN = 4  # turn angle at its end [rad]
 ANGLE, BEARING = 5, 6  # angle flown on the circle, last bearing to its centre [rad]
-CIRCLE_REACHED, CIRCLING = 7, 8  # 1: circle reached before; 1: now on the circle
+CIRCLE_REACHED, CIRCLING = 7, 8  # 1: circle reached or passed before; 1: on the circle
 TIMER = 9  # time since reaching the circle [s]
 EXIT_ANGLE = 10  # circle angle when the exit condition became true, -1 before [rad]
-FOLLOW_LINE = 11  # 1: the line starts at a waypoint and is followed even to a circle
+FOLLOW_LINE = 11  # 1: the line starts at a waypoint and is followed even to a circle; -1: none, fly to the target
 N_LEG = 12
 # L1
 XTRACK, NU = 12, 13  # crosstrack integral, last course error [rad]
@@ -43,7 +43,8 @@ P_T, Q_T = 41, 42  # filtered rate targets [rad/s]
 I_A, I_E = 43, 44  # integrators [rad of surface]
 E_A, E_E, D_A, D_E = 45, 46, 47, 48  # last errors [rad/s], filtered derivatives [rad/s2]
 S_A, S_E = 49, 50  # last surfaces before the limit, 1 = full throw
-N_CTL = 51
+COURSE = 51  # course of the last line, which CHANGE_ALTITUDE continues [rad]
+N_CTL = 52
 
 
 N_PAR = 72  # length of every parameter vector

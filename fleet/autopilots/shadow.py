@@ -2,6 +2,9 @@
 
 The replay reconstructs states that telemetry does not contain: filters, integrators, angle flown on a circle. Initial
 integrator values are unknown; a shift at the end aligns the outputs with the reported ones.
+
+The current mission item is reported once a second. The replay switches legs when its law does, and waits for the
+report; without a report in time it returns to the reported leg and replays the rows since then.
 """
 
 from math import isfinite, nan, sqrt
@@ -16,6 +19,7 @@ from fleet.frames import wrap
 from fleet.mission import SEQ
 
 _MATCH_WINDOW = 5.0  # window at the end for matching the outputs [s]
+_REPORT_DELAY = 2.0  # maximum delay of a reported item behind the switch to it [s]
 _MAX_STEP = 0.2  # step length for longer gaps in telemetry [s]
 
 
@@ -73,23 +77,30 @@ def replay_controller(
     ctl = np.zeros(S.N_CTL)
     residual = np.full((n, 6), nan)  # reported minus replayed: theta_c, delta_t, delta_a, delta_e, delta_r, phi_c
     last = -1
-    for k in range(n):
+    reported_ctl, switched = ctl, -1  # state on the reported leg, and row of the switch that waits for its report
+    refuted = False  # the law's condition to switch, as it still holds, was not followed by a report
+    k = -1
+    while k < n - 1:
+        k += 1
         if not (_is_finite(p[k]) and _is_finite(v[k]) and _is_finite(euler[k])):
             continue
         if last < 0:
             ctl = engage(par, legs, start, p[k], v[k], euler[k], Va[k], theta_c[k], delta[k, 3])
             last = k
+        if switched >= 0 and seq[k] == seq[switched] and t[k] - t[switched] > _REPORT_DELAY:
+            ctl, refuted = reported_ctl, True
+            last, k, switched = switched, switched, -1
+            continue
         dt = min(max(t[k] - t[last], 0.0), _MAX_STEP)
         last = k
-        _follow_reported_item(ctl, par, legs, seq[k], p[k])
+        if switched < 0 or seq[k] != seq[switched]:
+            switched = -1
+            _follow_reported_item(ctl, par, legs, seq[k], p[k])
         if not dt > 0.0:
             continue
-        phi_k, theta_k, thr_k, _ = fly(ctl, par, legs, p[k], v[k], euler[k], Va[k], nan, dt)
-        residual[k, 0], residual[k, 1], residual[k, 5] = (
-            theta_c[k] - theta_k,
-            delta[k, 3] - thr_k,
-            wrap(phi_c[k] - phi_k),
-        )
+        phi_k, theta_k, thr_k, leg_done = fly(ctl, par, legs, p[k], v[k], euler[k], Va[k], nan, dt)
+        residual[k, 0], residual[k, 1] = theta_c[k] - theta_k, delta[k, 3] - thr_k
+        residual[k, 5] = wrap(phi_c[k] - phi_k) if switched < 0 else nan  # which leg is flown is not known yet
         if _is_finite(rates[k]):
             roll = phi_c[k] if np.isfinite(phi_c[k]) else phi_k
             pitch = theta_c[k] if np.isfinite(theta_c[k]) else theta_k
@@ -99,6 +110,11 @@ def replay_controller(
                 delta[k, 1] - delta_e,
                 delta[k, 2] - delta_r,
             )
+        leg = int(ctl[S.LEG])
+        refuted = refuted and leg_done
+        if leg_done and not refuted and switched < 0 and leg + 1 < legs.shape[0] and legs[leg, SEQ] == seq[k]:
+            reported_ctl, switched = ctl.copy(), k
+            begin(ctl, par, legs, leg + 1, p[k])
     if last >= 0:
         reported = np.array([phi_c[n - 1], theta_c[n - 1], delta[n - 1, 3], Va[n - 1]])
         align_integrators(ctl, par, _typical_residual(residual[t >= t[n - 1] - _MATCH_WINDOW]), reported)

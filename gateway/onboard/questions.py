@@ -90,7 +90,7 @@ class RequestScheduler:
         self._watched_item = 0
         self._to = (aircraft.system, aircraft.component)
         self._since = now
-        self._param_list, self._mission_list = RetryTimer(3.0), RetryTimer()
+        self._param_list, self._mission_list, self._home_wait = RetryTimer(3.0), RetryTimer(), RetryTimer()
         self._rate_wait, self._rate_tries = RetryTimer(10.0), 0
         self._params_at = self._items_at = float("-inf")
         self._items_left: int | None = None
@@ -101,7 +101,7 @@ class RequestScheduler:
         if self._cache_check is not None and now - self._store_t >= STORE_S:
             self._store_t = now
             self._cache_check.store()
-        requests = self._mission(now) + self._params(now) + self._rates(now, share)
+        requests = self._mission(now) + self._home(now) + self._params(now) + self._rates(now, share)
         if now - self._timesync_t >= TIMESYNC_S:  # to measure the round-trip time
             self._timesync_t = now
             requests.append(dialect.MAVLink_timesync_message(0, round(now * 1e9)))
@@ -147,6 +147,13 @@ class RequestScheduler:
         self._watch_t, self._watched_item = now, (self._watched_item + 1) % count
         seq = min(route.unconfirmed, default=self._watched_item)
         return [dialect.MAVLink_mission_request_int_message(*self._to, seq)]
+
+    def _home(self, now: float) -> list[Any]:
+        """Return a request for HOME_POSITION where the mission was downloaded before the autopilot had a home."""
+        if not self.aircraft.mission.needs_home or not self._home_wait.due(now):
+            return []
+        request = (dialect.MAV_CMD_REQUEST_MESSAGE, 0, _IDS["HOME_POSITION"], 0, 0, 0, 0, 0, 0)
+        return [dialect.MAVLink_command_long_message(*self._to, *request)]
 
     def _params(self, now: float) -> list[Any]:
         if self._cache_check is not None and not self._cache_check.finished:

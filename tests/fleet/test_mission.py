@@ -81,8 +81,119 @@ def test_kinds_carry_what_they_need():
     assert list(r.legs[2:4, m.TURNS]) == [2, 30]
     np.testing.assert_allclose(r.legs[0, m.P_N : m.P_D], 0, atol=1e-6)  # no position: over home
     assert np.isnan(fly(items, 2).start).all()  # the line after a takeoff begins where the aircraft is
-    assert np.isnan(fly(items, 4).start).all()
+    np.testing.assert_array_equal(fly(items, 4).start, r.legs[2, m.P_N : m.P_D + 1])  # after a circle at its centre
     assert np.isfinite(fly(items, 3).start).all()
+
+
+def test_the_line_after_a_circle_starts_at_its_exit_where_param4_is_positive():
+    def circles(param4):
+        return [
+            HOME,
+            waypoint(1, 1),
+            waypoint(2, 2, command=18, param1=1.0, param3=80.0, param4=param4),
+            waypoint(3, 2, 1, command=19, param1=30.0, param4=param4),
+            waypoint(4, 2, 2, command=31, param2=90.0, param4=param4),
+            waypoint(5, 3),
+        ]
+
+    for param4, at_exit in ((0.0, 0.0), (1.0, 1.0), (-1.0, 0.0), (NAN, 0.0)):
+        r = fly(circles(param4))
+        assert list(r.legs[1:4, m.ACCEPT_RADIUS]) == [at_exit] * 3
+        for seq in (3, 4, 5):
+            assert np.isnan(fly(circles(param4), seq).start).all() == bool(at_exit)
+
+
+@pytest.mark.parametrize("default", [70.0, -70.0, 0.0])
+def test_without_a_radius_a_circle_has_the_size_and_a_direction_of_wp_loiter_rad(default):
+    def radius(command, value):
+        place = {31: "param2"}.get(command, "param3")
+        items = [HOME, waypoint(1, 1), waypoint(2, 2, command=command, **{place: value})]
+        return fly(items, 2, {"WP_LOITER_RAD": default}).legs[0, m.RADIUS]
+
+    size = abs(default) or 60.0  # up to 1 m it is not used
+    for command in (17, 18, 19, 31):
+        assert radius(command, 0.0) == 0.0  # the autopilot's radius and direction
+        assert radius(command, 1.0) == 0.0
+        assert radius(command, -1.0) == -size
+    assert (radius(18, 120.0), radius(31, -120.0)) == (120.0, -120.0)
+    assert (radius(19, 120.0), radius(19, -120.0)) == (0.0, -size)  # the time has no radius, only a direction
+
+
+def test_a_waypoint_is_passed_by_less_its_acceptance_radius():
+    r = fly([HOME, waypoint(1, 1, param2=10.0, param3=40.0), waypoint(2, 2)])
+    assert r.legs[0, m.ACCEPT_RADIUS] == -30.0
+
+
+def test_change_of_altitude_continues_on_the_line_of_the_leg_before():
+    change = Item(seq=2, command=30, frame=3, param1=1.0, alt_m=150.0)
+    r = fly([HOME, waypoint(1, 1), change, waypoint(3, 3)])
+    assert [int(k) for k in r.legs[:3, m.KIND]] == [m.WAYPOINT, m.CHANGE_ALTITUDE, m.WAYPOINT]
+    np.testing.assert_array_equal(r.legs[1, m.P_N : m.P_D], r.legs[0, m.P_N : m.P_D])
+    assert (r.legs[1, m.TURNS], r.legs[1, m.P_D]) == (1.0, -160.0)
+    assert r.sentences == ()
+    refused = m.unroll_route([waypoint(0, 1), waypoint(1, 2), change], seq=0, origin=ORIGIN, params={}, first=0)
+    assert m.CHANGE_ALTITUDE not in refused.legs[:, m.KIND] and "command 30" in refused.sentences[0]
+
+
+LANDING = [
+    *[HOME, waypoint(1, 1), waypoint(2, 4)],
+    Item(seq=3, command=189, frame=3),
+    waypoint(4, 3, 1),
+    waypoint(5, 3, command=21),
+    Item(seq=6, command=189, frame=3),
+    waypoint(7, 0, -9),
+    waypoint(8, 0, -9, command=21),
+]
+
+
+def test_do_land_start_is_passed_in_the_mission_and_entered_from_a_return():
+    assert seqs(fly(LANDING))[:4] == [1, 2, 4, 5]
+    items = [*LANDING[:3], Item(seq=3, command=20), *(Item(**vars_of(i) | {"seq": i.seq + 1}) for i in LANDING[3:])]
+    assert seqs(fly(items)) == [1, 2, 3]  # RTL_AUTOLAND 0: it circles at home
+    for autoland in (1.0, 2.0):
+        r = fly(items, params={"RTL_AUTOLAND": autoland})
+        assert seqs(r)[:5] == [1, 2, 3, 5, 6]  # the landing nearest to where the return starts
+        assert r.legs[2, m.TURNS] == autoland
+    no_landing = fly([*LANDING[:3]], params={"RTL_AUTOLAND": 2.0})
+    assert seqs(no_landing) == [1, 2, -1] and no_landing.legs[-1, m.TURNS] == 0.0
+
+
+def vars_of(item: Item) -> dict:
+    return {name: getattr(item, name) for name in item.__struct_fields__}
+
+
+def test_home_set_by_the_mission_is_where_it_returns():
+    moved = waypoint(1, 5, command=179, alt_m=20.0)
+    r = fly([HOME, moved, waypoint(2, 1)])
+    assert r.legs[-1, m.P_N] == pytest.approx(5000, rel=0.01)
+    assert r.legs[-1, m.P_D] == pytest.approx(-10 - 20 - 100)
+    assert fly([HOME, Item(**vars_of(moved) | {"param1": 1.0}), waypoint(2, 1)]).legs[-1, m.P_N] == pytest.approx(0)
+
+
+def test_a_delay_is_over_at_once_in_flight():
+    r = fly([HOME, waypoint(1, 1), Item(seq=2, command=93, param1=30.0), waypoint(3, 2)])
+    assert (seqs(r), r.sentences) == ([1, 3, -1], ())
+
+
+def test_jump_tags_lead_to_their_tag():
+    items = [HOME, waypoint(1, 1), Item(seq=2, command=600, param1=7.0), waypoint(3, 2), waypoint(4, 2, 1)]
+    items += [Item(seq=5, command=601, param1=7.0, param2=1.0), waypoint(6, 3)]
+    assert seqs(fly(items)) == [1, 3, 4, 3, 4, 6, -1] and fly(items).sentences == ()
+    unknown = [*items[:5], Item(seq=5, command=601, param1=8.0, param2=1.0), waypoint(6, 3)]
+    assert seqs(fly(unknown)) == [1, 3, 4, 6, -1] and "jump to 8" in fly(unknown).sentences[0]
+
+
+def test_jumps_taken_before_do_not_repeat():
+    items = [HOME, waypoint(1, 1), waypoint(2, 1, 1), jump(3, 1, 2), waypoint(4, 3)]
+    for taken, expected in ((0, [2, 1, 2, 1, 2, 4, -1]), (1, [2, 1, 2, 4, -1]), (2, [2, 4, -1])):
+        r = m.unroll_route(items, seq=2, origin=ORIGIN, params={}, jumps_taken={3: taken})
+        assert seqs(r) == expected
+
+
+def test_the_counter_of_a_completed_jump_starts_again_unless_an_option_keeps_it():
+    items = [HOME, waypoint(1, 1), waypoint(2, 2), jump(3, 1, 1), waypoint(4, 2, 1), jump(5, 1, 1), waypoint(6, 3)]
+    assert seqs(fly(items)) == [1, 2, 1, 2, 4, 1, 2, 1, 2, 4, 6, -1]
+    assert seqs(fly(items, params={"MIS_OPTIONS": 8.0})) == [1, 2, 1, 2, 4, 1, 2, 4, 6, -1]
 
 
 def test_loiter_here_is_at_the_point_before():
@@ -116,10 +227,20 @@ def test_speed_in_force_counts_before_seq_and_across_jumps():
     assert fly(items, 7).legs[0, m.VA_C] == 22
 
 
-def test_ground_speed_is_taken_as_airspeed_and_said():
+def test_a_ground_speed_is_no_airspeed_for_arduplane_but_for_px4():
     r = fly([HOME, speed(1, 15.0, kind=1.0), waypoint(2, 1)], 2)
-    assert r.legs[0, m.VA_C] == 15
-    assert any("ground speed" in s for s in r.sentences)
+    assert r.legs[0, m.VA_C] == 0
+    assert any("ground speed" in s and "ignored" in s for s in r.sentences)
+    px4 = without_home([speed(0, 15.0, kind=1.0), waypoint(1, 1)])
+    assert px4.legs[0, m.VA_C] == 15 and "used as airspeed" in px4.sentences[0]
+
+
+def test_an_airspeed_beyond_the_limits_is_ignored_as_by_the_autopilot():
+    items = [HOME, speed(1, 15.0), speed(2, 40.0), speed(3, 5.0), waypoint(4, 1)]
+    for names in (("AIRSPEED_MIN", "AIRSPEED_MAX"), ("ARSPD_FBW_MIN", "ARSPD_FBW_MAX")):
+        r = fly(items, 4, dict(zip(names, (10.0, 30.0), strict=True)))
+        assert r.legs[0, m.VA_C] == 15 and len(r.sentences) == 2
+    assert fly(items, 4).legs[0, m.VA_C] == 5
 
 
 def test_other_commands_only_use_up_a_number():
@@ -168,7 +289,7 @@ whole = st.one_of(st.integers(-(2**31), 2**31 - 1), st.just(NAN), st.just(0))
 an_item = st.builds(
     Item,
     seq=st.integers(-3, 12),
-    command=st.sampled_from([16, 17, 18, 19, 20, 21, 22, 31, 82, 93, 177, 178, 189, 600]),
+    command=st.sampled_from([16, 17, 18, 19, 20, 21, 22, 30, 31, 82, 93, 177, 178, 179, 189, 600, 601]),
     frame=st.sampled_from([0, 1, 2, 3, 5, 6, 10, 11]),
     param1=numbers,
     param2=numbers,
@@ -180,7 +301,11 @@ an_item = st.builds(
 
 
 @settings(max_examples=300, deadline=None, derandomize=True)
-@given(st.lists(an_item, max_size=14), st.integers(-2, 14), st.dictionaries(st.just("RTL_ALTITUDE"), st.floats()))
+@given(
+    st.lists(an_item, max_size=14),
+    st.integers(-2, 14),
+    st.dictionaries(st.sampled_from(m.ROUTE_PARAMS), st.one_of(st.floats(), st.integers(-2, 16).map(float))),
+)
 def test_nothing_raises_and_every_leg_is_finite(items, seq, params):
     r = fly(items, seq, params)
     assert np.isfinite(r.legs).all()

@@ -159,7 +159,8 @@ class RouteOverride:
         parameters: autopilot parameters
         restart_leg: start the leg to `seq` at the aircraft position, even if that item is current
         speed: airspeed at the start, ground speed for hovering aircraft [m/s]; None: unchanged
-        first_item: number of the first item to fly, as for `fleet.mission.route`
+        first_item: number of the first item to fly, as for `fleet.mission.unroll_route`
+        jumps_taken: jumps taken so far at each jump, as for `fleet.mission.unroll_route`
     """
 
     items: tuple[Item, ...]
@@ -168,11 +169,17 @@ class RouteOverride:
     restart_leg: bool = False
     speed: float | None = None
     first_item: int = 1
+    jumps_taken: Mapping[int, int] = field(default_factory=dict)
 
     def to_route(self, origin: Origin, received: Mapping[str, float]) -> Route:
         """Return the route."""
         return unroll_route(
-            self.items, seq=self.seq, origin=origin, params={**received, **self.parameters}, first=self.first_item
+            self.items,
+            seq=self.seq,
+            origin=origin,
+            params={**received, **self.parameters},
+            first=self.first_item,
+            jumps_taken=self.jumps_taken,
         )
 
     def scale_to_speed(self, velocity: np.ndarray, psi: float = 0.0) -> np.ndarray:

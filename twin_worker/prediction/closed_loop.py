@@ -33,8 +33,11 @@ from twin_worker.telemetry.history import TelemetryHistory
 MIN_ROLLOUT_S = 60.0  # shortest valid rollout [s]
 SHADOW_S = 60.0  # telemetry for the synchronisation of the controller twin [s]
 _WIND_MAX_AGE_S = 10.0  # maximum age of the autopilot's wind estimate [s]
+_ITEM_DELAY_S = 2.0  # between the mission and the telemetry that report the same item, at most [s]
 _SHADOW_STEP = 2  # window rows per shadow step
 _CACHE_SIZE = 1024  # cached routes: missions change rarely, and a route takes as long as a rollout
+JumpCounts = tuple[float, int, dict[int, int]]
+"""Time [s since 1970], the item that became current, and the jumps taken until then at each jump."""
 _NOT_MODELLED = {TAKEOFF: "take-off", LAND: "landing"}
 
 
@@ -90,6 +93,12 @@ class AutopilotConfig:
     autopilot: str = "ardupilot"  # reported type
     law: str = "arduplane"  # name in `laws.LAWS`; empty: unknown
     law_reason: str = ""  # how the law was selected, or why none is
+    jumps: tuple[JumpCounts, ...] = ()  # jumps taken after each change of the current item, oldest first
+
+    def jumps_taken(self, t: float, seq: int) -> dict[int, int]:
+        """Return the jumps taken at each jump when item `seq` was current at `t` [s since 1970]."""
+        known = [record for record in self.jumps if record[0] <= t + _ITEM_DELAY_S]
+        return next((counts for _, item, counts in reversed(known) if item == seq), known[-1][2] if known else {})
 
 
 @dataclass(frozen=True)
@@ -183,7 +192,8 @@ def replay_inputs(context: PredictionContext) -> ReplayWindow | Rollout:
     seq = np.where(np.isfinite(seq), seq, seq[np.isfinite(seq)][0]).astype(np.int64)
     onboard = context.onboard
     first = FIRST_ITEM.get(onboard.autopilot, 1)
-    mission_route = cached_route(onboard.items, int(seq[0]), context.origin, onboard.params, first)
+    jumps = onboard.jumps_taken(float(times[0]), int(seq[0]))
+    mission_route = cached_route(onboard.items, int(seq[0]), context.origin, onboard.params, first, jumps)
     problem = mission_route.summary
     if not len(mission_route.legs):
         return Rollout(None, int(seq[-1]), problem or "the mission has no legs to fly")
@@ -194,18 +204,29 @@ def replay_inputs(context: PredictionContext) -> ReplayWindow | Rollout:
     )
 
 
-def cached_route(items: tuple[Item, ...], seq: int, origin: Origin, params: Mapping[str, float], first: int) -> Route:
-    """Return the cached, read-only result of `fleet.mission.route`: legs from item `seq` on."""
-    return _cached_route(
-        items, seq, origin, tuple((name, params[name]) for name in ROUTE_PARAMS if name in params), first
-    )
+def cached_route(
+    items: tuple[Item, ...],
+    seq: int,
+    origin: Origin,
+    params: Mapping[str, float],
+    first: int,
+    jumps: Mapping[int, int] | None = None,
+) -> Route:
+    """Return the cached, read-only result of `fleet.mission.unroll_route`: legs from item `seq` on."""
+    used = tuple((name, params[name]) for name in ROUTE_PARAMS if name in params)
+    return _cached_route(items, seq, origin, used, first, tuple((jumps or {}).items()))
 
 
 @lru_cache(maxsize=_CACHE_SIZE)
 def _cached_route(
-    items: tuple[Item, ...], seq: int, origin: Origin, params: tuple[tuple[str, float], ...], first: int
+    items: tuple[Item, ...],
+    seq: int,
+    origin: Origin,
+    params: tuple[tuple[str, float], ...],
+    first: int,
+    jumps: tuple[tuple[int, int], ...],
 ) -> Route:
-    return unroll_route(items, seq=seq, origin=origin, params=dict(params), first=first)
+    return unroll_route(items, seq=seq, origin=origin, params=dict(params), first=first, jumps_taken=dict(jumps))
 
 
 def autopilot_wind(context: PredictionContext, window: Window) -> tuple[float, float]:

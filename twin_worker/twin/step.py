@@ -12,6 +12,7 @@ from twin_worker.prediction import method_selection
 from twin_worker.twin.state.budget import EARLY_FRACTION, Work
 from twin_worker.twin.state.events import record_event
 from twin_worker.twin.state.flight_phase import update_flight_phase
+from twin_worker.twin.state.home import complete_home
 from twin_worker.twin.state.state import Twin, ingest
 from twin_worker.twin.steps.alerts import link_alerts, prediction_alerts
 from twin_worker.twin.steps.extrapolate import can_propagate, extrapolate, rollout_overdue
@@ -152,6 +153,7 @@ def _step(twin: Twin, now: float) -> list[Message]:
         twin.confidence.timer.restart(now)
         twin.models.checkpoint(twin.environment.wind_t, twin.environment.wind, twin.identification.prior_model)
         update_flight_phase(twin, active_command(twin))
+        complete_home(twin)
         _score_predictions(twin)
     schedule = twin.config.schedule
     if identify_due(twin) and twin.budget_allows(Work.IDENTIFY):

@@ -1,6 +1,6 @@
 """Complete guidance step at 10 Hz: route, L1 and TECS; and the attitude loops below it."""
 
-from math import cos, pi, radians, sin, tan
+from math import atan2, cos, pi, radians, sin, tan
 
 import numpy as np
 
@@ -130,7 +130,7 @@ def init(
     ctl = np.zeros(S.N_CTL)
     has_start = np.isfinite(start[0]) and np.isfinite(start[1]) and np.isfinite(start[2])
     leg_rules.set_leg(ctl, par, legs, k, start if has_start else p)
-    ctl[S.FOLLOW_LINE] = 1.0 if has_start else 0.0
+    ctl[S.FOLLOW_LINE], ctl[S.COURSE] = 1.0 if has_start else 0.0, atan2(v[1], v[0])
     tecs.reset(ctl, par, -p[2], -v[2], Va, theta_c, delta_t)
     return ctl
 

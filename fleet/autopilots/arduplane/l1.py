@@ -6,7 +6,7 @@
 Source: Park, Deyst & How, "A New Nonlinear Guidance Logic for Trajectory Tracking" (2004); ArduPlane L1 controller.
 """
 
-from math import asin, atan, atan2, cos, pi, sin
+from math import asin, atan, atan2, cos, pi, sin, tan
 
 import numpy as np
 
@@ -55,15 +55,22 @@ def keep_turn_direction(ctl: np.ndarray, nu: float, n: float, e: float, psi: flo
 
 @kernel
 def follow_line(
-    ctl: np.ndarray, par: np.ndarray, leg: np.ndarray, p: np.ndarray, v: np.ndarray, psi: float, dt: float
+    ctl: np.ndarray,
+    par: np.ndarray,
+    line: tuple[float, float, float, float],
+    p: np.ndarray,
+    v: np.ndarray,
+    psi: float,
+    dt: float,
 ) -> float:
-    """Return the lateral acceleration to follow the line from the previous point to the target of the leg.
+    """Return the lateral acceleration to follow a line; from the aircraft's position: to fly directly to the end.
 
     Three regimes: far behind the start, fly to the start; more than 3 s past the end, fly to the end; else capture
     the line with nu = asin(crosstrack / L1) + integral + course error.
 
     Args:
-        ctl, par, leg: controller state, parameters, row of the route
+        ctl, par: controller state, parameters
+        line: start and end, north and east of each [m]
         p, v: position and ground velocity, NED, (3,) [m, m/s]
         psi: heading [rad]
         dt: step [s]
@@ -72,13 +79,13 @@ def follow_line(
     """
     v_n, v_e, speed = ground_track(v, psi)
     l1 = distance(par, speed)
-    t_n, t_e = leg[P_N] - ctl[S.PREV_N], leg[P_E] - ctl[S.PREV_E]
+    t_n, t_e = line[2] - line[0], line[3] - line[1]
     length = max(hypot(t_n, t_e), 1e-6)
     t_n, t_e = t_n / length, t_e / length
-    a_n, a_e = p[0] - ctl[S.PREV_N], p[1] - ctl[S.PREV_E]
+    a_n, a_e = p[0] - line[0], p[1] - line[1]
     along, crosstrack = a_n * t_n + a_e * t_e, a_n * t_e - a_e * t_n
     start_distance = hypot(a_n, a_e)
-    b_n, b_e = leg[P_N] - p[0], leg[P_E] - p[1]
+    b_n, b_e = line[2] - p[0], line[3] - p[1]
     if start_distance > l1 and along < -_MAX_CAPTURE_SIN * max(start_distance, 1.0):
         nu = angle_to(v_n, v_e, -a_n, -a_e)
     elif along > length + 3.0 * speed:
@@ -95,12 +102,21 @@ def follow_line(
 
 
 @kernel
-def circle_radius(par: np.ndarray, radius: float) -> float:
-    """Return a radius [m] increased for low air density, or for the loiter bank limit if set [m]."""
-    if par[P.LIM_BANK] > 0.0:
-        tas = par[P.VA_CRUISE] * par[P.EAS2TAS]
-        return max(radius, tas * tas / (G * max(np.tan(par[P.LIM_BANK]), 0.01)))
-    return radius * par[P.EAS2TAS] ** 2
+def circle_radius(par: np.ndarray, radius: float, va_c: float) -> float:
+    """Return the radius that is flown for a requested one: larger in thin air, where the true airspeed is higher [m].
+
+    With NAVL1_LIM_BANK the radius grows only as far as the bank of a level turn at sea level requires.
+
+    Args:
+        par: parameters
+        radius: requested, not negative [m]
+        va_c: commanded airspeed, equivalent [m/s]
+    """
+    widened = radius * par[P.EAS2TAS] ** 2
+    smallest = va_c * va_c / (G * tan(par[P.LIM_BANK])) if par[P.LIM_BANK] > 0.0 else 0.0  # at sea level
+    if smallest <= 0.0 or smallest > radius:
+        return widened
+    return max(smallest * par[P.EAS2TAS] ** 2, radius)
 
 
 @kernel
@@ -117,7 +133,7 @@ def follow_circle(
     Returns:
         lateral acceleration, right positive [m/s2]; whether the circle is reached
     """
-    v_n, v_e, speed = ground_track(v, psi)
+    v_n, v_e, speed = v[0], v[1], max(hypot(v[0], v[1]), 1.0)
     d = 1.0 if radius >= 0.0 else -1.0
     R = max(abs(radius), 1.0)
     c_n, c_e = leg[P_N] - p[0], leg[P_E] - p[1]

@@ -1,10 +1,12 @@
 """Leg sequencing and height demand along the route.
 
-A line is complete within the turn distance of its end, or beyond the line through its end at right angles.
-Source: ArduPlane mission logic, waypoint switching and altitude slope.
+A line is complete within the turn distance of its end, or beyond the line through its end at right angles. The next
+line starts at that end. After a circle it starts at the centre, or at the exit where the item's `param4` is positive;
+after a takeoff and a change of mode there is no line, and the aircraft flies directly to the target.
+Source: ArduPlane mission commands, waypoint switching, loiter exits and altitude slope.
 """
 
-from math import atan2, pi
+from math import asin, atan2, ceil, cos, pi, sin
 
 import numpy as np
 
@@ -16,6 +18,7 @@ from fleet.autopilots.control_law import hypot, kernel
 from fleet.frames import wrap
 from fleet.mission import (
     ACCEPT_RADIUS,
+    CHANGE_ALTITUDE,
     KIND,
     LAND,
     LOITER_TIME,
@@ -35,7 +38,10 @@ from fleet.mission import (
 _CLIMB_AT_ONCE = 1 << 14  # FLIGHT_OPTIONS: climb to the next altitude at once
 _EXIT_SECTOR = pi / 18  # exit from a circle within 10 deg of the exit course, plus 10 deg per extra turn [rad]
 _LINE_RADII = 3.0  # distance in radii beyond which the line to a circle is followed
-_ALT_TOLERANCE = 5.0  # altitude error that ends LOITER_TO_ALT [m]
+_ALT_TOLERANCE = 5.0  # altitude error that ends LOITER_TO_ALT and CHANGE_ALTITUDE [m]
+_RETURN_ALT_TOLERANCE = 10.0  # altitude error at which a return with RTL_AUTOLAND 1 proceeds to the landing [m]
+_LOITER_RADIUS = 60.0  # used where WP_LOITER_RAD is 1 m or less [m]
+_EXTENSION, _EXTEND_AT = 300.0, 200.0  # CHANGE_ALTITUDE lengthens its line by this, this far before its end [m]
 
 
 @kernel
@@ -67,29 +73,77 @@ def set_leg(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, from_p: 
         ctl[S.PREV_N + j] = from_p[j] if has_start else (legs[i, P_N + j] if i >= 0 else 0.0)
     if i < 0:
         return
+    _set_turn(ctl, legs, i)
+
+
+@kernel
+def _set_turn(ctl: np.ndarray, legs: np.ndarray, i: int) -> None:
+    """Set the turn angle at the end of leg `i`; 90 deg where no item follows."""
     ctl[S.TURN] = pi / 2
-    if i + 1 < legs.shape[0]:
+    if i + 1 < legs.shape[0] and not is_return(legs[i + 1]):
         bearing = atan2(legs[i, P_E] - ctl[S.PREV_E], legs[i, P_N] - ctl[S.PREV_N])
         ctl[S.TURN] = abs(wrap(atan2(legs[i + 1, P_E] - legs[i, P_E], legs[i + 1, P_N] - legs[i, P_N]) - bearing))
+
+
+@kernel
+def is_return(leg: np.ndarray) -> bool:
+    """Return whether a leg is a return to launch: another mode, without a line to it or from it."""
+    return int(leg[KIND]) == LOITER_UNLIMITED and (leg[SEQ] < 0.0 or leg[ACCEPT_RADIUS] > 0.0)
+
+
+@kernel
+def _has_line(legs: np.ndarray, i: int, k: int) -> bool:
+    """Return whether the leg `k` is flown along a line after leg `i`, also where the operator selected it."""
+    if i < 0 or k == i or is_return(legs[k]):
+        return False
+    return int(legs[i, KIND]) != TAKEOFF and int(legs[i, KIND]) != LOITER_UNLIMITED
 
 
 @kernel
 def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndarray) -> None:
     """Switch to leg `k` at the aircraft position `p`, NED (3,) [m].
 
-    The new line starts at the end of the previous one, but at the aircraft after a circle, after takeoff, or beyond its
-    own end.
+    The new line starts where the previous leg ends, but at the aircraft where the aircraft is beyond its end.
     """
     i = current_leg(ctl, legs)
-    continues = i >= 0 and k == i + 1 and int(legs[i, KIND]) == WAYPOINT
-    if not continues:
+    course, (end_n, end_e) = _course(ctl, legs, i, p), _extended_line(ctl, p)[2:]
+    if not _has_line(legs, i, k):
         set_leg(ctl, par, legs, k, p)
+        ctl[S.FOLLOW_LINE], ctl[S.COURSE] = -1.0, course
         return
-    set_leg(ctl, par, legs, k, legs[i, P_N : P_D + 1])
-    ctl[S.FOLLOW_LINE] = 1.0
+    circle = int(legs[i, KIND]) in (LOITER_TURNS, LOITER_TIME, LOITER_TO_ALT)
+    from_exit = circle and legs[i, ACCEPT_RADIUS] > 0.0 and k == i + 1
+    set_leg(ctl, par, legs, k, p if from_exit else legs[i, P_N : P_D + 1])
+    ctl[S.FOLLOW_LINE], ctl[S.COURSE] = 1.0, course
+    if int(legs[i, KIND]) == CHANGE_ALTITUDE:
+        ctl[S.PREV_N], ctl[S.PREV_E] = end_n, end_e
+        _set_turn(ctl, legs, k)
     along, length = along_line(ctl, legs[k], p)
-    if along > length:
+    if along >= length and int(legs[k, KIND]) != CHANGE_ALTITUDE:
         set_leg(ctl, par, legs, k, p)
+        ctl[S.FOLLOW_LINE], ctl[S.COURSE] = 1.0, course
+
+
+@kernel
+def _course(ctl: np.ndarray, legs: np.ndarray, i: int, p: np.ndarray) -> float:
+    """Return the course of the line of leg `i` [rad]; a line without length keeps the one before."""
+    if i < 0 or int(legs[i, KIND]) == CHANGE_ALTITUDE:
+        return ctl[S.COURSE]
+    to_here = int(legs[i, KIND]) == TAKEOFF or (int(legs[i, KIND]) != WAYPOINT and legs[i, ACCEPT_RADIUS] > 0.0)
+    n, e = (p[0], p[1]) if to_here else (legs[i, P_N], legs[i, P_E])
+    n, e = n - ctl[S.PREV_N], e - ctl[S.PREV_E]
+    return atan2(e, n) if hypot(n, e) > 0.1 else ctl[S.COURSE]
+
+
+@kernel
+def _extended_line(ctl: np.ndarray, p: np.ndarray) -> tuple[float, float, float, float]:
+    """Return the line of CHANGE_ALTITUDE: the previous one, lengthened in steps while its end is near [m]."""
+    c, s = cos(ctl[S.COURSE]), sin(ctl[S.COURSE])
+    along = (p[0] - ctl[S.PREV_N]) * c + (p[1] - ctl[S.PREV_E]) * s
+    reach = max(ceil((along + _EXTEND_AT) / _EXTENSION), 0.0) * _EXTENSION
+    start = min(along, 0.0) - _EXTENSION  # any point behind the aircraft on the line
+    n, e = ctl[S.PREV_N], ctl[S.PREV_E]
+    return n + start * c, e + start * s, n + reach * c, e + reach * s
 
 
 @kernel
@@ -113,22 +167,39 @@ def steer(
     kind = int(leg[KIND])
     if kind == TAKEOFF:
         return 0.0, p[2] <= leg[P_D]
+    line = (ctl[S.PREV_N], ctl[S.PREV_E], leg[P_N], leg[P_E])
+    if kind == CHANGE_ALTITUDE:
+        a_lat = l1.follow_line(ctl, par, _extended_line(ctl, p), p, v, euler[2], dt)
+        return a_lat, _altitude_reached(leg, p)
     if kind in (WAYPOINT, LAND):
         if hypot(leg[P_N] - ctl[S.PREV_N], leg[P_E] - ctl[S.PREV_E]) < 0.1:  # no line: start one here
             ctl[S.PREV_N], ctl[S.PREV_E] = p[0], p[1]
-        a_lat = l1.follow_line(ctl, par, leg, p, v, euler[2], dt)
+        if ctl[S.FOLLOW_LINE] < 0.0:
+            line = (p[0], p[1], leg[P_N], leg[P_E])
+        a_lat = l1.follow_line(ctl, par, line, p, v, euler[2], dt)
         return a_lat, kind == WAYPOINT and _arrived(ctl, par, leg, p, v, euler[2])
     radius = leg[RADIUS] if leg[RADIUS] != 0.0 else par[P.LOITER_RAD]
-    d, R = 1.0 if radius >= 0.0 else -1.0, l1.circle_radius(par, abs(radius))
+    d, R = 1.0 if radius >= 0.0 else -1.0, abs(radius) if abs(radius) > 1.0 else _LOITER_RADIUS
+    R = l1.circle_radius(par, R, ctl[S.V_DEM] / par[P.EAS2TAS])
     if (
         ctl[S.CIRCLE_REACHED] == 0.0
         and ctl[S.FOLLOW_LINE] > 0.0
         and hypot(leg[P_N] - p[0], leg[P_E] - p[1]) > _LINE_RADII * R
     ):
-        return l1.follow_line(ctl, par, leg, p, v, euler[2], dt), False
-    a_lat, circling = l1.follow_circle(ctl, par, leg, p, v, euler[2], d * R)
-    _update_circle(ctl, leg, p, circling, d, dt)
-    return a_lat, _circle_done(ctl, legs, i, p, v, euler[2], R)
+        return l1.follow_line(ctl, par, line, p, v, euler[2], dt), False
+    a_lat, on_circle = l1.follow_circle(ctl, par, leg, p, v, euler[2], d * R)
+    leg_done = _circle_done(ctl, legs, i, p, R, d)
+    _update_circle(ctl, leg, p, on_circle, d, dt)
+    return a_lat, leg_done
+
+
+@kernel
+def _altitude_reached(leg: np.ndarray, p: np.ndarray) -> bool:
+    """Return whether CHANGE_ALTITUDE is complete: climbed to, descended to, or within 5 m of its altitude."""
+    above = leg[P_D] - p[2]
+    if leg[TURNS] == 1.0:
+        return above >= 0.0
+    return above <= 0.0 if leg[TURNS] == 2.0 else abs(above) <= _ALT_TOLERANCE
 
 
 @kernel
@@ -139,46 +210,70 @@ def _arrived(ctl: np.ndarray, par: np.ndarray, leg: np.ndarray, p: np.ndarray, v
         _, _, speed = l1.ground_track(v, psi)
         reach = min(par[P.WP_RADIUS] * par[P.EAS2TAS] ** 2, l1.distance(par, speed))
         accept = reach * min(ctl[S.TURN], pi / 2) / (pi / 2)
-    if accept > 0.0 and to_go <= accept:
-        return True
     along, length = along_line(ctl, leg, p)
-    if along <= length + max(-accept, 0.0):
+    passed = along > length + max(-accept, 0.0)
+    if par[P.WP_MAX_RADIUS] > 0.0 and to_go > par[P.WP_MAX_RADIUS]:
+        if passed and accept >= 0.0:  # too far away: fly to it again from here
+            ctl[S.PREV_N], ctl[S.PREV_E], ctl[S.PREV_D] = p[0], p[1], p[2]
         return False
-    if par[P.WP_MAX_RADIUS] > 0.0 and to_go > par[P.WP_MAX_RADIUS]:  # passed too far away: fly to it again from here
-        ctl[S.PREV_N], ctl[S.PREV_E], ctl[S.PREV_D] = p[0], p[1], p[2]
-        return False
-    return True
+    return passed or (accept > 0.0 and to_go <= accept)
 
 
 @kernel
-def _update_circle(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray, circling: bool, d: float, dt: float) -> None:
-    """Integrate angle and time since reaching the circle."""
+def _update_circle(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray, on_circle: bool, d: float, dt: float) -> None:
+    """Integrate the time since the target was reached, and the angle since the circle was."""
     bearing = atan2(leg[P_E] - p[1], leg[P_N] - p[0])
-    ctl[S.CIRCLING] = 1.0 if circling else 0.0
-    if ctl[S.CIRCLE_REACHED] > 0.0:
+    if ctl[S.CIRCLING] > 0.0:
         ctl[S.ANGLE] += wrap(bearing - ctl[S.BEARING]) * d
+    if ctl[S.CIRCLE_REACHED] > 0.0:
         ctl[S.TIMER] += dt
     along, length = along_line(ctl, leg, p)
-    if circling or along > length:
+    if on_circle:
+        ctl[S.CIRCLING] = 1.0  # and stays on it in a gust
+    if on_circle or along > length:
         ctl[S.CIRCLE_REACHED] = 1.0
     ctl[S.BEARING] = bearing
 
 
 @kernel
-def _circle_done(ctl: np.ndarray, legs: np.ndarray, i: int, p: np.ndarray, v: np.ndarray, psi: float, R: float) -> bool:
+def _circle_done(ctl: np.ndarray, legs: np.ndarray, i: int, p: np.ndarray, R: float, d: float) -> bool:
+    """Return whether a circle of radius `R` [m] and direction `d` is left here, towards the next leg."""
     leg = legs[i]
-    if i + 1 >= legs.shape[0] or int(leg[KIND]) == LOITER_UNLIMITED or ctl[S.CIRCLE_REACHED] == 0.0:
+    if i + 1 >= legs.shape[0]:
+        return False
+    if is_return(leg):
+        near = ctl[S.CIRCLING] > 0.0 and abs(p[2] - leg[P_D]) < _RETURN_ALT_TOLERANCE
+        return leg[TURNS] == 2.0 or (leg[TURNS] == 1.0 and near)
+    if int(leg[KIND]) == LOITER_UNLIMITED or ctl[S.CIRCLE_REACHED] == 0.0:
         return False
     if ctl[S.EXIT_ANGLE] < 0.0:
-        if not exit_condition_met(ctl, leg, p):
+        off_circle = int(leg[KIND]) != LOITER_TIME and ctl[S.CIRCLING] == 0.0
+        if off_circle or not exit_condition_met(ctl, leg, p):
             return False
         ctl[S.EXIT_ANGLE] = max(ctl[S.ANGLE], 0.0)
-    out_n, out_e = legs[i + 1, P_N] - p[0], legs[i + 1, P_E] - p[1]
-    if hypot(legs[i + 1, P_N] - leg[P_N], legs[i + 1, P_E] - leg[P_E]) < R:  # the next target is inside the circle
+    if is_return(legs[i + 1]):
         return True
-    v_n, v_e, _ = l1.ground_track(v, psi)
     extra = np.floor(max(ctl[S.ANGLE] - ctl[S.EXIT_ANGLE], 0.0) / (2 * pi))
-    return abs(kernels.angle_to(v_n, v_e, out_n, out_e)) <= _EXIT_SECTOR * (1.0 + extra)
+    return abs(_exit_error(leg, legs[i + 1], p, R, d)) <= _EXIT_SECTOR * (1.0 + extra)
+
+
+@kernel
+def _exit_error(leg: np.ndarray, next_leg: np.ndarray, p: np.ndarray, R: float, d: float) -> float:
+    """Return the angle from the tangent of the circle, at the aircraft, to the exit course [rad].
+
+    The exit course leads from the nearest point of the circle to the next target. A target inside the circle is left
+    for before its bearing: by the angle of a chord as long as the target's distance from the circle.
+    """
+    angle = atan2(p[1] - leg[P_E], p[0] - leg[P_N])
+    t_n, t_e = next_leg[P_N] - leg[P_N], next_leg[P_E] - leg[P_E]
+    distance = hypot(t_n, t_e)
+    if distance <= 0.0:
+        return 0.0
+    if distance >= R:
+        exit_course = atan2(t_e - R * sin(angle), t_n - R * cos(angle))
+    else:
+        exit_course = atan2(t_e, t_n) + d * (pi / 2 - 2.0 * asin((R - distance) / (2.0 * R)))
+    return wrap(exit_course - (angle + d * pi / 2))
 
 
 @kernel
@@ -186,10 +281,10 @@ def exit_condition_met(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray) -> bool:
     """Return whether the turns, time or height of a circle are complete; p: NED, (3,) [m]."""
     kind = int(leg[KIND])
     if kind == LOITER_TURNS:
-        return ctl[S.ANGLE] >= 2 * pi * leg[TURNS]
+        return ctl[S.ANGLE] > 2 * pi * leg[TURNS]
     if kind == LOITER_TIME:
-        return ctl[S.TIMER] >= leg[TURNS]
-    return kind == LOITER_TO_ALT and abs(p[2] - leg[P_D]) < _ALT_TOLERANCE
+        return ctl[S.TIMER] > leg[TURNS]
+    return kind in (LOITER_TO_ALT, CHANGE_ALTITUDE) and abs(p[2] - leg[P_D]) < _ALT_TOLERANCE
 
 
 @kernel
@@ -205,12 +300,13 @@ def height_demand(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndar
         return -ctl[S.PREV_D]
     leg = legs[i]
     h, rise = -leg[P_D], ctl[S.PREV_D] - leg[P_D]
-    immediate = int(par[P.OPTIONS]) & _CLIMB_AT_ONCE != 0 or leg[SEQ] < 0.0
+    immediate = int(par[P.OPTIONS]) & _CLIMB_AT_ONCE != 0 or is_return(leg)
     if (
-        int(leg[KIND]) == TAKEOFF
+        int(leg[KIND]) in (TAKEOFF, CHANGE_ALTITUDE)
+        or par[P.SLOPE_MIN] <= 0.0
         or abs(rise) < par[P.SLOPE_MIN]
         or (rise > 0.0 and immediate)
-        or ctl[S.CIRCLE_REACHED] > 0.0
+        or ctl[S.CIRCLING] > 0.0
     ):
         return h
     along, length = along_line(ctl, leg, p)

@@ -130,14 +130,22 @@ class AircraftLink:
             self.params.process(message, self.autopilot, now)
         elif name in MISSION_MESSAGES:
             self.mission.process(message, is_upload=False, now=now)
-        elif name == "HOME_POSITION" and self.autopilot == "px4":
-            self.mission.set_home_altitude(message.altitude * 1e-3)
+        elif name == "HOME_POSITION":
+            self._process_home(message)
         elif name == "STATUSTEXT":
             self._process_text(message.severity, str(message.text).strip(), now)
         elif name == "AUTOPILOT_VERSION":
             self.board_id = heartbeat.board_id(message)
             if message.flight_sw_version:
                 self.firmware = self.firmware or heartbeat.firmware(message)
+
+    def _process_home(self, message: Any) -> None:
+        """Process HOME_POSITION: item 0 of an ArduPilot mission, the reference of relative altitudes of PX4."""
+        altitude_m = message.altitude * 1e-3
+        if self.autopilot == "px4":
+            self.mission.set_home_altitude(altitude_m)
+        elif self.autopilot == "ardupilot":
+            self.mission.set_home(message.latitude, message.longitude, altitude_m)
 
     def process_uplink(self, message: Any, now: float) -> None:
         """Process one mission protocol message from a ground station to this aircraft."""

@@ -74,6 +74,32 @@ def test_the_shadow_run_follows_the_reported_item_not_its_own_opinion():
     assert np.isfinite(ctl).all()
 
 
+def circled(until_s, delay_s):
+    """Fly a circle and leave it; the items are reported once a second and late. Give route, record, surfaces."""
+    legs = route(leg(m.LOITER_TURNS, n=400.0, radius=80.0, turns=1.0), leg(n=400.0, e=2000.0))
+    rows, _ = fly(legs, Plane(), 80)
+    left = int(np.argmax(rows[:, 14] == 2))
+    flown = rows[: left + round(until_s * 10)].copy()
+    k = np.arange(len(flown))
+    flown[:, 14] = rows[np.maximum(k - round(delay_s * 10), 0), 14]
+    return legs, flown, np.hstack([np.zeros((len(flown), 3)), flown[:, 13:14]])
+
+
+@pytest.mark.parametrize("until_s", [0.3, 0.9, 1.5])
+def test_a_circle_is_left_before_the_item_is_reported(until_s):
+    """Who waits for the report misses the exit, and predicts another turn."""
+    legs, rows, deltas = circled(until_s, 1.0)
+    ahead, ctl, _ = shadowed(legs, rows, deltas, 0)
+    assert ahead[int(ctl[ap.LEG]), m.SEQ] == 2
+
+
+def test_an_exit_that_no_report_confirms_is_taken_back():
+    legs, rows, deltas = circled(6.0, 100.0)
+    ahead, ctl, _ = shadowed(legs, rows, deltas, 0)
+    assert ahead[int(ctl[ap.LEG]), m.SEQ] == 1
+    assert ctl[S.ANGLE] > 0 and ctl[S.CIRCLE_REACHED] == 1.0  # and the circle goes on
+
+
 def test_the_shadow_run_passes_over_what_is_missing():
     legs, _, rows, deltas, _ = recorded(60)
     rng = np.random.default_rng(5)

@@ -36,7 +36,7 @@ class ReferenceFlight:
             self._add_status(message)
         elif isinstance(message, Mission):
             if message.complete:
-                if self._mission_complete and message.items != self.items:
+                if self._mission_complete and message.items[1:] != self.items[1:]:  # item 0 is home, which moves
                     self.events.append((message.t, "mission changed"))
                 self.items, self._mission_complete = message.items, True
         elif isinstance(message, Params):

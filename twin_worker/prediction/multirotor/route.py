@@ -94,6 +94,8 @@ def _separate_vertical(items: Sequence[Item]) -> list[Item]:
     """Offset a waypoint directly above the previous one: a leg for a multirotor, none for a fixed wing."""
     out: list[Item] = []
     for item in sorted(items, key=lambda i: i.seq):
+        if item.command == m.SPEED:  # a ground speed is a multirotor's own kind of speed
+            item = msgspec.structs.replace(item, param1=0.0)
         previous = out[-1] if out else None
         above = previous is not None and (previous.lat_e7, previous.lon_e7, previous.frame) == (
             item.lat_e7,

@@ -6,15 +6,20 @@ import msgspec
 import numpy as np
 
 from fleet.airframes.airframe import ServoMap, servo_map
-from fleet.contract import Mission, Params, Sample, Status
+from fleet.contract import Item, Mission, Params, Sample, Status
 from fleet.frames import Origin
+from fleet.mission_jumps import JUMPS, count_jumps, resets_counters
 from twin_worker.estimation.wind_filter import WindFilter, update_from_history
 from twin_worker.prediction.autopilot_identification import AutopilotEstimate
+from twin_worker.prediction.closed_loop import JumpCounts
 from twin_worker.telemetry.history import ArrivalDelay, TelemetryHistory
 from twin_worker.telemetry.resample import Resampler
 from twin_worker.twin.state.flight_phase import FlightPhase
 
 _MODE_CHANGES = 64  # kept
+_ITEM_CHANGES = 64  # kept
+_MAX_ALTITUDE_OFFSET_M = 200.0  # largest plausible difference of a position's and the receiver's altitude [m]
+_FIX_WAIT_S = 10.0  # telemetry after which a position is used in spite of such a difference [s]
 _TICK_S = 1.0  # between updates of the wind filter [s]
 _LATE_S = 10.0  # velocities older than this come too late for the wind [s]
 
@@ -47,7 +52,7 @@ class Telemetry(msgspec.Struct):
     rejected_rows: int = 0
 
     def add(self, sample: Sample) -> None:
-        """Append the rows of a sample; its first plausible position is the origin."""
+        """Append the rows of a sample; the first position of a valid fix is the origin."""
         self.rejected_rows += self.history.add(sample)
         if self.origin is None and sample.position is not None:
             self.origin = _first_position(self.history)
@@ -90,9 +95,17 @@ class Telemetry(msgspec.Struct):
 
 
 def _first_position(history: TelemetryHistory) -> Origin | None:
-    """Return the first position that is on earth; None before any."""
-    for lat, lon, alt in history.rows("position")[1]:
-        if abs(lat) <= 9e8 and abs(lon) <= 1.8e9 and abs(alt) <= 1e8:
+    """Return the first position on earth; None before any.
+
+    Between its fix and its alignment an autopilot reports latitude and longitude with an altitude near zero: such a
+    position is left out while the receiver's altitude differs from it.
+    """
+    t, positions = history.rows("position")
+    _, gnss = history.rows("gnss")
+    for t_k, (lat, lon, alt) in zip(t, positions, strict=True):
+        on_earth = abs(lat) <= 9e8 and abs(lon) <= 1.8e9 and abs(alt) <= 1e8 and (lat != 0 or lon != 0)
+        aligned = not len(gnss) or abs(alt - gnss[-1, 0]) * 1e-3 <= _MAX_ALTITUDE_OFFSET_M
+        if on_earth and (aligned or t_k - t[0] > _FIX_WAIT_S):
             return Origin(int(lat), int(lon), int(alt))
     return None
 
@@ -106,6 +119,8 @@ class OnboardState(msgspec.Struct):
         params: the newest
         mode_changes: (time [s since 1970], mode), oldest first
         plan_changed_t: last change of mode, mission or parameters [s since 1970]
+        received_items: items of the newest mission as received, before home was completed
+        jumps: jumps taken at each jump after each change of the current item, oldest first
     """
 
     status: Status | None = None
@@ -113,6 +128,8 @@ class OnboardState(msgspec.Struct):
     params: Params | None = None
     mode_changes: deque[tuple[float, str]] = msgspec.field(default_factory=lambda: deque(maxlen=_MODE_CHANGES))
     plan_changed_t: float = -np.inf
+    received_items: tuple[Item, ...] = ()
+    jumps: deque[JumpCounts] = msgspec.field(default_factory=lambda: deque(maxlen=_ITEM_CHANGES))
 
     def set_status(self, status: Status, *, record: bool = True) -> None:
         """Store a status; with `record` also its mode, where that is new."""
@@ -120,9 +137,31 @@ class OnboardState(msgspec.Struct):
             self.mode_changes.append((status.t, status.mode))
         self.status = status
 
-    def set_mission(self, mission: Mission) -> None:
-        """Store a mission."""
-        self.mission = mission
+    def set_mission(self, mission: Mission, first: int) -> None:
+        """Store a mission as received, and count its jumps; `first`: number of its first item to fly."""
+        same = self.received_items[first:] == mission.items[first:]
+        previous = self.mission.seq if self.mission is not None and same else -1
+        self.mission, self.received_items = mission, mission.items
+        if not same:
+            self.jumps.clear()
+        if previous == mission.seq or not any(item.command in JUMPS for item in mission.items):
+            return
+        taken = self.jumps[-1][2] if self.jumps else {}
+        items = {item.seq: item for item in mission.items}
+        resets = resets_counters(self.params.values if self.params else {}, first)
+        if previous >= first:
+            taken = count_jumps(items, taken, (previous, mission.seq), first=first, resets=resets)
+        self.jumps.append((mission.t, mission.seq, taken))
+
+    @property
+    def jumps_taken(self) -> dict[int, int]:
+        """Return the jumps taken so far at each jump of the mission."""
+        return self.jumps[-1][2] if self.jumps else {}
+
+    def complete_mission(self, items: tuple[Item, ...]) -> None:
+        """Replace the items of the mission by those with home completed."""
+        assert self.mission is not None
+        self.mission = msgspec.structs.replace(self.mission, items=items)
 
     def set_params(self, params: Params) -> None:
         """Store parameters."""
@@ -136,6 +175,7 @@ class OnboardState(msgspec.Struct):
         """Shift all changes by `step` [s]; the newest was at `plan_changed_t` by the new clock [s since 1970]."""
         self.mode_changes = deque(((t + step, mode) for t, mode in self.mode_changes), maxlen=_MODE_CHANGES)
         self.plan_changed_t = plan_changed_t
+        self.jumps = deque(((t + step, seq, taken) for t, seq, taken in self.jumps), maxlen=_ITEM_CHANGES)
 
 
 class Environment(msgspec.Struct):

@@ -26,6 +26,7 @@ from twin_worker.prediction.autopilot_identification import LAW_OF_AUTOPILOT
 from twin_worker.prediction.closed_loop import AutopilotConfig, PredictionContext
 from twin_worker.twin.state.budget import ComputeBudget, Schedule, Work
 from twin_worker.twin.state.events import invalidate_prediction
+from twin_worker.twin.state.home import complete_home
 from twin_worker.twin.state.inputs import Environment, OnboardState, Telemetry
 from twin_worker.twin.state.models import Identification, ModelBank
 from twin_worker.twin.state.outputs import AlertingState, ConfidenceState, PredictionState
@@ -177,6 +178,7 @@ class Twin(msgspec.Struct):
             self.autopilot,
             law,
             self.environment.autopilot.reason,
+            tuple(self.onboard.jumps),
         )
         return PredictionContext(
             window, self.telemetry.history, autopilot_config, self.environment.wind, self.telemetry.origin
@@ -199,9 +201,11 @@ def ingest(twin: Twin, message: Message) -> None:
     elif isinstance(message, Status):
         _ingest_status(twin, message)
     elif isinstance(message, Mission):
-        if twin.onboard.mission is None or twin.onboard.mission.items != message.items:
+        first = twin.first_item  # item 0 of a mission that contains home is no change: home moves, e.g. at arming
+        if twin.onboard.mission is None or twin.onboard.received_items[first:] != message.items[first:]:
             invalidate_prediction(twin, Event.MISSION, message.t, describe_mission(twin.onboard.mission, message))
-        twin.onboard.set_mission(message)
+        twin.onboard.set_mission(message, first)
+        complete_home(twin)
     elif isinstance(message, Params):
         names = changed_parameters(twin.received_params, message.values)
         if names or twin.onboard.params is None:

@@ -160,7 +160,12 @@ def _mission_feasibility(twin: Twin, now: float) -> HazardEstimate:
         return no_alert
     p = to_ned(twin.telemetry.origin, *position[-1:].T)[0]
     route = cached_route(
-        twin.onboard.mission.items, twin.onboard.mission.seq, twin.telemetry.origin, _params(twin), twin.first_item
+        twin.onboard.mission.items,
+        twin.onboard.mission.seq,
+        twin.telemetry.origin,
+        _params(twin),
+        twin.first_item,
+        twin.onboard.jumps_taken,
     )
     wind = np.array([*twin.environment.wind.wind[:2], twin.environment.wind.sigma])
     return feasibility_hazard(

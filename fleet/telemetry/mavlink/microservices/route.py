@@ -50,6 +50,7 @@ class MissionCollector:
         self.rejected = 0
         self.unconfirmed: set[int] = set()  # recalled items, accepted after a check of a few others
         self._recalled: tuple[Item, ...] = ()
+        self._home: Item | None = None  # replaces item 0 of missions that contain home (ArduPilot)
         self._home_m: float | None = None
         self._text = ""
         self._transfers: dict[bool, _MissionTransfer | None] = {False: None, True: None}
@@ -87,6 +88,19 @@ class MissionCollector:
             self._home_m = altitude_m
             self._changed = self._changed or bool(self.items)
 
+    def set_home(self, lat_e7: int, lon_e7: int, altitude_m: float) -> None:
+        """Set home of an autopilot whose item 0 is home: until it has one, it returns zeros for item 0."""
+        if not isfinite(altitude_m) or not (lat_e7 or lon_e7):
+            return
+        home = Item(seq=0, command=WAYPOINT, frame=0, lat_e7=lat_e7, lon_e7=lon_e7, alt_m=altitude_m)
+        self._changed = self._changed or (home != self._home and bool(self.items))
+        self._home = home
+
+    @property
+    def needs_home(self) -> bool:
+        """Return whether item 0 has no position, and home is unknown."""
+        return bool(self.items) and self._home is None and not _has_position(self.items[0])
+
     def missing(self) -> list[int] | None:
         """Return the missing sequence numbers of the download in progress; None without count."""
         transfer = self._transfers[False]
@@ -110,6 +124,8 @@ class MissionCollector:
         self._changed = False
         sentence = f"uav-{self.uav}: {self._text}" if self._text else ""
         items = self.items if self._home_m is None else tuple(_absolute(item, self._home_m) for item in self.items)
+        if self._home is not None and items and items[0].seq == 0:
+            items = (self._home, *items[1:])
         return Mission(uav=self.uav, t=now, items=items, seq=self.seq, complete=self.complete, sentence=sentence)
 
     def _set_current(self, seq: int) -> None:
@@ -152,13 +168,23 @@ class MissionCollector:
         transfer.notes.pop(item.seq, None)
         if note:
             transfer.notes[item.seq] = note
+        if not is_upload and item.seq == 0:
+            self._update_home(item)
         if not is_upload and transfer.is_complete():
             self._accept(transfer)
+
+    def _update_home(self, item: Item) -> None:
+        """Update a known home with item 0 as the autopilot reports it."""
+        if self._home is not None and item.command == WAYPOINT and item.frame == 0:
+            self.set_home(item.lat_e7, item.lon_e7, item.alt_m)
 
     def _check_item(self, message: Any) -> None:
         """Compare one item with the complete mission; request a download if it differs."""
         expected = self.items[message.seq : message.seq + 1]
-        if expected == (read_item(message)[0],):
+        if message.seq == 0 and expected and self._home is not None:  # home moves, the mission is the same
+            self._update_home(read_item(message)[0])
+            self.unconfirmed.discard(0)
+        elif expected == (read_item(message)[0],):
             self.unconfirmed.discard(message.seq)
         elif expected:
             self.needs_download = True
@@ -190,6 +216,10 @@ class MissionCollector:
     def _set_text(self, text: str) -> None:
         self._changed = self._changed or text != self._text
         self._text = text
+
+
+def _has_position(item: Item) -> bool:
+    return item.lat_e7 != 0 or item.lon_e7 != 0
 
 
 def _absolute(item: Item, home_m: float) -> Item:
