@@ -133,6 +133,7 @@ class RequestScheduler:
         self._watch_t = self._timesync_t = now
         self._store_t = now - STORE_S + FIRST_STORE_S
         self._watched_item = 0
+        self._needed_download = True
         self._to = (aircraft.system, aircraft.component)
         self._since = now
         self._param_list, self._mission_list = RetryTimer(3.0), RetryTimer()
@@ -154,6 +155,9 @@ class RequestScheduler:
 
     def _mission(self, now: float) -> list[Any]:
         route, missing = self.aircraft.mission, self.aircraft.mission.missing()
+        if route.needs_download and not self._needed_download:
+            self._mission_list.reset()
+        self._needed_download = route.needs_download
         if missing:
             if self._items_left == len(missing) and now - self._items_at < RETRY_S:
                 return []
