@@ -9,6 +9,8 @@ A leg is one row of float64; the columns are named below, the first one is the l
     LOITER_TO_ALT    circle until the altitude is reached
     TAKEOFF          climb wings level to the altitude
     LAND             fly to the point; no leg follows automatically
+    CONSTANT_BANK    hold a bank, at the height where the leg began
+    GLIDE            hold a bank and a pitch at idle
 
 Item 0 is home (ArduPilot), or the first to fly (PX4, whose mission does not contain home). MAVLink does not report how
 often a DO_JUMP was already taken: the count starts at zero.
@@ -25,11 +27,11 @@ import numpy as np
 from fleet.contract import MAX_ITEMS, Item
 from fleet.frames import Origin, to_ned
 
-WAYPOINT, LOITER_TURNS, LOITER_UNLIMITED, LOITER_TIME, LOITER_TO_ALT, TAKEOFF, LAND = range(7)
-KIND = 0  # leg type, one of the seven above
+WAYPOINT, LOITER_TURNS, LOITER_UNLIMITED, LOITER_TIME, LOITER_TO_ALT, TAKEOFF, LAND, CONSTANT_BANK, GLIDE = range(9)
+KIND = 0  # leg type, one of the nine above
 P_N, P_E, P_D = 1, 2, 3  # target, or centre of the circle, NED from the route's origin [m]
-RADIUS = 4  # radius of the circle, positive clockwise; 0: the autopilot's WP_LOITER_RAD [m]
-TURNS = 5  # turns; seconds for LOITER_TIME
+RADIUS = 4  # radius of the circle, positive clockwise; 0: the autopilot's WP_LOITER_RAD [m]; pitch [rad] for GLIDE
+TURNS = 5  # turns; seconds for LOITER_TIME; bank [rad] for CONSTANT_BANK and GLIDE
 VA_C = 6  # commanded airspeed; <= 0: cruise [m/s]
 ACCEPT_RADIUS = (
     7  # acceptance radius; 0: from the parameters; negative: pass by at that distance [m]; of a circle: 1: exit
@@ -38,7 +40,17 @@ ACCEPT_RADIUS = (
 SEQ = 8  # mission item of this leg; -1: return to launch after the last one
 N_COLUMNS = 9
 
-LEG_NAMES = ("waypoint", "loiter turns", "loiter", "loiter time", "loiter to altitude", "takeoff", "land")
+LEG_NAMES = (
+    "waypoint",
+    "loiter turns",
+    "loiter",
+    "loiter time",
+    "loiter to altitude",
+    "takeoff",
+    "land",
+    "bank",
+    "glide",
+)
 _KINDS = {16: WAYPOINT, 17: LOITER_UNLIMITED, 18: LOITER_TURNS, 19: LOITER_TIME, 20: LOITER_UNLIMITED}
 _KINDS |= {21: LAND, 22: TAKEOFF, 31: LOITER_TO_ALT, 82: WAYPOINT, 84: TAKEOFF, 85: LAND}
 _RETURN, _LAST_NAV, _JUMP, SPEED = 20, 95, 177, 178  # MAV_CMD: RETURN_TO_LAUNCH, NAV_LAST, DO_JUMP, DO_CHANGE_SPEED

@@ -18,6 +18,8 @@ import numpy as np
 from fleet.autopilots import arduplane
 from fleet.autopilots.arduplane import params as P
 from fleet.mission import (
+    CONSTANT_BANK,
+    GLIDE,
     KIND,
     LOITER_TIME,
     LOITER_TO_ALT,
@@ -37,6 +39,7 @@ from twin_worker.prediction.kinematic import wind_and_airspeed
 from twin_worker.prediction.method_selection import constant_turn_prediction
 from twin_worker.prediction.multirotor.rollout import items_in_force
 from twin_worker.telemetry.track import STEP, Track
+from twin_worker.twin.state.routes import present_route
 from twin_worker.twin.state.state import Twin
 
 _CIRCLES = (LOITER_TURNS, LOITER_UNLIMITED, LOITER_TIME, LOITER_TO_ALT)
@@ -265,17 +268,19 @@ def _follow_route(inputs: BaselineInput, ground_speed: Callable[[np.ndarray], np
 def _route_points(inputs: BaselineInput) -> np.ndarray | None:
     """Return the route ahead as points; None without a route or without a known active item."""
     twin = inputs.twin
-    if twin.no_route_reason() or twin.onboard.mission is None or twin.telemetry.origin is None:
-        return None
-    seq = items_in_force(inputs.track.t, twin.telemetry.history.rows("leg"), twin.onboard.mission)
-    if not np.isfinite(seq[-1]):
+    if twin.no_route_reason() or twin.telemetry.origin is None:
         return None
     params = twin.onboard.params.values if twin.onboard.params else {}
-    first = twin.first_item
-    remaining = unroll_route(
-        twin.onboard.mission.items, seq=int(seq[-1]), origin=twin.telemetry.origin, params=params, first=first
-    )
-    if not len(remaining.legs):
+    seq, remaining = np.zeros(len(inputs.track.t)), present_route(twin)
+    if remaining is None:
+        if twin.onboard.mission is None:
+            return None
+        seq = items_in_force(inputs.track.t, twin.telemetry.history.rows("leg"), twin.onboard.mission)
+        if not np.isfinite(seq[-1]):
+            return None
+        items, first = twin.onboard.mission.items, twin.first_item
+        remaining = unroll_route(items, seq=int(seq[-1]), origin=twin.telemetry.origin, params=params, first=first)
+    if not len(remaining.legs) or int(remaining.legs[0, KIND]) in (CONSTANT_BANK, GLIDE):
         return None
     other_item = np.flatnonzero(seq != seq[-1])
     on_item = inputs.track.p[int(other_item[-1]) + 1 if len(other_item) else 0 :]

@@ -4,7 +4,7 @@ A line is complete within the turn distance of its end, or beyond the line throu
 Source: ArduPlane mission logic, waypoint switching and altitude slope.
 """
 
-from math import atan2, pi
+from math import atan2, cos, pi, tan
 
 import numpy as np
 
@@ -13,9 +13,11 @@ from fleet.autopilots import control_law as kernels
 from fleet.autopilots.arduplane import l1
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.control_law import hypot, kernel
-from fleet.frames import wrap
+from fleet.frames import G, wrap
 from fleet.mission import (
     ACCEPT_RADIUS,
+    CONSTANT_BANK,
+    GLIDE,
     KIND,
     LAND,
     LOITER_TIME,
@@ -113,6 +115,8 @@ def steer(
     kind = int(leg[KIND])
     if kind == TAKEOFF:
         return 0.0, p[2] <= leg[P_D]
+    if kind in (CONSTANT_BANK, GLIDE):
+        return G * cos(euler[1]) * tan(leg[TURNS]), False
     if kind in (WAYPOINT, LAND):
         if hypot(leg[P_N] - ctl[S.PREV_N], leg[P_E] - ctl[S.PREV_E]) < 0.1:  # no line: start one here
             ctl[S.PREV_N], ctl[S.PREV_E] = p[0], p[1]
@@ -206,6 +210,8 @@ def height_demand(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndar
     leg = legs[i]
     h, rise = -leg[P_D], ctl[S.PREV_D] - leg[P_D]
     immediate = int(par[P.OPTIONS]) & _CLIMB_AT_ONCE != 0 or leg[SEQ] < 0.0
+    if int(leg[KIND]) in (CONSTANT_BANK, GLIDE):
+        return -ctl[S.PREV_D]
     if (
         int(leg[KIND]) == TAKEOFF
         or abs(rise) < par[P.SLOPE_MIN]

@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 
 from fleet.airframes.airframe import ServoMap, servo_map
+from fleet.autopilots.modes import ModeEntry
 from fleet.contract import Mission, Params, Sample, Status
 from fleet.frames import Origin
 from twin_worker.estimation.wind_filter import WindFilter, update_from_history
@@ -106,6 +107,9 @@ class OnboardState(msgspec.Struct):
         params: the newest
         mode_changes: (time [s since 1970], mode), oldest first
         plan_changed_t: last change of mode, mission or parameters [s since 1970]
+        entry: where the present mode was entered; None: before telemetry began
+        target: newest guidance target in a mode that flies to it, latitude, longitude, height [1e-7 deg, mm]; None:
+            none reported in this mode
     """
 
     status: Status | None = None
@@ -113,12 +117,22 @@ class OnboardState(msgspec.Struct):
     params: Params | None = None
     mode_changes: deque[tuple[float, str]] = msgspec.field(default_factory=lambda: deque(maxlen=_MODE_CHANGES))
     plan_changed_t: float = -np.inf
+    entry: ModeEntry | None = None
+    target: tuple[float, float, float] | None = None
 
     def set_status(self, status: Status, *, record: bool = True) -> None:
         """Store a status; with `record` also its mode, where that is new."""
         if record and (self.status is None or status.mode != self.status.mode):
             self.mode_changes.append((status.t, status.mode))
         self.status = status
+
+    def enter_mode(self, entry: ModeEntry | None) -> None:
+        """Store where a mode was entered; its target is not reported yet."""
+        self.entry, self.target = entry, None
+
+    def set_target(self, target: tuple[float, float, float]) -> None:
+        """Store the guidance target of the present mode."""
+        self.target = target
 
     def set_mission(self, mission: Mission) -> None:
         """Store a mission."""
@@ -136,6 +150,8 @@ class OnboardState(msgspec.Struct):
         """Shift all changes by `step` [s]; the newest was at `plan_changed_t` by the new clock [s since 1970]."""
         self.mode_changes = deque(((t + step, mode) for t, mode in self.mode_changes), maxlen=_MODE_CHANGES)
         self.plan_changed_t = plan_changed_t
+        if self.entry is not None:
+            self.entry = msgspec.structs.replace(self.entry, t=self.entry.t + step)
 
 
 class Environment(msgspec.Struct):

@@ -1,5 +1,7 @@
 """Predict the route with every available method, and select the method used."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from fleet.window import Window
@@ -7,15 +9,11 @@ from twin_worker.confidence.calibration_table import error_growth
 from twin_worker.confidence.tube_and_horizon import AHEAD
 from twin_worker.identification.fixed_wing.plant import DYNAMICS, method
 from twin_worker.numerics.interpolation import interpolate_rows
-from twin_worker.prediction.closed_loop import (
-    InitialCondition,
-    PredictionContext,
-    Rollout,
-    fly_from,
-    synchronise_controller,
-)
+from twin_worker.prediction.closed_loop import InitialCondition, fly_from, synchronise_controller
+from twin_worker.prediction.failsafe_route import with_failsafe
 from twin_worker.prediction.fixed_wing import ensemble
 from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_point_mass
+from twin_worker.prediction.replay_window import PredictionContext, Rollout
 from twin_worker.twin.state.budget import EARLY_FRACTION, Work
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.kinematic_prediction import PathForecast, no_prediction
@@ -36,6 +34,7 @@ def predict_route(twin: Twin, window: Window, ahead: np.ndarray) -> PathForecast
     initial = synchronise_controller(situation)
     if isinstance(initial, Rollout):
         return no_prediction(initial.sentence, initial.seq)
+    initial, failsafe_text = _with_failsafe(twin, situation, initial)
     t = float(window.t[-1])
     due = twin.prediction.selector.is_due(t)
     candidates, reason = method_paths(twin, (situation, initial), ahead, due)
@@ -45,8 +44,24 @@ def predict_route(twin: Twin, window: Window, ahead: np.ndarray) -> PathForecast
         twin.prediction.selector.add(t, float(np.linalg.norm(initial.window.v[-1])), ahead, candidates)
     _update_ensemble(twin, (situation, initial))
     chosen = twin.prediction.selector.best(tuple(candidates))
-    sentence = " ".join(filter(None, (twin.prediction.selector.describe(chosen), initial.sentence)))
+    sentence = " ".join(filter(None, (failsafe_text, twin.prediction.selector.describe(chosen), initial.sentence)))
     return PathForecast(candidates[chosen], chosen, initial.controller.law, initial.seq, sentence, initial.controller)
+
+
+def _with_failsafe(twin: Twin, situation: PredictionContext, initial: InitialCondition) -> tuple[InitialCondition, str]:
+    """Return the start with the failsafe after a link loss, and its description."""
+    plan = situation.onboard.failsafe
+    if plan is None:
+        return initial, ""
+    ctl, par, legs = initial.synchronised
+
+    def position_at(ctl: np.ndarray, legs: np.ndarray, times: np.ndarray) -> np.ndarray | None:
+        start = replace(initial, synchronised=(ctl, par, legs))
+        paths, _ = method_paths(twin, (situation, start), times, False)
+        return next(iter(paths.values()), None)
+
+    ctl, legs, text = with_failsafe(ctl, legs, plan, position_at)
+    return replace(initial, synchronised=(ctl, par, legs)), text
 
 
 def method_paths(
