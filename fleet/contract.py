@@ -344,6 +344,7 @@ class Event(StrEnum):
 
     MODE = "mode"
     MISSION = "mission"
+    TARGET = "target"
     PARAMETERS = "parameters"
     TAKE_OFF = "take_off"
     LANDING = "landing"
@@ -360,6 +361,7 @@ class Event(StrEnum):
 EVENT_TEXTS: dict[Event, str] = {
     Event.MODE: "flight mode changed: previous predictions are invalid",
     Event.MISSION: "mission on board changed: previous predictions are invalid",
+    Event.TARGET: "guidance target changed: previous predictions are invalid",
     Event.PARAMETERS: "autopilot parameters changed: previous predictions are invalid",
     Event.TAKE_OFF: "take-off: predictions along the route start",
     Event.LANDING: "landing: predictions end at the touch-down point",

@@ -10,6 +10,8 @@ A leg is one row of float64 with the columns of `fleet.mission_legs`; the first 
     TAKEOFF          climb wings level to the altitude
     LAND             fly to the point; no leg follows automatically
     CHANGE_ALTITUDE  continue on the line of the previous leg until the altitude is reached
+    CONSTANT_BANK    hold a bank, at the height where the leg began
+    GLIDE            hold a bank and a pitch at idle
 
 Item 0 is home (ArduPilot), or the first to fly (PX4, whose mission does not contain home). MAVLink does not report how
 often a DO_JUMP was already taken; `fleet.mission_jumps` counts it from the reported items.
@@ -31,6 +33,8 @@ from fleet.mission_legs import (
     ABSOLUTE,
     ACCEPT_RADIUS,
     CHANGE_ALTITUDE,
+    CONSTANT_BANK,
+    GLIDE,
     GLOBAL_FRAMES,
     KIND,
     KINDS,
@@ -62,7 +66,9 @@ from fleet.mission_legs import (
 __all__ = [
     "ACCEPT_RADIUS",
     "CHANGE_ALTITUDE",
+    "CONSTANT_BANK",
     "FIRST_ITEM",
+    "GLIDE",
     "GLOBAL_FRAMES",
     "KIND",
     "KINDS",

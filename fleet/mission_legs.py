@@ -11,11 +11,14 @@ import numpy as np
 
 from fleet.contract import Item
 
-WAYPOINT, LOITER_TURNS, LOITER_UNLIMITED, LOITER_TIME, LOITER_TO_ALT, TAKEOFF, LAND, CHANGE_ALTITUDE = range(8)
-KIND = 0  # leg type, one of the eight above
+WAYPOINT, LOITER_TURNS, LOITER_UNLIMITED, LOITER_TIME, LOITER_TO_ALT = range(5)
+TAKEOFF, LAND, CHANGE_ALTITUDE, CONSTANT_BANK, GLIDE = range(5, 10)
+KIND = 0  # leg type, one of the ten above
 P_N, P_E, P_D = 1, 2, 3  # target, or centre of the circle, NED from the route's origin [m]
-RADIUS = 4  # radius of the circle, positive clockwise; 0: the autopilot's WP_LOITER_RAD [m]
-TURNS = 5  # turns; seconds for LOITER_TIME; of a return: RTL_AUTOLAND; of CHANGE_ALTITUDE: 1 climb, 2 descend, 0 either
+RADIUS = 4  # radius of the circle, positive clockwise; 0: the autopilot's WP_LOITER_RAD [m]; pitch [rad] of GLIDE
+# Turns; seconds for LOITER_TIME; of a return: RTL_AUTOLAND; of CHANGE_ALTITUDE: 1 climb, 2 descend, 0 either;
+# of CONSTANT_BANK and GLIDE: bank [rad].
+TURNS = 5
 VA_C = 6  # commanded airspeed; <= 0: cruise [m/s]
 # Acceptance radius; 0: from the parameters; negative: pass by at that distance [m]. Of a circle, ArduPlane: 1: the next
 # line starts at the exit, 0: at the centre; PX4: 1: exit only towards the next leg. Of LOITER_UNLIMITED: 1: a return.
@@ -25,6 +28,7 @@ N_COLUMNS = 9
 
 LEG_NAMES = (
     *("waypoint", "loiter turns", "loiter", "loiter time", "loiter to altitude", "takeoff", "land", "change altitude"),
+    *("bank", "glide"),
 )
 KINDS = {16: WAYPOINT, 17: LOITER_UNLIMITED, 18: LOITER_TURNS, 19: LOITER_TIME, 20: LOITER_UNLIMITED}
 KINDS |= {21: LAND, 22: TAKEOFF, 30: CHANGE_ALTITUDE, 31: LOITER_TO_ALT, 82: WAYPOINT, 84: TAKEOFF, 85: LAND}

@@ -16,7 +16,8 @@ from twin_worker.confidence.tube_and_horizon import AHEAD
 from twin_worker.prediction.autopilot_parameters import SPEED_PARAMETERS, RouteOverride, range_error
 from twin_worker.prediction.kinematic import wind_and_airspeed
 from twin_worker.telemetry.history import TelemetryHistory
-from twin_worker.twin.state.state import ROUTE_MODES, Twin
+from twin_worker.twin.state.routes import ROUTE_MODES
+from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.kinematic_prediction import recent_track
 from twin_worker.twin.steps.predict_step import predict
 
@@ -83,7 +84,7 @@ def answer_query(twin: Twin, query: WhatIf) -> Prediction:
     if query.seq is not None and query.items is None:
         _check_seq(twin, query.seq)
     changes = list(_describe_changes(twin, query))
-    on_route = not twin.no_route_reason() and bool(len(twin.telemetry.history.rows("leg")[0]))
+    on_route = not twin.no_mission_reason() and bool(len(twin.telemetry.history.rows("leg")[0]))
     if query.start is not None or query.wind is not None:
         _move_flight(twin, query)
     if query.items is not None or query.seq is not None or query.start is not None:

@@ -44,7 +44,10 @@ I_A, I_E = 43, 44  # integrators [rad of surface]
 E_A, E_E, D_A, D_E = 45, 46, 47, 48  # last errors [rad/s], filtered derivatives [rad/s2]
 S_A, S_E = 49, 50  # last surfaces before the limit, 1 = full throw
 COURSE = 51  # course of the last line, which CHANGE_ALTITUDE continues [rad]
-N_CTL = 52
+# scheduled change of the route
+SWITCH_S, SWITCH_LEG = 52, 53  # time until the next change; 0: none [s]; leg that starts then
+NEXT_S, NEXT_LEG = 54, 55  # the same of the change after it, its time from the first one on
+N_CTL = 56
 
 
 N_PAR = 72  # length of every parameter vector

@@ -13,7 +13,8 @@ import numpy as np
 
 from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane.l1 import to_roll
-from fleet.autopilots.control_law import array_kernel, clip
+from fleet.autopilots.control_law import SWITCH_S, array_kernel, clip
+from fleet.autopilots.laws import switch_when_due
 from fleet.frames import G
 from fleet.mission import KIND, LAND, VA_C
 
@@ -57,6 +58,8 @@ def follow(
         V_horizontal = sqrt(max(V * V - h_dot * h_dot, 1.0))
         v[0], v[1], v[2] = V_horizontal * cos(psi) + wind[0], V_horizontal * sin(psi) + wind[1], -h_dot
         euler[0], euler[2] = phi, psi
+        if ctl[SWITCH_S] > 0.0:
+            switch_when_due(ctl, par, legs, p, dt)
         a_lat, leg_done = leg_rules.steer(ctl, par, legs, p, v, euler, dt)
         h_sp = leg_rules.height_demand(ctl, par, legs, p)
         i = leg_rules.current_leg(ctl, legs)

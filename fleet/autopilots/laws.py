@@ -26,7 +26,11 @@ from fleet.autopilots.control_law import (
     ARDUPLANE,
     LAW,
     LEG,
+    NEXT_LEG,
+    NEXT_S,
     PX4,
+    SWITCH_LEG,
+    SWITCH_S,
     TEXTBOOK,
     W_E,
     W_N,
@@ -162,6 +166,16 @@ def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndar
 
 
 @kernel
+def switch_when_due(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndarray, dt: float) -> None:
+    """Count down to the scheduled change of the route, and start its leg at `p`, NED (3,) [m], when it is due."""
+    ctl[SWITCH_S] -= dt
+    if ctl[SWITCH_S] <= 0.0:
+        begin(ctl, par, legs, int(ctl[SWITCH_LEG]), p)
+        ctl[SWITCH_S], ctl[SWITCH_LEG] = ctl[NEXT_S], ctl[NEXT_LEG]
+        ctl[NEXT_S] = 0.0
+
+
+@kernel
 def fly(
     ctl: np.ndarray,
     par: np.ndarray,
@@ -217,6 +231,8 @@ def guide(
 
     Arguments and result as for `arduplane.guide`.
     """
+    if ctl[SWITCH_S] > 0.0:
+        switch_when_due(ctl, par, legs, p, dt)
     if law_code(par) < ARDUPLANE:
         return _guide_generic(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
     # `arduplane.guide` inlined: a further call costs 10 % of the time

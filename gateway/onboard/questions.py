@@ -88,6 +88,7 @@ class RequestScheduler:
         self._watch_t = self._timesync_t = now
         self._store_t = now - STORE_S + FIRST_STORE_S
         self._watched_item = 0
+        self._needed_download = True
         self._to = (aircraft.system, aircraft.component)
         self._since = now
         self._param_list, self._mission_list, self._home_wait = RetryTimer(3.0), RetryTimer(), RetryTimer()
@@ -113,6 +114,9 @@ class RequestScheduler:
 
     def _mission(self, now: float) -> list[Any]:
         route, missing = self.aircraft.mission, self.aircraft.mission.missing()
+        if route.needs_download and not self._needed_download:
+            self._mission_list.reset()
+        self._needed_download = route.needs_download
         if missing:
             if self._items_left == len(missing) and now - self._items_at < RETRY_S:
                 return []
@@ -152,7 +156,7 @@ class RequestScheduler:
         """Return a request for HOME_POSITION where the mission was downloaded before the autopilot had a home."""
         if not self.aircraft.mission.needs_home or not self._home_wait.due(now):
             return []
-        request = (dialect.MAV_CMD_REQUEST_MESSAGE, 0, _IDS["HOME_POSITION"], 0, 0, 0, 0, 0, 0)
+        request = (dialect.MAV_CMD_REQUEST_MESSAGE, 0, dialect.MAVLINK_MSG_ID_HOME_POSITION, 0, 0, 0, 0, 0, 0)
         return [dialect.MAVLink_command_long_message(*self._to, *request)]
 
     def _params(self, now: float) -> list[Any]:

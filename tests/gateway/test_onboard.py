@@ -108,3 +108,29 @@ def test_a_lost_aircraft_is_not_spoken_to():
     assert onboard.tick(T0, intake.aircraft.values())
     intake.flush(T0 + 10)
     assert onboard.tick(T0 + 10, intake.aircraft.values()) == []
+
+
+@pytest.mark.parametrize("sign", ["text", "count"])
+def test_a_mission_over_another_radio_is_asked_for_within_a_second(sign):
+    aircraft, intake, onboard = Aircraft(0.0), MavlinkReceiver(), RequestSender()
+    known_at = None
+    for step in range(400):
+        t = T0 + 0.1 * step
+        data = aircraft.talker.heartbeat() + aircraft.talker.attitude(500 + 0.1 * step)
+        total = len(ITEMS) - 1
+        if step >= 300:
+            total = 4
+            aircraft.voice._items = ITEMS[:5]
+        if sign == "count" and step % 5 == 0:
+            data += aircraft.talker.pack(mav.MAVLink_mission_current_message(1, total))
+        if sign == "text" and step == 301:
+            data += aircraft.talker.pack(mav.MAVLink_statustext_message(6, b"Flight plan received"))
+        intake.receive(t, data, "air")
+        for _, request in onboard.tick(t, intake.aircraft.values()):
+            for frame in aircraft.hear(request, t):
+                intake.receive(t, frame, "air")
+        intake.flush(t)
+        (craft,) = intake.aircraft.values()
+        if step >= 300 and known_at is None and craft.mission.items == ITEMS[:5]:
+            known_at = step
+    assert known_at is not None and known_at <= 315

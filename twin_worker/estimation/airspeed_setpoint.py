@@ -17,9 +17,9 @@ _MAX_CHANGE, _MAX_OFFSET = 0.04, 0.06  # largest change and largest offset, rela
 _MIN_DIFFERENCE = 0.5  # smaller differences are rounding and noise [m/s]
 
 
-def reported_setpoint(history: TelemetryHistory, t: float) -> float:
-    """Return the reported airspeed set-point just before `t`; nan if it is not reported [m/s]."""
-    t_c, command = history.rows_since("command", t - _MEDIAN_S)
+def reported_setpoint(history: TelemetryHistory, t: float, since: float = -np.inf) -> float:
+    """Return the reported airspeed set-point just before `t`; nan if it is not reported after `since` [m/s]."""
+    t_c, command = history.rows_since("command", max(t - _MEDIAN_S, since))
     t_air, air = history.rows_since("air", t - _MEDIAN_S - 2.0)
     if len(t_c) < _MIN_REPORTS or len(t_air) < _MIN_REPORTS or air[:, 0].max() < 3.0:
         return float("nan")

@@ -18,7 +18,8 @@ from twin_worker.identification.fixed_wing.derivatives_model import DerivativesM
 from twin_worker.identification.fixed_wing.point_mass_model import EffectIncrements, with_effects
 from twin_worker.mismatch.effect_increments import EffectOutputs
 from twin_worker.numerics.ridge_regression import solve_ridge
-from twin_worker.prediction.closed_loop import Rollout, synchronise_controller
+from twin_worker.prediction.closed_loop import synchronise_controller
+from twin_worker.prediction.replay_window import Rollout
 from twin_worker.telemetry.resample import Resampler
 from twin_worker.twin.state.models import ActiveEffects, Checkpoint, VerifiedModel, latest_before
 from twin_worker.twin.state.state import Twin

@@ -27,7 +27,8 @@ from twin_worker.mismatch.job import (
     with_adaptation,
 )
 from twin_worker.mismatch.process import DiagnosisProcess
-from twin_worker.twin.state.state import ROUTE_MODES, Twin
+from twin_worker.twin.state.routes import ROUTE_MODES
+from twin_worker.twin.state.state import Twin
 
 BASELINE_S = 105.0  # own past used as the comparison model [s]
 FLIGHT_S = 120.0  # flight used for a diagnosis [s]

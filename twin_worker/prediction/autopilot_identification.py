@@ -18,10 +18,12 @@ from fleet.frames import wrap
 from fleet.mission import P_D, P_N, SEQ, VA_C, WAYPOINT
 from twin_worker.estimation.airspeed_setpoint import reported_setpoint
 from twin_worker.prediction.autopilot_parameters import CRUISE_OF, fixed_wing_controller
-from twin_worker.prediction.closed_loop import PredictionContext, ReplayWindow, autopilot_wind, replay_inputs
+from twin_worker.prediction.closed_loop import autopilot_wind
+from twin_worker.prediction.replay_window import PredictionContext, ReplayWindow, replay_inputs
 
 LAW_OF_AUTOPILOT = {"ardupilot": "arduplane", "px4": "px4"}
 REPLAY_INTERVAL_S = 10.0  # interval of replays [s]
+_MIN_REPLAY_S = 5.0  # shortest flight on the present route that is replayed [s]
 _MAX_BANK_ERROR = radians(6.0)  # largest error to the commanded banks of an accepted law [rad]
 _MIN_TURN_BANK = radians(12.0)  # smaller banks do not distinguish laws [rad]
 _SMOOTHING = 0.15  # smoothing weight of the newest replay
@@ -87,7 +89,7 @@ def identify_autopilot(estimate: AutopilotEstimate, autopilot: str, context: Pre
         estimate.values = {}
         return
     replay = replay_inputs(context)
-    if not isinstance(replay, ReplayWindow):
+    if not isinstance(replay, ReplayWindow) or replay.window.seconds < _MIN_REPLAY_S:
         return
     estimate.replay_t = float(replay.window.t[-1])
     _update_banks(estimate, replay.phi_c)

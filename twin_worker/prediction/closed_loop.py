@@ -3,24 +3,18 @@
 Source: Huang 2021, section 3.4 (identical controller, same route, identified model in the loop).
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fleet.autopilots import arduplane, laws
 from fleet.autopilots.shadow import replay_controller
-from fleet.contract import Item
-from fleet.frames import Origin, wrap
-from fleet.mission import FIRST_ITEM, KIND, LAND, P_D, P_N, ROUTE_PARAMS, SPEED, TAKEOFF, Route, unroll_route
+from fleet.mission import KIND, LAND, P_D, P_N, SPEED, TAKEOFF
 from fleet.physics.simulate import N_STATE, simulate
-from fleet.process.sanitise import format_below
 from fleet.window import Window
 from twin_worker.estimation.airspeed_setpoint import apply_setpoint, inferred_setpoint, reported_setpoint
-from twin_worker.estimation.wind_filter import WindFilter
 from twin_worker.identification.fixed_wing.plant import Plant, actuator_state, bias_corrected
-from twin_worker.numerics.interpolation import interpolate_rows, zero_order_hold
+from twin_worker.numerics.interpolation import interpolate_rows
 from twin_worker.prediction.autopilot_parameters import (
     CRUISE_OF,
     ControllerTwin,
@@ -28,36 +22,13 @@ from twin_worker.prediction.autopilot_parameters import (
     fixed_wing_controller,
     transfer_controller,
 )
-from twin_worker.telemetry.history import TelemetryHistory
+from twin_worker.prediction.replay_window import PredictionContext, Rollout, replay_inputs, reported
 
 MIN_ROLLOUT_S = 60.0  # shortest valid rollout [s]
-SHADOW_S = 60.0  # telemetry for the synchronisation of the controller twin [s]
+_REPORT_DELAY_S = 0.5  # reports sooner after a mode change may be older than it [s]
+_RESET_S = 10.0  # without reports, the set-point is that of the mode change for so long [s]
 _WIND_MAX_AGE_S = 10.0  # maximum age of the autopilot's wind estimate [s]
-_ITEM_DELAY_S = 2.0  # between the mission and the telemetry that report the same item, at most [s]
-_SHADOW_STEP = 2  # window rows per shadow step
-_CACHE_SIZE = 1024  # cached routes: missions change rarely, and a route takes as long as a rollout
-JumpCounts = tuple[float, int, dict[int, int]]
-"""Time [s since 1970], the item that became current, and the jumps taken until then at each jump."""
 _NOT_MODELLED = {TAKEOFF: "take-off", LAND: "landing"}
-
-
-@dataclass(frozen=True)
-class Rollout:
-    """Simulated flight ahead, or the reason why there is none.
-
-    Attributes:
-        path: position at each requested look-ahead time, NED, (k, 3) [m]; None without a prediction
-        seq: mission item at the start
-        sentence: limitations or reason, or empty
-        diverged: the twin left its flight envelope
-        controller: the controller twin
-    """
-
-    path: np.ndarray | None
-    seq: int
-    sentence: str
-    diverged: bool = False
-    controller: ControllerTwin | None = None
 
 
 @dataclass(frozen=True)
@@ -65,7 +36,7 @@ class InitialCondition:
     """Start of rollouts of any model.
 
     Attributes:
-        window: flight on the present route
+        window: newest flight without gaps
         synchronised: synchronised state, parameters and legs of the controller twin
         state: state, current commands and inputs, and air, as for `fleet.physics.simulate`
         seq: current mission item
@@ -81,92 +52,6 @@ class InitialCondition:
     controller: ControllerTwin
 
 
-@dataclass(frozen=True)
-class AutopilotConfig:
-    """Route and parameters of the autopilot."""
-
-    items: tuple[Item, ...]
-    params: Mapping[str, float]  # received
-    changed_t: float  # when route, mode and parameters last changed [s since 1970]
-    identified: Mapping[str, float] = field(default_factory=dict)  # from flight; used if not received
-    override: RouteOverride | None = None  # what-if query, from the start on
-    autopilot: str = "ardupilot"  # reported type
-    law: str = "arduplane"  # name in `laws.LAWS`; empty: unknown
-    law_reason: str = ""  # how the law was selected, or why none is
-    jumps: tuple[JumpCounts, ...] = ()  # jumps taken after each change of the current item, oldest first
-
-    def jumps_taken(self, t: float, seq: int) -> dict[int, int]:
-        """Return the jumps taken at each jump when item `seq` was current at `t` [s since 1970]."""
-        known = [record for record in self.jumps if record[0] <= t + _ITEM_DELAY_S]
-        return next((counts for _, item, counts in reversed(known) if item == seq), known[-1][2] if known else {})
-
-
-@dataclass(frozen=True)
-class ReplayWindow:
-    """Telemetry on the present route for the replay of a control law.
-
-    Attributes:
-        window: telemetry without gaps
-        legs, start_point: route from the first current item, and the point before
-        rows: t p v euler rates Va phi_c theta_c delta, as for `shadow`
-        seq: current mission item of each row
-        altitude_m: final height above mean sea level [m]
-        sentence: problems of the route, or empty
-    """
-
-    window: Window
-    legs: np.ndarray
-    start_point: np.ndarray
-    rows: tuple[np.ndarray, ...]
-    seq: np.ndarray
-    altitude_m: float
-    sentence: str
-
-    @property
-    def t(self) -> np.ndarray:
-        """Return times since the first row, (n,) [s]."""
-        return self.rows[0]
-
-    @property
-    def p(self) -> np.ndarray:
-        """Return positions, NED, (n, 3) [m]."""
-        return self.rows[1]
-
-    @property
-    def Va(self) -> np.ndarray:
-        """Return reported airspeeds, (n,) [m/s]."""
-        return self.rows[5]
-
-    @property
-    def phi_c(self) -> np.ndarray:
-        """Return the commanded banks, (n,) [rad]."""
-        return self.rows[6]
-
-
-@dataclass(frozen=True)
-class PredictionContext:
-    """Inputs of a prediction.
-
-    Attributes:
-        window: newest resampled telemetry, at least `SHADOW_S` if available
-        history: telemetry as received
-        onboard: active route and parameters
-        wind_filter: current wind filter
-        origin: origin of the twin's NED frame
-    """
-
-    window: Window
-    history: TelemetryHistory
-    onboard: AutopilotConfig
-    wind_filter: WindFilter
-    origin: Origin
-
-
-def _reported(history: TelemetryHistory, name: str, query_t: np.ndarray, max_age: float) -> np.ndarray:
-    """Return the last reported row at each time, nan after `max_age` seconds, (len(query_t), k)."""
-    return zero_order_hold(*history.rows_since(name, query_t[0] - max_age - 1.0), query_t, max_age)
-
-
 def fly_ahead(context: PredictionContext, plant: Plant, ahead: np.ndarray) -> Rollout:
     """Predict with the identified model and the controller twin in closed loop.
 
@@ -179,60 +64,10 @@ def fly_ahead(context: PredictionContext, plant: Plant, ahead: np.ndarray) -> Ro
     return initial if isinstance(initial, Rollout) else fly_from(initial, plant, ahead)
 
 
-def replay_inputs(context: PredictionContext) -> ReplayWindow | Rollout:
-    """Return the replay data of the present route, or the reason why there are none."""
-    window = _window_on_route(context.window, context.onboard.changed_t)
-    if len(window) < 5.0 / window.dt:
-        return Rollout(None, -1, f"{format_below(window.seconds, 5.0)} s on this route, 5 s are needed; wait")
-    stride = slice((len(window) - 1) % _SHADOW_STEP, None, _SHADOW_STEP)
-    times = window.t[stride]
-    seq = _reported(context.history, "leg", times, 15.0)[:, 0]
-    if not np.isfinite(seq[-1]):
-        return Rollout(None, -1, "the current mission item is not reported (MISSION_CURRENT)")
-    seq = np.where(np.isfinite(seq), seq, seq[np.isfinite(seq)][0]).astype(np.int64)
-    onboard = context.onboard
-    first = FIRST_ITEM.get(onboard.autopilot, 1)
-    jumps = onboard.jumps_taken(float(times[0]), int(seq[0]))
-    mission_route = cached_route(onboard.items, int(seq[0]), context.origin, onboard.params, first, jumps)
-    problem = mission_route.summary
-    if not len(mission_route.legs):
-        return Rollout(None, int(seq[-1]), problem or "the mission has no legs to fly")
-    start_point = mission_route.start if np.isfinite(mission_route.start).all() else window.p[0]
-    altitude = context.origin.alt_mm * 1e-3 - float(window.p[-1, 2])
-    return ReplayWindow(
-        window, mission_route.legs, start_point, _replay_rows(window, stride, context.history), seq, altitude, problem
-    )
-
-
-def cached_route(
-    items: tuple[Item, ...],
-    seq: int,
-    origin: Origin,
-    params: Mapping[str, float],
-    first: int,
-    jumps: Mapping[int, int] | None = None,
-) -> Route:
-    """Return the cached, read-only result of `fleet.mission.unroll_route`: legs from item `seq` on."""
-    used = tuple((name, params[name]) for name in ROUTE_PARAMS if name in params)
-    return _cached_route(items, seq, origin, used, first, tuple((jumps or {}).items()))
-
-
-@lru_cache(maxsize=_CACHE_SIZE)
-def _cached_route(
-    items: tuple[Item, ...],
-    seq: int,
-    origin: Origin,
-    params: tuple[tuple[str, float], ...],
-    first: int,
-    jumps: tuple[tuple[int, int], ...],
-) -> Route:
-    return unroll_route(items, seq=seq, origin=origin, params=dict(params), first=first, jumps_taken=dict(jumps))
-
-
 def autopilot_wind(context: PredictionContext, window: Window) -> tuple[float, float]:
     """Return the wind estimate of the autopilot if reported, else of the twin, NED [m/s]."""
-    reported = _reported(context.history, "wind", window.t[-1:], _WIND_MAX_AGE_S)[0]
-    w_n, w_e = reported if np.isfinite(reported).all() else context.wind_filter.wind[:2]
+    latest = reported(context.history, "wind", window.t[-1:], _WIND_MAX_AGE_S)[0]
+    w_n, w_e = latest if np.isfinite(latest).all() else context.wind_filter.wind[:2]
     return float(w_n), float(w_e)
 
 
@@ -251,7 +86,7 @@ def synchronise_controller(context: PredictionContext) -> InitialCondition | Rol
     ctl, _ = replay_controller(par, legs, replay.start_point, *replay.rows, replay.seq)  # type: ignore[call-arg]
     sentence = " ".join(filter(None, (onboard.law_reason, replay.sentence)))
     initial = InitialCondition(
-        replay.window, (ctl, par, legs), _simulation_state(context, replay.window), seq, sentence, controller
+        replay.flight, (ctl, par, legs), _simulation_state(context, replay.flight), seq, sentence, controller
     )
     if onboard.override is not None:
         initial = _apply_override(context, initial, onboard.override, setpoint)
@@ -261,10 +96,17 @@ def synchronise_controller(context: PredictionContext) -> InitialCondition | Rol
 
 
 def _airspeed_setpoint(context: PredictionContext, t: float, cruise: float) -> float:
-    """Return the airspeed set-point: reported, else the flown one of the mission speeds; nan if unknown [m/s]."""
-    setpoint = reported_setpoint(context.history, t)
+    """Return the airspeed set-point: reported, else the flown one of the mission speeds; nan if unknown [m/s].
+
+    A mode change resets the set-point of ArduPlane to cruise.
+    """
+    entry = context.onboard.entry
+    entered_t = -np.inf if entry is None else entry.t
+    setpoint = reported_setpoint(context.history, t, entered_t + _REPORT_DELAY_S)
     if np.isfinite(setpoint):
         return setpoint
+    if context.onboard.law == "arduplane" and t < entered_t + _RESET_S:
+        return cruise
     mission_speeds = {
         item.param2 for item in context.onboard.items if item.command == SPEED and 0 < item.param2 < np.inf
     }
@@ -362,38 +204,10 @@ def _hold_after_touchdown(p: np.ndarray, ctl: np.ndarray, legs: np.ndarray) -> b
     return touchdown_row < len(p)
 
 
-def _window_on_route(window: Window, changed_t: float) -> Window:
-    """Return the gap-free flight on the present route, at most `SHADOW_S`."""
-    start = max(int(np.searchsorted(window.t, changed_t)), len(window) - int(SHADOW_S / window.dt))
-    invalid_rows = np.flatnonzero(~window.ok)
-    start = max(start, int(invalid_rows[-1]) + 1 if len(invalid_rows) else 0)
-    return window.part(min(start, len(window) - 2), len(window))
-
-
-def _replay_rows(window: Window, stride: slice, history: TelemetryHistory) -> tuple[np.ndarray, ...]:
-    """Return the synchronisation data at some rows: t p v euler rates Va phi_c theta_c delta."""
-    times = window.t[stride]
-    command, Va = _reported(history, "command", times, 1.0), _reported(history, "air", times, 1.0)[:, 0]
-    euler, rates = window.x[stride, 6:9].copy(), window.x[stride, 3:6]
-    euler[:, 2] = wrap(euler[:, 2])
-    rows = (
-        times - times[0],
-        window.p[stride],
-        window.v[stride],
-        euler,
-        rates,
-        Va,
-        command[:, 0],
-        command[:, 1],
-        window.u[stride],
-    )
-    return tuple(np.ascontiguousarray(row) for row in rows)
-
-
 def _simulation_state(context: PredictionContext, window: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return state (12,), current commands and inputs (6,) and air (4,) at the end of the window."""
     state = np.concatenate([window.p[-1], window.x[-3:, :6].mean(axis=0), window.x[-1, 6:]])
-    command = _reported(context.history, "command", window.t[-1:], 1.0)[0, :2]
+    command = reported(context.history, "command", window.t[-1:], 1.0)[0, :2]
     command = np.where(np.isfinite(command), command, window.x[-1, 6:8])
     command = np.concatenate([command, actuator_state(window)])
     return state, command, np.array([*context.wind_filter.wind[:2], context.wind_filter.scale, _gust(context, window)])

@@ -12,6 +12,7 @@ import numpy as np
 from fleet.autopilots import arduplane
 from fleet.autopilots import greybox as law
 from fleet.autopilots.arduplane import params as P
+from fleet.autopilots.modes import NO_ITEM, ModeEntry
 from fleet.autopilots.shadow import replay_controller
 from fleet.contract import Item
 from fleet.frames import G, Origin
@@ -25,10 +26,12 @@ from twin_worker.prediction.autopilot_parameters import (
     fixed_wing_controller,
     transfer_controller,
 )
-from twin_worker.prediction.closed_loop import cached_route
+from twin_worker.prediction.failsafe_route import FailsafePlan, with_failsafe
+from twin_worker.prediction.replay_window import MAX_EARLY_S, cached_route, leg_start
+from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.track import STEP, Track
 
-MIN_TRACK_S = 5.0  # minimum track on this route [s]
+MIN_TRACK_S = 5.0  # minimum track without gaps [s]
 _SYNC_S = 60.0  # flight for the synchronisation of the guidance [s]
 _COMPARE_S, _START_INTERVAL_S, _RUN_S = 80.0, 8.0, 20.0  # compared flight, interval of starts, length of a rollout [s]
 _PERIOD_VALUES = (9.0, 12.0, 16.0, 20.0, 26.0)  # NAVL1_PERIOD tried if not received [s]
@@ -65,6 +68,10 @@ class KinematicConfig:
     wind: np.ndarray | None  # NED, (3,) [m/s]; None: no airspeed received
     override: RouteOverride | None = None  # what-if query, from the start on
     first_item: int = 1  # number of the first mission item to fly
+    entry: ModeEntry | None = None  # where the mode was entered
+    mode_route: Route | None = None  # of a mode without mission, which replaces the items
+    history: TelemetryHistory | None = None  # reported mission items
+    failsafe: FailsafePlan | None = None  # after a link loss
 
 
 @dataclass(frozen=True)
@@ -107,37 +114,45 @@ def fly(
         config, model: configuration of the autopilot, and the identified model
         ahead: requested look-ahead times, (k,) [s]
     """
-    first = max(int(np.searchsorted(track.t, config.changed_t)), len(track) - int(_SYNC_S / STEP))
-    invalid_rows = np.flatnonzero(~track.ok | ~np.isfinite(seq))
-    first = max(first, int(invalid_rows[-1]) + 1 if len(invalid_rows) else 0)
-    if len(track) - first < MIN_TRACK_S / STEP:
-        reported = len(track) and np.isfinite(seq[-1])
-        reason = (
-            f"{format_below(max(len(track) - first, 0) * STEP, MIN_TRACK_S)} s on this route, {MIN_TRACK_S:.0f} s "
-            "are needed; wait"
-        )
-        return KinematicRollout(
-            None, -1, reason if reported else "the current mission item is not reported (MISSION_CURRENT)"
-        )
-    recent = track.part(first, len(track))
-    return _fly_route(recent, seq[first:].astype(np.int64), config, model, ahead)
+    invalid_rows = np.flatnonzero(~track.ok)
+    flown = track.part(int(invalid_rows[-1]) + 1 if len(invalid_rows) else 0, len(track))
+    if len(flown) < MIN_TRACK_S / STEP:
+        reason = f"{format_below(len(flown) * STEP, MIN_TRACK_S)} s without gaps, {MIN_TRACK_S:.0f} s are needed; wait"
+        return KinematicRollout(None, -1, reason)
+    if flown.t[-1] < config.changed_t - MAX_EARLY_S:
+        return KinematicRollout(None, -1, "the route changed after this telemetry")
+    seq = seq[-len(flown) :] if config.mode_route is None else np.full(len(flown), NO_ITEM)
+    first = max(int(np.searchsorted(flown.t, config.changed_t)), len(flown) - int(_SYNC_S / STEP))
+    unknown_rows = np.flatnonzero(~np.isfinite(seq))
+    first = max(min(first, len(flown) - 2), int(unknown_rows[-1]) + 1 if len(unknown_rows) else 0)
+    if first >= len(flown):
+        return KinematicRollout(None, -1, "the current mission item is not reported (MISSION_CURRENT)")
+    return _fly_route(flown, first, seq[first:].astype(np.int64), (config, model), ahead)
 
 
 def _fly_route(
-    recent: Track, seq: np.ndarray, config: KinematicConfig, model: KinematicModel, ahead: np.ndarray
+    flown: Track, first: int, seq: np.ndarray, options: tuple[KinematicConfig, KinematicModel], ahead: np.ndarray
 ) -> KinematicRollout:
+    """Predict from the end of `flown`, which is on the present route from row `first` on, with the items `seq`."""
+    config, model = options
+    recent = flown.part(first, len(flown))
     controller = fixed_wing_controller(config.params, model.identified, sentence=law.LAW)
     par = controller.par(_altitude(recent, config))
-    mission_route = cached_route(config.items, int(seq[0]), config.origin, config.params, config.first_item)
+    mission_route = config.mode_route or cached_route(
+        config.items, int(seq[0]), config.origin, config.params, config.first_item
+    )
     if not len(mission_route.legs):
         return KinematicRollout(None, int(seq[-1]), mission_route.summary or "the mission has no legs to fly")
-    w, V = wind_and_airspeed(recent, config.wind)
+    w, V = wind_and_airspeed(flown, config.wind)
     if V < _MIN_AIRSPEED or np.linalg.norm(recent.v[-1] - [*w, 0.0]) < _MIN_AIRSPEED:
         return KinematicRollout(None, int(seq[-1]), "too slow to fly on wings")
-    start_point = mission_route.start if np.isfinite(mission_route.start).all() else recent.p[0]
+    start_point = mission_route.start
+    if config.mode_route is None:
+        at = int(seq[0]), float(recent.t[0]), recent.p[0]
+        start_point = leg_start(mission_route, config.entry, config.history, at)
     ctl = _synchronise(recent, seq, (par, mission_route.legs, start_point), w)
     lags = _lag_parameters(
-        recent, mission_route.legs[int(ctl[arduplane.LEG])], par, controller.default_names, (model, V)
+        flown, mission_route.legs[int(ctl[arduplane.LEG])], par, controller.default_names, (model, V)
     )
     guidance = _RouteGuidance(ctl, par, mission_route, lags, controller)
     if config.override is not None:
@@ -146,13 +161,22 @@ def _fly_route(
         return KinematicRollout(None, int(seq[-1]), guidance.route.summary or "the mission has no legs to fly")
     if int(guidance.route.legs[int(guidance.ctl[arduplane.LEG]), KIND]) == TAKEOFF:
         return KinematicRollout(None, int(seq[-1]), "take-off is not modelled: no route-aware prediction")
-    state, out = _state(recent, w), np.empty((int(ahead[-1] / STEP) + 2, 3))
+    state, sentence = _state(flown, w), guidance.route.summary
     if config.override is not None and config.override.speed is not None:
         state[3] = config.override.speed
-    law.follow(guidance.ctl, guidance.par, guidance.route.legs, guidance.lags, state, w, STEP, out)
-    path = interpolate_rows(ahead, STEP * np.arange(len(out)), out)
+
+    def path_of(ctl: np.ndarray, legs: np.ndarray, times: np.ndarray) -> np.ndarray:
+        out = np.empty((int(times[-1] / STEP) + 2, 3))
+        law.follow(ctl.copy(), guidance.par, legs, guidance.lags, state, w, STEP, out)
+        return interpolate_rows(times, STEP * np.arange(len(out)), out)
+
+    ctl, legs = guidance.ctl, guidance.route.legs
+    if config.failsafe is not None:
+        ctl, legs, failsafe_text = with_failsafe(ctl, legs, config.failsafe, path_of)
+        sentence = " ".join(filter(None, (failsafe_text, sentence)))
+    path = path_of(ctl, legs, ahead)
     start_seq = int(seq[-1]) if config.override is None else config.override.seq
-    return KinematicRollout(path, start_seq, guidance.route.summary, guidance.controller)
+    return KinematicRollout(path, start_seq, sentence, guidance.controller)
 
 
 @dataclass(frozen=True)

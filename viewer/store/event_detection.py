@@ -199,6 +199,7 @@ def _model(state: DetectorState, model: Model) -> Detection:
 
 
 _PREDICTION_EVENTS = {  # events in predictions; other messages report modes, missions and the link sooner
+    Event.TARGET: EventKind.MODE,
     Event.PARAMETERS: EventKind.PARAMETERS,
     Event.TAKE_OFF: EventKind.TAKE_OFF,
     Event.LANDING: EventKind.LANDING,

@@ -10,7 +10,7 @@ from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.control_law import array_kernel, clip, kernel
 from fleet.frames import G
-from fleet.mission import VA_C
+from fleet.mission import GLIDE, KIND, RADIUS, VA_C
 
 FULL_THROW = radians(45.0)  # full throw [rad]
 _P, _I, _D, _IMAX, _FLTT, _FLTD = 1, 2, 3, 4, 5, 6  # offsets of the gains from FF in `par`, for roll and pitch
@@ -162,6 +162,9 @@ def fly(
     demand.update_speed(ctl, par, v, euler, Va, Va_dot, dt)
     va_c, no_airspeed = commanded_airspeed(ctl, par, legs), not np.isfinite(Va)
     theta_c, delta_t = tecs.update(ctl, par, h_sp, va_c, -p[2], -v[2], euler[0], no_airspeed, dt)
+    i = leg_rules.current_leg(ctl, legs)
+    if i >= 0 and int(legs[i, KIND]) == GLIDE:
+        theta_c, delta_t = legs[i, RADIUS], par[P.THR_MIN]
     return phi_c, theta_c, delta_t, leg_done
 
 

@@ -6,7 +6,7 @@ after a takeoff and a change of mode there is no line, and the aircraft flies di
 Source: ArduPlane mission commands, waypoint switching, loiter exits and altitude slope.
 """
 
-from math import asin, atan2, ceil, cos, pi, sin
+from math import asin, atan2, ceil, cos, pi, sin, tan
 
 import numpy as np
 
@@ -15,10 +15,12 @@ from fleet.autopilots import control_law as kernels
 from fleet.autopilots.arduplane import l1
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.control_law import hypot, kernel
-from fleet.frames import wrap
+from fleet.frames import G, wrap
 from fleet.mission import (
     ACCEPT_RADIUS,
     CHANGE_ALTITUDE,
+    CONSTANT_BANK,
+    GLIDE,
     KIND,
     LAND,
     LOITER_TIME,
@@ -167,6 +169,8 @@ def steer(
     kind = int(leg[KIND])
     if kind == TAKEOFF:
         return 0.0, p[2] <= leg[P_D]
+    if kind in (CONSTANT_BANK, GLIDE):
+        return G * cos(euler[1]) * tan(leg[TURNS]), False
     line = (ctl[S.PREV_N], ctl[S.PREV_E], leg[P_N], leg[P_E])
     if kind == CHANGE_ALTITUDE:
         a_lat = l1.follow_line(ctl, par, _extended_line(ctl, p), p, v, euler[2], dt)
@@ -301,6 +305,8 @@ def height_demand(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndar
     leg = legs[i]
     h, rise = -leg[P_D], ctl[S.PREV_D] - leg[P_D]
     immediate = int(par[P.OPTIONS]) & _CLIMB_AT_ONCE != 0 or is_return(leg)
+    if int(leg[KIND]) in (CONSTANT_BANK, GLIDE):
+        return -ctl[S.PREV_D]
     if (
         int(leg[KIND]) in (TAKEOFF, CHANGE_ALTITUDE)
         or par[P.SLOPE_MIN] <= 0.0

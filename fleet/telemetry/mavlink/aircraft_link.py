@@ -20,6 +20,7 @@ LINK_LOST_S = 3.0  # silence after which the link is lost [s]
 STATUS_PERIOD_S = 0.95  # period of status messages; below 1 s because it is checked every 0.1 s [s]
 TEXT_LIFETIME_S = 30.0  # display time of an operator text [s]
 MAX_ERROR_SEVERITY = 3  # texts up to this severity are shown to the operator (MAV_SEVERITY_ERROR)
+MISSION_RECEIVED = "Flight plan received"  # text of ArduPilot after an upload by any ground station
 MAX_TEXTS = 2_000
 _FIRMWARE_TEXTS = ("ArduPlane V", "ArduCopter V", "APM:", "PX4 v", "Blimp V", "ArduRover V")  # autopilot and version
 
@@ -174,6 +175,8 @@ class AircraftLink:
 
     def _process_text(self, severity: int, text: str, now: float) -> None:
         self.texts.append((now, severity, text))
+        if text.startswith(MISSION_RECEIVED):
+            self.mission.mark_replaced()
         if text.startswith(_FIRMWARE_TEXTS):
             self.firmware = self.firmware or text
         if severity <= MAX_ERROR_SEVERITY:

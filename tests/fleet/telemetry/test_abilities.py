@@ -24,7 +24,7 @@ from twin_worker.evaluation.replay import run_offline
 from twin_worker.prediction import method_selection as turn_rate
 from twin_worker.telemetry import resample
 from twin_worker.telemetry.history import TelemetryHistory
-from twin_worker.twin.state import flight_phase, state
+from twin_worker.twin.state import flight_phase, routes
 from twin_worker.twin.steps import identify_step
 from twin_worker.validation import verify
 
@@ -37,7 +37,7 @@ def test_the_figures_are_those_the_twin_works_by():
         max(identify_step._WINDOW_LIMITS_S[1] + most, identify_step._PAPER_WINDOW_S + papers) == needs.MAX_IDENTIFY_S
         and least < papers < most
     )
-    assert state.ROUTE_MODES == needs.ROUTE_MODES
+    assert routes.ROUTE_MODES == needs.ROUTE_MODES
     assert min(verify.HORIZONS_S) == needs.MIN_STRETCH_S
     assert verify._STEADY_STD == needs.MIN_EXCITATION
     assert max(4 * turn_rate.STEP, 50 * resample.DT) == needs.TURN_RATE_S

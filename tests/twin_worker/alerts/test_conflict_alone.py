@@ -18,7 +18,7 @@ from twin_worker.alerts.gaussian_forecast import axis_z, to_gaussian
 from twin_worker.alerts.geofence import GeofenceLimits, geofence_hazard, ground_hazard, read_geofence
 from twin_worker.alerts.hysteresis import RULES, AlertState, HazardEstimate
 from twin_worker.twin.step import Twin, advance
-from twin_worker.twin.steps.alerts import home, prediction_alerts
+from twin_worker.twin.steps.alerts import prediction_alerts
 
 NAN, INF = float("nan"), float("inf")
 KINDS = tuple(RULES)
@@ -321,12 +321,12 @@ def test_a_fence_from_parameters_is_watched() -> None:
 
 def test_home_is_item_0_or_where_it_stood() -> None:
     twin = flying()
-    assert home(twin) == HERE
+    assert twin.home == HERE
     twin.onboard.status = msgspec.structs.replace(twin.onboard.status, autopilot="px4")
-    assert home(twin) is None
+    assert twin.home is None
     twin.onboard.status = msgspec.structs.replace(twin.onboard.status, armed=False)
     told(twin, None, 1)
-    stood = home(twin)
+    stood = twin.home
     assert stood is not None and abs(stood.alt_mm - HERE.alt_mm - 100_000) < 100
 
 

@@ -12,7 +12,7 @@ from tests.support.point_mass import PLANE, Plane, begin, fly, leg, route
 from twin_worker.estimation.wind_filter import WindFilter
 from twin_worker.prediction import autopilot_identification as learning
 from twin_worker.prediction.autopilot_identification import AutopilotEstimate, identify_autopilot
-from twin_worker.prediction.closed_loop import AutopilotConfig, PredictionContext, ReplayWindow
+from twin_worker.prediction.replay_window import AutopilotConfig, PredictionContext, ReplayWindow
 
 OURS = {
     "arduplane": PLANE | {"NAVL1_PERIOD": 15},

@@ -12,7 +12,8 @@ from tests.support.flights import DT, HERE, SPEED, T0, item, truth
 from twin_worker.estimation.wind_filter import WindFilter
 from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.prediction import closed_loop
-from twin_worker.prediction.closed_loop import AutopilotConfig, PredictionContext, fly_ahead
+from twin_worker.prediction.closed_loop import fly_ahead
+from twin_worker.prediction.replay_window import AutopilotConfig, PredictionContext
 
 AHEAD = np.arange(0.0, 31.0)
 FLOWN_S = 30.0

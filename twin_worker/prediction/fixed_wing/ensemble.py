@@ -8,12 +8,13 @@ import numpy as np
 from fleet.physics import point_mass as H
 from twin_worker.confidence.tube_and_horizon import track_frame
 from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel
-from twin_worker.prediction.closed_loop import InitialCondition, PredictionContext
+from twin_worker.prediction.closed_loop import InitialCondition
 from twin_worker.prediction.fixed_wing.point_mass_rollout import (
     model_ground_velocity,
     start_and_air,
     unexplained_velocity,
 )
+from twin_worker.prediction.replay_window import PredictionContext
 
 MEMBERS = 24
 _MIN_SURVIVING = 0.5  # minimum fraction of members that stay in their envelope [-]

@@ -8,7 +8,8 @@ from fleet.physics import point_mass as H
 from fleet.window import Window
 from twin_worker.estimation.wind_filter import DRIFT, DRIFT_S, GUST, GUST_S
 from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel, airspeed_of
-from twin_worker.prediction.closed_loop import InitialCondition, PredictionContext, Rollout, sample_rollout
+from twin_worker.prediction.closed_loop import InitialCondition, sample_rollout
+from twin_worker.prediction.replay_window import PredictionContext, Rollout
 
 _AIRSPEED_ROWS = 8  # rows of 0.1 s in the mean airspeed at the start
 _WINDOW_ROWS = 60  # rows of the window that they use

@@ -6,12 +6,13 @@ import msgspec
 import numpy as np
 
 from fleet.airframes.airframe import ServoMap, servo_map
+from fleet.autopilots.modes import ModeEntry
 from fleet.contract import Item, Mission, Params, Sample, Status
 from fleet.frames import Origin
 from fleet.mission_jumps import JUMPS, count_jumps, resets_counters
 from twin_worker.estimation.wind_filter import WindFilter, update_from_history
 from twin_worker.prediction.autopilot_identification import AutopilotEstimate
-from twin_worker.prediction.closed_loop import JumpCounts
+from twin_worker.prediction.replay_window import JumpCounts
 from twin_worker.telemetry.history import ArrivalDelay, TelemetryHistory
 from twin_worker.telemetry.resample import Resampler
 from twin_worker.twin.state.flight_phase import FlightPhase
@@ -121,6 +122,9 @@ class OnboardState(msgspec.Struct):
         plan_changed_t: last change of mode, mission or parameters [s since 1970]
         received_items: items of the newest mission as received, before home was completed
         jumps: jumps taken at each jump after each change of the current item, oldest first
+        entry: where the present mode was entered; None: before telemetry began
+        target: newest guidance target in a mode that flies to it, latitude, longitude, height [1e-7 deg, mm]; None:
+            none reported in this mode
     """
 
     status: Status | None = None
@@ -130,12 +134,22 @@ class OnboardState(msgspec.Struct):
     plan_changed_t: float = -np.inf
     received_items: tuple[Item, ...] = ()
     jumps: deque[JumpCounts] = msgspec.field(default_factory=lambda: deque(maxlen=_ITEM_CHANGES))
+    entry: ModeEntry | None = None
+    target: tuple[float, float, float] | None = None
 
     def set_status(self, status: Status, *, record: bool = True) -> None:
         """Store a status; with `record` also its mode, where that is new."""
         if record and (self.status is None or status.mode != self.status.mode):
             self.mode_changes.append((status.t, status.mode))
         self.status = status
+
+    def enter_mode(self, entry: ModeEntry | None) -> None:
+        """Store where a mode was entered; its target is not reported yet."""
+        self.entry, self.target = entry, None
+
+    def set_target(self, target: tuple[float, float, float]) -> None:
+        """Store the guidance target of the present mode."""
+        self.target = target
 
     def set_mission(self, mission: Mission, first: int) -> None:
         """Store a mission as received, and count its jumps; `first`: number of its first item to fly."""
@@ -176,6 +190,8 @@ class OnboardState(msgspec.Struct):
         self.mode_changes = deque(((t + step, mode) for t, mode in self.mode_changes), maxlen=_MODE_CHANGES)
         self.plan_changed_t = plan_changed_t
         self.jumps = deque(((t + step, seq, taken) for t, seq, taken in self.jumps), maxlen=_ITEM_CHANGES)
+        if self.entry is not None:
+            self.entry = msgspec.structs.replace(self.entry, t=self.entry.t + step)
 
 
 class Environment(msgspec.Struct):

@@ -52,6 +52,11 @@ class PredictionState(msgspec.Struct):
         """Store the state to publish."""
         self.state = state
 
+    def set_learning_state(self, state: TwinState) -> None:
+        """Store the state of the identification, which is less than a prediction along a route without its model."""
+        if self.state in (TwinState.WAITING, TwinState.IDENTIFYING):
+            self.state = state
+
     def publish(self, prediction: Prediction) -> None:
         """Store a prediction."""
         self.latest = prediction

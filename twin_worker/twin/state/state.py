@@ -19,24 +19,25 @@ from fleet.contract import (
     Status,
     Verdict,
 )
+from fleet.frames import Origin
 from fleet.mission import FIRST_ITEM
 from fleet.vehicles import UNKNOWN, VehicleClass, vehicle_class
 from fleet.window import Window
 from twin_worker.prediction.autopilot_identification import LAW_OF_AUTOPILOT
-from twin_worker.prediction.closed_loop import AutopilotConfig, PredictionContext
+from twin_worker.prediction.replay_window import AutopilotConfig, PredictionContext
 from twin_worker.twin.state.budget import ComputeBudget, Schedule, Work
 from twin_worker.twin.state.events import invalidate_prediction
 from twin_worker.twin.state.home import complete_home
 from twin_worker.twin.state.inputs import Environment, OnboardState, Telemetry
 from twin_worker.twin.state.models import Identification, ModelBank
 from twin_worker.twin.state.outputs import AlertingState, ConfidenceState, PredictionState
+from twin_worker.twin.state.routes import ROUTE_MODES, failsafe_plan, mode_entry, present_route, update_target
 from twin_worker.validation.verify import FIT_THRESHOLD
 
 _CONTROLLER_PREFIXES = ("FW_", "MPC_", "NAV_", "NPFG_", "Q_WP_", "RTL_", "WPNAV_", "WP_")  # not ArduPlane
 _ARDUPLANE_NAMES = {name for row in arduplane.TABLE for name in (row.name, *(older for older, _ in row.old_names))}
 _MAX_NAMED = 3  # maximum number of changed parameters in the text
 AUTO = "auto"  # use the prediction method with the lowest error
-ROUTE_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
 
 
 def changed_parameters(before: Mapping[str, float], after: Mapping[str, float]) -> list[str]:
@@ -178,17 +179,41 @@ class Twin(msgspec.Struct):
             self.autopilot,
             law,
             self.environment.autopilot.reason,
+            self.onboard.entry,
+            present_route(self),
+            failsafe_plan(self),
             tuple(self.onboard.jumps),
         )
         return PredictionContext(
             window, self.telemetry.history, autopilot_config, self.environment.wind, self.telemetry.origin
         )
 
+    @property
+    def mode(self) -> str:
+        """Return the flight mode from the heartbeat, e.g. AUTO; empty: unknown."""
+        return self.onboard.status.mode if self.onboard.status else ""
+
+    @property
+    def home(self) -> Origin | None:
+        """Return home: item 0 of an ArduPilot mission, else the last disarmed position; None if unknown."""
+        items = self.onboard.mission.items if self.onboard.mission is not None else ()
+        first = next((item for item in items if item.seq == 0), None)
+        ardupilot = self.onboard.status is not None and self.onboard.status.autopilot == "ardupilot"
+        if first is None or not ardupilot or not (first.lat_e7 or first.lon_e7) or not abs(first.alt_m) < 1e5:
+            return self.alerts.home_fallback
+        return Origin(first.lat_e7, first.lon_e7, round(first.alt_m * 1e3))
+
     def no_route_reason(self) -> str:
+        """Return why the aircraft follows no known route; empty if it does."""
+        route = None if self.mode in ROUTE_MODES else present_route(self)
+        if route is None:
+            return self.no_mission_reason()
+        return "" if len(route.legs) else f"mode {self.mode}: {route.summary}"
+
+    def no_mission_reason(self) -> str:
         """Return why the aircraft follows no mission; empty if it does."""
-        mode = self.onboard.status.mode if self.onboard.status else ""
-        if mode not in ROUTE_MODES:
-            return f"mode {mode or 'unknown'} follows no mission"
+        if self.mode not in ROUTE_MODES:
+            return f"mode {self.mode or 'unknown'} follows no mission"
         if self.onboard.mission is None or not self.onboard.mission.items:
             return "no mission on board"
         return ""
@@ -198,6 +223,8 @@ def ingest(twin: Twin, message: Message) -> None:
     """Ingest one message from the gateway."""
     if isinstance(message, Sample):
         twin.telemetry.add(message)
+        if message.target is not None:
+            update_target(twin, message.target)
     elif isinstance(message, Status):
         _ingest_status(twin, message)
     elif isinstance(message, Mission):
@@ -228,6 +255,7 @@ def _ingest_status(twin: Twin, status: Status) -> None:
     if 0 < (step := status.clock_advance_s - previous.clock_advance_s) < np.inf:
         _shift_clock(twin, step)
     if status.mode != previous.mode:
+        twin.onboard.enter_mode(mode_entry(twin, status.t))
         details = f"{status.mode[:20]}, previously {previous.mode[:20]}"
         invalidate_prediction(twin, Event.MODE if previous.mode else None, status.t, details)
 

@@ -16,8 +16,8 @@ from twin_worker.alerts.geofence import (
 )
 from twin_worker.alerts.hysteresis import HazardEstimate
 from twin_worker.confidence.table_files import UNCALIBRATED
-from twin_worker.prediction.closed_loop import cached_route
 from twin_worker.prediction.multirotor.rollout import RETURN_MODES
+from twin_worker.prediction.replay_window import cached_route
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.kinematic_prediction import is_hovering
 
@@ -78,19 +78,9 @@ def _update_home_fallback(twin: Twin) -> None:
     twin.alerts.disarmed_at(Origin(*map(int, position[-1])) if len(position) else None)
 
 
-def home(twin: Twin) -> Origin | None:
-    """Return home: item 0 of an ArduPilot mission, else the last disarmed position; None if unknown."""
-    items = twin.onboard.mission.items if twin.onboard.mission is not None else ()
-    first = next((item for item in items if item.seq == 0), None)
-    ardupilot = twin.onboard.status is not None and twin.onboard.status.autopilot == "ardupilot"
-    if first is None or not ardupilot or not (first.lat_e7 or first.lon_e7) or not abs(first.alt_m) < 1e5:
-        return twin.alerts.home_fallback
-    return Origin(first.lat_e7, first.lon_e7, round(first.alt_m * 1e3))
-
-
 def _ground_and_geofence(twin: Twin, gaussian: GaussianForecast) -> list[HazardEstimate]:
     """Evaluate ground clearance and geofence; neither without a home position."""
-    home_origin, on_rotors = home(twin), is_hovering(twin)
+    home_origin, on_rotors = twin.home, is_hovering(twin)
     if home_origin is None:
         return [_not_predicted(AlertKind.GROUND), _not_predicted(AlertKind.GEOFENCE)]
     margin = MIN_HEIGHT_ROTORS_M if on_rotors else MIN_HEIGHT_WINGS_M
@@ -125,7 +115,7 @@ def _is_landing(twin: Twin, on_rotors: bool) -> bool:
     mode = twin.onboard.status.mode if twin.onboard.status is not None else ""
     if "LAND" in mode or (on_rotors and mode in RETURN_MODES):
         return True
-    if twin.no_route_reason() or twin.onboard.mission is None:
+    if twin.no_mission_reason() or twin.onboard.mission is None:
         return False
     items = sorted(twin.onboard.mission.items, key=lambda item: item.seq)
     commands = [item.command for item in items if item.seq >= twin.onboard.mission.seq]
@@ -153,7 +143,7 @@ def _mission_feasibility(twin: Twin, now: float) -> HazardEstimate:
     """Evaluate the feasibility of the legs ahead for a fixed wing that follows its mission."""
     no_alert = HazardEstimate(AlertKind.NOT_ACHIEVABLE, 0.0, "", "the mission is achievable")
     _, position = twin.telemetry.history.rows_since("position", twin.telemetry.history.newest - 3.0)
-    if not twin.vehicle_class.has_wings or twin.no_route_reason() or is_hovering(twin) or not len(position):
+    if not twin.vehicle_class.has_wings or twin.no_mission_reason() or is_hovering(twin) or not len(position):
         return no_alert
     assert twin.telemetry.origin is not None and twin.onboard.mission is not None
     if twin.onboard.mission.seq < twin.first_item:

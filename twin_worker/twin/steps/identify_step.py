@@ -13,7 +13,8 @@ from twin_worker.identification.fixed_wing import derivatives_model
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel, linearise
 from twin_worker.identification.fixed_wing.plant import PAPER, Plant
 from twin_worker.identification.linear.linear_model import AXES, identify_axis
-from twin_worker.prediction.closed_loop import InitialCondition, Rollout, fly_from, synchronise_controller
+from twin_worker.prediction.closed_loop import InitialCondition, fly_from, synchronise_controller
+from twin_worker.prediction.replay_window import Rollout
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.resample import DT
 from twin_worker.telemetry.track import SETTLING_S, hovering_mask
@@ -190,10 +191,10 @@ def identify_and_verify(twin: Twin) -> list[Message]:
     if window is None or no_data_verdict is not None:
         if twin.models.active_model is None and no_data_verdict is not None:
             twin.identification.conclude(no_data_verdict)
-            twin.prediction.set_state(TwinState.WAITING)
+            twin.prediction.set_learning_state(TwinState.WAITING)
         return []
     if twin.models.active_model is None:
-        twin.prediction.set_state(TwinState.IDENTIFYING)
+        twin.prediction.set_learning_state(TwinState.IDENTIFYING)
     fraction = _HOLD_OUT_FRACTION[twin.config.method != PAPER]
     n_train = len(window) - int(np.clip(fraction * len(window), *_hold_out_limits(twin)))
     try:

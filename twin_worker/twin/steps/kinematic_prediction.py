@@ -11,7 +11,8 @@ from twin_worker.prediction import kinematic
 from twin_worker.prediction.autopilot_parameters import ControllerTwin, RouteOverride, multirotor_controller
 from twin_worker.prediction.multirotor import fit, rollout
 from twin_worker.telemetry.track import SETTLING_S, Track, hovering_mask, resample_track
-from twin_worker.twin.state.state import ROUTE_MODES, Twin
+from twin_worker.twin.state.routes import ROUTE_MODES, failsafe_plan, present_route
+from twin_worker.twin.state.state import Twin
 
 _FIT_WINDOW_S = 130.0  # flight time used to fit the kinematic models [s]
 _VTOL_COMMANDS = (84, 85)  # MAV_CMD: NAV_VTOL_TAKEOFF, NAV_VTOL_LAND
@@ -112,6 +113,10 @@ def _fixed_wing_config(twin: Twin) -> kinematic.KinematicConfig:
         wind,
         twin.prediction.override,
         twin.first_item,
+        twin.onboard.entry,
+        present_route(twin),
+        twin.telemetry.history,
+        failsafe_plan(twin),
     )
 
 

@@ -6,8 +6,9 @@ from fleet.window import Window
 from twin_worker.identification.fixed_wing.plant import PAPER
 from twin_worker.identification.fixed_wing.point_mass_model import FIT_WINDOW_S, MIN_FIT_S, identify
 from twin_worker.prediction.autopilot_identification import REPLAY_INTERVAL_S, identify_autopilot
-from twin_worker.prediction.closed_loop import Rollout, synchronise_controller
+from twin_worker.prediction.closed_loop import synchronise_controller
 from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_point_mass
+from twin_worker.prediction.replay_window import Rollout
 from twin_worker.twin.state.state import Twin
 
 IDENTIFY_PERIOD_S = 5.0  # between identifications [s]

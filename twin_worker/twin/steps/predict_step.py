@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from fleet.contract import EVENT_TEXTS, Array, Controller, Event, Message, Prediction, TwinState
+from fleet.contract import EVENT_TEXTS, Array, Controller, Event, Message, Outcome, Prediction, TwinState
 from twin_worker.confidence.table_files import airframe_class, group_name
 from twin_worker.confidence.tube_and_horizon import AHEAD, NOMINAL_COVERAGE, Confidence, PointForecast
 from twin_worker.identification.fixed_wing.plant import DYNAMICS
@@ -180,14 +180,20 @@ def _best_forecast(twin: Twin, recent: Track, ahead: np.ndarray) -> tuple[PathFo
         text = kinematic.sentence if is_hovering(twin) else f"{kinematic.sentence}; {reason}"
         forecasts = {kinematic.method: replace(kinematic, sentence=text)}
         return select_method(twin, float(recent.t[-1]), forecasts, recent, ahead), float(recent.t[-1])
-    _set_state(
-        twin, TwinState.VERIFIED if twin.models.active_model else TwinState.IDENTIFYING if usable else TwinState.WAITING
-    )
+    _set_state(twin, _state_without_route(twin))
     parts = dict.fromkeys(part for part in (reason, kinematic.sentence, recent.sentence, "turn rate only") if part)
     path = constant_turn_prediction(recent, ahead)
     return PathForecast(path, "imm", _IMM_LAW, kinematic.seq if path is None else -1, "; ".join(parts)), float(
         recent.t[-1]
     )
+
+
+def _state_without_route(twin: Twin) -> TwinState:
+    """Return the state of a twin that predicts no route, as the identification sees it."""
+    if twin.models.active_model is not None:
+        return TwinState.VERIFIED
+    waits = twin.identification.verdict.outcome is Outcome.INSUFFICIENT_DATA
+    return TwinState.WAITING if waits else TwinState.IDENTIFYING
 
 
 def _is_usable(path_forecast: PathForecast) -> bool:

@@ -9,15 +9,11 @@ from twin_worker.confidence.calibration_table import error_growth
 from twin_worker.confidence.tube_and_horizon import AHEAD
 from twin_worker.identification.fixed_wing.plant import DYNAMICS, method
 from twin_worker.numerics.interpolation import interpolate_rows
-from twin_worker.prediction.closed_loop import (
-    InitialCondition,
-    PredictionContext,
-    Rollout,
-    fly_from,
-    synchronise_controller,
-)
+from twin_worker.prediction.closed_loop import InitialCondition, fly_from, synchronise_controller
+from twin_worker.prediction.failsafe_route import with_failsafe
 from twin_worker.prediction.fixed_wing import ensemble
 from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_point_mass
+from twin_worker.prediction.replay_window import PredictionContext, Rollout
 from twin_worker.telemetry.track import Track
 from twin_worker.twin.state.budget import EARLY_FRACTION, Work
 from twin_worker.twin.state.state import Twin
@@ -41,13 +37,14 @@ def predict_route(twin: Twin, window: Window, recent: Track, ahead: np.ndarray) 
     initial = synchronise_controller(situation)
     if isinstance(initial, Rollout):
         return no_prediction(initial.sentence, initial.seq)
+    initial, failsafe_text = _with_failsafe(twin, situation, initial)
     t = float(window.t[-1])
     due = twin.prediction.selector.is_due(t)
     candidates, reason = method_paths(twin, (situation, initial), ahead, due)
     if not candidates:
         return no_prediction(reason or "no verified model yet", initial.seq)
     _update_ensemble(twin, (situation, initial))
-    sentence, control = initial.sentence, initial.controller
+    sentence, control = " ".join(filter(None, (failsafe_text, initial.sentence))), initial.controller
     forecasts = {
         name: PathForecast(path, name, control.law, initial.seq, sentence, control) for name, path in candidates.items()
     }
@@ -77,6 +74,22 @@ def select_method(
         selector.add(t, float(np.linalg.norm(recent.v[-1])), ahead, paths)
     chosen = forecasts[selector.best(tuple(forecasts))]
     return replace(chosen, sentence=" ".join(filter(None, (selector.describe(chosen.method), chosen.sentence))))
+
+
+def _with_failsafe(twin: Twin, situation: PredictionContext, initial: InitialCondition) -> tuple[InitialCondition, str]:
+    """Return the start with the failsafe after a link loss, and its description."""
+    plan = situation.onboard.failsafe
+    if plan is None:
+        return initial, ""
+    ctl, par, legs = initial.synchronised
+
+    def position_at(ctl: np.ndarray, legs: np.ndarray, times: np.ndarray) -> np.ndarray | None:
+        start = replace(initial, synchronised=(ctl, par, legs))
+        paths, _ = method_paths(twin, (situation, start), times, False)
+        return next(iter(paths.values()), None)
+
+    ctl, legs, text = with_failsafe(ctl, legs, plan, position_at)
+    return replace(initial, synchronised=(ctl, par, legs)), text
 
 
 def method_paths(

@@ -13,6 +13,8 @@ import numpy as np
 from fleet.autopilots import arduplane
 from fleet.autopilots.arduplane import params as P
 from fleet.mission import (
+    CONSTANT_BANK,
+    GLIDE,
     KIND,
     LOITER_TIME,
     LOITER_TO_ALT,
@@ -29,6 +31,7 @@ from fleet.mission import (
 from twin_worker.prediction.kinematic import wind_and_airspeed
 from twin_worker.prediction.multirotor.rollout import items_in_force
 from twin_worker.telemetry.track import STEP, Track
+from twin_worker.twin.state.routes import present_route
 from twin_worker.twin.state.state import Twin
 
 ROUTE_SPEED, ROUTE_WIND = "route_speed", "route_wind"
@@ -219,20 +222,25 @@ def _follow(track: Track, ahead: np.ndarray, points: np.ndarray, ground_speed: n
 
 def _route_points(twin: Twin, track: Track, seconds: float) -> np.ndarray | None:
     """Return the route ahead as distinct points with commanded speed, (n, 4); None without route or active item."""
-    if twin.no_route_reason() or twin.onboard.mission is None or twin.telemetry.origin is None:
-        return None
-    seq = items_in_force(track.t, twin.telemetry.history.rows("leg"), twin.onboard.mission)
-    if not np.isfinite(seq[-1]):
+    if twin.no_route_reason() or twin.telemetry.origin is None:
         return None
     params = twin.received_params
-    remaining = unroll_route(
-        twin.onboard.mission.items,
-        seq=int(seq[-1]),
-        origin=twin.telemetry.origin,
-        params=params,
-        first=twin.first_item,
-    )
-    if not len(remaining.legs):
+    seq, remaining = np.zeros(len(track.t)), present_route(twin)
+    if remaining is None:
+        if twin.onboard.mission is None:
+            return None
+        seq = items_in_force(track.t, twin.telemetry.history.rows("leg"), twin.onboard.mission)
+        if not np.isfinite(seq[-1]):
+            return None
+        remaining = unroll_route(
+            twin.onboard.mission.items,
+            seq=int(seq[-1]),
+            origin=twin.telemetry.origin,
+            params=params,
+            first=twin.first_item,
+            jumps_taken=twin.onboard.jumps_taken,
+        )
+    if not len(remaining.legs) or int(remaining.legs[0, KIND]) in (CONSTANT_BANK, GLIDE):
         return None
     other_item = np.flatnonzero(seq != seq[-1])
     on_item = track.p[int(other_item[-1]) + 1 if len(other_item) else 0 :]

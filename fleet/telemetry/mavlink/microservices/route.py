@@ -16,6 +16,7 @@ CHECK_STRIDE, CHECK_COUNT = 10, 3  # check of a recalled mission: the first 3 of
 ACCEPT_S = 3.0  # silence after which an upload without acknowledgement is accepted [s]
 PARTIAL_AFTER_S = 2.0  # silence after which an incomplete list is published [s]
 
+_NO_IDENTITY = ((0, 0), (65535, 0))  # item count and mission id where neither is reported
 _MIN_HOME_MOVE_M = 1.0  # smaller changes of home are ignored [m]
 _ABSOLUTE = {3: 0, 6: 5}  # MAV_FRAME: relative to home -> above sea level
 
@@ -53,6 +54,7 @@ class MissionCollector:
         self._home: Item | None = None  # replaces item 0 of missions that contain home (ArduPilot)
         self._home_m: float | None = None
         self._text = ""
+        self._identity: tuple[int, int] | None = None  # reported item count and mission id
         self._transfers: dict[bool, _MissionTransfer | None] = {False: None, True: None}
         self._changed = False
 
@@ -61,6 +63,7 @@ class MissionCollector:
         name = message.get_type()
         if name == "MISSION_CURRENT":
             self._set_current(message.seq)
+            self._check_identity((getattr(message, "total", 0), getattr(message, "mission_id", 0)))
         elif getattr(message, "mission_type", 0) != 0:
             return  # geofence or rally points
         elif name == "MISSION_COUNT":
@@ -133,6 +136,19 @@ class MissionCollector:
         if seq != self.seq:
             self.seq = seq
             self._changed = self._changed or self.complete or bool(self.items)
+
+    def _check_identity(self, identity: tuple[int, int]) -> None:
+        """Request a download if the reported item count or mission id is not that of the last report."""
+        if identity in _NO_IDENTITY:
+            return
+        known, self._identity = self._identity, identity
+        if known is not None and known != identity:
+            self.mark_replaced()
+
+    def mark_replaced(self) -> None:
+        """Request a download: the autopilot reports that it received another mission."""
+        self._transfers[False] = None  # the download is of the replaced mission
+        self.needs_download = True
 
     def _start_transfer(self, count: int, is_upload: bool, now: float) -> None:
         if count > MAX_ITEMS:

@@ -1,0 +1,163 @@
+"""Modes without a mission: predicted from the mode change on; and the failsafe that follows a link loss."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from fleet.contract import Event, Prediction
+from fleet.frames import to_geodetic, to_ned
+from tests.support.flights import ROUTE, drive, predictions, sample, status
+from twin_worker.twin.step import Twin, advance
+
+MODELS = (*ROUTE, "greybox")
+
+
+def entered(twin: Twin, mode: str) -> Prediction:
+    """The prediction that follows a mode change at once."""
+    (made,) = predictions(drive(twin, [status(twin, mode=mode)]))
+    return made
+
+
+def path_of(made: Prediction) -> tuple[np.ndarray, np.ndarray]:
+    return made.ahead.numpy(), made.path.numpy().astype(float)
+
+
+def home_of(twin: Twin) -> np.ndarray:
+    home = twin.home
+    return to_ned(twin.telemetry.origin, *(np.array([x]) for x in (home.lat_e7, home.lon_e7, home.alt_mm)))[0]
+
+
+def with_params(twin: Twin, **values: float) -> Twin:
+    params = twin.onboard.params
+    twin.onboard.set_params(msgspec.structs.replace(params, values=params.values | values))
+    return twin
+
+
+def radius_of(twin: Twin) -> float:
+    return abs(twin.received_params.get("WP_LOITER_RAD", 60.0))
+
+
+def test_loiter_circles_where_it_was_entered(winged):
+    made = entered(winged, "LOITER")
+    ahead, path = path_of(made)
+    assert made.method in MODELS and made.seq == -1
+    distance = np.linalg.norm(path[:, :2] - path[0, :2], axis=1)
+    assert distance.max() < 4.0 * radius_of(winged)
+    assert distance[ahead >= 80] == pytest.approx(radius_of(winged), abs=35.0)
+
+
+def test_rtl_flies_home_and_circles_there_at_its_altitude(winged):
+    with_params(winged, RTL_ALTITUDE=130.0, RTL_AUTOLAND=0.0)
+    ahead, path = path_of(entered(winged, "RTL"))
+    home = home_of(winged)
+    late = path[ahead >= 140]
+    assert np.linalg.norm(late[:, :2] - home[:2], axis=1) == pytest.approx(radius_of(winged), abs=35.0)
+    assert home[2] - late[:, 2] == pytest.approx(130.0, abs=15.0)
+
+
+def test_guided_flies_to_each_new_target(winged):
+    entered(winged, "GUIDED")
+    for k, offset in enumerate(((900.0, 300.0), (-800.0, 700.0)), start=1):
+        t = winged.telemetry.history.newest + 0.2
+        target = np.array([*offset, -140.0])
+        rows = to_geodetic(winged.telemetry.origin, target)[None]
+        results = [
+            r for r in advance(winged, (sample(1, t, target=(np.array([t]), rows)),)) if isinstance(r, Prediction)
+        ]
+        ahead, path = path_of(results[-1])
+        assert (results[-1].event is Event.TARGET) == (k > 1)
+        late = path[ahead >= 150]
+        assert np.linalg.norm(late[:, :2] - target[:2], axis=1) == pytest.approx(radius_of(winged), abs=40.0)
+
+
+def test_cruise_keeps_its_course(winged):
+    ahead, path = path_of(entered(winged, "CRUISE"))
+    v = winged.telemetry.history.rows_since("velocity", -np.inf)[1][-1]
+    course = v[:2] / np.linalg.norm(v[:2])
+    moved = path[ahead >= 60][:, :2] - path[0, :2]
+    assert abs(moved[:, 0] * course[1] - moved[:, 1] * course[0]).max() < 60.0
+    assert (moved @ course).min() > 800.0
+
+
+def test_circle_holds_its_bank(twin):
+    ahead, path = path_of(entered(with_params(twin, ROLL_LIMIT_DEG=60.0), "CIRCLE"))
+    wind = twin.environment.wind.wind[:2]
+    air = path[:, :2] - ahead[:, None] * wind  # a circle in the air
+    one_lap = air[(ahead > 20) & (ahead < 80)]
+    centre = 0.5 * (one_lap.max(axis=0) + one_lap.min(axis=0))
+    radii = np.linalg.norm(one_lap - centre, axis=1)
+    assert radii.std() < 0.15 * radii.mean() and 60.0 < radii.mean() < 250.0
+
+
+def test_a_mode_flown_by_hand_is_a_turn_rate(winged):
+    made = entered(winged, "FBWA")
+    assert made.method == "imm" and "FBWA follows no mission" in made.sentence
+
+
+def test_a_return_to_auto_is_predicted_at_once(winged):
+    entered(winged, "LOITER")
+    made = entered(winged, "AUTO")
+    assert made.method in MODELS and made.seq >= 1
+
+
+def test_an_unknown_home_is_said(winged):
+    winged.onboard.set_mission(msgspec.structs.replace(winged.onboard.mission, items=()))
+    made = entered(winged, "RTL")
+    assert made.method == "imm" and "home position unknown" in made.sentence
+
+
+# --- link loss -------------------------------------------------------------------------------------------------------
+
+RADIO = {"THR_FAILSAFE": 1.0, "FS_LONG_TIMEOUT": 5.0, "RC_FS_TIMEOUT": 1.0, "RTL_AUTOLAND": 0.0, "FS_GCS_ENABL": 0.0}
+
+
+def lost(twin: Twin) -> Prediction:
+    """The first prediction after telemetry has stopped."""
+    now, made = twin.telemetry.history.newest, []
+    while not any(p.coast_s > 0 for p in made) and now < twin.telemetry.history.newest + 12.0:
+        now += 1.0
+        made += [r for r in advance(twin, (), now) if isinstance(r, Prediction)]
+    return made[-1]
+
+
+def test_a_lost_link_is_followed_by_the_return_that_the_parameters_describe(winged):
+    with_params(winged, **RADIO, FS_SHORT_ACTN=0.0, FS_LONG_ACTN=1.0)
+    made = lost(winged)
+    ahead, path = path_of(made)
+    assert "RTL 5.0 s after the loss (FS_LONG_ACTN 1)" in made.sentence and "every radio link" in made.sentence
+    late = path[ahead >= 150]
+    assert np.linalg.norm((late - home_of(winged))[:, :2], axis=1) == pytest.approx(radius_of(winged), abs=40.0)
+
+
+def test_a_lost_link_without_failsafe_continues_the_mission(winged):
+    with_params(winged, **RADIO, FS_SHORT_ACTN=0.0, FS_LONG_ACTN=0.0)
+    made = lost(winged)
+    assert "failsafe: AUTO continues by the parameters" in made.sentence and made.seq >= 1
+
+
+def test_parameters_that_were_not_received_are_said(winged):
+    names = ("FS_LONG_ACTN", "FS_GCS_ENABL")
+    params = winged.onboard.params
+    left = {name: value for name, value in params.values.items() if name not in names}
+    winged.onboard.set_params(msgspec.structs.replace(params, values=left))
+    assert "failsafe parameters not received" in lost(winged).sentence
+
+
+def test_a_hand_flown_aircraft_circles_and_returns_after_the_loss(twin):
+    with_params(twin, **RADIO, FS_SHORT_ACTN=0.0, FS_LONG_ACTN=0.0)
+    entered(twin, "FBWA")
+    made = lost(twin)
+    assert made.method in MODELS and "CIRCLE 1.2 s" in made.sentence and "RTL 5.0 s" in made.sentence
+
+
+@pytest.mark.parametrize(("action", "mode"), [(2.0, "FBWA"), (4.0, "FBWB")])
+def test_wings_level_failsafes_fly_straight(twin, action, mode):
+    with_params(twin, **RADIO | {"FS_SHORT_ACTN": action, "FS_LONG_ACTN": 0.0, "FS_LONG_TIMEOUT": 200.0})
+    made = lost(twin)
+    ahead, path = path_of(made)
+    assert f"{mode} 1.2 s" in made.sentence
+    steps = np.diff(path[(ahead > 20) & (ahead < 50), :2], axis=0)
+    course = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+    assert abs(course - course[0]).max() < 0.15
+    sink = path[ahead <= 40][-1, 2] - path[0, 2]
+    assert (sink > 25.0) if mode == "FBWA" else (abs(sink) < 25.0)

@@ -1,0 +1,146 @@
+"""Routes that no mission describes: of the present mode, and of the failsafe after a link loss."""
+
+from collections.abc import Sequence
+from math import atan2, isfinite
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fleet.autopilots.failsafe import link_loss_steps
+from fleet.autopilots.modes import TARGET_MODES, ModeEntry, ModeSituation, hold_bank, mode_route
+from fleet.contract import Event, Rows
+from fleet.frames import Origin, to_geodetic, to_ned
+from fleet.mission import FIRST_ITEM, Route, unroll_route
+from twin_worker.prediction.autopilot_identification import LAW_OF_AUTOPILOT
+from twin_worker.prediction.failsafe_route import FailsafePlan
+from twin_worker.prediction.multirotor.rollout import item_in_force
+from twin_worker.twin.state.events import invalidate_prediction
+
+if TYPE_CHECKING:
+    from twin_worker.twin.state.state import Twin
+
+ROUTE_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
+_MAX_ENTRY_AGE_S = 2.0  # maximum age of the position where a mode was entered [s]
+_TARGET_MOVED_M = 2.0  # a guidance target that moves further is a new one [m]
+_FAILSAFE_PARAMETERS = {"arduplane": ("FS_LONG_ACTN", "FS_GCS_ENABL"), "px4": ("NAV_DLL_ACT",)}
+
+
+def present_route(twin: "Twin") -> Route | None:
+    """Return the route of a mode without mission; None in a mission, under manual control, or in a what-if."""
+    entry, origin = twin.onboard.entry, twin.telemetry.origin
+    if origin is None or twin.prediction.override is not None or twin.mode in ROUTE_MODES:
+        return None
+    if twin.vehicle_class.is_rotorcraft or (twin.mode == "RTL" and twin.received_params.get("Q_RTL_MODE", 0.0) != 0):
+        return None
+    law = LAW_OF_AUTOPILOT.get(twin.autopilot, "")
+    if entry is not None:
+        target = twin.onboard.target
+        situation = _situation(twin, entry.ned(origin), entry.course, None if target is None else _ned(origin, target))
+        route = mode_route(law, twin.mode, situation, twin.received_params)
+        if route is not None:
+            return route
+    return _hand_flown_until_failsafe(twin, law)
+
+
+def _hand_flown_until_failsafe(twin: "Twin", law: str) -> Route | None:
+    """Return the present bank as route of a hand-flown mode, if a failsafe ends it; else None."""
+    if not twin.telemetry.link_lost or not link_loss_steps(law, twin.mode, twin.received_params):
+        return None
+    assert twin.telemetry.origin is not None
+    position, attitude = (_newest(twin, name) for name in ("position", "attitude"))
+    if position is None or attitude is None:
+        return None
+    here = _ned(twin.telemetry.origin, position)
+    return hold_bank(_situation(twin, here, 0.0, None), float(attitude[0]))
+
+
+def failsafe_plan(twin: "Twin") -> FailsafePlan | None:
+    """Return the mode changes after a link loss; None while the link is up."""
+    if not twin.telemetry.link_lost or twin.vehicle_class.is_rotorcraft or twin.prediction.override is not None:
+        return None
+    law, params = LAW_OF_AUTOPILOT.get(twin.autopilot, ""), twin.received_params
+    if not any(name in params for name in _FAILSAFE_PARAMETERS.get(law, ())):
+        return FailsafePlan((), _no_route, "failsafe parameters not received: the mode is assumed to continue")
+    steps = link_loss_steps(law, twin.mode, params)
+    if not steps:
+        return FailsafePlan((), _no_route, f"failsafe: {twin.mode} continues by the parameters")
+
+    def route_of(mode: str, p: np.ndarray, course: float) -> Route | None:
+        if mode in ROUTE_MODES:
+            return _mission_from_here(twin)
+        return mode_route(law, mode, _situation(twin, p, course, None), params, failsafe=True)
+
+    return FailsafePlan(steps, route_of, "(assumes that every radio link is lost)")
+
+
+def _no_route(mode: str, p: np.ndarray, course: float) -> None:
+    return None
+
+
+def _mission_from_here(twin: "Twin") -> Route | None:
+    mission = twin.onboard.mission
+    seq = item_in_force(twin.telemetry.history.newest, twin.telemetry.history.rows_since("leg"), mission)
+    if mission is None or not isfinite(seq):
+        return None
+    assert twin.telemetry.origin is not None
+    first = FIRST_ITEM.get(twin.autopilot, 1)
+    params = twin.received_params
+    return unroll_route(mission.items, seq=int(seq), origin=twin.telemetry.origin, params=params, first=first)
+
+
+def _situation(twin: "Twin", entry: np.ndarray, course: float, target: np.ndarray | None) -> ModeSituation:
+    origin, home, position = twin.telemetry.origin, twin.home, _newest(twin, "position")
+    assert origin is not None
+    return ModeSituation(
+        origin,
+        entry,
+        course,
+        entry if position is None else _ned(origin, position),
+        None if home is None else _ned(origin, (home.lat_e7, home.lon_e7, home.alt_mm)),
+        target,
+        twin.onboard.mission.items if twin.onboard.mission else (),
+    )
+
+
+def _newest(twin: "Twin", name: str) -> np.ndarray | None:
+    """Return the newest row of one kind, if it is recent."""
+    _, rows = twin.telemetry.history.rows_since(name, twin.telemetry.history.newest - _MAX_ENTRY_AGE_S)
+    return rows[-1] if len(rows) else None
+
+
+def _ned(origin: Origin, position: Sequence[float] | np.ndarray) -> np.ndarray:
+    return to_ned(origin, *(np.array([x], float) for x in position))[0]
+
+
+def mode_entry(twin: "Twin", t: float) -> ModeEntry | None:
+    """Return the newest position and course as the entry of a mode at `t`; None without either."""
+    t_p, positions = twin.telemetry.history.rows_since("position", t - _MAX_ENTRY_AGE_S)
+    _, velocities = twin.telemetry.history.rows_since("velocity", t - _MAX_ENTRY_AGE_S)
+    if not len(t_p) or not len(velocities) or twin.telemetry.origin is None:
+        return None
+    v, since = velocities[-1], min(max(t - float(t_p[-1]), 0.0), _MAX_ENTRY_AGE_S)
+    lat, lon, alt = to_geodetic(Origin(*(int(x) for x in positions[-1])), v * since)
+    return ModeEntry(t, (float(lat), float(lon), float(alt)), atan2(v[1], v[0]))
+
+
+def update_target(twin: "Twin", rows: Rows) -> None:
+    """Store the guidance target of the present mode; one that moved invalidates the prediction."""
+    t = rows.t.numpy()
+    if twin.mode not in TARGET_MODES or twin.telemetry.origin is None or not len(t):
+        return
+    t_target, target = float(t[-1]), rows.x.numpy()[-1].astype(float)
+    if twin.onboard.entry is None:  # the first status arrived in this mode
+        twin.onboard.enter_mode(mode_entry(twin, t_target))
+    elif not t_target > twin.onboard.entry.t:
+        return
+    previous, new = twin.onboard.target, (float(target[0]), float(target[1]), float(target[2]))
+    if previous is not None and not _has_moved(previous, new):
+        return
+    twin.onboard.set_target(new)
+    commanded = previous is not None and twin.mode == "GUIDED"
+    invalidate_prediction(twin, Event.TARGET if commanded else None, t_target)
+
+
+def _has_moved(previous: tuple[float, float, float], new: tuple[float, float, float]) -> bool:
+    distance = np.linalg.norm(_ned(Origin(*(int(x) for x in previous)), new))
+    return bool(distance > _TARGET_MOVED_M)
