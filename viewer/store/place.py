@@ -34,8 +34,8 @@ class SceneFrame:
         scene = ned_to_scene(to_ned(self.origin, lat, lon, alt))
         if (np.abs(scene) > REACH_M / UNIT_M).any():
             distance_km = np.abs(scene).max() * UNIT_M / 1000
-            found = f"position: found {distance_km:.0f} km from the scene origin"
-            raise OutOfRangeError(f"{found}, expected at most 100 km; open another viewer")
+            distance = f"position: found {distance_km:.0f} km from the scene origin"
+            raise OutOfRangeError(f"{distance}, expected at most 100 km; open another viewer")
         return scene
 
     def from_geodetic_point(self, lat_e7: float, lon_e7: float, alt_mm: float) -> tuple[float, float, float]:
