@@ -5,7 +5,6 @@ Source: Huang 2021, section 3.4 (identical controller, same route, identified mo
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from fleet.autopilots import arduplane, laws
 from fleet.autopilots.shadow import replay_controller
 from fleet.contract import Item
 from fleet.frames import Origin, wrap
-from fleet.mission import FIRST_ITEM, KIND, LAND, P_D, P_N, ROUTE_PARAMS, SPEED, TAKEOFF, Route, unroll_route
+from fleet.mission import FIRST_ITEM, KIND, LAND, P_D, P_N, SPEED, TAKEOFF
 from fleet.physics.simulate import N_STATE, simulate
 from fleet.process.sanitise import format_below
 from fleet.window import Window
@@ -28,6 +27,7 @@ from twin_worker.prediction.autopilot_parameters import (
     fixed_wing_controller,
     transfer_controller,
 )
+from twin_worker.prediction.route_cache import cached_route
 from twin_worker.telemetry.history import TelemetryHistory
 
 MIN_ROLLOUT_S = 60.0  # shortest valid rollout [s]
@@ -35,7 +35,6 @@ SHADOW_S = 60.0  # telemetry for the synchronisation of the controller twin [s]
 _WIND_MAX_AGE_S = 10.0  # maximum age of the autopilot's wind estimate [s]
 _ITEM_DELAY_S = 2.0  # between the mission and the telemetry that report the same item, at most [s]
 _SHADOW_STEP = 2  # window rows per shadow step
-_CACHE_SIZE = 1024  # cached routes: missions change rarely, and a route takes as long as a rollout
 JumpCounts = tuple[float, int, dict[int, int]]
 """Time [s since 1970], the item that became current, and the jumps taken until then at each jump."""
 _NOT_MODELLED = {TAKEOFF: "take-off", LAND: "landing"}
@@ -193,7 +192,7 @@ def replay_inputs(context: PredictionContext) -> ReplayWindow | Rollout:
     onboard = context.onboard
     first = FIRST_ITEM.get(onboard.autopilot, 1)
     jumps = onboard.jumps_taken(float(times[0]), int(seq[0]))
-    mission_route = cached_route(onboard.items, int(seq[0]), context.origin, onboard.params, first, jumps)
+    mission_route = cached_route(onboard.items, int(seq[0]), context.origin, onboard.params, first, jumps=jumps)
     problem = mission_route.summary
     if not len(mission_route.legs):
         return Rollout(None, int(seq[-1]), problem or "the mission has no legs to fly")
@@ -202,31 +201,6 @@ def replay_inputs(context: PredictionContext) -> ReplayWindow | Rollout:
     return ReplayWindow(
         window, mission_route.legs, start_point, _replay_rows(window, stride, context.history), seq, altitude, problem
     )
-
-
-def cached_route(
-    items: tuple[Item, ...],
-    seq: int,
-    origin: Origin,
-    params: Mapping[str, float],
-    first: int,
-    jumps: Mapping[int, int] | None = None,
-) -> Route:
-    """Return the cached, read-only result of `fleet.mission.unroll_route`: legs from item `seq` on."""
-    used = tuple((name, params[name]) for name in ROUTE_PARAMS if name in params)
-    return _cached_route(items, seq, origin, used, first, tuple((jumps or {}).items()))
-
-
-@lru_cache(maxsize=_CACHE_SIZE)
-def _cached_route(
-    items: tuple[Item, ...],
-    seq: int,
-    origin: Origin,
-    params: tuple[tuple[str, float], ...],
-    first: int,
-    jumps: tuple[tuple[int, int], ...],
-) -> Route:
-    return unroll_route(items, seq=seq, origin=origin, params=dict(params), first=first, jumps_taken=dict(jumps))
 
 
 def autopilot_wind(context: PredictionContext, window: Window) -> tuple[float, float]:

@@ -25,7 +25,7 @@ from twin_worker.prediction.autopilot_parameters import (
     fixed_wing_controller,
     transfer_controller,
 )
-from twin_worker.prediction.closed_loop import cached_route
+from twin_worker.prediction.route_cache import cached_route
 from twin_worker.telemetry.track import STEP, Track
 
 MIN_TRACK_S = 5.0  # minimum track on this route [s]
