@@ -309,7 +309,8 @@ def test_no_folder_is_crowded() -> None:
 
 
 SHARED = (  # what concealer and finder may both stand on: words, frames, formats; nothing that flies or decides
-    *("fleet", "fleet.contract", "fleet.cli", "fleet.process", "fleet.commands", "fleet.frames", "fleet.mission"),
+    *("fleet", "fleet.contract", "fleet.cli", "fleet.process", "fleet.commands", "fleet.frames"),
+    *("fleet.mission", "fleet.mission_jumps", "fleet.mission_legs"),
     *("fleet.bus.codec", "fleet.config", "fleet.process.sanitise", "fleet.process.logs", "fleet.process.children"),
     *("fleet.process.interrupt", "fleet.process.private_files", "fleet.bus", "fleet.simulator"),
 )

@@ -27,7 +27,8 @@ from twin_worker.prediction.autopilot_parameters import (
     transfer_controller,
 )
 from twin_worker.prediction.failsafe_route import FailsafePlan, with_failsafe
-from twin_worker.prediction.replay_window import MAX_EARLY_S, cached_route, leg_start
+from twin_worker.prediction.replay_window import MAX_EARLY_S, leg_start
+from twin_worker.prediction.route_cache import cached_route
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.track import STEP, Track
 

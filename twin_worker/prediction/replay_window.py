@@ -2,20 +2,20 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 
 import numpy as np
 
 from fleet.autopilots.modes import NO_ITEM, ModeEntry
 from fleet.contract import Item
 from fleet.frames import Origin, wrap
-from fleet.mission import FIRST_ITEM, KIND, LAND, ROUTE_PARAMS, WAYPOINT, Route, unroll_route
+from fleet.mission import FIRST_ITEM, KIND, LAND, WAYPOINT, Route
 from fleet.process.sanitise import format_below
 from fleet.window import Window
 from twin_worker.estimation.wind_filter import WindFilter
 from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.prediction.autopilot_parameters import ControllerTwin, RouteOverride
 from twin_worker.prediction.failsafe_route import FailsafePlan
+from twin_worker.prediction.route_cache import cached_route
 from twin_worker.telemetry.history import TelemetryHistory
 
 SHADOW_S = 60.0  # telemetry for the synchronisation of the controller twin [s]
@@ -24,7 +24,6 @@ MAX_EARLY_S = 1.0  # a route that changed at most this long after the newest tel
 _ITEM_REPORT_S = 2.0  # longest period of reports of the current mission item [s]
 _ITEM_DELAY_S = 2.0  # between the mission and the telemetry that report the same item, at most [s]
 _SHADOW_STEP = 2  # window rows per shadow step
-_CACHE_SIZE = 1024  # cached routes: missions change rarely, and a route takes as long as a rollout
 JumpCounts = tuple[float, int, dict[int, int]]
 """Time [s since 1970], the item that became current, and the jumps taken until then at each jump."""
 
@@ -158,7 +157,7 @@ def replay_inputs(context: PredictionContext) -> ReplayWindow | Rollout:
         seq = np.where(np.isfinite(seq), seq, seq[np.isfinite(seq)][0]).astype(np.int64)
         first = FIRST_ITEM.get(onboard.autopilot, 1)
         jumps = onboard.jumps_taken(float(times[0]), int(seq[0]))
-        route = cached_route(onboard.items, int(seq[0]), context.origin, onboard.params, first, jumps)
+        route = cached_route(onboard.items, int(seq[0]), context.origin, onboard.params, first, jumps=jumps)
     else:
         seq, route = np.full(len(times), int(NO_ITEM)), onboard.mode_route
     if not len(route.legs):
@@ -198,31 +197,6 @@ def _is_first_item(history: TelemetryHistory, entry_t: float, until: float, seq:
     if not len(t) or t[0] > entry_t + _ITEM_REPORT_S:  # not known any more
         return False
     return bool((items[(t > entry_t) & (t <= until), 0] == seq).all())
-
-
-def cached_route(
-    items: tuple[Item, ...],
-    seq: int,
-    origin: Origin,
-    params: Mapping[str, float],
-    first: int,
-    jumps: Mapping[int, int] | None = None,
-) -> Route:
-    """Return the cached, read-only result of `fleet.mission.unroll_route`: legs from item `seq` on."""
-    used = tuple((name, params[name]) for name in ROUTE_PARAMS if name in params)
-    return _cached_route(items, seq, origin, used, first, tuple((jumps or {}).items()))
-
-
-@lru_cache(maxsize=_CACHE_SIZE)
-def _cached_route(
-    items: tuple[Item, ...],
-    seq: int,
-    origin: Origin,
-    params: tuple[tuple[str, float], ...],
-    first: int,
-    jumps: tuple[tuple[int, int], ...],
-) -> Route:
-    return unroll_route(items, seq=seq, origin=origin, params=dict(params), first=first, jumps_taken=dict(jumps))
 
 
 def _gap_free(window: Window) -> Window:

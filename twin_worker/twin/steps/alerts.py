@@ -17,7 +17,7 @@ from twin_worker.alerts.geofence import (
 from twin_worker.alerts.hysteresis import HazardEstimate
 from twin_worker.confidence.table_files import UNCALIBRATED
 from twin_worker.prediction.multirotor.rollout import RETURN_MODES
-from twin_worker.prediction.replay_window import cached_route
+from twin_worker.prediction.route_cache import cached_route
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.kinematic_prediction import is_hovering
 
@@ -155,7 +155,7 @@ def _mission_feasibility(twin: Twin, now: float) -> HazardEstimate:
         twin.telemetry.origin,
         _params(twin),
         twin.first_item,
-        twin.onboard.jumps_taken,
+        jumps=twin.onboard.jumps_taken,
     )
     wind = np.array([*twin.environment.wind.wind[:2], twin.environment.wind.sigma])
     return feasibility_hazard(
