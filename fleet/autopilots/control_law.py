@@ -19,7 +19,7 @@ ANGLE, BEARING = 5, 6  # angle flown on the circle, last bearing to its centre [
 CIRCLE_REACHED, CIRCLING = 7, 8  # 1: circle reached before; 1: now on the circle
 TIMER = 9  # time since reaching the circle [s]
 EXIT_ANGLE = 10  # circle angle when the exit condition became true, -1 before [rad]
-FOLLOW_LINE = 11  # 1: the line starts at a waypoint and is followed even to a circle
+FOLLOW_LINE = 11  # 1: the line starts at a waypoint and is followed even to a circle; -1: no line is followed
 N_LEG = 12
 # L1
 XTRACK, NU = 12, 13  # crosstrack integral, last course error [rad]

@@ -120,7 +120,11 @@ def steer(
     if kind in (WAYPOINT, LAND):
         if hypot(leg[P_N] - ctl[S.PREV_N], leg[P_E] - ctl[S.PREV_E]) < 0.1:  # no line: start one here
             ctl[S.PREV_N], ctl[S.PREV_E] = p[0], p[1]
+        start_n, start_e = ctl[S.PREV_N], ctl[S.PREV_E]
+        if ctl[S.FOLLOW_LINE] < 0.0:  # no crosstrack: the line starts at the aircraft at every step
+            ctl[S.PREV_N], ctl[S.PREV_E] = p[0], p[1]
         a_lat = l1.follow_line(ctl, par, leg, p, v, euler[2], dt)
+        ctl[S.PREV_N], ctl[S.PREV_E] = start_n, start_e
         return a_lat, kind == WAYPOINT and _arrived(ctl, par, leg, p, v, euler[2])
     radius = leg[RADIUS] if leg[RADIUS] != 0.0 else par[P.LOITER_RAD]
     d, R = 1.0 if radius >= 0.0 else -1.0, l1.circle_radius(par, abs(radius))
