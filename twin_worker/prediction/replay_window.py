@@ -181,7 +181,7 @@ def items_since_entry(
 def leg_start(
     route: Route, entry: ModeEntry | None, history: TelemetryHistory | None, at: tuple[int, float, np.ndarray]
 ) -> np.ndarray:
-    """Return the point where the line of the first leg of a mission starts, NED, (3,) [m]; nan: at the aircraft.
+    """Return the point where the line of the first leg of a mission starts, NED, (3,) [m]; inf: there is no line.
 
     After a mode change no line is followed until the first item is complete.
 
@@ -193,7 +193,7 @@ def leg_start(
     """
     seq, t, p = at
     if entry is not None and history is not None and _is_first_item(history, entry.t, t, seq):
-        return np.full(3, np.nan)
+        return np.full(3, np.inf)
     return route.start if np.isfinite(route.start).all() else p
 
 
