@@ -1,17 +1,6 @@
 """Route: convert MAVLink mission items to the legs that a compiled controller reads.
 
-A leg is one row of float64 with the columns of `fleet.mission_legs`; the first one is the leg type:
-
-    WAYPOINT         fly the line from the previous point to here, then continue
-    LOITER_TURNS     circle `TURNS` times, exit towards the next leg
-    LOITER_UNLIMITED circle indefinitely
-    LOITER_TIME      circle for `TURNS` seconds
-    LOITER_TO_ALT    circle until the altitude is reached
-    TAKEOFF          climb wings level to the altitude
-    LAND             fly to the point; no leg follows automatically
-    CHANGE_ALTITUDE  continue on the line of the previous leg until the altitude is reached
-    CONSTANT_BANK    hold a bank, at the height where the leg began
-    GLIDE            hold a bank and a pitch at idle
+The columns and types of legs are those of `fleet.mission_legs`.
 
 Item 0 is home (ArduPilot), or the first to fly (PX4, whose mission does not contain home). MAVLink does not report how
 often a DO_JUMP was already taken; `fleet.mission_jumps` counts it from the reported items.

@@ -1,6 +1,18 @@
 """Legs of a route: the columns of a leg, and the leg of one mission item.
 
-A leg is one row of float64, with the columns named here; `fleet.mission` describes the leg types.
+A leg is one row of float64 with the columns named here; the first one is the leg type:
+
+    WAYPOINT         fly the line from the previous point to here, then continue
+    LOITER_TURNS     circle `TURNS` times, exit towards the next leg
+    LOITER_UNLIMITED circle indefinitely
+    LOITER_TIME      circle for `TURNS` seconds
+    LOITER_TO_ALT    circle until the altitude is reached
+    TAKEOFF          climb wings level to the altitude
+    LAND             fly to the point; no leg follows automatically
+    CHANGE_ALTITUDE  continue on the line of the previous leg until the altitude is reached
+    CONSTANT_BANK    hold a bank, at the height where the leg began
+    GLIDE            hold a bank and a pitch at idle
+
 Source: MAVLink mission protocol, MAV_CMD and MAV_FRAME; ArduPlane mission command list.
 """
 

@@ -24,6 +24,7 @@ from fleet.autopilots.arduplane.guide import assume_commanded_speed
 from fleet.autopilots.arduplane.guide import fly as fly_arduplane
 from fleet.autopilots.control_law import (
     ARDUPLANE,
+    FOLLOW_LINE,
     LAW,
     LEG,
     NEXT_LEG,
@@ -171,6 +172,8 @@ def switch_when_due(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.nd
     ctl[SWITCH_S] -= dt
     if ctl[SWITCH_S] <= 0.0:
         begin(ctl, par, legs, int(ctl[SWITCH_LEG]), p)
+        if law_code(par) >= ARDUPLANE:
+            ctl[FOLLOW_LINE] = -1.0
         ctl[SWITCH_S], ctl[SWITCH_LEG] = ctl[NEXT_S], ctl[NEXT_LEG]
         ctl[NEXT_S] = 0.0
 

@@ -16,14 +16,14 @@ Source: ArduPlane flight modes, PX4 user guide (fixed-wing flight modes), and th
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, hypot, isfinite, radians, sin
 
 import msgspec
 import numpy as np
 
 from fleet.contract import Item
-from fleet.frames import Origin, to_ned
+from fleet.frames import Origin, to_ned, wrap
 from fleet.mission import (
     CONSTANT_BANK,
     GLIDE,
@@ -46,6 +46,8 @@ NO_ITEM = -1.0  # mission item of a leg that belongs to no mission
 _HOLD_LEG_M = 1e5  # length of the line of a heading-hold mode [m]
 _TARGET_TOLERANCE_M = 5.0  # distance at which two points are the same [m]
 _PX4_ALT_TOLERANCE_M = 10.0  # NAV_FW_ALT_RAD: height error at which a climb is complete [m]
+_STEERED_M, _STEERED_RAD = 50.0, radians(10.0)  # off the line or off its course by more: the pilot has steered
+_STEERING_BANK = radians(10.0)  # a steered aircraft with more bank is still being steered [rad]
 _LAND_START = 189  # MAV_CMD_DO_LAND_START
 
 
@@ -173,6 +175,27 @@ def _hold_course(situation: ModeSituation, params: Mapping[str, float]) -> Route
     return Route(route.origin, route.legs, situation.entry, route.sentences)
 
 
+def after_steering(situation: ModeSituation, course: float, bank: float, height_error: float) -> ModeSituation | None:
+    """Return the situation of a heading-hold mode after stick inputs: the pilot may select another course and height.
+
+    Args:
+        situation: of the mode change
+        course, bank: present [rad]
+        height_error: reported set-point minus height; nan: not reported [m]
+    Returns:
+        situation with the course and height that are held; None while the pilot steers
+    """
+    offset = situation.position - situation.entry
+    crosstrack = offset[1] * cos(situation.course) - offset[0] * sin(situation.course)
+    steered = abs(crosstrack) > _STEERED_M or abs(wrap(course - situation.course)) > _STEERED_RAD
+    if steered and abs(bank) > _STEERING_BANK:
+        return None
+    entry = (situation.position if steered else situation.entry).copy()
+    if isfinite(height_error):
+        entry[2] = situation.position[2] - height_error
+    return replace(situation, entry=entry, course=course if steered else situation.course)
+
+
 def _px4_return(situation: ModeSituation, params: Mapping[str, float]) -> Route:
     """Climb to RTL_RETURN_ALT in a circle, fly home, descend to RTL_DESCEND_ALT in a circle, and stay there."""
     home, here = situation.home, situation.position
@@ -232,6 +255,8 @@ MODES: dict[str, dict[str, _Rule]] = {
     },
 }
 """Rules by law, as in `fleet.autopilots.laws.LAWS`, and mode, as in `Status.mode`."""
+HEADING_HOLD_MODES = ("CRUISE",)
+"""Modes that hold course and height until the pilot steers."""
 TARGET_MODES = ("RTL", "LOITER", "GUIDED", "AVOID_ADSB", "TAKEOFF")
 """Modes whose reported guidance target is the point they fly to."""
 

@@ -14,17 +14,34 @@ _MEDIAN_S = 3.0  # window of the median [s]
 _MIN_REPORTS = 3  # minimum reports in the window
 _STEADY_S = 20.0  # window in which the airspeed must be steady
 _MAX_CHANGE, _MAX_OFFSET = 0.04, 0.06  # largest change and largest offset, relative to the airspeed [-]
-_MIN_DIFFERENCE = 0.5  # smaller differences are rounding and noise [m/s]
+MIN_DIFFERENCE = 0.5  # smaller differences are rounding and noise [m/s]
 
 
 def reported_setpoint(history: TelemetryHistory, t: float, since: float = -np.inf) -> float:
-    """Return the reported airspeed set-point just before `t`; nan if it is not reported after `since` [m/s]."""
-    t_c, command = history.rows_since("command", max(t - _MEDIAN_S, since))
+    """Return the reported airspeed set-point just before `t`; nan if it is not reported after `since` [m/s].
+
+    The reports follow a new set-point at limited acceleration; while they change, none is returned.
+    """
+    reports = _setpoint_reports(history, t, max(t - _MEDIAN_S, since))
+    half = len(reports) // 2
+    if not half or abs(_median(reports[half:]) - _median(reports[:half])) > MIN_DIFFERENCE:
+        return float("nan")
+    return _median(reports)
+
+
+def reported_demand(history: TelemetryHistory, t: float) -> float:
+    """Return the newest reported airspeed demand, which follows the set-point; nan if it is not reported [m/s]."""
+    reports = _setpoint_reports(history, t, t - _MEDIAN_S)
+    return _median(reports[-_MIN_REPORTS:]) if len(reports) else float("nan")
+
+
+def _setpoint_reports(history: TelemetryHistory, t: float, since: float) -> np.ndarray:
+    """Return the airspeed demands reported from `since` to `t`; empty if there are too few [m/s]."""
+    t_c, command = history.rows_since("command", since)
     t_air, air = history.rows_since("air", t - _MEDIAN_S - 2.0)
     if len(t_c) < _MIN_REPORTS or len(t_air) < _MIN_REPORTS or air[:, 0].max() < 3.0:
-        return float("nan")
-    setpoints = command[:, 4] + np.interp(t_c, t_air, air[:, 0])
-    return _median(setpoints[t_c <= t]) if (t_c <= t).any() else float("nan")
+        return np.empty(0)
+    return (command[:, 4] + np.interp(t_c, t_air, air[:, 0]))[t_c <= t]
 
 
 def inferred_setpoint(history: TelemetryHistory, t: float, speeds: np.ndarray) -> float:
@@ -60,7 +77,7 @@ def apply_setpoint(legs: np.ndarray, seq: float, cruise: float, setpoint: float)
     """
     matches = np.flatnonzero(legs[:, SEQ] == seq)
     speeds = np.where(legs[:, VA_C] > 0, legs[:, VA_C], cruise)
-    if not len(matches) or not abs(setpoint - speeds[matches[0]]) > _MIN_DIFFERENCE:
+    if not len(matches) or not abs(setpoint - speeds[matches[0]]) > MIN_DIFFERENCE:
         return legs
     other_legs = np.flatnonzero(speeds != speeds[matches[0]])
     earlier, later = other_legs[other_legs < matches[0]], other_legs[other_legs > matches[0]]

@@ -8,11 +8,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleet.autopilots import arduplane, laws
+from fleet.autopilots.arduplane.params import EAS2TAS
+from fleet.autopilots.control_law import V_DEM
 from fleet.autopilots.shadow import replay_controller
 from fleet.mission import KIND, LAND, P_D, P_N, SPEED, TAKEOFF
 from fleet.physics.simulate import N_STATE, simulate
 from fleet.window import Window
-from twin_worker.estimation.airspeed_setpoint import apply_setpoint, inferred_setpoint, reported_setpoint
+from twin_worker.estimation.airspeed_setpoint import (
+    MIN_DIFFERENCE,
+    apply_setpoint,
+    inferred_setpoint,
+    reported_demand,
+    reported_setpoint,
+)
 from twin_worker.identification.fixed_wing.plant import Plant, actuator_state, bias_corrected
 from twin_worker.numerics.interpolation import interpolate_rows
 from twin_worker.prediction.autopilot_parameters import (
@@ -84,6 +92,8 @@ def synchronise_controller(context: PredictionContext) -> InitialCondition | Rol
     setpoint = _airspeed_setpoint(context, float(replay.window.t[-1]), float(controller.values[CRUISE_OF[onboard.law]]))
     legs = apply_setpoint(replay.legs, float(seq), float(controller.values[CRUISE_OF[onboard.law]]), setpoint)
     ctl, _ = replay_controller(par, legs, replay.start_point, *replay.rows, replay.seq)  # type: ignore[call-arg]
+    if onboard.law == "arduplane":
+        _align_speed_demand(ctl, par, reported_demand(context.history, float(replay.window.t[-1])))
     sentence = " ".join(filter(None, (onboard.law_reason, replay.sentence)))
     initial = InitialCondition(
         replay.flight, (ctl, par, legs), _simulation_state(context, replay.flight), seq, sentence, controller
@@ -93,6 +103,13 @@ def synchronise_controller(context: PredictionContext) -> InitialCondition | Rol
     return _not_modelled(initial) or replace(
         initial, sentence=" ".join(filter(None, (initial.sentence, _default_warning(initial.controller))))
     )
+
+
+def _align_speed_demand(ctl: np.ndarray, par: np.ndarray, demand: float) -> None:
+    """Set the speed demand of ArduPlane to the reported equivalent airspeed [m/s], where it is on its way elsewhere."""
+    V = demand * par[EAS2TAS]
+    if abs(V - ctl[V_DEM]) > MIN_DIFFERENCE:  # false for nan
+        ctl[V_DEM] = V
 
 
 def _airspeed_setpoint(context: PredictionContext, t: float, cruise: float) -> float:

@@ -27,7 +27,7 @@ from twin_worker.prediction.autopilot_parameters import (
     transfer_controller,
 )
 from twin_worker.prediction.failsafe_route import FailsafePlan, with_failsafe
-from twin_worker.prediction.replay_window import MAX_EARLY_S, leg_start
+from twin_worker.prediction.replay_window import MAX_EARLY_S, items_since_entry, leg_start
 from twin_worker.prediction.route_cache import cached_route
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.track import STEP, Track
@@ -123,6 +123,8 @@ def fly(
     if flown.t[-1] < config.changed_t - MAX_EARLY_S:
         return KinematicRollout(None, -1, "the route changed after this telemetry")
     seq = seq[-len(flown) :] if config.mode_route is None else np.full(len(flown), NO_ITEM)
+    if config.mode_route is None:
+        seq = items_since_entry(seq, flown.t, config.entry, config.history)
     first = max(int(np.searchsorted(flown.t, config.changed_t)), len(flown) - int(_SYNC_S / STEP))
     unknown_rows = np.flatnonzero(~np.isfinite(seq))
     first = max(min(first, len(flown) - 2), int(unknown_rows[-1]) + 1 if len(unknown_rows) else 0)

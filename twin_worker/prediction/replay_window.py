@@ -8,7 +8,7 @@ import numpy as np
 from fleet.autopilots.modes import NO_ITEM, ModeEntry
 from fleet.contract import Item
 from fleet.frames import Origin, wrap
-from fleet.mission import FIRST_ITEM, KIND, LAND, WAYPOINT, Route
+from fleet.mission import FIRST_ITEM, Route
 from fleet.process.sanitise import format_below
 from fleet.window import Window
 from twin_worker.estimation.wind_filter import WindFilter
@@ -154,7 +154,8 @@ def replay_inputs(context: PredictionContext) -> ReplayWindow | Rollout:
         seq = reported(context.history, "leg", times, 15.0)[:, 0]
         if not np.isfinite(seq[-1]):
             return Rollout(None, -1, "the current mission item is not reported (MISSION_CURRENT)")
-        seq = np.where(np.isfinite(seq), seq, seq[np.isfinite(seq)][0]).astype(np.int64)
+        seq = np.where(np.isfinite(seq), seq, seq[np.isfinite(seq)][0])
+        seq = items_since_entry(seq, times, onboard.entry, context.history).astype(np.int64)
         first = FIRST_ITEM.get(onboard.autopilot, 1)
         jumps = onboard.jumps_taken(float(times[0]), int(seq[0]))
         route = cached_route(onboard.items, int(seq[0]), context.origin, onboard.params, first, jumps=jumps)
@@ -171,12 +172,27 @@ def replay_inputs(context: PredictionContext) -> ReplayWindow | Rollout:
     return ReplayWindow(window, flight, route.legs, start_point, rows, seq, altitude, route.summary)
 
 
+def items_since_entry(
+    seq: np.ndarray, t: np.ndarray, entry: ModeEntry | None, history: TelemetryHistory | None
+) -> np.ndarray:
+    """Return the items at times `t`, with the first one reported after a mode change from that change on, (n,).
+
+    A mode change may jump to another item, which is reported up to a second later.
+    """
+    if entry is None or history is None or not len(t) or t[-1] < entry.t or t[0] > entry.t + _ITEM_REPORT_S:
+        return seq
+    t_leg, items = history.rows_since("leg", entry.t)
+    if not len(t_leg) or t_leg[0] > entry.t + _ITEM_REPORT_S:
+        return seq
+    return np.where((t >= entry.t) & (t < t_leg[0]), items[0, 0], seq)
+
+
 def leg_start(
     route: Route, entry: ModeEntry | None, history: TelemetryHistory | None, at: tuple[int, float, np.ndarray]
 ) -> np.ndarray:
-    """Return the point where the line of the first leg of a mission starts, NED, (3,) [m]; nan: at the aircraft.
+    """Return the point where the line of the first leg of a mission starts, NED, (3,) [m]; inf: there is no line.
 
-    After a mode change it starts where the mode was entered, until the first item is complete.
+    After a mode change no line is followed until the first item is complete.
 
     Args:
         route: from the current item on
@@ -186,8 +202,7 @@ def leg_start(
     """
     seq, t, p = at
     if entry is not None and history is not None and _is_first_item(history, entry.t, t, seq):
-        is_line = int(route.legs[0, KIND]) in (WAYPOINT, LAND)
-        return entry.ned(route.origin) if is_line else np.full(3, np.nan)
+        return np.full(3, np.inf)
     return route.start if np.isfinite(route.start).all() else p
 
 

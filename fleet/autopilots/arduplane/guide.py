@@ -117,7 +117,7 @@ def init(
         par: parameters (N_PAR,)
         legs: route (m, 9)
         k: leg to fly
-        start: start point of its line, NED, (3,) [m]; nan: aircraft position
+        start: start point of its line, NED, (3,) [m]; nan: aircraft position; inf: no line, as after a mode change
         p, v: position and ground velocity, NED, (3,) [m, m/s]
         euler: phi, theta, psi (3,) [rad]
         Va: equivalent airspeed; nan: no sensor [m/s]
@@ -130,7 +130,8 @@ def init(
     ctl = np.zeros(S.N_CTL)
     has_start = np.isfinite(start[0]) and np.isfinite(start[1]) and np.isfinite(start[2])
     leg_rules.set_leg(ctl, par, legs, k, start if has_start else p)
-    ctl[S.FOLLOW_LINE], ctl[S.COURSE] = 1.0 if has_start else 0.0, atan2(v[1], v[0])
+    ctl[S.FOLLOW_LINE] = 1.0 if has_start else (-1.0 if np.isinf(start[0]) else 0.0)
+    ctl[S.COURSE] = atan2(v[1], v[0])
     tecs.reset(ctl, par, -p[2], -v[2], Va, theta_c, delta_t)
     return ctl
 

@@ -309,3 +309,46 @@ def test_finite_in_finite_out(law, rows, p, v, euler, Va, Va_dot, dt, k):
     assert abs(out[0]) <= 1.0 and 0 <= out[2] <= 1
     assert max(abs(s) for s in surfaces) <= 1
     assert hypot(*surfaces[:2]) <= 1.5
+
+
+# --- modes without a mission -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("law", ["arduplane"])
+def test_a_constant_bank_is_held_at_the_height_where_it_began(law):
+    rows, _ = fly(route(leg(m.CONSTANT_BANK, h=0.0, turns=radians(18))), Plane(), 60, par_of(law))
+    last = rows[rows[:, 0] > 20]
+    assert last[:, 11] == pytest.approx(radians(18), abs=radians(0.5))
+    assert abs(last[:, 3] + 100).max() < 3.0
+    assert abs(last[:, 10] - 20).max() < 0.5
+
+
+def test_a_glide_is_idle_at_its_pitch():
+    rows, _ = fly(route(leg(m.GLIDE, radius=radians(-2))), Plane(), 5, par_of("arduplane"))
+    assert (rows[:, 13] == 0.0).all() and rows[:, 12] == pytest.approx(radians(-2))
+    assert rows[:, 11] == pytest.approx(0.0)
+    assert rows[-1, 3] > rows[0, 3]
+
+
+def test_after_a_mode_change_no_line_is_followed():
+    legs = route(leg(n=3000.0, e=3000.0))
+    along = np.array([1.0, -1.0]) / np.sqrt(2)  # across the line from the start
+    direct, on_line = (
+        fly(legs, Plane(), 60, par_of("arduplane"), start=start)[0] for start in (np.full(3, np.inf), (0, 0, -100))
+    )
+    assert abs(on_line[-1, 1:3] @ along) < 3.0
+    assert direct[-1, 1:3] @ along > 8.0  # as far as the turn has carried it
+    to_go = np.array([3000.0, 3000.0]) - direct[-1, 1:3]
+    assert np.arctan2(direct[-1, 5], direct[-1, 4]) == pytest.approx(np.arctan2(to_go[1], to_go[0]), abs=0.02)
+
+
+@pytest.mark.parametrize("law", ["arduplane", "px4", "textbook"])
+def test_a_scheduled_change_starts_its_leg_in_time_and_the_next_one_after_it(law):
+    legs = route(leg(n=9000.0), leg(n=9000.0), leg(m.LOITER_UNLIMITED, e=400.0, radius=80.0), leg(n=-9000.0))
+    plane = Plane()
+    ctl = laws.init(par_of(law), legs, 0, np.zeros(3), plane.p, plane.v, plane.euler, plane.Va, TRIM_ALPHA, 0.5)
+    ctl[[S.SWITCH_S, S.SWITCH_LEG, S.NEXT_S, S.NEXT_LEG]] = 3.0, 2, 5.0, 3
+    rows, _ = fly(legs, plane, 12, par_of(law), ctl=ctl)
+    switches = rows[np.flatnonzero(np.diff(rows[:, 14])) + 1]
+    assert switches[:, 14].tolist() == [3, 4]
+    assert switches[:, 0] == pytest.approx([3.0, 8.0], abs=0.15)

@@ -122,6 +122,19 @@ def test_hand_flown_and_unknown_modes_have_no_route():
         assert modes.mode_route(law, mode, situation(), {}) is None
 
 
+def test_cruise_keeps_its_line_until_the_pilot_has_steered():
+    on_line = situation(position=ENTRY + np.array([5.0, 800.0, 3.0]))
+    held = modes.after_steering(on_line, pi / 2 + 0.05, 0.0, float("nan"))
+    assert held is not None and held.entry == pytest.approx(ENTRY) and held.course == pi / 2
+    climbs = modes.after_steering(on_line, pi / 2, 0.0, 25.0)
+    assert climbs is not None and climbs.entry[2] == pytest.approx(on_line.position[2] - 25.0)
+    assert modes.after_steering(on_line, 0.9, 0.4, 0.0) is None
+    turned = modes.after_steering(on_line, 0.9, 0.05, 0.0)
+    assert turned is not None and turned.course == 0.9 and turned.entry == pytest.approx(on_line.position)
+    aside = modes.after_steering(situation(position=ENTRY + np.array([90.0, 800.0, 0.0])), pi / 2, 0.0, 0.0)
+    assert aside is not None and aside.entry[0] == ENTRY[0] + 90.0
+
+
 # --- link loss -------------------------------------------------------------------------------------------------------
 
 

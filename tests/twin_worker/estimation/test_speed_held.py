@@ -5,7 +5,7 @@ import pytest
 
 from fleet.contract import Array, Rows, Sample
 from tests.support.flights import T0
-from twin_worker.estimation.airspeed_setpoint import inferred_setpoint
+from twin_worker.estimation.airspeed_setpoint import inferred_setpoint, reported_demand, reported_setpoint
 from twin_worker.telemetry.history import TelemetryHistory
 
 SPEEDS = np.array([20.0, 22.5, 25.0])
@@ -38,3 +38,26 @@ def test_between_two_speeds_on_the_way_to_another_or_far_from_all_none_is_told()
     assert np.isnan(held(0.0 * flat)) and np.isnan(held(flat[:3] * 20))
     assert np.isnan(held(20.0 * flat, np.empty(0)))
     assert held(20.3 * flat, SPEEDS[:1]) == 20.0
+
+
+def reporting(demand) -> tuple[TelemetryHistory, float]:
+    """Telemetry of an aircraft at 20 m/s that reports an airspeed demand 5 times a second, and its end."""
+    history, t = heard(np.full(100, 20.0)), T0 + 0.2 * np.arange(len(demand))
+    x = np.zeros((len(t), 5))
+    x[:, 4] = np.asarray(demand) - 20.0
+    history.add(Sample(uav=1, t=float(t[-1]), command=Rows(Array.of(t, "<f8"), Array.of(x))))
+    return history, float(t[-1])
+
+
+def test_a_demand_on_its_way_is_no_set_point():
+    steady, t = reporting(np.full(45, 23.0))
+    assert reported_setpoint(steady, t) == pytest.approx(23.0) == reported_demand(steady, t)
+    ramp, t = reporting(np.concatenate([np.full(33, 18.0), np.linspace(18.0, 22.0, 12)]))
+    assert np.isnan(reported_setpoint(ramp, t))
+    assert reported_demand(ramp, t) == pytest.approx(21.6, abs=0.1)
+
+
+def test_reports_from_before_a_mode_change_do_not_count():
+    history, t = reporting(np.full(45, 18.0))
+    assert np.isnan(reported_setpoint(history, t, since=t + 0.1))
+    assert np.isnan(reported_demand(heard(np.full(100, 20.0)), T0 + 9.9))

@@ -1,10 +1,12 @@
 """Modes without a mission: predicted from the mode change on; and the failsafe that follows a link loss."""
 
+from itertools import pairwise
+
 import msgspec
 import numpy as np
 import pytest
 
-from fleet.contract import Event, Prediction
+from fleet.contract import Event, Prediction, TwinState
 from fleet.frames import to_geodetic, to_ned
 from tests.support.flights import ROUTE, drive, predictions, sample, status
 from twin_worker.twin.step import Twin, advance
@@ -104,6 +106,15 @@ def test_an_unknown_home_is_said(winged):
     winged.onboard.set_mission(msgspec.structs.replace(winged.onboard.mission, items=()))
     made = entered(winged, "RTL")
     assert made.method == "imm" and "home position unknown" in made.sentence
+
+
+def test_the_state_does_not_alternate_before_the_first_model(heard):
+    twin, states = Twin.of(1), []
+    for message in heard[:350]:
+        advance(twin, (message,))
+        states.append(twin.prediction.state)
+    assert TwinState.PREDICTING in states
+    assert sum(a is not b for a, b in pairwise(states)) <= 3
 
 
 # --- link loss -------------------------------------------------------------------------------------------------------

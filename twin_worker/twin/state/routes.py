@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fleet.autopilots.failsafe import link_loss_steps
-from fleet.autopilots.modes import TARGET_MODES, ModeEntry, ModeSituation, hold_bank, mode_route
+from fleet.autopilots.modes import (
+    HEADING_HOLD_MODES,
+    TARGET_MODES,
+    ModeEntry,
+    ModeSituation,
+    after_steering,
+    hold_bank,
+    mode_route,
+)
 from fleet.contract import Event, Rows
 from fleet.frames import Origin, to_geodetic, to_ned
 from fleet.mission import FIRST_ITEM, Route, unroll_route
@@ -35,11 +43,24 @@ def present_route(twin: "Twin") -> Route | None:
     law = LAW_OF_AUTOPILOT.get(twin.autopilot, "")
     if entry is not None:
         target = twin.onboard.target
-        situation = _situation(twin, entry.ned(origin), entry.course, None if target is None else _ned(origin, target))
-        route = mode_route(law, twin.mode, situation, twin.received_params)
+        situation: ModeSituation | None = _situation(
+            twin, entry.ned(origin), entry.course, None if target is None else _ned(origin, target)
+        )
+        if twin.mode in HEADING_HOLD_MODES:
+            situation = _held_course(twin, situation)
+        route = None if situation is None else mode_route(law, twin.mode, situation, twin.received_params)
         if route is not None:
             return route
     return _hand_flown_until_failsafe(twin, law)
+
+
+def _held_course(twin: "Twin", situation: ModeSituation) -> ModeSituation | None:
+    """Return the situation of a heading-hold mode now; None while the pilot steers, or without attitude."""
+    velocity, attitude, command = (_newest(twin, name) for name in ("velocity", "attitude", "command"))
+    if velocity is None or attitude is None:
+        return None
+    height_error = float("nan") if command is None else float(command[3])
+    return after_steering(situation, atan2(velocity[1], velocity[0]), float(attitude[0]), height_error)
 
 
 def _hand_flown_until_failsafe(twin: "Twin", law: str) -> Route | None:
