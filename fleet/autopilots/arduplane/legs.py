@@ -95,8 +95,8 @@ def is_return(leg: np.ndarray) -> bool:
 
 @kernel
 def _has_line(legs: np.ndarray, i: int, k: int) -> bool:
-    """Return whether the leg `k` is flown along a line after leg `i`, also where the operator selected it."""
-    if i < 0 or k == i or is_return(legs[k]):
+    """Return whether leg `k` is flown along a line after leg `i`; an item selected with a mode has none."""
+    if i < 0 or k != i + 1 or is_return(legs[k]):
         return False
     return int(legs[i, KIND]) != TAKEOFF and int(legs[i, KIND]) != LOITER_UNLIMITED
 
@@ -113,8 +113,7 @@ def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndar
         set_leg(ctl, par, legs, k, p)
         ctl[S.FOLLOW_LINE], ctl[S.COURSE] = -1.0, course
         return
-    circle = int(legs[i, KIND]) in (LOITER_TURNS, LOITER_TIME, LOITER_TO_ALT)
-    from_exit = circle and legs[i, ACCEPT_RADIUS] > 0.0 and k == i + 1
+    from_exit = int(legs[i, KIND]) in (LOITER_TURNS, LOITER_TIME, LOITER_TO_ALT) and legs[i, ACCEPT_RADIUS] > 0.0
     set_leg(ctl, par, legs, k, p if from_exit else legs[i, P_N : P_D + 1])
     ctl[S.FOLLOW_LINE], ctl[S.COURSE] = 1.0, course
     if int(legs[i, KIND]) == CHANGE_ALTITUDE:

@@ -148,3 +148,13 @@ def test_beyond_the_largest_radius_a_waypoint_is_not_accepted():
         plane = Plane((north, 0.0, -100.0))
         ctl = begin(legs, plane, par, (-500.0, 0.0, -100.0))
         assert leg_rules.steer(ctl, par, legs, plane.p, plane.v, np.zeros(3), 0.1)[1] == expected
+
+
+def test_an_item_out_of_order_is_flown_to_directly():
+    """As s03 of the recordings: a return enters the landing sequence, whose first line starts at the aircraft."""
+    par, _ = ap.parameters(PLANE)
+    legs = route(leg(n=500.0), leg(n=1000.0), leg(n=1500.0, e=800.0))
+    ctl = begin(legs, Plane(), start=(0, 0, -100))
+    here = np.array([100.0, 60.0, -100.0])
+    leg_rules.begin(ctl, par, legs, 2, here)
+    assert (ctl[ap.LEG], ctl[S.FOLLOW_LINE], ctl[S.PREV_N], ctl[S.PREV_E]) == (2, -1.0, 100.0, 60.0)
