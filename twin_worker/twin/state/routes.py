@@ -43,11 +43,8 @@ def present_route(twin: "Twin") -> Route | None:
     law = LAW_OF_AUTOPILOT.get(twin.autopilot, "")
     if entry is not None:
         target = twin.onboard.target
-        situation: ModeSituation | None = _situation(
-            twin, entry.ned(origin), entry.course, None if target is None else _ned(origin, target)
-        )
-        if twin.mode in HEADING_HOLD_MODES:
-            situation = _course_hold(twin, situation)
+        entered = _situation(twin, entry.ned(origin), entry.course, None if target is None else _ned(origin, target))
+        situation = _course_hold(twin, entered) if twin.mode in HEADING_HOLD_MODES else entered
         route = None if situation is None else mode_route(law, twin.mode, situation, twin.received_params)
         if route is not None:
             return route
