@@ -38,6 +38,8 @@ def present_route(twin: "Twin") -> Route | None:
     entry, origin = twin.onboard.entry, twin.telemetry.origin
     if origin is None or twin.prediction.override is not None or twin.mode in ROUTE_MODES:
         return None
+    if twin.environment.flight_phase.flying is False:  # on the ground
+        return None
     if twin.vehicle_class.is_rotorcraft or (twin.mode == "RTL" and twin.received_params.get("Q_RTL_MODE", 0.0) != 0):
         return None
     law = LAW_OF_AUTOPILOT.get(twin.autopilot, "")
