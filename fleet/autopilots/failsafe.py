@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 GLIDE, LEVEL, LAND_SEQUENCE = "FBWA", "FBWB", "AUTO"
-_HAND_FLOWN = ("MANUAL", "STABILIZE", "ACRO", "FBWA", "AUTOTUNE", "FBWB", "CRUISE", "TRAINING")
+_MANUAL = ("MANUAL", "STABILIZE", "ACRO", "FBWA", "AUTOTUNE", "FBWB", "CRUISE", "TRAINING")
 _NAVIGATES = ("AUTO", "AVOID_ADSB", "GUIDED", "LOITER", "THERMAL")
 _DETECTION_S = 0.2  # time in which ArduPlane detects that the remote control is lost [s]
 _SHORT_MODES = {0: "CIRCLE", 1: "CIRCLE", 2: GLIDE, 4: LEVEL}
@@ -44,7 +44,7 @@ def _arduplane_short(mode: str, action: int) -> str:
     """Return the mode of ArduPlane's short action; empty: no change."""
     if action == _SHORT_DISABLED or (mode in _NAVIGATES and action == 0):
         return ""
-    return _SHORT_MODES.get(action, "CIRCLE") if mode in _NAVIGATES + _HAND_FLOWN else ""
+    return _SHORT_MODES.get(action, "CIRCLE") if mode in _NAVIGATES + _MANUAL else ""
 
 
 def _arduplane_long(mode: str, action: int) -> str:
@@ -53,7 +53,7 @@ def _arduplane_long(mode: str, action: int) -> str:
         return _LONG_MODES.get(action, "")
     if mode == "RTL":
         return _LONG_MODES[action] if action in (4, 5) else ""
-    continues = mode in (*_HAND_FLOWN, "CIRCLE", "LOITER", "THERMAL", "TAKEOFF")
+    continues = mode in (*_MANUAL, "CIRCLE", "LOITER", "THERMAL", "TAKEOFF")
     return _LONG_MODES.get(action, "RTL") if continues and action != _PARACHUTE else ""
 
 

@@ -97,8 +97,8 @@ _Rule = Callable[[ModeSituation, Mapping[str, float]], Route]
 
 def _parameter(params: Mapping[str, float], names: Sequence[tuple[str, float]], default: float) -> float:
     """Return the first finite parameter of `names` (name, unit in SI), else the default in SI."""
-    found = (params[name] * unit for name, unit in names if isfinite(params.get(name, float("nan"))))
-    return next(found, default)
+    values = (params[name] * unit for name, unit in names if isfinite(params.get(name, float("nan"))))
+    return next(values, default)
 
 
 def make_leg(kind: int, point: np.ndarray, **columns: float) -> np.ndarray:

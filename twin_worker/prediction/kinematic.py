@@ -116,29 +116,29 @@ def fly(
         ahead: requested look-ahead times, (k,) [s]
     """
     invalid_rows = np.flatnonzero(~track.ok)
-    flown = track.part(int(invalid_rows[-1]) + 1 if len(invalid_rows) else 0, len(track))
-    if len(flown) < MIN_TRACK_S / STEP:
-        reason = f"{format_below(len(flown) * STEP, MIN_TRACK_S)} s without gaps, {MIN_TRACK_S:.0f} s are needed; wait"
+    flight = track.part(int(invalid_rows[-1]) + 1 if len(invalid_rows) else 0, len(track))
+    if len(flight) < MIN_TRACK_S / STEP:
+        reason = f"{format_below(len(flight) * STEP, MIN_TRACK_S)} s without gaps, {MIN_TRACK_S:.0f} s are needed; wait"
         return KinematicRollout(None, -1, reason)
-    if flown.t[-1] < config.changed_t - MAX_EARLY_S:
+    if flight.t[-1] < config.changed_t - MAX_EARLY_S:
         return KinematicRollout(None, -1, "the route changed after this telemetry")
-    seq = seq[-len(flown) :] if config.mode_route is None else np.full(len(flown), NO_ITEM)
+    seq = seq[-len(flight) :] if config.mode_route is None else np.full(len(flight), NO_ITEM)
     if config.mode_route is None:
-        seq = items_since_entry(seq, flown.t, config.entry, config.history)
-    first = max(int(np.searchsorted(flown.t, config.changed_t)), len(flown) - int(_SYNC_S / STEP))
+        seq = items_since_entry(seq, flight.t, config.entry, config.history)
+    first = max(int(np.searchsorted(flight.t, config.changed_t)), len(flight) - int(_SYNC_S / STEP))
     unknown_rows = np.flatnonzero(~np.isfinite(seq))
-    first = max(min(first, len(flown) - 2), int(unknown_rows[-1]) + 1 if len(unknown_rows) else 0)
-    if first >= len(flown):
+    first = max(min(first, len(flight) - 2), int(unknown_rows[-1]) + 1 if len(unknown_rows) else 0)
+    if first >= len(flight):
         return KinematicRollout(None, -1, "the current mission item is not reported (MISSION_CURRENT)")
-    return _fly_route(flown, first, seq[first:].astype(np.int64), (config, model), ahead)
+    return _fly_route(flight, first, seq[first:].astype(np.int64), (config, model), ahead)
 
 
 def _fly_route(
-    flown: Track, first: int, seq: np.ndarray, options: tuple[KinematicConfig, KinematicModel], ahead: np.ndarray
+    flight: Track, first: int, seq: np.ndarray, options: tuple[KinematicConfig, KinematicModel], ahead: np.ndarray
 ) -> KinematicRollout:
-    """Predict from the end of `flown`, which is on the present route from row `first` on, with the items `seq`."""
+    """Predict from the end of `flight`, which is on the present route from row `first` on, with the items `seq`."""
     config, model = options
-    recent = flown.part(first, len(flown))
+    recent = flight.part(first, len(flight))
     controller = fixed_wing_controller(config.params, model.identified, sentence=law.LAW)
     par = controller.par(_altitude(recent, config))
     mission_route = config.mode_route or cached_route(
@@ -146,7 +146,7 @@ def _fly_route(
     )
     if not len(mission_route.legs):
         return KinematicRollout(None, int(seq[-1]), mission_route.summary or "the mission has no legs to fly")
-    w, V = wind_and_airspeed(flown, config.wind)
+    w, V = wind_and_airspeed(flight, config.wind)
     if V < _MIN_AIRSPEED or np.linalg.norm(recent.v[-1] - [*w, 0.0]) < _MIN_AIRSPEED:
         return KinematicRollout(None, int(seq[-1]), "too slow to fly on wings")
     start_point = mission_route.start
@@ -155,7 +155,7 @@ def _fly_route(
         start_point = leg_start(mission_route, config.entry, config.history, at)
     ctl = _synchronise(recent, seq, (par, mission_route.legs, start_point), w)
     lags = _lag_parameters(
-        flown, mission_route.legs[int(ctl[arduplane.LEG])], par, controller.default_names, (model, V)
+        flight, mission_route.legs[int(ctl[arduplane.LEG])], par, controller.default_names, (model, V)
     )
     guidance = _RouteGuidance(ctl, par, mission_route, lags, controller)
     if config.override is not None:
@@ -164,7 +164,7 @@ def _fly_route(
         return KinematicRollout(None, int(seq[-1]), guidance.route.summary or "the mission has no legs to fly")
     if int(guidance.route.legs[int(guidance.ctl[arduplane.LEG]), KIND]) == TAKEOFF:
         return KinematicRollout(None, int(seq[-1]), "take-off is not modelled: no route-aware prediction")
-    state, sentence = _state(flown, w), guidance.route.summary
+    state, sentence = _state(flight, w), guidance.route.summary
     if config.override is not None and config.override.speed is not None:
         state[3] = config.override.speed
 

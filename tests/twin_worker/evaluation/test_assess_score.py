@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
-from tests.support.flights import HERE
+from fleet.contract import Status
+from tests.support import flights as f
+from tests.support.flights import HERE, T0
 from twin_worker.evaluation.scoring.compare import BEATEN, MATCHED, ONE_FLIGHT, WORSE, compare
-from twin_worker.evaluation.scoring.log import OURS, EvaluationCase, EvaluationStart, MethodForecast
+from twin_worker.evaluation.scoring.log import OURS, EvaluationCase, EvaluationStart, MethodForecast, ReferenceFlight
 from twin_worker.evaluation.scoring.score import LIMITS, passage_quantile, score_method, survival_at
 from twin_worker.evaluation.scoring.summary import method_figures, summarise
 
@@ -182,3 +184,12 @@ def test_the_summary_counts_what_counts_and_tells_the_rest_apart():
 
 def test_every_limit_is_scored():
     assert sorted(score_method([case(ours=EAST)], OURS).passages) == sorted(LIMITS)
+
+
+def test_a_new_target_in_guided_is_an_event():
+    reference = ReferenceFlight()
+    for k, (mode, north) in enumerate((("AUTO", 0), ("GUIDED", 900), ("GUIDED", 900), ("GUIDED", 5000))):
+        reference.add(Status(uav=1, t=T0 + k, mode=mode))
+        place = np.array([[470_000_000 + north, 80_000_000, 600_000]])
+        reference.add(f.sample(1, T0 + k + 0.5, target=(np.array([T0 + k + 0.5]), place)))
+    assert [(t - T0, reason) for t, reason in reference.events] == [(1.0, "mode changed"), (3.5, "target changed")]

@@ -34,7 +34,7 @@ def flown(law: str, banks=None, **more: float) -> ReplayWindow:
     good = Window(rows[:, 0], np.zeros((n, 9)), np.zeros((n, 4)), *parts[1:3], np.ones(n, bool), np.zeros(n, bool))
     start = np.array([0.0, 0.0, -100.0])
     return ReplayWindow(
-        good, legs, start, tuple(map(np.ascontiguousarray, told)), rows[:, 14].astype(np.int64), 0.0, ""
+        good, good, legs, start, tuple(map(np.ascontiguousarray, told)), rows[:, 14].astype(np.int64), 0.0, ""
     )
 
 

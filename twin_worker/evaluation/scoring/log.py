@@ -11,6 +11,7 @@ from twin_worker.telemetry.history import TelemetryHistory
 
 _MAX_GAP_S = 2.0  # an instant without a position within this time is in a telemetry gap [s]
 _LANDING = (21, 85)  # MAV_CMD: NAV_LAND, NAV_VTOL_LAND
+_TARGET_MOVED_M = 2.0  # a guidance target that moves further is a new one [m]
 _UNLIMITED_S = 1e9  # [s]
 
 
@@ -26,6 +27,7 @@ class ReferenceFlight:
         self._params: dict[str, float] = {}
         self._mission_complete = False
         self._was_armed = False
+        self._target: np.ndarray | None = None
         self._positions: tuple[np.ndarray, np.ndarray] | None = None
 
     def add(self, message: Message) -> None:
@@ -49,11 +51,24 @@ class ReferenceFlight:
         self.first_t = sample.t if np.isnan(self.first_t) else self.first_t
         self._history.add(Sample(uav=sample.uav, t=sample.t, position=sample.position, leg=sample.leg))
         self._positions = None
+        self._add_target(sample)
         if sample.leg is None:
             return
         t, seq = self._history.rows("leg", sample.t - 1.0)
         if len(t) and any(item.seq == seq[-1, 0] and item.command in _LANDING for item in self.items):
             self.events.append((float(t[-1]), "landing"))
+
+    def _add_target(self, sample: Sample) -> None:
+        """Record a new guidance target in GUIDED: a command, as a mode change is."""
+        if self.status is None or self.status.mode != "GUIDED":
+            self._target = None
+        elif sample.target is not None:
+            target = sample.target.x.numpy()[-1].astype(float)
+            if self._target is not None:
+                before = Origin(*(int(x) for x in self._target))
+                if np.linalg.norm(to_ned(before, *target[:, None])) > _TARGET_MOVED_M:
+                    self.events.append((sample.t, "target changed"))
+            self._target = target
 
     def _add_status(self, status: Status) -> None:
         if self.status and self.status.mode and status.mode != self.status.mode:

@@ -38,23 +38,22 @@ def present_route(twin: "Twin") -> Route | None:
     entry, origin = twin.onboard.entry, twin.telemetry.origin
     if origin is None or twin.prediction.override is not None or twin.mode in ROUTE_MODES:
         return None
+    if twin.environment.flight_phase.flying is False:  # on the ground
+        return None
     if twin.vehicle_class.is_rotorcraft or (twin.mode == "RTL" and twin.received_params.get("Q_RTL_MODE", 0.0) != 0):
         return None
     law = LAW_OF_AUTOPILOT.get(twin.autopilot, "")
     if entry is not None:
         target = twin.onboard.target
-        situation: ModeSituation | None = _situation(
-            twin, entry.ned(origin), entry.course, None if target is None else _ned(origin, target)
-        )
-        if twin.mode in HEADING_HOLD_MODES:
-            situation = _held_course(twin, situation)
+        entered = _situation(twin, entry.ned(origin), entry.course, None if target is None else _ned(origin, target))
+        situation = _course_hold(twin, entered) if twin.mode in HEADING_HOLD_MODES else entered
         route = None if situation is None else mode_route(law, twin.mode, situation, twin.received_params)
         if route is not None:
             return route
-    return _hand_flown_until_failsafe(twin, law)
+    return _manual_until_failsafe(twin, law)
 
 
-def _held_course(twin: "Twin", situation: ModeSituation) -> ModeSituation | None:
+def _course_hold(twin: "Twin", situation: ModeSituation) -> ModeSituation | None:
     """Return the situation of a heading-hold mode now; None while the pilot steers, or without attitude."""
     velocity, attitude, command = (_newest(twin, name) for name in ("velocity", "attitude", "command"))
     if velocity is None or attitude is None:
@@ -63,7 +62,7 @@ def _held_course(twin: "Twin", situation: ModeSituation) -> ModeSituation | None
     return after_steering(situation, atan2(velocity[1], velocity[0]), float(attitude[0]), height_error)
 
 
-def _hand_flown_until_failsafe(twin: "Twin", law: str) -> Route | None:
+def _manual_until_failsafe(twin: "Twin", law: str) -> Route | None:
     """Return the present bank as route of a hand-flown mode, if a failsafe ends it; else None."""
     if not twin.telemetry.link_lost or not link_loss_steps(law, twin.mode, twin.received_params):
         return None
