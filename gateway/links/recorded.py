@@ -47,7 +47,7 @@ class ReplayLink:
         self.spec = spec
         self.dropped = self.unsent = 0
         self.known_peers: Sequence[Hashable] = ()
-        self.recording = Recording(spec.address, spec.offset)
+        self.recording = Recording(spec.address, spec.offset, spec.options)
         self.pace = ReplayPace(spec.speed)
         self._ids = IdAllocator() if ids is None else ids
         self._copies = OffsetCopies(spec.copies)

@@ -4,7 +4,9 @@ import multiprocessing
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
+from fleet.telemetry.recording.options import RecordingOptions
 from twin_worker.diagnosis.baseline.own_past import OwnPast, conceal_channels, exclude_concealed
 from twin_worker.diagnosis.data.flight import FlightData, read_flights
 from twin_worker.diagnosis.inference.diagnose import diagnose
@@ -13,11 +15,20 @@ from twin_worker.diagnosis.model.baseline import Baseline
 
 ReportProgress = Callable[[str], None]
 Reference = Baseline | OwnPast
+
+
+class RecordingTask(NamedTuple):
+    """One recording to diagnose, with the data that it lacks."""
+
+    path: Path
+    options: RecordingOptions
+
+
 TaskResult = tuple[list[Report], str]  # reports of one task, and the error message or an empty string
 
 
 def diagnose_all(
-    tasks: Sequence[Path | FlightData],
+    tasks: Sequence[Path | RecordingTask | FlightData],
     reference: Reference,
     jobs: int,
     progress: ReportProgress,
@@ -50,16 +61,16 @@ def _init_worker(reference: Reference, conceal: Sequence[str]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _task(task: Path | FlightData) -> TaskResult:
+def _task(task: Path | RecordingTask | FlightData) -> TaskResult:
     return _diagnose_task(task, _reference, lambda message: None, _conceal)
 
 
 def _diagnose_task(
-    task: Path | FlightData, reference: Reference, progress: ReportProgress, conceal: Sequence[str]
+    task: Path | RecordingTask | FlightData, reference: Reference, progress: ReportProgress, conceal: Sequence[str]
 ) -> TaskResult:
     reports: list[Report] = []
     try:
-        for flight in [task] if isinstance(task, FlightData) else read_flights(task, reference.card):
+        for flight in _flights_of(task, reference):
             progress(f"{flight.name}: {flight.seconds:.0f} s of flight")
             if isinstance(reference, OwnPast):
                 reports.append(reference.diagnose(flight, progress, conceal))
@@ -70,3 +81,11 @@ def _diagnose_task(
     except (ValueError, OSError) as error:
         return reports, str(error)
     return reports, ""
+
+
+def _flights_of(task: Path | RecordingTask | FlightData, reference: Reference) -> list[FlightData]:
+    if isinstance(task, FlightData):
+        return [task]
+    if isinstance(task, RecordingTask):
+        return read_flights(task.path, reference.card, task.options)
+    return read_flights(task, reference.card)

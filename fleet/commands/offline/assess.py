@@ -7,6 +7,7 @@ from fleet.cli import stop_on_signal
 from fleet.process.children import run_until
 from fleet.process.interrupt import INTERRUPTED
 from fleet.process.logs import report_progress
+from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
 
 EXAMPLES = """
   fleet assess flight.tlog
@@ -37,6 +38,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes that share the aircraft (1)")
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
+    add_recording_arguments(parser)
 
 
 def check_arguments(args: argparse.Namespace) -> None:
@@ -77,6 +79,7 @@ def run(args: argparse.Namespace) -> int:
     options = [f"--{name}={getattr(args, name)}" for name in ("every", "method", "methods", "jobs", "offset")]
     options += [f"--{name}={value}" for name, value in (("out", args.out), ("json", args.json)) if value]
     options += ["--without-params"] if args.without_params else []
+    options += RecordingOptions.of(args).arguments()
     code = run_until(stop, "twin_worker.evaluation", *options, "--", *map(str, args.file))
     if stop.is_set():
         report_progress("assess", "stopped; unfinished results are not written")

@@ -7,6 +7,7 @@ from fleet.cli import stop_on_signal
 from fleet.process.children import run_until
 from fleet.process.interrupt import INTERRUPTED
 from fleet.process.logs import report_progress
+from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
 
 EXAMPLES = """
   fleet calibrate monday/*.tlog --airframe skywalker --out skywalker.json
@@ -27,6 +28,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=Path, required=True, metavar="MODEL", help="write the simulation to MODEL")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the fit achieved to FILE")
+    add_recording_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -35,6 +37,7 @@ def run(args: argparse.Namespace) -> int:
     options = [
         f"--{name}={getattr(args, name)}" for name in ("airframe", "until", "out", "json") if getattr(args, name)
     ]
+    options += RecordingOptions.of(args).arguments()
     code = run_until(stop, "twin_worker.diagnosis.learn", *options, "--", *map(str, args.file))
     if stop.is_set():
         report_progress("calibrate", "stopped; no model was written")

@@ -7,6 +7,7 @@ from fleet.cli import stop_on_signal
 from fleet.process.children import run_until
 from fleet.process.interrupt import INTERRUPTED
 from fleet.process.logs import report_progress
+from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
 
 _MAX_PAST_S = 1e6
 
@@ -45,6 +46,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--report", type=Path, metavar="DIR", help="write figures, a page and corrected models into DIR"
     )
+    add_recording_arguments(parser)
 
 
 def check_arguments(args: argparse.Namespace) -> None:
@@ -75,6 +77,7 @@ def run(args: argparse.Namespace) -> int:
         for name in ("model", "airframe", "json", "report", "jobs", "against_own_past", "conceal")
     }
     options = [f"--{name.replace('_', '-')}={value}" for name, value in values.items() if value]
+    options += RecordingOptions.of(args).arguments()
     simulated = ["--against", *map(str, args.against)] if args.against else []
     code = run_until(stop, "twin_worker.diagnosis", *options, *simulated, "--", *map(str, args.file))
     if stop.is_set():

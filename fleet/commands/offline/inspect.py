@@ -20,6 +20,7 @@ from fleet.report.progress import show_progress
 from fleet.report.report_text import table
 from fleet.telemetry.inspection.findings import AircraftFindings, FileFindings, LinkTexts, compute_findings
 from fleet.telemetry.inspection.survey import Survey, survey_recording
+from fleet.telemetry.recording.options import NO_OPTIONS, RecordingOptions, add_recording_arguments
 from fleet.telemetry.recording.recordings import Recording
 
 EXAMPLES = """
@@ -47,6 +48,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plot", type=Path, metavar="FILE", help="a page for every aircraft: .png, .svg or .pdf")
     parser.add_argument("--twin", action="store_true", help="replay the recording through a twin and report the result")
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
+    add_recording_arguments(parser)
     parser.add_argument("--keys", action="store_true", help="explain every key of the JSON and stop")
 
 
@@ -56,12 +58,13 @@ def run(args: argparse.Namespace) -> int:
         print(describe_keys())
         return 0
     _check(args)
+    options = RecordingOptions.of(args)
     files: list[FileFindings] = []
     pages: list[tuple[Survey, AircraftFindings, LinkTexts, str]] = []
     console = Console()
     for path in args.file:
-        inspected = inspect_file(path, args.offset)
-        file = msgspec.structs.replace(inspected.file, twin=_run_twin(path)) if args.twin else inspected.file
+        inspected = inspect_file(path, args.offset, options)
+        file = msgspec.structs.replace(inspected.file, twin=_run_twin(path, options)) if args.twin else inspected.file
         files.append(file)
         if args.json != "-":
             console.print(table(file))
@@ -89,13 +92,13 @@ def describe_keys() -> str:
     return "\n".join(lines)
 
 
-def inspect_file(path: Path, offset: int = 0) -> InspectedFile:
+def inspect_file(path: Path, offset: int = 0, options: RecordingOptions = NO_OPTIONS) -> InspectedFile:
     """Read one recording; report every error in it as a text."""
     surveys: dict[int, Survey] = {}
     facts: dict[int, LinkTexts] = {}
     sentences: list[str] = []
     try:
-        recording = Recording(path, offset)
+        recording = Recording(path, offset, options)
         with show_progress([recording], _report, Console(stderr=True), leave=False):
             surveys = survey_recording((news for _, step in recording.steps() for news in step), recording.kind)
         facts = {uav: LinkTexts(link.firmware, tuple(link.texts)) for uav, link in recording.aircraft.items()}
@@ -142,11 +145,13 @@ def _check(args: argparse.Namespace) -> None:
             raise ValueError(f"{option}: found the recording {str(name)!r} itself, expected another file; rename it")
 
 
-def _run_twin(path: Path) -> dict[str, Any]:
+def _run_twin(path: Path, options: RecordingOptions) -> dict[str, Any]:
     """Replay the recording through a twin in a separate process; return results by UAV id, or `sentence`."""
     with _folder() as folder:
         output = folder / "twin.json"
-        code, errors = run_to_end("twin_worker.evaluation.replay", str(path), "--json", str(output))
+        code, errors = run_to_end(
+            "twin_worker.evaluation.replay", str(path), "--json", str(output), *options.arguments()
+        )
         try:
             result = json.loads(output.read_text())
         except (OSError, ValueError):

@@ -19,7 +19,7 @@ from fleet.contract import (
     Status,
     Verdict,
 )
-from fleet.mission import FIRST_ITEM
+from fleet.mission import FIRST_ITEM, extends, route_items
 from fleet.vehicles import UNKNOWN, VehicleClass, vehicle_class
 from fleet.window import Window
 from twin_worker.prediction.autopilot_identification import LAW_OF_AUTOPILOT
@@ -166,7 +166,7 @@ class Twin(msgspec.Struct):
     def situation(self, window: Window) -> PredictionContext:
         """Return the initial data of a prediction from the end of `window`."""
         assert self.telemetry.origin is not None
-        items = self.onboard.mission.items if self.onboard.mission else ()
+        items = route_items(self.onboard.mission)
         law = LAW_OF_AUTOPILOT.get(self.autopilot, self.environment.autopilot.law)
         autopilot_config = AutopilotConfig(
             items,
@@ -199,7 +199,7 @@ def ingest(twin: Twin, message: Message) -> None:
     elif isinstance(message, Status):
         _ingest_status(twin, message)
     elif isinstance(message, Mission):
-        if twin.onboard.mission is None or twin.onboard.mission.items != message.items:
+        if not _is_same_mission(twin.onboard.mission, message):
             invalidate_prediction(twin, Event.MISSION, message.t, describe_mission(twin.onboard.mission, message))
         twin.onboard.set_mission(message)
     elif isinstance(message, Params):
@@ -209,6 +209,13 @@ def ingest(twin: Twin, message: Message) -> None:
             invalidate_prediction(twin, Event.PARAMETERS if names else None, message.t, text)
         twin.onboard.set_params(message)
         twin.telemetry.set_servo_map(message.values)
+
+
+def _is_same_mission(before: Mission | None, after: Mission) -> bool:
+    """Return whether a mission is the known one, or more items of an incomplete one."""
+    if before is None:
+        return False
+    return before.items == after.items or (not before.complete and extends(after.items, before.items))
 
 
 def _ingest_status(twin: Twin, status: Status) -> None:
