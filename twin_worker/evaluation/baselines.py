@@ -29,6 +29,7 @@ from fleet.mission import (
     TURNS,
     VA_C,
     Route,
+    route_items,
     unroll_route,
 )
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
@@ -273,7 +274,7 @@ def _route_points(inputs: BaselineInput) -> np.ndarray | None:
     params = twin.onboard.params.values if twin.onboard.params else {}
     first = twin.first_item
     remaining = unroll_route(
-        twin.onboard.mission.items, seq=int(seq[-1]), origin=twin.telemetry.origin, params=params, first=first
+        route_items(twin.onboard.mission), seq=int(seq[-1]), origin=twin.telemetry.origin, params=params, first=first
     )
     if not len(remaining.legs):
         return None

@@ -124,6 +124,8 @@ def notes(results: dict[str, Any], names: list[str]) -> list[str]:
         if others:
             counts_text = ", ".join(f"{n} by {by}" for by, n in others.items())
             lines.append(f"{_LABELS.get(name, name)}: of {results[name]['starts']} predictions {counts_text}")
+    short = "mission shorter than a full start, scored as far as it goes (censored)"
+    lines += [f"{flight}: {short}" for flight in results.get("run", {}).get("short", ())]
     for reason, row in results["apart"].items():
         lines.append(
             f"excluded: {row['starts']} starts, {reason}; ours within 10 % for {_number(row['m1_t10_lq_s'])} "

@@ -182,3 +182,11 @@ def test_the_summary_counts_what_counts_and_tells_the_rest_apart():
 
 def test_every_limit_is_scored():
     assert sorted(score_method([case(ours=EAST)], OURS).passages) == sorted(LIMITS)
+
+
+def test_a_censored_start_counts_up_to_its_end() -> None:
+    passages = np.array([[20.0, 1.0], [10.0, 0.0], [60.0, 1.0], [60.0, 1.0]])
+    assert survival_at(passages, 60.0) == pytest.approx(0.75)  # one of four passed; the one censored at 20 s drops out
+    assert survival_at(np.array([[20.0, 1.0], [30.0, 0.0], [60.0, 1.0]]), 60.0) == pytest.approx(0.5)
+    assert np.isnan(survival_at(np.array([[20.0, 1.0], [10.0, 0.0]]), 60.0))
+    assert survival_at(np.array([[20.0, 0.0], [10.0, 1.0]]), 60.0) == 0.0
