@@ -15,7 +15,7 @@ from math import hypot
 
 import numpy as np
 
-from fleet.contract import MAX_ITEMS, Item
+from fleet.contract import MAX_ITEMS, Item, Mission
 from fleet.frames import Origin, to_ned
 from fleet.mission_jumps import JUMPS, jump_target, nearest_landing, repetitions, resets_counters
 from fleet.mission_legs import (
@@ -93,6 +93,7 @@ ROUTE_PARAMS = (
     *("AIRSPEED_MIN", "ARSPD_FBW_MIN", "AIRSPEED_MAX", "ARSPD_FBW_MAX"),
 )
 """Autopilot parameters that shape a route."""
+_UNKNOWN = -1  # command of the item after the last known one
 _MAX_REMARKS = 3  # remarks reported of one mission
 _MAX_LEG = 500e3  # a longer leg is an input error, and flat earth does not give its direction [m]
 _RTL_ALTITUDE = 100.0  # ArduPlane's default RTL_ALTITUDE [m]
@@ -150,6 +151,20 @@ def join_remarks(sentences: Sequence[str]) -> str:
     return " ".join([*sentences[:_MAX_REMARKS], *([f"and {n_more} more remarks on the mission"] if n_more > 0 else [])])
 
 
+def route_items(mission: Mission | None) -> tuple[Item, ...]:
+    """Return the items of a mission; an incomplete one ends in an item that `unroll_route` treats as unknown."""
+    if mission is None or mission.complete or not mission.items:
+        return mission.items if mission else ()
+    next_seq = max(item.seq for item in mission.items) + 1
+    return (*mission.items, Item(seq=next_seq, command=_UNKNOWN)) if 0 < next_seq < MAX_ITEMS else mission.items
+
+
+def extends(items: Sequence[Item], known: Sequence[Item]) -> bool:
+    """Return whether `items` contain all `known` ones unchanged: more of the same mission has arrived."""
+    by_seq = {item.seq: item for item in items}
+    return bool(known) and all(by_seq.get(item.seq) == item for item in known)
+
+
 def unroll_route(
     items: Sequence[Item],
     *,
@@ -198,9 +213,7 @@ def _make_builder(items: Sequence[Item], origin: Origin, params: Mapping[str, fl
         return builder
     n_missing = builder.last + 1 - len(by_seq)
     if n_missing:
-        builder.remark(
-            f"mission: found {len(by_seq)} of {builder.last + 1} items; skipped {n_missing}, download the mission again"
-        )
+        builder.remark(f"mission: found {len(by_seq)} of {builder.last + 1} items; download the mission again")
     builder.home = builder.last_point = _home(builder) if first else np.zeros(3)
     lat, lon = (np.array([getattr(item, name) for item in by_seq.values()], float) for name in ("lat_e7", "lon_e7"))
     builder.positions = dict(zip(by_seq, to_ned(origin, lat, lon, np.zeros(len(lat))), strict=True))
@@ -245,22 +258,42 @@ def _advance_to(builder: _RouteBuilder, seq: int) -> int:
                 builder.jumps_left[item_seq] = 0.0  # the aircraft has passed it
         elif item is not None:
             _apply_item(builder, item)
+        else:
+            builder.last_kind = TAKEOFF  # the line to the next item starts at an unknown point
         item_seq += 1
     return item_seq
 
 
 def _append_legs(builder: _RouteBuilder, item_seq: int, limit: int) -> None:
-    """Append the legs from item `item_seq` on; return to launch follows the last item."""
+    """Append the legs from item `item_seq` on; return to launch follows the last item, a circle the last known one."""
     while item_seq <= builder.last and len(builder.legs) < limit:
         item = builder.items.get(item_seq)
-        is_jump = item is not None and item.command in JUMPS
-        if item is not None and not is_jump:
+        if item is None and not builder.legs:  # the current item itself is missing: the next known one is flown to
+            item_seq += 1
+            continue
+        if item is None or item.command == _UNKNOWN:
+            _append_hold(builder, item_seq)
+            return
+        is_jump = item.command in JUMPS
+        if not is_jump:
             _apply_item(builder, item)
-        item_seq = _seq_after_jump(builder, item) if item is not None and is_jump else item_seq + 1
+        item_seq = _seq_after_jump(builder, item) if is_jump else item_seq + 1
         if item_seq > builder.last and not _is_final(builder):
             builder.legs.append(_return_leg(builder))
-        if item_seq > builder.last or (item is not None and item.command == _RETURN):
+        if item_seq > builder.last or item.command == _RETURN:
             item_seq = _seq_after_return(builder)
+
+
+def _append_hold(builder: _RouteBuilder, item_seq: int) -> None:
+    """Append a circle at the last known point: no one knows what follows."""
+    builder.remark(
+        f"mission item {item_seq}: not received, expected every item; predicted up to the one before, "
+        "download the mission again"
+    )
+    if builder.legs and not _is_final(builder):
+        leg = np.zeros(N_COLUMNS)
+        leg[KIND], leg[SEQ], leg[P_N : P_D + 1] = LOITER_UNLIMITED, -1, builder.last_point
+        builder.legs.append(leg)
 
 
 def _is_final(builder: _RouteBuilder) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 from fleet.telemetry.mavlink.parsing.decode import IDS
 from fleet.telemetry.mavlink.parsing.scan import COMPONENT, ID, SYSTEM
 from fleet.telemetry.recording.opening import read_speed
+from fleet.telemetry.recording.options import NO_OPTIONS, RecordingOptions
 
 COLUMNS = {"messages": ID, "systems": SYSTEM, "components": COMPONENT}
 """Setting of a link -> column of a frame that it tests; the prefix `no-` inverts it."""
@@ -82,6 +83,7 @@ class LinkSpec(NamedTuple):
     offset: int = 0  # UAV id = MAVLink system id + offset
     copies: int = 1  # aircraft in place of each recorded one, itself included
     results: bool = False  # also replay recorded results of workers
+    options: RecordingOptions = NO_OPTIONS  # mission, parameters and column map of a recording
     message_filter: MessageFilter = MessageFilter()
     sign: str = ""  # one of SIGN; empty: signatures are not checked
     key: str = ""  # name of a key; empty: the only one
@@ -143,7 +145,8 @@ def _read_endpoint(text: str, kind: str, rest: str) -> LinkSpec | None:
         settings = dict(parse_qsl(query))
         speed = read_speed(settings.pop("speed", "1"))
         copies, results = int(settings.pop("copies", "1")), settings.pop("results", "0")
+        options = RecordingOptions(*(settings.pop(name, "") for name in ("mission", "params", "columns")))
         valid = 1 <= copies <= MAX_COPIES and (results == "0" or (results == "1" and copies == 1))
         if path and not settings and valid:
-            return LinkSpec(text, kind, unquote(path), 0, speed, copies=copies, results=results == "1")
+            return LinkSpec(text, kind, unquote(path), 0, speed, copies=copies, results=results == "1", options=options)
     return None

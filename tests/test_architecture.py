@@ -31,6 +31,7 @@ ORDER = (  # a folder, or a module in the root of a package, imports only from i
     ("fleet.telemetry.mavlink",),
     ("fleet.telemetry.onboard_logs",),
     ("fleet.telemetry.onboard_logs.dataflash", "fleet.telemetry.onboard_logs.ulog"),
+    ("fleet.telemetry.onboard_logs.columns", "fleet.telemetry.onboard_logs.ros2"),
     ("fleet.telemetry.recording",),
     ("fleet.telemetry.replay", "fleet.telemetry.inspection"),
     ("fleet.report",),

@@ -8,15 +8,29 @@ import numba as nb
 import numpy as np
 
 _FUNCTION = {4: "delta_a", 19: "delta_e", 21: "delta_r", 70: "delta_t", 77: "delta_e+a", 78: "delta_e-a"}
+_FUNCTION |= {79: "delta_e+r", 80: "delta_e-r", 24: "flaperon_left", 25: "flaperon_right"}
+_FUNCTION |= {73: "throttle_left", 74: "throttle_right"}
 _INPUTS = ("delta_a", "delta_e", "delta_r", "delta_t")
 _MIXES = {  # contribution of each servo's deflection to each input
     **{name: {name: 1.0} for name in _INPUTS},
     "delta_e+a": {"delta_e": 1.0, "delta_a": -1.0},  # left elevon
     "delta_e-a": {"delta_e": 1.0, "delta_a": 1.0},  # right elevon
+    "delta_e+r": {"delta_e": 1.0, "delta_r": 1.0},  # left half of a V-tail
+    "delta_e-r": {"delta_e": 1.0, "delta_r": -1.0},  # right half
+    "flaperon_left": {"delta_a": 1.0},  # flaps move the two in opposite directions: they cancel
+    "flaperon_right": {"delta_a": 1.0},
+    "throttle_left": {"delta_t": 1.0},  # differential thrust: their mean is the throttle
+    "throttle_right": {"delta_t": 1.0},
 }
+_MOTORS = ("delta_t", "throttle_left", "throttle_right")
 _SERVOS = 8
 _PX4_MOTORS, _PX4_SURFACES = 101, 201  # PWM_MAIN_FUNCn of the first motor, of the first control surface
 _PX4_TYPES = {1: "delta_a", 2: "delta_a", 3: "delta_e", 4: "delta_r", 5: "delta_e+a", 6: "delta_e-a"}  # CA_SV_CSn_TYPE
+_PX4_TYPES |= {7: "delta_e+r", 8: "delta_e-r"}
+ASSUMED = "servo map assumed"
+"""Beginning of the sentence of a map without any source."""
+_OLD_CHANNELS = {4: ("RCMAP_ROLL", 1), 19: ("RCMAP_PITCH", 2), 70: ("RCMAP_THROTTLE", 3), 21: ("RCMAP_YAW", 4)}
+_OLD_SIGNS = {1: (1, 1), 2: (1, -1), 3: (-1, 1), 4: (-1, -1)}  # ELEVON_OUTPUT, VTAIL_OUTPUT: up up, up down, ...
 _PX4_LEFT = 1  # a left aileron: up in a roll to the right
 
 
@@ -65,24 +79,26 @@ def _inputs_of_rows(pulses: np.ndarray, trim: np.ndarray, up: np.ndarray, down: 
 def servo_map(params: Mapping[str, float]) -> ServoMap:
     """Read SERVOn_FUNCTION, _MIN, _MAX, _TRIM, _REVERSED; without them assume aileron, elevator, throttle, rudder.
 
-    Source: ArduPilot, "Servo functions" (4 aileron, 19 elevator, 21 rudder, 70 throttle, 77 and 78 elevons); PX4:
-    PWM_MAIN_* and CA_SV_CSn_TYPE.
+    Source: ArduPilot, "Servo functions" (4 aileron, 19 elevator, 21 rudder, 70 throttle, 77 and 78 elevons, 79 and 80
+    V-tail, 24 and 25 flaperons, 73 and 74 differential thrust), before 3.8 RCn_FUNCTION, ELEVON_OUTPUT, VTAIL_OUTPUT;
+    PX4: PWM_MAIN_* and CA_SV_CSn_TYPE.
     """
     params = {name: value for name, value in params.items() if isfinite(value)}
-    params = {**_px4_as_ardupilot(params), **params}
+    params = {**_px4_as_ardupilot(params), **_old_as_ardupilot(params), **params}
     functions = {n: _FUNCTION.get(int(params.get(f"SERVO{n}_FUNCTION", -1))) for n in range(1, _SERVOS + 1)}
     known = {n: name for n, name in functions.items() if name}
     sentence = ""
     if not known:
         known = {1: "delta_a", 2: "delta_e", 3: "delta_t", 4: "delta_r"}
-        sentence = "servo map assumed (no SERVOn_FUNCTION): 1 aileron, 2 elevator, 3 throttle, 4 rudder"
+        sentence = f"{ASSUMED} (no SERVOn_FUNCTION): 1 aileron, 2 elevator, 3 throttle, 4 rudder"
     n_servos = {name: sum(name in _MIXES[other] for other in known.values()) for name in _INPUTS}
     trim, up, down = np.full(_SERVOS, 1500.0), np.zeros((_SERVOS, 4)), np.zeros((_SERVOS, 4))
     for n, name in known.items():
         low, high = params.get(f"SERVO{n}_MIN", 1100.0), params.get(f"SERVO{n}_MAX", 1900.0)
-        centre = low if name == "delta_t" else params.get(f"SERVO{n}_TRIM", 0.5 * (low + high))
+        is_motor = name in _MOTORS
+        centre = low if is_motor else params.get(f"SERVO{n}_TRIM", 0.5 * (low + high))
         sign = -1.0 if params.get(f"SERVO{n}_REVERSED", 0.0) else 1.0
-        if name == "delta_t" and sign < 0:
+        if is_motor and sign < 0:
             centre = high
         trim[n - 1] = centre
         for input_name, weight in _MIXES[name].items():
@@ -106,4 +122,34 @@ def _px4_as_ardupilot(params: Mapping[str, float]) -> dict[str, float]:
         converted |= {f"SERVO{n}_FUNCTION": float(numbers[name]), f"SERVO{n}_REVERSED": float(reverse)}
         converted |= {f"SERVO{n}_MIN": params.get(f"PWM_MAIN_MIN{n}", 1000.0)}
         converted |= {f"SERVO{n}_MAX": params.get(f"PWM_MAIN_MAX{n}", 2000.0)}
+    return converted
+
+
+def _old_as_ardupilot(params: Mapping[str, float]) -> dict[str, float]:
+    """Convert the output parameters of ArduPlane before 3.8 to the later ones; empty for later firmware.
+
+    Outputs 1 to 4 follow RCMAP_*, all others RCn_FUNCTION. With ELEVON_OUTPUT the outputs of pitch and roll carry
+    (pitch - roll) and (pitch + roll), with VTAIL_OUTPUT those of pitch and yaw (pitch - yaw) and (pitch + yaw), each
+    with a sign. Source: ArduPlane 3.7 documentation, "Elevon planes", "V-tail planes".
+    """
+    if not any(f"RC{n}_REV" in params for n in range(1, 5)) or any(name.startswith("SERVO1_") for name in params):
+        return {}
+    channel = {number: int(params.get(name, default)) for number, (name, default) in _OLD_CHANNELS.items()}
+    functions = {n: int(params.get(f"RC{n}_FUNCTION", 0)) for n in range(1, _SERVOS + 1)}
+    functions |= {n: number for number, n in channel.items() if 1 <= n <= _SERVOS}
+    signs = {n: 1.0 if params.get(f"RC{n}_REV", 1.0) >= 0 else -1.0 for n in functions}
+    for name, across, pair in (("ELEVON_OUTPUT", 4, (77, 78)), ("VTAIL_OUTPUT", 21, (80, 79))):
+        mixing = _OLD_SIGNS.get(int(params.get(name, 0.0)))
+        if mixing is not None:  # reversed inputs of the mixer: both outputs by pitch, their order by the other
+            pitch, other = channel[19], channel[across]
+            both, order = signs.get(pitch, 1.0), signs.get(pitch, 1.0) * signs.get(other, 1.0)
+            first, second = pair if order > 0 else pair[::-1]
+            functions |= {pitch: first, other: second}
+            signs |= {pitch: both * mixing[0], other: both * mixing[1]}
+    converted: dict[str, float] = {}
+    for n, function in functions.items():
+        converted[f"SERVO{n}_FUNCTION"], converted[f"SERVO{n}_REVERSED"] = float(function), float(signs.get(n, 1.0) < 0)
+        for key in ("MIN", "MAX", "TRIM"):
+            if f"RC{n}_{key}" in params:
+                converted[f"SERVO{n}_{key}"] = params[f"RC{n}_{key}"]
     return converted

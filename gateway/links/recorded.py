@@ -45,7 +45,7 @@ class ReplayLink(Endpoint):
 
     def __init__(self, spec: LinkSpec, ids: IdAllocator | None = None) -> None:
         super().__init__(spec)
-        self.recording = Recording(spec.address, spec.offset)
+        self.recording = Recording(spec.address, spec.offset, spec.options)
         self.pace = ReplayPace(spec.speed)
         self._ids = IdAllocator() if ids is None else ids
         self._copies = OffsetCopies(spec.copies)

@@ -50,6 +50,64 @@ def test_elevons_mix():
     assert inputs(ELEVONS, s1=1500, s2=1900, **calm) == [0.5, 0.5, 0.0, 0.0]
 
 
+def test_a_v_tail_mixes_pitch_and_yaw():
+    tail = PLANE | {"SERVO2_FUNCTION": 79, "SERVO4_FUNCTION": 80}
+    assert inputs(tail, s2=1900, s4=1900, s3=1100)[1:3] == [1.0, 0.0]
+    assert inputs(tail, s2=1900, s4=1100, s3=1100)[1:3] == [0.0, 1.0]  # left = pitch + yaw, right = pitch - yaw
+    px4 = {"PWM_MAIN_FUNC1": 201, "PWM_MAIN_FUNC2": 202, "CA_SV_CS0_TYPE": 7, "CA_SV_CS1_TYPE": 8}
+    assert inputs(px4, s1=2000, s2=1000)[1:3] == [0.0, 1.0]
+    assert inputs(px4, s1=2000, s2=2000)[1:3] == [1.0, 0.0]
+
+
+def test_flaperons_are_ailerons_whose_flaps_cancel():
+    flaperons = {"SERVO1_FUNCTION": 24, "SERVO2_FUNCTION": 25}
+    assert inputs(flaperons, s1=1900, s2=1900)[0] == 1.0
+    assert inputs(flaperons, s1=1700, s2=1300)[0] == 0.0  # 200 us of flap
+
+
+def test_differential_thrust_is_its_mean():
+    twin = PLANE | {"SERVO3_FUNCTION": 73, "SERVO5_FUNCTION": 74}
+    assert inputs(twin, s3=1100, s5=1900)[3] == 0.5
+    assert inputs(twin, s3=1900, s5=1900)[3] == 1.0
+
+
+OLD = {f"RC{n}_REV": 1.0 for n in range(1, 9)} | {f"RC{n}_MIN": 1000.0 for n in range(1, 9)}
+OLD |= {f"RC{n}_MAX": 2000.0 for n in range(1, 9)} | {f"RC{n}_TRIM": 1500.0 for n in range(1, 9)}
+
+
+def old_mixer(a: float, b: float, signs: tuple[int, int]) -> tuple[float, float]:
+    """The outputs of the two channels for pitch `a` and roll or yaw `b`, with a gain of 0.5."""
+    return 1500 + 500 * signs[0] * 0.5 * (a - b), 1500 + 500 * signs[1] * 0.5 * (a + b)
+
+
+def test_old_firmware_follows_its_channels():
+    assert inputs(OLD | {"RC3_TRIM": 1000.0}, s1=2000, s2=1250, s3=1500, s4=1750) == [1.0, -0.5, 0.5, 0.5]
+    assert inputs(OLD | {"RC1_REV": -1.0}, s1=2000, s3=1000)[0] == -1.0
+    second = OLD | {"RC5_FUNCTION": 4.0}
+    assert inputs(second, s1=2000, s5=1500, s3=1000)[0] == 0.5
+    swapped = OLD | {"RCMAP_ROLL": 2.0, "RCMAP_PITCH": 1.0}
+    assert inputs(swapped, s1=2000, s3=1000)[:2] == [0.0, 1.0]
+    assert servo_map(OLD).sentence == ""
+
+
+@pytest.mark.parametrize(("value", "signs"), [(1, (1, 1)), (2, (1, -1)), (3, (-1, 1)), (4, (-1, -1))])
+@pytest.mark.parametrize(("a", "b"), [(1.0, 0.0), (0.0, 1.0), (0.4, -0.6)])
+def test_old_elevons_and_v_tails_are_unmixed(value: int, signs: tuple[int, int], a: float, b: float):
+    pitch, other = old_mixer(a, b, signs)
+    elevons = inputs(OLD | {"ELEVON_OUTPUT": float(value)}, s2=pitch, s1=other, s3=1000)
+    assert elevons == pytest.approx([b / 2, a / 2, 0.0, 0.0])  # as later firmware: half of each at a gain of 0.5
+    tail = inputs(OLD | {"VTAIL_OUTPUT": float(value)}, s2=pitch, s4=other, s3=1000)
+    assert tail == pytest.approx([0.0, a / 2, b / 2, 0.0])
+
+
+@pytest.mark.parametrize("reversed_pitch", [1.0, -1.0])
+@pytest.mark.parametrize("reversed_other", [1.0, -1.0])
+def test_reversed_channels_of_old_elevons(reversed_pitch: float, reversed_other: float):
+    pitch, other = old_mixer(0.4 * reversed_pitch, -0.6 * reversed_other, (1, 1))
+    params = OLD | {"ELEVON_OUTPUT": 1.0, "RC2_REV": reversed_pitch, "RC1_REV": reversed_other}
+    assert inputs(params, s2=pitch, s1=other, s3=1000) == pytest.approx([-0.3, 0.2, 0.0, 0.0])
+
+
 def test_two_ailerons_share_one_input():
     params = PLANE | {"SERVO5_FUNCTION": 4}
     assert inputs(params, s1=1900, s5=1900)[0] == 1.0

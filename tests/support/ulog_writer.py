@@ -10,7 +10,15 @@ from fleet.telemetry.onboard_logs.ulog.reader import UlogLog
 MAGIC = b"ULog\x01\x12\x35\x01"
 START_US = 10_000_000
 UTC_US = 1_600_000_000_000_000  # satellite time when the log's clock was zero
-_TYPE = {"f4": "float", "f8": "double", "u1": "uint8_t", "u2": "uint16_t", "i4": "int32_t", "u8": "uint64_t"}
+_TYPE = {
+    "u4": "uint32_t",
+    "f4": "float",
+    "f8": "double",
+    "u1": "uint8_t",
+    "u2": "uint16_t",
+    "i4": "int32_t",
+    "u8": "uint64_t",
+}
 EARTH_M = 6_371_000.0
 
 

@@ -6,12 +6,13 @@ from pathlib import Path
 
 from fleet.cli import make_parser, run_command
 from fleet.commands.offline.diagnose import EXAMPLES, arguments, check_arguments
+from fleet.telemetry.recording.options import RecordingOptions
 from twin_worker.diagnosis.baseline.own_past import OwnPast, check
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.learn import calibrate_recordings, card_or_unknown, log_progress
 from twin_worker.diagnosis.model.baseline import Baseline
 from twin_worker.diagnosis.output import keep
-from twin_worker.diagnosis.share import Reference, diagnose_all
+from twin_worker.diagnosis.share import RecordingTask, Reference, diagnose_all
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -22,21 +23,25 @@ def _run(args: argparse.Namespace) -> int:
         reference: Reference = keep.load(args.model)[0]
     else:  # a calibration, or the past of each flight
         card = card_or_unknown(args.airframe)
-        reference = calibrate_recordings(args.against, card) if args.against else OwnPast(args.against_own_past, card)
+        options = RecordingOptions.of(args)
+        past = args.against_own_past
+        reference = calibrate_recordings(args.against, card, options=options) if args.against else OwnPast(past, card)
     reports: list[Report] = []
-    n_refused = 0
-    for file_reports, refusal in diagnose_all(args.file, reference, args.jobs, log_progress, args.conceal):
+    refused: list[tuple[str, str]] = []
+    tasks = [RecordingTask(path, RecordingOptions.of(args)) for path in args.file]
+    results = diagnose_all(tasks, reference, args.jobs, log_progress, args.conceal)
+    for task, (file_reports, refusal) in zip(tasks, results, strict=True):
         for report in file_reports:
             print(f"{report.flight}: {report.sentence}", flush=True)
         reports += file_reports
         if refusal:
-            n_refused += 1
+            refused.append((task.path.name.split(".")[0], refusal))
             log_progress(refusal)
     if args.json:
-        keep.write(reports, args.json)
+        keep.write(reports, args.json, refused)
     if args.report:
         _page(reports, reference, args.report)
-    return 2 if n_refused and not reports else 1 if n_refused else 0
+    return 2 if refused and not reports else 1 if refused else 0
 
 
 def _page(reports: list[Report], reference: Reference, folder: Path) -> None:

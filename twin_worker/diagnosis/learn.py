@@ -9,6 +9,7 @@ from pathlib import Path
 from fleet.cli import make_parser, run_command
 from fleet.commands.offline.calibrate import EXAMPLES, arguments
 from fleet.process.logs import report_progress
+from fleet.telemetry.recording.options import NO_OPTIONS, RecordingOptions
 from twin_worker.diagnosis.baseline.calibrate import calibrate
 from twin_worker.diagnosis.baseline.past import calibrate_past, part_before
 from twin_worker.diagnosis.data.card import UNKNOWN, AircraftCard, read_card
@@ -31,7 +32,12 @@ def card_or_unknown(path: Path | None) -> AircraftCard:
     return UNKNOWN
 
 
-def calibrate_recordings(files: Sequence[Path], card: AircraftCard, until: float | None = None) -> Baseline:
+def calibrate_recordings(
+    files: Sequence[Path],
+    card: AircraftCard,
+    until: float | None = None,
+    options: RecordingOptions = NO_OPTIONS,
+) -> Baseline:
     """Calibrate on recordings, or on the part of each before `until` [s, on its own clock].
 
     Raises:
@@ -41,7 +47,7 @@ def calibrate_recordings(files: Sequence[Path], card: AircraftCard, until: float
     flights: list[FlightData] = []
     for path in files:
         log_progress(f"reading {path.name}")
-        flights += read_flights(path, card)
+        flights += read_flights(path, card, options)
     if until is None:
         base = calibrate(flights, card, log_progress)
     elif len(flights) == 1:
@@ -56,7 +62,7 @@ def calibrate_recordings(files: Sequence[Path], card: AircraftCard, until: float
 def _run(args: argparse.Namespace) -> int:
     if not args.out.absolute().parent.is_dir():
         raise ValueError(f"--out: found no folder {str(args.out.parent)!r}, expected one; make it first")
-    base = calibrate_recordings(args.file, card_or_unknown(args.airframe), args.until)
+    base = calibrate_recordings(args.file, card_or_unknown(args.airframe), args.until, RecordingOptions.of(args))
     save(args.out, base)
     explained = ", ".join(f"{name} {x:.0%}" for name, x in base.r2.items())
     print(f"{args.out.name}: calibrated on {len(base.flights)} flights; variance explained: {explained}")

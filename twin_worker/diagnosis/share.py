@@ -5,7 +5,9 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
+from fleet.telemetry.recording.options import RecordingOptions
 from twin_worker.diagnosis.baseline.own_past import OwnPast, conceal_channels, exclude_concealed
 from twin_worker.diagnosis.data.flight import FlightData, read_flights
 from twin_worker.diagnosis.inference.diagnose import diagnose
@@ -14,11 +16,20 @@ from twin_worker.diagnosis.model.baseline import Baseline
 
 ReportProgress = Callable[[str], None]
 Reference = Baseline | OwnPast
+
+
+class RecordingTask(NamedTuple):
+    """One recording to diagnose, with the data that it lacks."""
+
+    path: Path
+    options: RecordingOptions
+
+
 TaskResult = tuple[list[Report], str]  # reports of one task, and the error message or an empty string
 
 
 def diagnose_all(
-    tasks: Sequence[Path | FlightData],
+    tasks: Sequence[Path | RecordingTask | FlightData],
     reference: Reference,
     jobs: int,
     progress: ReportProgress,
@@ -43,14 +54,14 @@ def diagnose_all(
 
 
 def _diagnose_task(
-    task: Path | FlightData,
+    task: Path | RecordingTask | FlightData,
     reference: Reference,
     conceal: Sequence[str],
     progress: ReportProgress = lambda message: None,
 ) -> TaskResult:
     reports: list[Report] = []
     try:
-        for flight in [task] if isinstance(task, FlightData) else read_flights(task, reference.card):
+        for flight in _flights_of(task, reference):
             progress(f"{flight.name}: {flight.seconds:.0f} s of flight")
             if isinstance(reference, OwnPast):
                 reports.append(reference.diagnose(flight, progress, conceal))
@@ -60,3 +71,11 @@ def _diagnose_task(
     except (ValueError, OSError) as error:
         return reports, str(error)
     return reports, ""
+
+
+def _flights_of(task: Path | RecordingTask | FlightData, reference: Reference) -> list[FlightData]:
+    if isinstance(task, FlightData):
+        return [task]
+    if isinstance(task, RecordingTask):
+        return read_flights(task.path, reference.card, task.options)
+    return read_flights(task, reference.card)

@@ -10,9 +10,10 @@ from rich.console import Console
 from fleet.cli import make_parser, run_command
 from fleet.commands.offline.assess import EXAMPLES, arguments, baseline_methods, check_arguments
 from fleet.process.logs import report_progress
+from fleet.telemetry.recording.options import RecordingOptions
 from twin_worker.evaluation.drive import EvaluationPlan
 from twin_worker.evaluation.scoring.log import EvaluationCase
-from twin_worker.evaluation.scoring.summary import summarise
+from twin_worker.evaluation.scoring.summary import short_flights, summarise
 from twin_worker.evaluation.share import assess_recordings
 from twin_worker.evaluation.table import table
 
@@ -29,10 +30,15 @@ def _run(args: argparse.Namespace) -> int:
     from twin_worker.service.warm_up import warm_up  # numba is slow to import: report first
 
     warm_up()
-    plan = EvaluationPlan(args.every, args.method, baseline_methods(args.methods), args.without_params)
-    evaluation = assess_recordings(args.file, plan, jobs=args.jobs, offset=args.offset, report=_report)
-    results = summarise(evaluation.cases)
-    results["run"] = {
+    options = RecordingOptions.of(args)
+    plan = EvaluationPlan(args.every, args.method, baseline_methods(args.methods), args.without_params, options)
+    try:
+        evaluation = assess_recordings(args.file, plan, jobs=args.jobs, offset=args.offset, report=_report)
+    except ValueError as error:
+        if args.json:
+            args.json.write_text(json.dumps({"run": {"refused": [str(error)], "counted": 0}}, indent=1) + "\n")
+        raise
+    run = {
         "files": [str(path) for path in args.file],
         "every_s": plan.every_s,
         "method": args.method,
@@ -41,11 +47,15 @@ def _run(args: argparse.Namespace) -> int:
         "counted": sum(not case.exclusion for case in evaluation.cases),
         "apart": sum(bool(case.exclusion) for case in evaluation.cases),
         "silent": evaluation.missed,
+        "short": short_flights(evaluation.cases),
+        "sentences": evaluation.sentences,
+        "refused": evaluation.refused,
     }
+    results = summarise(evaluation.cases) | {"run": run}
     console = Console()
     console.width = console.width if console.is_terminal else _PLAIN_WIDTH
     console.print(table(results))
-    for sentence in evaluation.sentences:
+    for sentence in (*evaluation.sentences, *evaluation.refused):
         _report(sentence)
     if args.json:
         args.json.write_text(json.dumps(results, indent=1) + "\n")

@@ -6,9 +6,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fleet.contract import Message, Params, Prediction, Status
+from fleet.telemetry.recording.options import NO_OPTIONS, RecordingOptions
 from twin_worker.confidence.tube_and_horizon import AHEAD
 from twin_worker.evaluation.baselines import BASELINES, BaselineInput
-from twin_worker.evaluation.scoring.compare import MIN_EVENT_FREE_S, MIN_FIRST_S, resolve_start
+from twin_worker.evaluation.scoring.compare import MIN_EVENT_FREE_S, MIN_FIRST_S, resolve_starts
 from twin_worker.evaluation.scoring.log import OURS, EvaluationCase, EvaluationStart, MethodForecast, ReferenceFlight
 from twin_worker.identification.fixed_wing.plant import DYNAMICS, PAPER
 from twin_worker.twin.state.state import AUTO, ingest
@@ -29,12 +30,14 @@ class EvaluationPlan:
         method: method of the twin
         methods: names of the methods to compare with
         without_params: withhold the autopilot's parameters from every twin
+        options: mission, parameters and column map from files
     """
 
     every_s: float = 5.0
     method: str = AUTO
     methods: tuple[str, ...] = (*BASELINES, PAPER)
     without_params: bool = False
+    options: RecordingOptions = NO_OPTIONS
 
 
 @dataclass
@@ -114,7 +117,7 @@ class RecordingDriver:
 
 def _resolve_starts(evaluated: EvaluatedUav) -> Iterator[EvaluationCase]:
     """Yield every start so far, compared with the actual flight."""
-    yield from (resolve_start(evaluated.reference, start) for start in evaluated.starts)
+    yield from resolve_starts(evaluated.reference, evaluated.starts)
     evaluated.starts.clear()
 
 

@@ -16,6 +16,7 @@ from typing import Any
 from fleet.cli import make_parser, run_command
 from fleet.contract import Message, Model, Outcome, Prediction
 from fleet.process.logs import report_progress
+from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
 from fleet.telemetry.recording.recordings import replay_messages
 from twin_worker.alerts.traffic import TrafficMonitor
 from twin_worker.confidence.weighted_quantile import survival
@@ -137,8 +138,9 @@ def format_row(uav: str, row: dict[str, Any]) -> str:
 
 def _run(args: argparse.Namespace) -> int:
     rows_by_file = {}
+    options = RecordingOptions.of(args)
     for path in args.files:
-        rows = replay(replay_messages(path, args.offset), path.name)
+        rows = replay(replay_messages(path, args.offset, options=options), path.name)
         rows_by_file[str(path)] = rows
         print(f"{path.name}: {len(rows)} UAVs")
         for uav, row in rows.items():
@@ -156,6 +158,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="recording, e.g. flight.tlog.xz")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the same rows to FILE")
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + offset (0)")
+    add_recording_arguments(parser)
     return run_command("twin_worker.evaluation.replay", _run, parser.parse_args(argv))
 
 

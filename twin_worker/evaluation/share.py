@@ -4,7 +4,7 @@ import multiprocessing
 import signal
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -45,11 +45,13 @@ class Evaluation:
         cases: evaluated starts, in the order of files
         missed: intervals without any prediction
         sentences: warnings of the readers
+        refused: reason for each recording that could not be read
     """
 
     cases: list[EvaluationCase]
     missed: int
     sentences: list[str]
+    refused: list[str] = field(default_factory=list)
 
 
 def assess_recordings(
@@ -64,7 +66,7 @@ def assess_recordings(
         offset: UAV id = MAVLink system id + this
         report: prints a line of progress where there is no terminal
     Raises:
-        ValueError: when a file is not a recording.
+        ValueError: when no file is a recording; the text has every reason.
     """
     context = multiprocessing.get_context("spawn")
     shares = context.Array("d", len(files) * jobs)
@@ -79,7 +81,14 @@ def assess_recordings(
     order = {name: k for k, name in enumerate(recording_names(files))}
     unsorted_cases = [case for evaluation in evaluations for case in evaluation.cases]
     cases = sorted(unsorted_cases, key=lambda case: (order[case.start.flight.rpartition(":")[0]], case.start.uav))
-    return Evaluation(cases, sum(part.missed for part in evaluations), evaluations[0].sentences)
+    return Evaluation(cases, sum(part.missed for part in evaluations), *_texts(evaluations[0], files))
+
+
+def _texts(first: Evaluation, files: Sequence[Path]) -> tuple[list[str], list[str]]:
+    """Return warnings and refusals, the same in every process."""
+    if len(first.refused) == len(files):
+        raise ValueError("; ".join(first.refused))
+    return first.sentences, first.refused
 
 
 _shares: Any = None
@@ -100,16 +109,21 @@ def _evaluate_share(task: Task, shares: Any) -> Evaluation:
     """Evaluate this process's share of the aircraft, numbered in order of appearance."""
     files, plan, offset, (k, jobs) = task
     cases: list[EvaluationCase] = []
-    missed, sentences, uav_count = 0, [], 0
+    missed, sentences, refused, uav_count = 0, list[str](), list[str](), 0
     for number, (path, name) in enumerate(zip(files, recording_names(files), strict=True)):
-        recording = Recording(path, offset)
-        drive = RecordingDriver(name, plan, (uav_count, k, jobs))
-        cases += drive.run(_messages(recording, shares, number * jobs + k))
+        try:
+            recording = Recording(path, offset, plan.options)
+            drive = RecordingDriver(name, plan, (uav_count, k, jobs))
+            cases += drive.run(_messages(recording, shares, number * jobs + k))
+        except (ValueError, OSError) as error:
+            refused.append(str(error))
+            shares[number * jobs + k] = 1.0
+            continue
         shares[number * jobs + k] = 1.0
         uav_count += len(drive.uavs)
         missed += drive.missed
         sentences += recording.skipped
-    return Evaluation(cases, missed, sentences)
+    return Evaluation(cases, missed, sentences, refused)
 
 
 def recording_names(files: Sequence[Path]) -> list[str]:

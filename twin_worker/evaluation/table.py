@@ -124,6 +124,8 @@ def notes(results: dict[str, Any], names: list[str]) -> list[str]:
         counts = results[name]["made_by"]
         if others := ", ".join(f"{n} by {source}" for source, n in counts.items() if source != name):
             lines.append(f"{_LABELS.get(name, name)}: of {results[name]['starts']} predictions {others}")
+    short = "mission shorter than a full start, scored as far as it goes (censored)"
+    lines += [f"{flight}: {short}" for flight in results.get("run", {}).get("short", ())]
     for reason, row in results["apart"].items():
         time = _number(row["m1_t10_lq_s"])
         lines.append(f"excluded: {row['starts']} starts, {reason}; ours within 10 % for {time} s (quartile)")

@@ -21,6 +21,7 @@ import scipy.stats
 
 from fleet.cli import make_parser, run_command
 from fleet.process.logs import report_progress
+from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
 from twin_worker.paper_experiments.experiment import (
     FIRST_STEPS,
     STATE_NAMES,
@@ -99,7 +100,7 @@ def _run(args: argparse.Namespace) -> int:
     flights: list[RecordedFlight] = []
     for path in args.files:
         report_progress("paper", f"reading {path.name}")
-        flights += read_flights(path)
+        flights += read_flights(path, options=RecordingOptions.of(args))
     if not flights:
         raise ValueError("paper: found no flight with attitude, velocity, position and servo rows; use another FILE")
     plan = ExperimentPlan(args.seen, args.unseen, args.every)
@@ -149,6 +150,7 @@ def main(argv: list[str] | None = None) -> int:
         parser.add_argument(f"--{name}", type=_seconds, default=default, metavar="S", help=f"{text} ({default:.0f} s)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="draw the figures into DIR")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the numbers to FILE")
+    add_recording_arguments(parser)
     return run_command("twin_worker.paper_experiments", _run, parser.parse_args(argv))
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from fleet.airframes.airframe import servo_map
 from fleet.contract import Outcome, Params, Sample
 from fleet.frames import Origin, ned_to_body
+from fleet.telemetry.recording.options import NO_OPTIONS, RecordingOptions
 from fleet.telemetry.recording.recordings import replay_messages
 from fleet.window import STATES as ALL
 from fleet.window import Window
@@ -62,16 +63,17 @@ class RecordedFlight:
                 yield start
 
 
-def read_flights(path: Path, offset: int = 0) -> Iterator[RecordedFlight]:
+def read_flights(path: Path, offset: int = 0, options: RecordingOptions = NO_OPTIONS) -> Iterator[RecordedFlight]:
     """Read every flight of a recording that has all required rows.
 
     Args:
         path: recording, e.g. flight.tlog.xz
         offset: UAV id = MAVLink system id + this
+        options: mission, parameters and column map from files
     """
     histories: dict[int, TelemetryHistory] = {}
     params: dict[int, dict[str, float]] = {}
-    for message in replay_messages(path, offset):
+    for message in replay_messages(path, offset, options=options):
         if isinstance(message, Sample):
             histories.setdefault(message.uav, TelemetryHistory(keep_s=1e5)).add(message)
         elif isinstance(message, Params):

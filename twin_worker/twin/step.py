@@ -148,6 +148,7 @@ def _step(twin: Twin, now: float) -> list[Message]:
         return []
     twin.telemetry.step(now)
     results = _update_link(twin, now)
+    twin.telemetry.learn_servo_map()
     twin.environment.update_wind(twin.telemetry.history)
     if twin.confidence.timer.due(now, _TICK_S):
         twin.confidence.timer.restart(now)

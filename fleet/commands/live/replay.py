@@ -2,6 +2,7 @@
 
 import argparse
 import threading
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from urllib.parse import quote
@@ -13,6 +14,7 @@ from fleet.process.logs import report_progress
 from fleet.report.progress import show_progress
 from fleet.telemetry.recording.ids import IdAllocator
 from fleet.telemetry.recording.opening import read_speed
+from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
 from fleet.telemetry.replay.broadcaster import MAX_PER_LINK, Broadcaster, loopback_address, share_out
 
 EXAMPLES = """
@@ -42,6 +44,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         f"repeatable: the copies are distributed, at most {MAX_PER_LINK} aircraft each",
     )
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
+    add_recording_arguments(parser)
     router_arguments(parser)
 
 
@@ -86,6 +89,8 @@ def check_arguments(args: argparse.Namespace) -> None:
         ValueError: when an option is invalid; the text names it.
     """
     read_speed(args.speed)
+    if args.to and RecordingOptions.of(args).arguments():
+        raise ValueError("--to: found --mission, --params or --columns too, expected none of them; drop them")
     if not 1 <= args.copies <= 10_000:
         raise ValueError(f"--copies: found {args.copies}, expected 1 to 10,000; change it")
     if args.results and args.copies > 1:
@@ -95,4 +100,11 @@ def check_arguments(args: argparse.Namespace) -> None:
 def replay_link(name: str, args: argparse.Namespace) -> str:
     """Return the gateway's `--link` for one recording, from its name and --speed, --copies and --results."""
     path = quote(str(Path(name).resolve()), safe="/ ")
-    return f"replay:{path}?speed={args.speed}&copies={args.copies}&results={int(args.results)}"
+    options = {name: value for name, value in asdict(RecordingOptions.of(args)).items() if value}
+    extra = "".join(f"&{name}={quote(value, safe='/')}" for name, value in _absolute(options).items())
+    return f"replay:{path}?speed={args.speed}&copies={args.copies}&results={int(args.results)}{extra}"
+
+
+def _absolute(options: dict[str, str]) -> dict[str, str]:
+    """Return the options with absolute paths; the name of a shipped column map is no path."""
+    return {name: str(Path(value).resolve()) if Path(value).exists() else value for name, value in options.items()}

@@ -24,6 +24,7 @@ from fleet.contract import FleetRow, FleetState, TwinState
 from fleet.process.children import Children
 from fleet.process.logs import add_time, report_progress
 from fleet.process.sanitise import printable
+from fleet.telemetry.recording.options import add_recording_arguments
 
 EXAMPLES = """
   fleet up --uavs 8
@@ -57,6 +58,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--speed", default="1", help="replay speed, a number or max (1)")
     parser.add_argument("--copies", type=int, default=1, metavar="N", help="aircraft for each recorded one (1)")
+    add_recording_arguments(parser)
     parser.add_argument("--results", action="store_true", help="show the recorded results, compute none")
     parser.add_argument("--for", dest="seconds", type=float, default=0.0, help="stop this long after the first sample")
     parser.add_argument("--no-viewer", action="store_true", help="without the web page")

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from fleet.cli import check_parent, run_module
+from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
 
 EXAMPLES = """
   fleet assess flight.tlog
@@ -34,6 +35,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes that share the aircraft (1)")
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
+    add_recording_arguments(parser)
 
 
 def check_arguments(args: argparse.Namespace) -> None:
@@ -72,5 +74,6 @@ def run(args: argparse.Namespace) -> int:
     options = [f"--{name}={getattr(args, name)}" for name in ("every", "method", "methods", "jobs", "offset")]
     options += [f"--{name}={value}" for name, value in (("out", args.out), ("json", args.json)) if value]
     options += ["--without-params"] if args.without_params else []
+    options += RecordingOptions.of(args).arguments()
     lost = "unfinished results are not written"
     return run_module("assess", lost, "twin_worker.evaluation", *options, "--", *map(str, args.file))

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from fleet.cli import run_module
+from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
 
 EXAMPLES = """
   fleet calibrate monday/*.tlog --airframe skywalker --out skywalker.json
@@ -24,11 +25,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=Path, required=True, metavar="MODEL", help="write the simulation to MODEL")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the fit achieved to FILE")
+    add_recording_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Start the calibration and return its exit code."""
     values = {name: getattr(args, name) for name in ("airframe", "until", "out", "json")}
     options = [f"--{name}={value}" for name, value in values.items() if value]
+    options += RecordingOptions.of(args).arguments()
     lost = "no model was written"
     return run_module("calibrate", lost, "twin_worker.diagnosis.learn", *options, "--", *map(str, args.file))

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from fleet.cli import check_parent, run_module
+from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
 
 _MAX_PAST_S = 1e6
 
@@ -42,6 +43,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--report", type=Path, metavar="DIR", help="write figures, a page and corrected models into DIR"
     )
+    add_recording_arguments(parser)
 
 
 def check_arguments(args: argparse.Namespace) -> None:
@@ -68,6 +70,7 @@ def run(args: argparse.Namespace) -> int:
     names = ("model", "airframe", "json", "report", "jobs", "against_own_past", "conceal")
     values = {name: getattr(args, name) for name in names}
     options = [f"--{name.replace('_', '-')}={value}" for name, value in values.items() if value]
+    options += RecordingOptions.of(args).arguments()
     simulated = ["--against", *map(str, args.against)] if args.against else []
     lost = "unfinished results are not written"
     return run_module("diagnose", lost, "twin_worker.diagnosis", *options, *simulated, "--", *map(str, args.file))

@@ -22,6 +22,7 @@ from fleet.report.progress import show_progress
 from fleet.report.report_text import table
 from fleet.telemetry.inspection.findings import AircraftFindings, FileFindings, LinkTexts, compute_findings
 from fleet.telemetry.inspection.survey import Survey, survey_recording
+from fleet.telemetry.recording.options import NO_OPTIONS, RecordingOptions, add_recording_arguments
 from fleet.telemetry.recording.recordings import Recording
 
 EXAMPLES = """
@@ -41,6 +42,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plot", type=Path, metavar="FILE", help="a page for every aircraft: .png, .svg or .pdf")
     parser.add_argument("--twin", action="store_true", help="replay the recording through a twin and report the result")
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
+    add_recording_arguments(parser)
     parser.add_argument("--keys", action="store_true", help="explain every key of the JSON and stop")
 
 
@@ -50,13 +52,14 @@ def run(args: argparse.Namespace) -> int:
         print(describe_keys())
         return 0
     _check(args)
+    options = RecordingOptions.of(args)
     files: list[FileFindings] = []
     pages: list[tuple[Survey, AircraftFindings, LinkTexts, str]] = []
     console = Console()
     for path in args.file:
-        file, surveys, facts = inspect_file(path, args.offset)
+        file, surveys, facts = inspect_file(path, args.offset, options)
         if args.twin:
-            file = msgspec.structs.replace(file, twin=_run_twin(path))
+            file = msgspec.structs.replace(file, twin=_run_twin(path, options))
         files.append(file)
         if args.json != "-":
             console.print(table(file))
@@ -81,13 +84,15 @@ def describe_keys() -> str:
     return "\n".join(lines)
 
 
-def inspect_file(path: Path, offset: int = 0) -> tuple[FileFindings, dict[int, Survey], dict[int, LinkTexts]]:
+def inspect_file(
+    path: Path, offset: int = 0, options: RecordingOptions = NO_OPTIONS
+) -> tuple[FileFindings, dict[int, Survey], dict[int, LinkTexts]]:
     """Read one recording; return its findings, with every error as a text, and survey and texts by UAV id."""
     surveys: dict[int, Survey] = {}
     facts: dict[int, LinkTexts] = {}
     sentences: list[str] = []
     try:
-        recording = Recording(path, offset)
+        recording = Recording(path, offset, options)
         report = partial(report_progress, "fleet inspect")
         with show_progress([recording], report, Console(stderr=True), leave=False):
             surveys = survey_recording((news for _, step in recording.steps() for news in step), recording.kind)
@@ -125,11 +130,13 @@ def _check(args: argparse.Namespace) -> None:
             raise ValueError(f"{option}: found the recording {str(name)!r} itself, expected another file; rename it")
 
 
-def _run_twin(path: Path) -> dict[str, Any]:
+def _run_twin(path: Path, options: RecordingOptions) -> dict[str, Any]:
     """Replay the recording through a twin in a separate process; return results by UAV id, or `sentence`."""
     with _folder() as folder:
         output = folder / "twin.json"
-        code, errors = run_to_end("twin_worker.evaluation.replay", str(path), "--json", str(output))
+        code, errors = run_to_end(
+            "twin_worker.evaluation.replay", str(path), "--json", str(output), *options.arguments()
+        )
         try:
             result = json.loads(output.read_text())
         except (OSError, ValueError):

@@ -11,6 +11,7 @@ from fleet.cli import id_range, stop_on_signal
 from fleet.process.children import run_until
 from fleet.process.interrupt import INTERRUPTED
 from fleet.process.logs import report_progress
+from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
 
 EXAMPLES = """
   fleet paper identify --out figures --json paper.json
@@ -42,6 +43,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes that share the predictions (1)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="draw the figures into DIR")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the numbers to FILE")
+    add_recording_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -95,6 +97,7 @@ def _evaluate(args: argparse.Namespace, files: list[Path], stop: Event) -> int:
     else:
         command = ["twin_worker.evaluation", f"--methods={_COMPARED_METHODS}", f"--every={_EVERY_S}"]
         command.append(f"--jobs={args.jobs}")
+    options += RecordingOptions.of(args).arguments()
     code = run_until(stop, *command, *options, *map(str, files))
     if stop.is_set():
         report_progress("paper", "stopped; unfinished results are not written")

@@ -23,6 +23,8 @@ MAX_ERROR_SEVERITY = 3  # texts up to this severity are shown to the operator (M
 MISSION_RECEIVED = "Flight plan received"  # text of ArduPilot after an upload by any ground station
 MAX_TEXTS = 2_000
 _FIRMWARE_TEXTS = ("ArduPlane V", "ArduCopter V", "APM:", "PX4 v", "Blimp V", "ArduRover V")  # autopilot and version
+_MISSION_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
+_ABSOLUTE_FRAMES = (0, 5)  # MAV_FRAME: altitude above sea level
 
 
 class AircraftLink:
@@ -152,6 +154,11 @@ class AircraftLink:
         """Process one mission protocol message from a ground station to this aircraft."""
         self.mission.process(message, is_upload=True, now=now)
 
+    def process_target(self, message: Any, now: float) -> None:
+        """Process one POSITION_TARGET_GLOBAL_INT of an aircraft without mission list."""
+        if self.mode in _MISSION_MODES and message.coordinate_frame in _ABSOLUTE_FRAMES:
+            self.mission.add_target(message.lat_int, message.lon_int, message.alt, now)
+
     def process_log_event(self, event: OnboardEvent, now: float) -> None:
         """Process one event of an onboard log."""
         if event.kind == "mode":
@@ -162,6 +169,10 @@ class AircraftLink:
             self.params.set_value(*event.value)
         elif event.kind == "mission":
             self.mission.set_items(event.value)
+        elif event.kind == "partial mission":
+            self.mission.set_partial(*event.value)
+        elif event.kind == "home":
+            self.mission.set_home_altitude(event.value)
         elif event.kind == "text":
             severity, text = event.value
             self._process_text(severity, text, now)

@@ -27,6 +27,7 @@ from fleet.telemetry.mavlink.parsing.decode import (
 )
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes, merge_received
 from fleet.telemetry.mavlink.parsing.scan import COMPONENT, EXTRA, ID, SEQ, SYSTEM
+from fleet.telemetry.mavlink.targets import queue_targets
 from fleet.telemetry.mavlink.timing import update_timings
 
 MAX_UAVS = 2_000  # over all links
@@ -212,6 +213,7 @@ class MavlinkReceiver:
                 owner[owned], message_kinds(frames)[owned], frames.arrival[owned], frames.headers[owned, SEQ]
             )
             process_table_rows(frames, owner, self._aircraft_by_number, self.arrays)
+            queue_targets(frames, owner, self._aircraft_by_number)
             update_timings(frames, owner, [link.timing for link in self._aircraft_by_number])
 
     def _frame_owners(self, frames: Frames) -> np.ndarray:

@@ -13,8 +13,10 @@ class OnboardEvent(NamedTuple):
     """Log entry that is not a telemetry row."""
 
     t: float  # log time [s]
-    kind: str  # mode: name · armed: bool · param: (name, value) · mission: tuple[Item, ...] · text: (severity, text)
+    kind: str  # one of those below
     value: Any
+    """Of mode: name · armed: bool · param: (name, value) · text: (severity, text) · home: altitude [m] ·
+    mission: tuple[Item, ...] · partial mission: (tuple[Item, ...], number of items on board, 0 unknown)"""
 
 
 class Chunk(NamedTuple):

@@ -13,8 +13,8 @@ from fleet.telemetry.mavlink.parsing.received import collect_payloads
 from fleet.telemetry.recording.opening import RecordingFile
 
 CHUNK = 1 << 20
-MAX_DAMAGE = 1 << 25  # damaged bytes, beyond `_MAX_DAMAGE_RATIO` times the good ones, that end reading
-_MAX_DAMAGE_RATIO = 4
+MAX_DAMAGE = 1 << 25  # damaged bytes, beyond `MAX_DAMAGE_RATIO` times the good ones, that end reading
+MAX_DAMAGE_RATIO = 4
 PRESCAN_SHARE = 0.1  # fraction of the work before the first frame is returned
 BACK_S = 1.0  # a larger step back is a clock adjustment and is removed [s]
 BACKLOG_S = 5.0  # a larger variation of arrival minus boot time is a backlog [s]
@@ -77,7 +77,7 @@ class Tlog:
                 if not chunk:
                     counts[s.BAD_BYTES] += len(data) - done
                     return
-                if counts[s.BAD_BYTES] > MAX_DAMAGE + _MAX_DAMAGE_RATIO * (place - counts[s.BAD_BYTES]):
+                if counts[s.BAD_BYTES] > MAX_DAMAGE + MAX_DAMAGE_RATIO * (place - counts[s.BAD_BYTES]):
                     self.search_aborted = place
                     return
                 rest = data[done:]

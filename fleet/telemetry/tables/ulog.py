@@ -270,21 +270,22 @@ TABLE: tuple[FieldSource, ...] = (
     ),
 )
 
-MIN_RATE_HZ = {"attitude": 4.0, "imu": 4.0, "position": 1.0, "velocity": 1.0, "air": 2.0, "servo": 2.0, "command": 1.0}
-"""Minimum rate of an active source; without one, the source with the most rows wins [Hz]."""
-
 CALCULATED = {
     "actuator_servos": "servo: calculated as 1500 ± 500 us from actuator_servos, in PX4's order of surfaces",
     "actuator_motors": "servo: calculated as 1000 to 2000 us from actuator_motors, in PX4's order of motors",
 }
 """Notes on fields that are calculated, not logged."""
 
-LATCHED_TOPICS = ("vehicle_status", "vtol_vehicle_status", "mission_result", "mission", "position_setpoint_triplet")
+LATCHED_TOPICS = (
+    *("vehicle_status", "vtol_vehicle_status", "mission_result", "mission", "position_setpoint_triplet"),
+    *("navigator_mission_item", "home_position"),
+)
 """Topics published on change: the last value before the log start applies at the start."""
 
 _AUXILIARY_TOPICS = (
     *("vehicle_angular_velocity", "actuator_controls_0", "actuator_controls_1", "vehicle_thrust_setpoint"),
     *("position_controller_status", "fw_pos_ctrl_status", "tecs_status", "vehicle_status", "vtol_vehicle_status"),
+    "home_position",
 )
 TOPICS: frozenset[str] = frozenset({row.message for row in TABLE} | set(_AUXILIARY_TOPICS))
 

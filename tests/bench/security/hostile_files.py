@@ -15,12 +15,14 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from tests.bench.security import hostile_tables as tables
 from tests.support.ulog_writer import flight, ulog
 
 CPU_S, MEMORY_MB = 30.0, 300.0
 _ROW = "vehicle_attitude"
 _READ = """
 import json, resource, sys
+from fleet.telemetry.recording.options import RecordingOptions
 from fleet.telemetry.recording.recordings import Recording
 from fleet.telemetry.mavlink.warm import warm_up
 from tests.bench.peak_memory import peak_mb
@@ -28,7 +30,7 @@ warm_up()
 begun = resource.getrusage(resource.RUSAGE_SELF)
 said, news = "", 0
 try:
-    recording = Recording(sys.argv[1])
+    recording = Recording(sys.argv[1], options=RecordingOptions(columns=sys.argv[2]))
     for _, heard in recording.steps():
         news += len(heard)
     said = "; ".join(recording.skipped)
@@ -37,6 +39,15 @@ except (ValueError, OSError) as error:
 ended = resource.getrusage(resource.RUSAGE_SELF)
 cpu = ended.ru_utime + ended.ru_stime - begun.ru_utime - begun.ru_stime
 print(json.dumps({"cpu_s": cpu, "mb": peak_mb(), "news": news, "said": said}))
+"""
+
+
+_COLUMNS = """
+[tables.all]
+time = "t"
+[position]
+columns = ["x", 8.5, 500]
+units = ["deg", "deg", "m"]
 """
 
 
@@ -53,7 +64,9 @@ def read_apart(path: Path, cpu_s: float = 60.0, memory_mb: float = 4000.0) -> di
         resource.setrlimit(resource.RLIMIT_DATA, (int(memory_mb * 2**20), int(memory_mb * 2**20)))
 
     _compile_once()
-    command = [sys.executable, "-c", _READ, str(path)]
+    columns = path.parent / "columns.toml"
+    columns.write_text(_COLUMNS)
+    command = [sys.executable, "-c", _READ, str(path), str(columns)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, preexec_fn=bound)
     if done.returncode:
         words = done.stderr.strip().splitlines()[-1:] or ["ended by the system"]
@@ -241,6 +254,14 @@ FILES: dict[str, tuple[str, Callable[[], bytes]]] = {
     "text and 8 GB": ("bomb.log.gz", lambda: _bomb(lambda: long_lines()[:2000])),
     "records in records": ("records.parauav", records_in_records),
     "a hundred thousand ids": ("ids.parauav", many_ids),
+    "stream of false starts": ("fd.mavlink", lambda: tables.stream_of_false_starts(_frames(200, step_us=100_000))),
+    "table of one line": ("line.csv", tables.one_line_table),
+    "table and 8 GB": ("bomb.csv.gz", lambda: _bomb(lambda: b"t,x\n1,2\n")),
+    "MATLAB of a billion cells": ("cells.mat", tables.matlab_of_a_billion),
+    "MATLAB that unfolds": ("packed.mat", tables.matlab_that_unfolds),
+    "MCAP that unfolds": ("packed.mcap", tables.mcap_that_unfolds),
+    "MCAP of long records": ("long.mcap", tables.mcap_of_long_records),
+    "SQLite bag without end": ("endless.db3", tables.bag_without_end),
     "fleet recording and 8 GB": ("bomb.parauav.gz", lambda: _bomb(lambda: many_ids()[:20_000])),
 }
 

@@ -18,6 +18,8 @@ from gateway.links.recorded import split_replays
 from tests.bench.security.hostile_files import CPU_S, FILES, MEMORY_MB, a_flight, read_apart, rightful_files, written
 
 SHORT = ("regex", "nested formats", "records in records", "DataFlash, formats over and over", "tlog with gaps")
+SHORT += ("MATLAB of a billion cells", "MATLAB that unfolds", "MCAP that unfolds", "MCAP of long records")
+SHORT += ("SQLite bag without end",)
 """Those that are over quickly; `python -m tests.bench.security` reads all."""
 
 

@@ -22,6 +22,7 @@ from twin_worker.evaluation.baselines import BASELINES
 from twin_worker.evaluation.drive import EvaluationPlan, RecordingDriver
 from twin_worker.evaluation.scoring.compare import MIN_EVENT_FREE_S, MIN_FIRST_S
 from twin_worker.evaluation.scoring.log import OURS, ReferenceFlight
+from twin_worker.evaluation.scoring.summary import short_flights
 from twin_worker.evaluation.share import assess_recordings
 from twin_worker.evaluation.table import KEYS, covariance, notes
 
@@ -209,6 +210,20 @@ def test_what_flies_without_a_mission_is_told_apart():
     found = list(drive.run(sorted((status(T0, "FBWB"), *messages(turn(100.0))), key=lambda m: m.t)))
     assert found and {case.exclusion for case in found} == {"mode FBWB follows no mission"}
     assert all(case.start.forecasts["route"].source == "imm" for case in found)
+
+
+def test_a_short_mission_is_scored_as_far_as_it_goes():
+    """No start of 40 s in AUTO has a minute: they are scored up to the change of mode, and the flight is listed."""
+    flight = turn(220.0)
+    news = (status(T0), ROUTE, status(T0 + 175.0, "RTL"))
+    drive = RecordingDriver("flight", EvaluationPlan(every_s=5.0, methods=("route",)))
+    cases = list(drive.run(sorted((*messages(flight), *news), key=lambda m: m.t)))
+    counted = [case for case in cases if not case.exclusion]
+    assert counted and all(T0 + 120.0 <= case.start.t <= T0 + 165.0 for case in counted)
+    for case in counted:
+        known = case.start.ahead[np.isfinite(case.positions).all(axis=1)]
+        assert case.start.t + known[-1] <= T0 + 175.5
+    assert short_flights(cases) == ["flight:uav-1"]
 
 
 # --- what is written -------------------------------------------------------------------------------------------------

@@ -193,3 +193,11 @@ def test_a_new_target_in_guided_is_an_event():
         place = np.array([[470_000_000 + north, 80_000_000, 600_000]])
         reference.add(f.sample(1, T0 + k + 0.5, target=(np.array([T0 + k + 0.5]), place)))
     assert [(t - T0, reason) for t, reason in reference.events] == [(1.0, "mode changed"), (3.5, "target changed")]
+
+
+def test_a_censored_start_counts_up_to_its_end() -> None:
+    passages = np.array([[20.0, 1.0], [10.0, 0.0], [60.0, 1.0], [60.0, 1.0]])
+    assert survival_at(passages, 60.0) == pytest.approx(0.75)  # one of four passed; the one censored at 20 s drops out
+    assert survival_at(np.array([[20.0, 1.0], [30.0, 0.0], [60.0, 1.0]]), 60.0) == pytest.approx(0.5)
+    assert np.isnan(survival_at(np.array([[20.0, 1.0], [10.0, 0.0]]), 60.0))
+    assert survival_at(np.array([[20.0, 0.0], [10.0, 1.0]]), 60.0) == 0.0

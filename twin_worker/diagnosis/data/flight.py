@@ -10,6 +10,7 @@ from scipy.signal import firwin, upfirdn
 from fleet.contract import Params, Sample, Status
 from fleet.frames import Origin, to_ned
 from fleet.process.sanitise import format_below
+from fleet.telemetry.recording.options import NO_OPTIONS, RecordingOptions
 from fleet.telemetry.recording.recordings import replay_messages
 from fleet.vehicles import vehicle_class
 from twin_worker.diagnosis.data.card import AircraftCard
@@ -111,7 +112,7 @@ class FlightData:
         return float(self.ok.sum() * DT)
 
 
-def read_flights(path: Path, card: AircraftCard) -> list[FlightData]:
+def read_flights(path: Path, card: AircraftCard, options: RecordingOptions = NO_OPTIONS) -> list[FlightData]:
     """Read every aircraft of a recording.
 
     Raises:
@@ -121,7 +122,7 @@ def read_flights(path: Path, card: AircraftCard) -> list[FlightData]:
     telemetry: dict[int, tuple[TelemetryHistory, dict[str, float]]] = {}
     rotors: dict[int, str] = {}
     skipped: list[str] = []
-    for message in replay_messages(path, skipped=skipped):
+    for message in replay_messages(path, skipped=skipped, options=options):
         uav = message.uav
         history, params = telemetry.setdefault(uav, (TelemetryHistory(keep_s=np.inf), {}))
         if isinstance(message, Sample):

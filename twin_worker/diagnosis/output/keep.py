@@ -90,11 +90,17 @@ def _hypothesis(entry: dict[str, Any]) -> FaultHypothesis:
     return FaultHypothesis(effect, str(entry["of"]), ()).with_parameters(par, onset)
 
 
-def write(reports: Sequence[Report], path: Path) -> None:
-    """Write the reports, and for each named outcome `<path>-<flight>.npz` with t, f_base, f_model."""
-    path.write_text(
-        json.dumps([as_json(report, _write_predictions(report, path)) for report in reports], indent=1) + "\n"
-    )
+def write(reports: Sequence[Report], path: Path, refused: Sequence[tuple[str, str]] = ()) -> None:
+    """Write the reports, and for each named outcome `<path>-<flight>.npz` with t, f_base, f_model.
+
+    Args:
+        reports: reports
+        path: JSON file
+        refused: name and reason of each recording that could not be diagnosed, with verdict `refused`
+    """
+    rows = [as_json(report, _write_predictions(report, path)) for report in reports]
+    rows += [{"flight": name, "verdict": "refused", "sentence": reason} for name, reason in refused]
+    path.write_text(json.dumps(rows, indent=1) + "\n")
 
 
 def as_json(report: Report, predictions: Path | None = None) -> dict[str, Any]:

@@ -4,13 +4,13 @@ Starts of one flight are dependent, so the bootstrap resamples flights, not star
 Source: Davison & Hinkley 1997, "Bootstrap methods and their application", section 3.8 (cluster bootstrap, percentile).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from fleet.frames import G
-from fleet.mission import P_D, P_N, unroll_route
+from fleet.mission import unroll_route
 from twin_worker.evaluation.scoring.log import OURS, EvaluationCase, EvaluationStart, ReferenceFlight
 from twin_worker.evaluation.scoring.score import LIMITS, MethodScores
 from twin_worker.numerics.prediction_errors import path_length
@@ -18,12 +18,29 @@ from twin_worker.telemetry.flight_phase import classify_phase
 
 MIN_FIRST_S = 120.0  # minimum time since the first sample: the identification window must be complete [s]
 MIN_EVENT_FREE_S = 60.0  # minimum flight without an event after a start [s]
+MIN_SHORT_S = 10.0  # the same in a flight without any start that has `MIN_EVENT_FREE_S` [s]
 _PHASE_S = 10.0  # flight after a start that determines its phase [s]
 _GROUND_SPEED = 3.0  # a slower fixed wing is on the ground [m/s]
 
 
-def resolve_start(reference: ReferenceFlight, start: EvaluationStart) -> EvaluationCase:
-    """Attach the actual flight to a start; look-aheads after an event or in a telemetry gap are unknown."""
+def resolve_starts(reference: ReferenceFlight, starts: Sequence[EvaluationStart]) -> list[EvaluationCase]:
+    """Attach the actual flight to all starts of a flight; a short mission is scored as far as it goes."""
+    cases = [resolve_start(reference, start) for start in starts]
+    if any(not case.exclusion for case in cases):
+        return cases
+    return [resolve_start(reference, start, MIN_SHORT_S) for start in starts]
+
+
+def resolve_start(
+    reference: ReferenceFlight, start: EvaluationStart, event_free_s: float = MIN_EVENT_FREE_S
+) -> EvaluationCase:
+    """Attach the actual flight to a start; look-aheads after an event or in a telemetry gap are unknown.
+
+    Args:
+        reference: the actual flight
+        start: the start
+        event_free_s: minimum flight without an event after the start [s]
+    """
     end, reason = reference.next_event(start.t)
     instants = start.t + start.ahead
     positions = reference.positions_at(start.origin, instants)
@@ -39,12 +56,15 @@ def resolve_start(reference: ReferenceFlight, start: EvaluationStart) -> Evaluat
         length=np.interp(start.ahead, grid, length),
         phase=_phase(reference, start),
         route=legs[:, P_N : P_D + 1],
-        exclusion=_exclusion_reason(reference, start, end, reason),
+        exclusion=_exclusion_reason(reference, start, (end, reason), event_free_s),
     )
 
 
-def _exclusion_reason(reference: ReferenceFlight, start: EvaluationStart, end: float, event: str) -> str:
+def _exclusion_reason(
+    reference: ReferenceFlight, start: EvaluationStart, next_event: tuple[float, str], event_free_s: float
+) -> str:
     """Return the reason for exclusion of a start; empty: included."""
+    end, event = next_event
     fixed_wing = reference.status is not None and reference.status.vehicle == "fixed_wing"
     if start.no_route_reason:
         return start.no_route_reason
@@ -52,10 +72,10 @@ def _exclusion_reason(reference: ReferenceFlight, start: EvaluationStart, end: f
         return "on the ground"
     if start.first_s < MIN_FIRST_S:
         return f"within {MIN_FIRST_S:.0f} s of the first sample"
-    if end < start.t + MIN_EVENT_FREE_S:
-        return f"{event} within {MIN_EVENT_FREE_S:.0f} s"
-    if not reference.has_position(start.t + np.array([0.0, MIN_EVENT_FREE_S])).all():
-        return "no positions around its start or 60 s later"
+    if end < start.t + event_free_s:
+        return f"{event} within {event_free_s:.0f} s"
+    if not reference.has_position(start.t + np.array([0.0, event_free_s])).all():
+        return f"no positions around its start or {event_free_s:.0f} s later"
     return ""
 
 

@@ -111,13 +111,29 @@ def passage_quantile(passages: np.ndarray, share: float) -> float:
     """
     if not len(passages):
         return float("nan")
-    time, censored = passages[np.lexsort((passages[:, 1], passages[:, 0]))].T
-    at_risk = np.arange(len(time), 0, -1)
-    surviving = np.cumprod(1.0 - (censored == 0) / at_risk)
+    time, surviving = _surviving(passages)
     reached = np.flatnonzero(surviving <= 1.0 - share + 1e-12)
     return float(time[reached[0]] if len(reached) else time[-1])
 
 
 def survival_at(passages: np.ndarray, seconds: float) -> float:
-    """Return the share within the limit at a time up to which all starts were followed [s]; nan without starts."""
-    return float(np.mean(passages[:, 0] >= seconds - 1e-6)) if len(passages) else float("nan")
+    """Return the Kaplan-Meier estimate of the share within the limit at a time [s]; nan if none was followed so far.
+
+    Where all starts were followed up to that time, this is their plain share.
+    """
+    if not len(passages):
+        return float("nan")
+    followed = (passages[:, 1] == 0) | (passages[:, 0] >= seconds - 1e-6)
+    if followed.all():
+        return float(np.mean(passages[:, 0] >= seconds - 1e-6))
+    time, surviving = _surviving(passages)
+    if time[-1] < seconds - 1e-6 and surviving[-1] > 0:
+        return float("nan")
+    passed = np.flatnonzero(time < seconds - 1e-6)
+    return float(surviving[passed[-1]]) if len(passed) else 1.0
+
+
+def _surviving(passages: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times of passages, rising, and the share that survives each, (s,) both."""
+    time, censored = passages[np.lexsort((passages[:, 1], passages[:, 0]))].T
+    return time, np.cumprod(1.0 - (censored == 0) / np.arange(len(time), 0, -1))

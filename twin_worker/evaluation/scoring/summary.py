@@ -34,6 +34,17 @@ def summarise(cases: Sequence[EvaluationCase]) -> dict[str, Any]:
     return out
 
 
+def short_flights(cases: Sequence[EvaluationCase]) -> list[str]:
+    """Return the flights whose mission is too short for full starts; they are scored as far as they go."""
+    return sorted({case.start.flight for case in cases if not case.exclusion and _is_short(case)})
+
+
+def _is_short(case: EvaluationCase) -> bool:
+    """Return whether the flight after a start is known for less than is required elsewhere."""
+    known = case.start.ahead[np.isfinite(case.positions).all(axis=1)]
+    return not len(known) or float(known[-1]) < MIN_EVENT_FREE_S - 1e-6
+
+
 def method_figures(method_scores: MethodScores) -> dict[str, Any]:
     """Compute the figures of one method."""
     columns = _reported_columns(method_scores)

@@ -13,7 +13,7 @@ from fleet.autopilots import copter
 from fleet.autopilots.copter import Limits
 from fleet.contract import Item, Mission
 from fleet.frames import Origin
-from fleet.mission import join_remarks
+from fleet.mission import join_remarks, route_items
 from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.prediction.multirotor.route import (
     limit_speeds,
@@ -101,7 +101,7 @@ def multirotor_config(
         options: `origin` of the twin's frame, `flown` track, `prefix` of the parameters
     """
     origin, track, prefix = options["origin"], options["flown"], options.get("prefix", "")
-    items = mission.items if mission else ()
+    items = route_items(mission)
     seq_offset = int(autopilot == "px4" and bool(items))
     limit, absent = copter.limits(params, prefix)
     if "speed" in absent and track is not None:

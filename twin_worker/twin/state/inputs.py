@@ -5,7 +5,8 @@ from collections import deque
 import msgspec
 import numpy as np
 
-from fleet.airframes.airframe import ServoMap, servo_map
+from fleet.airframes.airframe import ASSUMED, ServoMap, servo_map
+from fleet.airframes.servo_learning import MIN_ROWS, learn_servo_map
 from fleet.autopilots.modes import ModeEntry
 from fleet.contract import Item, Mission, Params, Sample, Status
 from fleet.frames import Origin
@@ -22,6 +23,9 @@ _ITEM_CHANGES = 64  # kept
 _MAX_ALTITUDE_OFFSET_M = 200.0  # largest plausible difference of a position's and the receiver's altitude [m]
 _FIX_WAIT_S = 10.0  # telemetry after which a position is used in spite of such a difference [s]
 _TICK_S = 1.0  # between updates of the wind filter [s]
+_LEARN_FROM = ("servo", "attitude", "command", "air")
+_LEARN_S, _LEARN_PERIOD_S = 160.0, 20.0  # flight time that the servo map is learnt from, and between two attempts [s]
+_FLYING_AIRSPEED = 8.0  # [m/s]
 _LATE_S = 10.0  # velocities older than this come too late for the wind [s]
 
 
@@ -39,6 +43,8 @@ class Telemetry(msgspec.Struct):
         link_lost: no telemetry arrives
         link_restored_t: when it last arrived again [s since 1970]
         rejected_rows: rows left out, because they were implausible
+        servos_learned_t: when the servo map was learnt from flight; -inf: it was not [s since 1970]
+        servos_tried_t: when that was last tried [s since 1970]
     """
 
     history: TelemetryHistory = msgspec.field(default_factory=TelemetryHistory)
@@ -51,6 +57,8 @@ class Telemetry(msgspec.Struct):
     link_lost: bool = False
     link_restored_t: float = -np.inf
     rejected_rows: int = 0
+    servos_learned_t: float = -np.inf
+    servos_tried_t: float = -np.inf
 
     def add(self, sample: Sample) -> None:
         """Append the rows of a sample; the first position of a valid fix is the origin."""
@@ -76,14 +84,34 @@ class Telemetry(msgspec.Struct):
         self.origin = origin
 
     def set_servo_map(self, values: dict[str, float]) -> None:
-        """Derive the servo map from autopilot parameters."""
-        self.servo_map = servo_map(values)
+        """Derive the servo map from autopilot parameters; one learnt from flight is kept where they tell nothing."""
+        from_params = servo_map(values)
+        if not (from_params.sentence.startswith(ASSUMED) and np.isfinite(self.servos_learned_t)):
+            self.servo_map, self.servos_learned_t = from_params, -np.inf
+
+    def learn_servo_map(self) -> None:
+        """Learn the servo map from the last minutes of flight, where no parameter tells it; at most every 20 s."""
+        newest = self.history.newest
+        if not self.servo_map.sentence.startswith(ASSUMED) or newest - self.servos_tried_t < _LEARN_PERIOD_S:
+            return
+        self.servos_tried_t = newest
+        series = {name: self.history.rows_since(name, newest - _LEARN_S) for name in _LEARN_FROM}
+        t, pulses = series["servo"]
+        if min(len(rows) for rows, _ in series.values()) < MIN_ROWS:
+            return
+        attitude, command, air = (_at(t, *series[name]) for name in ("attitude", "command", "air"))
+        flying = air[:, 0] > _FLYING_AIRSPEED
+        learned = learn_servo_map(
+            pulses[flying], (command[:, :2] - attitude[:, :2])[flying], attitude[flying, 3:5], air[flying, 1]
+        )
+        if learned is not None:
+            self.servo_map, self.servos_learned_t = learned, newest
 
     def reset_clock(self) -> None:
         """Forget all rows: the new time may be earlier than the old one."""
         self.history.clear()
         self.resampler.clear()
-        self.data_t = self.last_step_t = self.link_restored_t = -np.inf
+        self.data_t = self.last_step_t = self.link_restored_t = self.servos_tried_t = -np.inf
         self.delay = ArrivalDelay(self.delay.gateway_t)
 
     def shift_clock(self, step: float) -> None:
@@ -93,6 +121,12 @@ class Telemetry(msgspec.Struct):
         self.history.shift_times(newest - 0.5 * step if arrived else np.inf, step)
         self.resampler.clear()
         self.link_restored_t += step
+
+
+def _at(t: np.ndarray, source_t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Interpolate rows to times `t`, nan outside, (n, k)."""
+    inside = (t >= source_t[0]) & (t <= source_t[-1])
+    return np.where(inside[:, None], np.column_stack([np.interp(t, source_t, c) for c in values.T]), np.nan)
 
 
 def _first_position(history: TelemetryHistory) -> Origin | None:

@@ -20,7 +20,7 @@ from fleet.contract import (
     Verdict,
 )
 from fleet.frames import Origin
-from fleet.mission import FIRST_ITEM
+from fleet.mission import FIRST_ITEM, extends, route_items
 from fleet.vehicles import UNKNOWN, VehicleClass, vehicle_class
 from fleet.window import Window
 from twin_worker.prediction.autopilot_identification import LAW_OF_AUTOPILOT
@@ -168,7 +168,7 @@ class Twin(msgspec.Struct):
     def situation(self, window: Window) -> PredictionContext:
         """Return the initial data of a prediction from the end of `window`."""
         assert self.telemetry.origin is not None
-        items = self.onboard.mission.items if self.onboard.mission else ()
+        items = route_items(self.onboard.mission)
         law = LAW_OF_AUTOPILOT.get(self.autopilot, self.environment.autopilot.law)
         autopilot_config = AutopilotConfig(
             items,
@@ -229,7 +229,7 @@ def ingest(twin: Twin, message: Message) -> None:
         _ingest_status(twin, message)
     elif isinstance(message, Mission):
         first = twin.first_item  # item 0 of a mission that contains home is no change: home moves, e.g. at arming
-        if twin.onboard.mission is None or twin.onboard.received_items[first:] != message.items[first:]:
+        if not _is_same_mission(twin.onboard, message, first):
             invalidate_prediction(twin, Event.MISSION, message.t, describe_mission(twin.onboard.mission, message))
         twin.onboard.set_mission(message, first)
         complete_home(twin)
@@ -240,6 +240,14 @@ def ingest(twin: Twin, message: Message) -> None:
             invalidate_prediction(twin, Event.PARAMETERS if names else None, message.t, text)
         twin.onboard.set_params(message)
         twin.telemetry.set_servo_map(message.values)
+
+
+def _is_same_mission(onboard: OnboardState, mission: Mission, first: int) -> bool:
+    """Return whether a mission is the known one from item `first` on, or more items of an incomplete one."""
+    if onboard.mission is None:
+        return False
+    known = onboard.received_items[first:]
+    return known == mission.items[first:] or (not onboard.mission.complete and extends(mission.items, known))
 
 
 def _ingest_status(twin: Twin, status: Status) -> None:

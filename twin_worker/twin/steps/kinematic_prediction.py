@@ -7,6 +7,7 @@ import numpy as np
 
 from fleet.autopilots import copter, greybox
 from fleet.contract import Mission
+from fleet.mission import route_items
 from twin_worker.prediction import kinematic
 from twin_worker.prediction.autopilot_parameters import ControllerTwin, RouteOverride, multirotor_controller
 from twin_worker.prediction.multirotor import fit, rollout
@@ -103,7 +104,7 @@ def _multirotor_config(twin: Twin, recent: Track, override: RouteOverride | None
 
 def _fixed_wing_config(twin: Twin) -> kinematic.KinematicConfig:
     assert twin.telemetry.origin is not None
-    items = twin.onboard.mission.items if twin.onboard.mission else ()
+    items = route_items(twin.onboard.mission)
     wind = twin.environment.wind.wind if np.isfinite(twin.environment.wind.t) else None
     return kinematic.KinematicConfig(
         items,

@@ -26,6 +26,7 @@ from fleet.mission import (
     TURNS,
     VA_C,
     Route,
+    route_items,
     unroll_route,
 )
 from twin_worker.prediction.kinematic import wind_and_airspeed
@@ -233,7 +234,7 @@ def _route_points(twin: Twin, track: Track, seconds: float) -> np.ndarray | None
         if not np.isfinite(seq[-1]):
             return None
         remaining = unroll_route(
-            twin.onboard.mission.items,
+            route_items(twin.onboard.mission),
             seq=int(seq[-1]),
             origin=twin.telemetry.origin,
             params=params,

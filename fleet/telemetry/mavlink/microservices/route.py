@@ -1,22 +1,26 @@
 """Collect the onboard mission from downloads and uploads of any ground station."""
 
 from itertools import pairwise
-from math import isfinite
+from math import inf, isfinite
 from typing import Any
 
 import msgspec
 
 from fleet.contract import MAX_ITEMS, Item, Mission
+from fleet.telemetry.mavlink.microservices.learned import LearnedMission
 
 NO_COMMAND = 0  # not a MAV_CMD; marks an invalid item
 NAV_LAST = 95  # MAV_CMD_NAV_LAST: commands above it have no waypoint
 DO_JUMP = 177
 WAYPOINT = 16
 CHECK_STRIDE, CHECK_COUNT = 10, 3  # check of a recalled mission: the first 3 of every 10 items are downloaded
+TARGET_AFTER_S = 15.0  # the mission list may still arrive for this time after the first position target [s]
+TARGET_CONFIRM_S = 1.0  # a target belongs to the current item when both are unchanged for this time [s]
 ACCEPT_S = 3.0  # silence after which an upload without acknowledgement is accepted [s]
 PARTIAL_AFTER_S = 2.0  # silence after which an incomplete list is published [s]
 
 _NO_IDENTITY = ((0, 0), (65535, 0))  # item count and mission id where neither is reported
+_MAX_ALTITUDE_M = 1e5
 _MIN_HOME_MOVE_M = 1.0  # smaller changes of home are ignored [m]
 _ABSOLUTE = {3: 0, 6: 5}  # MAV_FRAME: relative to home -> above sea level
 
@@ -57,6 +61,10 @@ class MissionCollector:
         self._identity: tuple[int, int] | None = None  # reported item count and mission id
         self._transfers: dict[bool, _MissionTransfer | None] = {False: None, True: None}
         self._changed = False
+        self._learned = LearnedMission()
+        self._is_learned = False  # the items are from position targets
+        self._target: tuple[int, int, int, int] | None = None  # current item, position [1e-7 deg], altitude [m]
+        self._target_t, self._first_target_t = inf, inf
 
     def process(self, message: Any, *, is_upload: bool, now: float) -> None:
         """Process one mission protocol message; `is_upload` if a ground station sent it to the aircraft."""
@@ -80,6 +88,45 @@ class MissionCollector:
         transfer = _MissionTransfer(len(items), 0.0)
         transfer.items = dict(enumerate(items))
         self._accept(transfer)
+
+    def set_partial(self, items: tuple[Item, ...], total: int) -> None:
+        """Set the known items of a mission of `total` items, 0 if unknown; the mission is complete if none is missing.
+
+        Items after the first missing one are not predicted: nothing tells what is flown in between.
+        """
+        if total and [item.seq for item in items] == list(range(total)):
+            self.set_items(items)
+        elif items != self.items:
+            self.items, self.complete, self._changed = items, False, True
+            expected = f"{total}" if total else "an unknown number"
+            self._set_text(
+                f"found {len(items)} mission items, expected {expected}; predicted up to the last known one, "
+                "name a mission file with --mission"
+            )
+
+    @property
+    def needs_targets(self) -> bool:
+        """Return whether no mission list is known, so that position targets are all there is."""
+        return not self.complete and (not self.items or self._is_learned)
+
+    def add_target(self, lat_e7: int, lon_e7: int, alt_m: float, now: float) -> None:
+        """Learn the current item from the position the autopilot flies to, above sea level [1e-7 deg, m]."""
+        self._first_target_t = min(self._first_target_t, now)
+        if not (isfinite(alt_m) and abs(alt_m) < _MAX_ALTITUDE_M and (lat_e7 or lon_e7)):
+            return
+        target = (self.seq, lat_e7, lon_e7, round(alt_m))
+        if target != self._target:
+            self._target, self._target_t = target, now
+        is_confirmed = now - self._target_t >= TARGET_CONFIRM_S and now - self._first_target_t >= TARGET_AFTER_S
+        if not (self.needs_targets and is_confirmed and 0 <= self.seq < MAX_ITEMS):
+            return
+        item = Item(seq=self.seq, command=WAYPOINT, frame=0, lat_e7=lat_e7, lon_e7=lon_e7, alt_m=float(target[3]))
+        if self._learned.add(item):
+            self.items, self._is_learned, self._changed = self._learned.items, True, True
+            self._set_text(
+                f"no mission list was received; {len(self.items)} items are known from position targets, "
+                "taken as waypoints; request the mission, or name a file with --mission"
+            )
 
     def set_recalled(self, items: tuple[Item, ...]) -> None:
         """Set the previous mission; it is reused if the count and a few items are equal."""
@@ -220,9 +267,11 @@ class MissionCollector:
             self.items, self.complete, self._text = items, True, text
             self._changed = True
         self._transfers[False] = self._transfers[True] = None
+        self._is_learned = False
         self.needs_download, self.unconfirmed, self._recalled = False, transfer.recalled, ()
 
     def _publish_partial(self, transfer: _MissionTransfer) -> None:
+        self._is_learned = False
         items = tuple(transfer.items[seq] for seq in sorted(transfer.items))
         if items and items != self.items:
             self.items = items

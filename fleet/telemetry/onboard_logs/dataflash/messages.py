@@ -10,6 +10,7 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from fleet.contract import MAX_ITEMS, Item
+from fleet.telemetry.mavlink.microservices.learned import LearnedMission
 from fleet.telemetry.mavlink.onboard_log import OnboardEvent
 from fleet.telemetry.onboard_logs.dataflash.records import Records
 from fleet.vehicles import FIXED_WING, HELICOPTER, MULTIROTOR, QUADPLANE
@@ -75,6 +76,7 @@ _SUBSYSTEMS = {
 }
 """Source: ArduPilot AP_Logger.h, enum class LogErrorSubsystem."""
 _ABSOLUTE, _RELATIVE = 0, 3  # MAV_FRAME
+_LIST_GAP_S = 5.0  # a list that is not continued for this time is incomplete [s]
 
 
 class EventExtractor:
@@ -176,12 +178,17 @@ def _parameter_events(records: Records) -> Iterator[OnboardEvent]:
 
 
 class _MissionExtractor:
-    """Evaluate CMD: a sequence from item 0 (home) to the end is a mission list; any other CMD is an executed item."""
+    """Evaluate CMD: a sequence from item 0 (home) to the end is a mission list; any other CMD is an executed item.
+
+    An executed item that the list lacks is added to it: a log that starts in flight has no list, others a part of it.
+    """
 
     def __init__(self) -> None:
         self._items: dict[int, Item] = {}
         self._next_seq: int | None = None  # next item of the list in progress
         self._t = 0.0
+        self._learned: LearnedMission | None = None  # with the executed items
+        self._total = 0  # number of items on board, 0 if unknown
         self._latest: tuple[Item, ...] = ()
         self._listed: dict[int, np.ndarray] = {}  # by id of this block's records: mask of list items
 
@@ -195,10 +202,12 @@ class _MissionExtractor:
                 yield from self.finish()
                 self._next_seq = 0
             if item.seq != self._next_seq:
+                yield from self._merge(item, float(t), item_total[i])
                 continue
             self._listed[id(records)][i] = True
             self._items[item.seq] = item
             self._next_seq, self._t = item.seq + 1, float(t)
+            self._total = _total(item_total[i])
             if self._next_seq >= item_total[i] or self._next_seq >= MAX_ITEMS:
                 yield from self.finish()
 
@@ -208,8 +217,34 @@ class _MissionExtractor:
     def finish(self) -> Iterator[OnboardEvent]:
         items, self._items, self._next_seq = tuple(self._items.values()), {}, None
         if items and items != self._latest:
-            self._latest = items
-            yield OnboardEvent(self._t, "mission", items)
+            self._latest, self._learned = items, None
+            yield self._event(self._t)
+
+    def _merge(self, executed: Item, t: float, total: float) -> Iterator[OnboardEvent]:
+        """Add an executed item that the list lacks; a list still being logged has priority."""
+        if self._next_seq is not None and t - self._t < _LIST_GAP_S:
+            return
+        yield from self.finish()
+        if any(item.seq == executed.seq for item in self._latest):
+            return
+        if self._learned is None:
+            self._learned = LearnedMission()
+            for item in self._latest:
+                self._learned.add_known(item)
+        self._learned.add(executed)
+        self._total = _total(total)
+        self._latest = tuple(item for item in self._learned.items if not self._total or item.seq < self._total)
+        yield self._event(t)
+
+    def _event(self, t: float) -> OnboardEvent:
+        if len(self._latest) >= self._total > 0:
+            return OnboardEvent(t, "mission", self._latest)
+        return OnboardEvent(t, "partial mission", (self._latest, self._total))
+
+
+def _total(value: float) -> int:
+    """Return a number of items; 0 for an implausible one."""
+    return int(value) if 0 < value <= MAX_ITEMS else 0
 
 
 def _items(records: Records) -> Iterator[Item | None]:

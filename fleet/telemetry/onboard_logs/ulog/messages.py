@@ -9,7 +9,7 @@ import numpy as np
 from fleet import vehicles
 from fleet.telemetry.mavlink import heartbeat
 from fleet.telemetry.mavlink.onboard_log import OnboardEvent
-from fleet.telemetry.onboard_logs.ulog.topic import Topic
+from fleet.telemetry.onboard_logs.topic import Topic
 from fleet.telemetry.tables.ulog import ARMED, AUTOSTART, TRANSITIONS, VEHICLE_TYPE, mode_name
 
 _MIN_UTC_US, _MAX_UTC_US = 1.2e15, 4e15  # plausible GPS time: 2008 to 2096

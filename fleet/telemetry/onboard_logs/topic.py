@@ -1,4 +1,4 @@
-"""View of a ULog topic for the table: fields as arrays, other topics interpolated to the same times."""
+"""View of a topic of an onboard log for the table: fields as arrays, other topics interpolated to the same times."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -31,6 +31,16 @@ class Topic:
         if any(field.startswith(key + ".") for field in self._data):
             return self._view(self._query_t, key + ".")
         raise AttributeError(name)
+
+    def field(self, name: str) -> Any:
+        """Return a field by its full name, which may contain dots and brackets.
+
+        Raises:
+            AttributeError: if there is none; the table row does not apply.
+        """
+        if name not in self._data:
+            raise AttributeError(name)
+        return self._values(name)
 
     def interpolated(self, name: str) -> "Topic":
         """Return another topic interpolated to the times of this one; the second instance is `name.1`."""

@@ -1,0 +1,1 @@
+"""Reader of tables (CSV, MATLAB) by a column map."""
