@@ -18,7 +18,7 @@ import numpy as np
 from fleet.contract import MAX_ITEMS, Item, Mission
 from fleet.frames import Origin, to_ned
 from fleet.mission_jumps import JUMPS, jump_target, nearest_landing, repetitions, resets_counters
-from fleet.mission_legs import (
+from fleet.mission_legs import (  # noqa: F401 - also for users of routes
     ABSOLUTE,
     ACCEPT_RADIUS,
     CHANGE_ALTITUDE,
@@ -51,38 +51,6 @@ from fleet.mission_legs import (
     make_leg,
     position_error,
 )
-
-__all__ = [
-    "ACCEPT_RADIUS",
-    "CHANGE_ALTITUDE",
-    "CONSTANT_BANK",
-    "FIRST_ITEM",
-    "GLIDE",
-    "GLOBAL_FRAMES",
-    "KIND",
-    "KINDS",
-    "LAND",
-    "LEG_NAMES",
-    "LOITER_TIME",
-    "LOITER_TO_ALT",
-    "LOITER_TURNS",
-    "LOITER_UNLIMITED",
-    "N_COLUMNS",
-    "P_D",
-    "P_E",
-    "P_N",
-    "RADIUS",
-    "ROUTE_PARAMS",
-    "SEQ",
-    "SPEED",
-    "TAKEOFF",
-    "TURNS",
-    "VA_C",
-    "WAYPOINT",
-    "Route",
-    "join_remarks",
-    "unroll_route",
-]
 
 # MAV_CMD: RETURN_TO_LAUNCH, NAV_CONTINUE_AND_CHANGE_ALT, NAV_DELAY, NAV_LAST, DO_CHANGE_SPEED, DO_SET_HOME
 _RETURN, _CHANGE_ALTITUDE, _DELAY, _LAST_NAV, SPEED, _SET_HOME = 20, 30, 93, 95, 178, 179

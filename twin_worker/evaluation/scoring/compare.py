@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fleet.frames import G
-from fleet.mission import unroll_route
+from fleet.mission import P_D, P_N, unroll_route
 from twin_worker.evaluation.scoring.log import OURS, EvaluationCase, EvaluationStart, ReferenceFlight
 from twin_worker.evaluation.scoring.score import LIMITS, MethodScores
 from twin_worker.numerics.prediction_errors import path_length
