@@ -227,7 +227,7 @@ def _advance_to(builder: _RouteBuilder, seq: int) -> int:
         elif item is not None:
             _apply_item(builder, item)
         else:
-            builder.last_kind = TAKEOFF  # the line to the next item starts at an unknown point
+            builder.last_leg = None  # the line to the next item starts at an unknown point
         item_seq += 1
     return item_seq
 

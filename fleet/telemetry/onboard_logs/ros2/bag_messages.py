@@ -37,7 +37,7 @@ class BagMessage(NamedTuple):
     data: bytes
 
 
-Opener = Callable[[], IO[bytes]]
+Opener = Callable[[], Any]
 
 
 def mcap_messages(opener: Opener, skipped: list[str]) -> Iterator[BagMessage]:
