@@ -6,7 +6,7 @@ import sqlite3
 import struct
 import tempfile
 from collections.abc import Callable, Iterator
-from typing import IO, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import lz4.frame
 import zstandard
@@ -37,7 +37,7 @@ class BagMessage(NamedTuple):
     data: bytes
 
 
-Opener = Callable[[], IO[bytes]]
+Opener = Callable[[], Any]
 
 
 def mcap_messages(opener: Opener, skipped: list[str]) -> Iterator[BagMessage]:

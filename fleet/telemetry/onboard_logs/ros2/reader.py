@@ -7,7 +7,7 @@ applies to them.
 import re
 from array import array
 from collections.abc import Callable, Iterator
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from mcap.records import Schema
@@ -61,7 +61,7 @@ class _BagLog(TopicLog):
 
     messages: Callable[[Opener, list[str]], Iterator[BagMessage]]
 
-    def __init__(self, opener: Callable[[], IO[bytes]], name: str) -> None:
+    def __init__(self, opener: Opener, name: str) -> None:
         """Read the bag; problems are listed in `skipped`.
 
         Args:
