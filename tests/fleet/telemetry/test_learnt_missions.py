@@ -15,6 +15,7 @@ from fleet.telemetry.mavlink.microservices.parameter_file import read_parameters
 from fleet.telemetry.mavlink.microservices.route import TARGET_AFTER_S, MissionCollector
 from fleet.telemetry.recording.options import RecordingOptions
 from fleet.telemetry.recording.recordings import Recording
+from tests.support.dataflash_writer import Writer
 from tests.support.flights import item
 from tests.support.talker import of
 from tests.support.ulog_writer import START_US, flight, read, said, ulog
@@ -181,6 +182,30 @@ def test_position_targets_with_the_current_item_become_waypoints() -> None:
     assert "position targets" in made[-1].sentence
     collector.set_items(waypoints(0, 1))
     assert not collector.needs_targets and collector.take_update(99.0).items == waypoints(0, 1)
+
+
+# --- DataFlash ------------------------------------------------------------------------------------------------------
+
+
+def commands(*rows: tuple[float, int, int]):
+    """A log with CMD messages: time [s], item, number of items."""
+    writer = Writer().fmt("CMD", "QHHHffffLLfB", "TimeUS,CTot,CNum,CId,Prm1,Prm2,Prm3,Prm4,Lat,Lng,Alt,Frame")
+    for t, seq, total in rows:
+        writer.say("CMD", round(t * 1e6), total, seq, 16, 0.0, 0.0, 0.0, 0.0, 47.0 + seq, 8.5, 30.0, 3 if seq else 0)
+    events = [event for chunk in writer.log().chunks() for event in chunk.events]
+    return [(event.kind, event.value) for event in events if "mission" in event.kind]
+
+
+def test_a_dataflash_log_begun_in_flight_learns_from_the_executed_items() -> None:
+    events = commands((1.0, 2, 6), (20.0, 3, 6), (40.0, 4, 6))
+    assert [kind for kind, _ in events] == ["partial mission"] * 3
+    assert [([i.seq for i in items], total) for _, (items, total) in events][-1] == ([2, 3, 4], 6)
+
+
+def test_an_incomplete_list_is_published_as_such_and_completed_in_flight() -> None:
+    events = commands((1.0, 0, 4), (1.02, 1, 4), (8.0, 2, 4), (16.0, 3, 4), (17.0, 3, 4), (18.0, 3, 4))
+    assert events[0][0] == "partial mission" and [i.seq for i in events[0][1][0]] == [0, 1]
+    assert events[-1][0] == "mission" and [i.seq for i in events[-1][1]] == [0, 1, 2, 3]
 
 
 # --- files ----------------------------------------------------------------------------------------------------------

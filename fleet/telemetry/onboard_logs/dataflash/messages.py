@@ -198,6 +198,8 @@ class _MissionExtractor:
         for i, (t, item) in enumerate(zip(records.t, _items(records), strict=True)):
             if item is None:
                 continue
+            if self._next_seq is not None and t - self._t > _LIST_GAP_S:
+                yield from self.finish()  # not continued: incomplete
             if item.seq == 0:
                 yield from self.finish()
                 self._next_seq = 0
@@ -222,9 +224,8 @@ class _MissionExtractor:
 
     def _merge(self, executed: Item, t: float, total: float) -> Iterator[OnboardEvent]:
         """Add an executed item that the list lacks; a list still being logged has priority."""
-        if self._next_seq is not None and t - self._t < _LIST_GAP_S:
+        if self._next_seq is not None:
             return
-        yield from self.finish()
         if any(item.seq == executed.seq for item in self._latest):
             return
         if self._learned is None:

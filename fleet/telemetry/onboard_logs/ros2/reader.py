@@ -61,7 +61,7 @@ class _BagLog(TopicLog):
 
     messages: Callable[[Opener, list[str]], Iterator[BagMessage]]
 
-    def __init__(self, opener: Callable[[], Any], name: str) -> None:
+    def __init__(self, opener: Opener, name: str) -> None:
         """Read the bag; problems are listed in `skipped`.
 
         Args:
