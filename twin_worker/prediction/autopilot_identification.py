@@ -19,12 +19,11 @@ from fleet.mission import P_D, P_N, SEQ, VA_C, WAYPOINT
 from twin_worker.estimation.airspeed_setpoint import reported_setpoint
 from twin_worker.prediction.autopilot_parameters import CRUISE_OF, fixed_wing_controller
 from twin_worker.prediction.closed_loop import autopilot_wind
-from twin_worker.prediction.replay_window import PredictionContext, ReplayWindow, replay_inputs
+from twin_worker.prediction.replay_window import MAX_BANK_ERROR, PredictionContext, ReplayWindow, replay_inputs
 
 LAW_OF_AUTOPILOT = {"ardupilot": "arduplane", "px4": "px4"}
 REPLAY_INTERVAL_S = 10.0  # interval of replays [s]
 _MIN_REPLAY_S = 5.0  # shortest flight on the present route that is replayed [s]
-_MAX_BANK_ERROR = radians(6.0)  # largest error to the commanded banks of an accepted law [rad]
 _MIN_TURN_BANK = radians(12.0)  # smaller banks do not distinguish laws [rad]
 _SMOOTHING = 0.15  # smoothing weight of the newest replay
 _LIMIT_BAND = radians(0.3), 8  # band below the steepest bank, and minimum reports in it, that indicate a limit [rad]
@@ -206,7 +205,7 @@ def _select_law(estimate: AutopilotEstimate, autopilot: str) -> None:
         return
     law, error = min(estimate.bank_error.items(), key=lambda pair: pair[1])
     within = f"the commanded banks within {degrees(error):.1f} deg"
-    if error < _MAX_BANK_ERROR:
+    if error < MAX_BANK_ERROR:
         estimate.law = law
         estimate.reason = f"autopilot {autopilot}: control law {laws.LAWS[law].description} matches {within}"
     else:

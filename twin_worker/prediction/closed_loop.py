@@ -30,7 +30,7 @@ from twin_worker.prediction.autopilot_parameters import (
     fixed_wing_controller,
     transfer_controller,
 )
-from twin_worker.prediction.replay_window import PredictionContext, Rollout, replay_inputs, reported
+from twin_worker.prediction.replay_window import PredictionContext, Rollout, replay_inputs, reported, route_error
 
 MIN_ROLLOUT_S = 60.0  # shortest valid rollout [s]
 _REPORT_DELAY_S = 0.5  # reports sooner after a mode change may be older than it [s]
@@ -91,7 +91,9 @@ def synchronise_controller(context: PredictionContext) -> InitialCondition | Rol
     par = laws.with_wind(controller.par(replay.altitude_m), *autopilot_wind(context, replay.window))
     setpoint = _airspeed_setpoint(context, float(replay.window.t[-1]), float(controller.values[CRUISE_OF[onboard.law]]))
     legs = apply_setpoint(replay.legs, float(seq), float(controller.values[CRUISE_OF[onboard.law]]), setpoint)
-    ctl, _ = replay_controller(par, legs, replay.start_point, *replay.rows, replay.seq)  # type: ignore[call-arg]
+    ctl, rms = replay_controller(par, legs, replay.start_point, *replay.rows, replay.seq)  # type: ignore[call-arg]
+    if error := route_error(onboard.mode_route, float(rms), replay.phi_c, replay.window.seconds):
+        return Rollout(None, seq, error)
     if onboard.law == "arduplane":
         _align_speed_demand(ctl, par, reported_demand(context.history, float(replay.window.t[-1])))
     sentence = " ".join(filter(None, (onboard.law_reason, replay.sentence)))

@@ -27,7 +27,7 @@ from twin_worker.prediction.autopilot_parameters import (
     transfer_controller,
 )
 from twin_worker.prediction.failsafe_route import FailsafePlan, with_failsafe
-from twin_worker.prediction.replay_window import MAX_EARLY_S, items_since_entry, leg_start
+from twin_worker.prediction.replay_window import MAX_EARLY_S, items_since_entry, leg_start, route_error
 from twin_worker.prediction.route_cache import cached_route
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.track import STEP, Track
@@ -153,7 +153,9 @@ def _fly_route(
     if config.mode_route is None:
         at = int(seq[0]), float(recent.t[0]), recent.p[0]
         start_point = leg_start(mission_route, config.entry, config.history, at)
-    ctl = _synchronise(recent, seq, (par, mission_route.legs, start_point), w)
+    ctl, rms, banks = _synchronise(recent, seq, (par, mission_route.legs, start_point), w)
+    if error := route_error(config.mode_route, rms, banks, STEP * len(recent)):
+        return KinematicRollout(None, int(seq[-1]), error)
     lags = _lag_parameters(
         flight, mission_route.legs[int(ctl[arduplane.LEG])], par, controller.default_names, (model, V)
     )
@@ -215,17 +217,20 @@ def _apply_override(
     return _RouteGuidance(ctl, par, new_route, lags, controller)
 
 
-def _synchronise(recent: Track, seq: np.ndarray, par_legs_start: tuple[np.ndarray, ...], w: np.ndarray) -> np.ndarray:
-    """Synchronise the guidance with the flight."""
+def _synchronise(
+    recent: Track, seq: np.ndarray, par_legs_start: tuple[np.ndarray, ...], w: np.ndarray
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """Synchronise the guidance with the flight; return its state, the RMS error of its bank [rad], and the banks."""
     n = len(recent)
     missing = np.full(n, np.nan)
     air = recent.v - [*w, 0.0]
     psi = np.arctan2(air[:, 1], air[:, 0])
-    euler = np.column_stack([_banks(recent, air), 0.0 * psi, psi])
+    banks = _banks(recent, air)
+    euler = np.column_stack([banks, 0.0 * psi, psi])
     triple, quad = np.full((n, 3), np.nan), np.full((n, 4), np.nan)
-    rows = (recent.t - recent.t[0], recent.p, recent.v, euler, triple, missing, missing, missing, quad, seq)
-    ctl, _ = replay_controller(*par_legs_start, *(np.ascontiguousarray(row) for row in rows))  # type: ignore[call-arg]
-    return ctl
+    rows = (recent.t - recent.t[0], recent.p, recent.v, euler, triple, missing, banks, missing, quad, seq)
+    ctl, rms = replay_controller(*par_legs_start, *(np.ascontiguousarray(row) for row in rows))  # type: ignore[call-arg]
+    return ctl, float(rms), banks
 
 
 def _banks(recent: Track, air: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import radians
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from twin_worker.prediction.failsafe_route import FailsafePlan
 from twin_worker.prediction.route_cache import cached_route
 from twin_worker.telemetry.history import TelemetryHistory
 
+MAX_BANK_ERROR = radians(6.0)  # largest error to the commanded banks of an accepted law [rad]
+_MIN_COMPARED_S = 10.0  # shortest flight in which banks are compared [s]
 SHADOW_S = 60.0  # telemetry for the synchronisation of the controller twin [s]
 MIN_FLIGHT_S = 5.0  # shortest telemetry without gaps before a rollout [s]
 MAX_EARLY_S = 1.0  # a route that changed at most this long after the newest telemetry is flown from there [s]
@@ -170,6 +173,25 @@ def replay_inputs(context: PredictionContext) -> ReplayWindow | Rollout:
         route.start if onboard.mode_route is not None else leg_start(route, onboard.entry, context.history, at)
     )
     return ReplayWindow(window, flight, route.legs, start_point, rows, seq, altitude, route.summary)
+
+
+def route_error(mode_route: Route | None, rms: float, banks: np.ndarray, seconds: float) -> str:
+    """Describe why the flight does not follow the assumed route of a mode; empty if it does, and in a mission.
+
+    The banks that the law demands on the route must be nearer to the flight than straight flight is.
+
+    Args:
+        mode_route: route of the mode
+        rms: of demanded minus commanded or flown banks; nan: unknown [rad]
+        banks: commanded or flown banks, (n,) [rad]
+        seconds: flight on the route [s]
+    """
+    finite = banks[np.isfinite(banks)]
+    if mode_route is None or seconds < _MIN_COMPARED_S or not len(finite):
+        return ""
+    if not rms > max(MAX_BANK_ERROR, float(np.sqrt(np.mean(finite**2)))):
+        return ""
+    return f"the flight does not follow the route of its mode: bank error {np.degrees(rms):.0f} deg"
 
 
 def items_since_entry(

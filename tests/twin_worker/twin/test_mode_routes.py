@@ -117,6 +117,19 @@ def test_the_state_does_not_alternate_before_the_first_model(heard):
     assert sum(a is not b for a, b in pairwise(states)) <= 3
 
 
+def test_a_flight_that_does_not_follow_the_route_of_its_mode_is_a_turn_rate(winged):
+    now = winged.telemetry.history.newest
+    entered(winged, "GUIDED")
+    away = to_geodetic(winged.telemetry.origin, np.array([3000.0, -9000.0, -140.0]))
+    entry = msgspec.structs.replace(winged.onboard.entry, t=now - 40.0)
+    winged.onboard.enter_mode(entry)  # as if it had flown there for 40 s, but it has flown its mission
+    winged.onboard.set_target(tuple(float(x) for x in away))
+    winged.onboard.plan_changed(now - 40.0)
+    winged.prediction.expire()
+    made = predictions(advance(winged, (), now + 1.2))[-1]
+    assert made.method == "imm" and "does not follow the route of its mode" in made.sentence
+
+
 # --- link loss -------------------------------------------------------------------------------------------------------
 
 RADIO = {"THR_FAILSAFE": 1.0, "FS_LONG_TIMEOUT": 5.0, "RC_FS_TIMEOUT": 1.0, "RTL_AUTOLAND": 0.0, "FS_GCS_ENABL": 0.0}
