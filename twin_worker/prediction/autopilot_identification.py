@@ -6,7 +6,7 @@ and waypoint radius are read from the flight. Parameters that cannot be identifi
 as defaults.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import atan2, degrees, isfinite, pi, radians
 
@@ -98,7 +98,8 @@ def identify_autopilot(estimate: AutopilotEstimate, autopilot: str, context: Pre
         for law, absent in missing.items():
             _fit_turn_parameters(estimate, law, absent, (context, replay), values[law])
     if own_law is None:
-        _select_law(estimate, autopilot)
+        received = [law for law, absent in missing.items() if next(iter(_TURN_PARAMETERS[law])) not in absent]
+        _select_law(estimate, autopilot, received)
     if estimate.law:
         estimate.values = values[estimate.law]
 
@@ -198,12 +199,14 @@ def _bank_rms(law: str, replay_data: tuple[PredictionContext, ReplayWindow], val
     return float(rms) if isfinite(rms) else np.inf
 
 
-def _select_law(estimate: AutopilotEstimate, autopilot: str) -> None:
-    """Select the law with the smallest bank error if it is below the limit."""
+def _select_law(estimate: AutopilotEstimate, autopilot: str, received: Sequence[str]) -> None:
+    """Select the law with the smallest bank error if it is below the limit; first of those whose parameters came."""
     if not estimate.bank_error:
         estimate.reason = f"autopilot {autopilot}: no commanded bank received in a turn yet, control law unknown"
         return
-    law, error = min(estimate.bank_error.items(), key=lambda pair: pair[1])
+    matching = {law: error for law, error in estimate.bank_error.items() if error < MAX_BANK_ERROR}
+    own = {law: error for law, error in matching.items() if law in received}
+    law, error = min((own or matching or estimate.bank_error).items(), key=lambda pair: pair[1])
     within = f"the commanded banks within {degrees(error):.1f} deg"
     if error < MAX_BANK_ERROR:
         estimate.law = law

@@ -89,7 +89,7 @@ def check_arguments(args: argparse.Namespace) -> None:
         ValueError: when an option is invalid; the text names it.
     """
     read_speed(args.speed)
-    if args.to and RecordingOptions.of(args).arguments():
+    if getattr(args, "to", None) and RecordingOptions.of(args).arguments():
         raise ValueError("--to: found --mission, --params or --columns too, expected none of them; drop them")
     if not 1 <= args.copies <= 10_000:
         raise ValueError(f"--copies: found {args.copies}, expected 1 to 10,000; change it")

@@ -134,7 +134,6 @@ NOMINAL_EXCITATION = (1.0, 0.8, 0.4, 0.0, 0.0)  # amplitude of the test pilot in
 _ONSET_S, _TRANSIENT_START_S = (50.0, 110.0), (45.0, 140.0)
 _BASELINE_SETTINGS = {"propulsion/engine/propeller-sense": 0.0, "conceal/slipstream": 0.0}  # but as a hidden effect
 _EXTRA_PARAMS = {"c172p": {"KFF_RDDRMIX": 0.3}, "small": {}}  # otherwise its rudder hardly moves
-_W20_MPS = 1.5  # light turbulence
 _STEEP_SHARE = 0.35  # fraction of flights over the full height range
 
 
@@ -158,6 +157,7 @@ class PlannedFlight(NamedTuple):
     hidden_faults: tuple[Fault, ...]
     steep: bool
     seconds: float
+    w20_mps: float = 1.5  # wind at 20 ft for turbulence: light
 
     def build_uav(self, faults: tuple[Fault, ...]) -> SimulatedUav:
         """Create the aircraft with `faults`: all hidden faults, some or none."""
@@ -177,7 +177,7 @@ class PlannedFlight(NamedTuple):
         """Draw the wind; none for the Cessna, where it has little effect."""
         mean, towards = rng.uniform(1.0, 5.0), rng.uniform(-pi, pi)
         mean = 0.0 if self.job.airframe == "c172p" else float(mean)
-        return Weather(mean, float(towards), exponent=0.0, drift=0.5, w20_mps=_W20_MPS)
+        return Weather(mean, float(towards), exponent=0.0, drift=0.5, w20_mps=self.w20_mps)
 
 
 def baseline_type(airframe: str) -> AircraftType:

@@ -215,7 +215,7 @@ def test_what_flies_without_a_mission_is_told_apart():
 def test_a_short_mission_is_scored_as_far_as_it_goes():
     """No start of 40 s in AUTO has a minute: they are scored up to the change of mode, and the flight is listed."""
     flight = turn(220.0)
-    news = (status(T0), ROUTE, status(T0 + 175.0, "RTL"))
+    news = (status(T0), ROUTE, status(T0 + 175.0, "STABILIZE"))
     drive = RecordingDriver("flight", EvaluationPlan(every_s=5.0, methods=("route",)))
     cases = list(drive.run(sorted((*messages(flight), *news), key=lambda m: m.t)))
     counted = [case for case in cases if not case.exclusion]

@@ -23,6 +23,7 @@ from twin_worker.mismatch.effect_increments import EffectOutputs, actual_deflect
 from twin_worker.twin.state.models import MAX_CHECKPOINTS, latest_before
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.step import advance
+from twin_worker.twin.steps import rollouts
 
 FAULT_S, NAMED_S, END_S = 70.0, 100.0, 150.0
 
@@ -152,8 +153,9 @@ def faulty(tmp_path_factory) -> tuple[Message, ...]:
     return tuple(replay_messages(path))
 
 
-def test_with_what_was_named_predictions_are_nearer_than_without(faulty):
-    """Both hear the same; one is told at 100 s what happened at 70 s."""
+def test_with_what_was_named_predictions_are_nearer_than_without(faulty, monkeypatch):
+    """Both hear the same; one is told at 100 s what happened at 70 s. The route lines need no model: without them."""
+    monkeypatch.setattr(rollouts, "route_lines", lambda *_: {})
     begin = next(m.t for m in faulty if isinstance(m, Sample))
     twin, plain, said = Twin.of(1), None, {"with": [], "without": []}
     for message in faulty:

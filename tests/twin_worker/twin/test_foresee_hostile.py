@@ -37,7 +37,7 @@ def onto(twin: Twin, name: str, seq: int) -> str:
     now = twin.telemetry.history.newest
     t = now - np.arange(61.0)[::-1]
     twin.telemetry.history.replace_rows("leg", t, np.full((len(t), 1), float(seq)))
-    twin.onboard.mission = Mission(uav=twin.config.uav, t=now - 90.0, items=items, seq=seq)
+    twin.onboard.mission = Mission(uav=twin.config.uav, t=now - 90.0, items=items, seq=seq, complete=True)
     twin.onboard.plan_changed_t = -np.inf
     twin.prediction.ensemble_timer.expire()
     return said

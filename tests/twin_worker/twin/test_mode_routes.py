@@ -103,7 +103,7 @@ def test_a_return_to_auto_is_predicted_at_once(winged):
 
 
 def test_an_unknown_home_is_said(winged):
-    winged.onboard.set_mission(msgspec.structs.replace(winged.onboard.mission, items=()))
+    winged.onboard.set_mission(msgspec.structs.replace(winged.onboard.mission, items=()), winged.first_item)
     made = entered(winged, "RTL")
     assert made.method == "imm" and "home position unknown" in made.sentence
 

@@ -16,7 +16,7 @@ from fleet.autopilots.modes import (
     hold_bank,
     mode_route,
 )
-from fleet.contract import Event, Rows
+from fleet.contract import Event
 from fleet.frames import Origin, to_geodetic, to_ned
 from fleet.mission import FIRST_ITEM, Route, unroll_route
 from twin_worker.prediction.autopilot_identification import LAW_OF_AUTOPILOT
@@ -143,12 +143,12 @@ def mode_entry(twin: "Twin", t: float) -> ModeEntry | None:
     return ModeEntry(t, (float(lat), float(lon), float(alt)), atan2(v[1], v[0]))
 
 
-def update_target(twin: "Twin", rows: Rows) -> None:
-    """Store the guidance target of the present mode; one that moved invalidates the prediction."""
-    t = rows.t.numpy()
+def update_target(twin: "Twin") -> None:
+    """Store the newest guidance target of the present mode; one that moved invalidates the prediction."""
+    t, targets = twin.telemetry.history.rows("target")
     if twin.mode not in TARGET_MODES or twin.telemetry.origin is None or not len(t):
         return
-    t_target, target = float(t[-1]), rows.x.numpy()[-1].astype(float)
+    t_target, target = float(t[-1]), targets[-1].astype(float)
     if twin.onboard.entry is None:  # the first status arrived in this mode
         twin.onboard.enter_mode(mode_entry(twin, t_target))
     elif not t_target > twin.onboard.entry.t:

@@ -224,7 +224,7 @@ def ingest(twin: Twin, message: Message) -> None:
     if isinstance(message, Sample):
         twin.telemetry.add(message)
         if message.target is not None:
-            update_target(twin, message.target)
+            update_target(twin)
     elif isinstance(message, Status):
         _ingest_status(twin, message)
     elif isinstance(message, Mission):

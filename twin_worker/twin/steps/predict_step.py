@@ -193,7 +193,7 @@ def _state_without_route(twin: Twin) -> TwinState:
     if twin.models.active_model is not None:
         return TwinState.VERIFIED
     waits = twin.identification.verdict.outcome is Outcome.INSUFFICIENT_DATA
-    return TwinState.WAITING if waits else TwinState.IDENTIFYING
+    return TwinState.WAITING if waits or not twin.vehicle_class.has_wings else TwinState.IDENTIFYING
 
 
 def _is_usable(path_forecast: PathForecast) -> bool:

@@ -114,7 +114,7 @@ def _leg_points(
     arc = max(_commanded_angle(leg, R, start, inputs) - traversed_angle, 0.0)
     if next_target is not None and int(leg[KIND]) != LOITER_UNLIMITED:
         arc += _angle_to_exit(angle + side * arc, target, next_target, (R, side))
-    arc = min(arc, inputs.length / R + 2 * pi)
+    arc = min(arc, 2.0 * inputs.length / R)  # more is not flown
     sweep = angle + side * np.linspace(0.0, arc, int(arc * R / _STEP) + 2)
     yield target + R * np.column_stack([np.cos(sweep), np.sin(sweep), np.zeros(len(sweep))])
 
