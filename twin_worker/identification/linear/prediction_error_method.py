@@ -7,10 +7,8 @@ Source: Huang 2021, eq. 16-17 (Newton-Raphson on J = e'e); Ljung 1999, section 1
 
 import numba as nb
 import numpy as np
+import scipy.linalg
 
-from twin_worker.numerics.gauss_newton import gauss_newton
-
-_WEIGHT_UPDATES = (0, 2)  # steps before which the weights are estimated from the residuals
 _MAX_ERROR = 20.0  # errors are clipped to this [scaled units]
 
 
@@ -114,25 +112,31 @@ def refine(
     Returns:
         the refined [A B c]; the start if no step descends
     """
-    par0, Lambda = prior.ravel(), precision.ravel()
+    par, par0, Lambda = D0.ravel().copy(), prior.ravel(), precision.ravel()
     shape, W = D0.shape, np.full(len(D0), 1.0)
     ok = np.ascontiguousarray(ok)
-    newest = normal_equations(D0, y, u, ok, W, length)  # at the point evaluated last
-
-    def linearise(par: np.ndarray, count: int) -> tuple[float, np.ndarray, np.ndarray]:
-        nonlocal W, newest
-        if count in _WEIGHT_UPDATES:
-            squares = newest[3]
-            W = effective_fraction / np.maximum(squares[:-1] / max(squares[-1], 1.0), 1e-4)
-            newest = normal_equations(par.reshape(shape), y, u, ok, W, length)
-        cost, g, H, _ = newest
-        offset = par - par0
-        return cost + float(Lambda @ offset**2), H + np.diag(Lambda), g - Lambda * offset
-
-    def move(par: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, float]:
-        nonlocal newest
-        candidate = par + change
-        newest = normal_equations(candidate.reshape(shape), y, u, ok, W, length)
-        return candidate, newest[0] + float(Lambda @ (candidate - par0) ** 2)
-
-    return gauss_newton(D0.ravel().copy(), linearise, move, steps=steps)[0].reshape(shape)
+    mu, best = 1e-3, np.inf
+    slopes = None
+    for step in range(steps):
+        if slopes is None:
+            cost, g, H, squares = normal_equations(par.reshape(shape), y, u, ok, W, length)
+            if step in (0, 2):  # new weights from the residuals, then a new cost
+                W = effective_fraction / np.maximum(squares[:-1] / max(squares[-1], 1.0), 1e-4)
+                cost, g, H, squares = normal_equations(par.reshape(shape), y, u, ok, W, length)
+            best = cost + float(Lambda @ (par - par0) ** 2)
+            slopes = g, H
+        g, H = slopes
+        lhs = H + np.diag(Lambda + mu * (np.diag(H) + Lambda))
+        scaling = 1 / np.sqrt(np.diag(lhs))  # variances differ by orders of magnitude
+        scaled = scaling[:, None] * lhs * scaling
+        trial = par + scaling * scipy.linalg.solve(scaled, scaling * (g - Lambda * (par - par0)), assume_a="pos")
+        cost, g, H, _ = normal_equations(trial.reshape(shape), y, u, ok, W, length)
+        total = cost + float(Lambda @ (trial - par0) ** 2)
+        if np.isfinite(total) and total < best:
+            converged = best - total < 1e-3 * best
+            par, best, mu, slopes = trial, total, mu / 5, (None if step == 1 else (g, H))
+            if converged:
+                break
+        else:
+            mu *= 8
+    return par.reshape(shape)
