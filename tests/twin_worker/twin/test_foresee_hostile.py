@@ -12,7 +12,7 @@ from tests.support.odd_missions import INF, NAN, ODD
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.predict_step import predict
 
-FAST_S = 0.05  # the best of three predictions takes no longer [s]
+FAST_S = 0.2  # CPU time of the best of three predictions, far below the period of 1 s on a slow machine too [s]
 MOST_WORDS = 1500  # letters of a sentence
 
 

@@ -27,10 +27,10 @@ from fleet.mission import (
     VA_C,
     Route,
     route_items,
-    unroll_route,
 )
 from twin_worker.prediction.kinematic import wind_and_airspeed
 from twin_worker.prediction.multirotor.rollout import items_in_force
+from twin_worker.prediction.route_cache import cached_route
 from twin_worker.telemetry.track import STEP, Track
 from twin_worker.twin.state.routes import present_route
 from twin_worker.twin.state.state import Twin
@@ -233,14 +233,8 @@ def _route_points(twin: Twin, track: Track, seconds: float) -> np.ndarray | None
         seq = items_in_force(track.t, twin.telemetry.history.rows("leg"), twin.onboard.mission)
         if not np.isfinite(seq[-1]):
             return None
-        remaining = unroll_route(
-            route_items(twin.onboard.mission),
-            seq=int(seq[-1]),
-            origin=twin.telemetry.origin,
-            params=params,
-            first=twin.first_item,
-            jumps_taken=twin.onboard.jumps_taken,
-        )
+        items, jumps = route_items(twin.onboard.mission), twin.onboard.jumps_taken
+        remaining = cached_route(items, int(seq[-1]), twin.telemetry.origin, params, twin.first_item, jumps=jumps)
     if not len(remaining.legs) or int(remaining.legs[0, KIND]) in (CONSTANT_BANK, GLIDE):
         return None
     other_item = np.flatnonzero(seq != seq[-1])
