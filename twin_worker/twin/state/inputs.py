@@ -18,8 +18,8 @@ from twin_worker.telemetry.history import ArrivalDelay, TelemetryHistory
 from twin_worker.telemetry.resample import Resampler
 from twin_worker.twin.state.flight_phase import FlightPhase
 
-_MODE_CHANGES = 64  # kept
-_ITEM_CHANGES = 64  # kept
+_MODE_CHANGES = 64  # stored changes of the mode
+_ITEM_CHANGES = 64  # stored changes of the current item
 _MAX_ALTITUDE_OFFSET_M = 200.0  # largest plausible difference of a position's and the receiver's altitude [m]
 _FIX_WAIT_S = 10.0  # telemetry after which a position is used in spite of such a difference [s]
 _TICK_S = 1.0  # between updates of the wind filter [s]
@@ -84,7 +84,7 @@ class Telemetry(msgspec.Struct):
         self.origin = origin
 
     def set_servo_map(self, values: dict[str, float]) -> None:
-        """Derive the servo map from autopilot parameters; one learnt from flight is kept where they tell nothing."""
+        """Derive the servo map from autopilot parameters; one learnt from flight stays where they contain none."""
         from_params = servo_map(values)
         if not (from_params.sentence.startswith(ASSUMED) and np.isfinite(self.servos_learned_t)):
             self.servo_map, self.servos_learned_t = from_params, -np.inf

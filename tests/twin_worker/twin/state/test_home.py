@@ -17,7 +17,7 @@ HOME = msgspec.structs.replace(ZEROS, lat_e7=470_000_000, lon_e7=80_000_000, alt
 
 
 def standing(t, alt_mm, *, gnss_mm=None, above_home=None):
-    """Give the rows of one message before take-off."""
+    """Return the rows of one message before take-off."""
     kinds = {"position": ([f.T0 + t], [[*PLACE, alt_mm]])}
     kinds |= {} if gnss_mm is None else {"gnss": ([f.T0 + t], [[gnss_mm]])}
     kinds |= {} if above_home is None else {"height": ([f.T0 + t], [[above_home]])}
