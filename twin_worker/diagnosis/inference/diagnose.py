@@ -31,7 +31,7 @@ from twin_worker.diagnosis.inference.validation.cross_validate import (
     free_form,
     high_segments,
 )
-from twin_worker.diagnosis.inference.validation.force_prediction import free_run_error
+from twin_worker.diagnosis.inference.validation.force_prediction import free_run_errors
 from twin_worker.diagnosis.inference.validation.spread import covariances, recommend_manoeuvre, reported_sigma
 from twin_worker.diagnosis.model.baseline import CHANNEL_OF, CHANNELS, Baseline
 from twin_worker.diagnosis.model.residual import ModelledFlight
@@ -105,6 +105,7 @@ def diagnose(flight: FlightData, base: Baseline, progress: ReportProgress = lamb
         channel = CHANNELS.index(anomaly.channel) if anomaly else judged
         where = (CHANNELS[channel], high_segments(modelled.t, white_after[:, channel], whitened.ok))
         terms = free_form(modelled, weather, channel)
+    free_runs = free_run_errors(modelled, [weather, *([(*weather, *validation.fitted)] if validation.fitted else [])])
     report = Report(
         flight=flight.name,
         outcome=outcome,
@@ -116,8 +117,8 @@ def diagnose(flight: FlightData, base: Baseline, progress: ReportProgress = lamb
         fit_after=validation.after,
         force_before=errors[0],
         force_after=errors[1],
-        free_run_error_before=float(np.degrees(free_run_error(modelled, weather))),
-        free_run_error_after=float(np.degrees(free_run_error(modelled, (*weather, *validation.fitted)))),
+        free_run_error_before=float(np.degrees(free_runs[0])),
+        free_run_error_after=float(np.degrees(free_runs[-1])),
         where=where,
         anomaly_ratio={entry.kind: entry.net_gain / entry.limit(base) for entry in anomalies},
         terms=terms,

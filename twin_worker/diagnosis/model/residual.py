@@ -1,10 +1,11 @@
 """Residuals of all channels, measured less simulated, with hypotheses active in the simulation."""
 
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from math import exp
-from typing import Any
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.signal import lfilter
@@ -18,7 +19,10 @@ from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline
 
 RHO_0 = 1.225  # [kg/m3]
 _DIFFERENTIATED = ("v_n", "v_e", "v_d", "phi", "theta", "psi", "p", "q", "r")
+_FLOW_STAGES = (Stage.SENSOR, Stage.DELTA, Stage.AIR)
+_N_RECENT = 6  # results stored for repeated evaluations
 Signals = dict[str, np.ndarray]
+Value = TypeVar("Value")
 
 
 def density(h: Any) -> Any:
@@ -39,6 +43,32 @@ class EquationTerms:
     scale: Signals
 
 
+class FlowTerms(NamedTuple):
+    """Terms that effects on forces, moments and mass leave unchanged; fields as in `EquationTerms`."""
+
+    flow: Flow
+    thrust: np.ndarray
+    measured: Signals
+    intermediate: Signals
+    scale: Signals
+
+
+class _Recent(Generic[Value]):
+    """Values of the last few sets of hypotheses, found by comparison: effects are not hashable."""
+
+    def __init__(self) -> None:
+        self._entries: deque[tuple[tuple[FaultHypothesis, ...], Value]] = deque(maxlen=_N_RECENT)
+
+    def get(self, hypotheses: tuple[FaultHypothesis, ...], compute: Callable[[], Value]) -> Value:
+        """Return the value of these hypotheses, computed if it is not among the last few."""
+        for entry, value in self._entries:
+            if entry == hypotheses:
+                return value
+        value = compute()
+        self._entries.appendleft((hypotheses, value))
+        return value
+
+
 class ModelledFlight:
     """One flight evaluated under one baseline."""
 
@@ -51,6 +81,8 @@ class ModelledFlight:
         self.t = decimated(flight.t)
         self.ok = valid_decimated(flight.ok)
         self.throttle_integral = decimated(np.cumsum(flight.commands[:, 3]) * DT)
+        self._recent_flow: _Recent[FlowTerms] = _Recent()
+        self._recent_residuals: _Recent[np.ndarray] = _Recent()
 
     @cached_property
     def _smooth(self) -> Signals:
@@ -153,10 +185,18 @@ class ModelledFlight:
                     total[name] = total.get(name, 0.0) + x
         return total
 
-    def equation_terms(self, hypotheses: tuple[FaultHypothesis, ...] = ()) -> EquationTerms:
-        """Compute the terms of all equations with the hypotheses active."""
+    def _flow_terms(self, hypotheses: tuple[FaultHypothesis, ...]) -> "FlowTerms":
+        """Compute the terms that only sensor, servo and air effects change; recent results are reused.
+
+        Effects on forces, moments and mass are compared by hundreds under the same flow.
+        """
+        acting = tuple(hypothesis for hypothesis in hypotheses if hypothesis.effect.stage in _FLOW_STAGES)
+        return self._recent_flow.get(acting, lambda: self._compute_flow_terms(acting))
+
+    def _compute_flow_terms(self, hypotheses: tuple[FaultHypothesis, ...]) -> "FlowTerms":
         base, body = self.base, self.base.card.body
-        s, (d_a, d_e, d_r, d_t) = self.corrected_readings(hypotheses), self.inputs(hypotheses)
+        s, delta = self.corrected_readings(hypotheses), self.inputs(hypotheses)
+        d_a, d_e, d_r, d_t = delta
         flow = Flow(
             self.t, s["h"], s["h"] - self.flight.ground, body, delta_t=d_t, throttle_time=self.throttle_integral
         )
@@ -172,15 +212,39 @@ class ModelledFlight:
         flow.p, flow.q, flow.r = s["p"], s["q"], s["r"]
         flow.rho = density(s["h"]) * (1.0 + air.get("rho", 0.0))
         flow.q_bar = 0.5 * flow.rho * Va * Va
-        span, chord = body.b / (2 * Va), body.c / (2 * Va)
-        p_hat, q_hat, r_hat = flow.p * span, flow.q * chord, flow.r * span
         q_S = flow.q_bar * body.S
         thrust = eq.thrust_terms(d_t, Va, flow.rho / RHO_0, base.speed)
         if "T" in base.coef:
             flow.T = base.coef["T"] @ thrust
             flow.C_m_elevator, flow.C_n_rudder = base.coef["M"][3] * d_e, base.coef["N"][5] * d_r
-        c_z0 = body.mass * f[2] / q_S
-        flow.C_L = -c_z0
+        flow.C_L = -body.mass * f[2] / q_S
+        J_x, J_y, J_z, _ = base.card.inertia
+        coupled = base.card.known
+        measured = {
+            "L": J_x * s["p_dot"] + coupled * (J_z - J_y) * flow.q * flow.r,
+            "M": J_y * s["q_dot"] + coupled * (J_x - J_z) * flow.p * flow.r,
+            "N": J_z * s["r_dot"] + coupled * (J_y - J_x) * flow.p * flow.q,
+            "alpha": flow.alpha,
+            "beta": flow.beta,
+            "airspeed": s.get("Va", np.zeros_like(Va)),
+        }
+        intermediate = {
+            "apart": disagreement,
+            "f": f,
+            "delta": np.array([d_a, d_e, d_r, d_t]),
+            "Va_share": s.get("Va_share", np.ones_like(Va)),
+            "baro": s.get("baro", s["h"]) - s.get("gnss", s["h"]),
+        }
+        scale = {"X": q_S, "L": q_S * body.b, "N": q_S * body.b, "M": q_S * body.c}
+        return FlowTerms(flow, thrust, measured, intermediate, scale)
+
+    def equation_terms(self, hypotheses: tuple[FaultHypothesis, ...] = ()) -> EquationTerms:
+        """Compute the terms of all equations with the hypotheses active."""
+        base, body = self.base, self.base.card.body
+        flow, thrust, of_flow, unaffected, scale = self._flow_terms(hypotheses)
+        f, q_S, (d_a, d_e, d_r, _) = unaffected["f"], scale["X"], unaffected["delta"]
+        span, chord = body.b / (2 * flow.Va), body.c / (2 * flow.Va)
+        p_hat, q_hat, r_hat = flow.p * span, flow.q * chord, flow.r * span
         add = self._increments(flow, hypotheses, (Stage.WRENCH, Stage.MASS))
         mass = body.mass * (1.0 + add.get("mass", 0.0))
         force = mass * f
@@ -197,26 +261,15 @@ class ModelledFlight:
         regressors["X"] = eq.force_terms(c_z, d_e, beta)
         regressors["L"] = regressors["N"] = eq.lateral_terms(beta, (p_hat, r_hat), (d_a, d_r), c_z)
         regressors["M"] = eq.pitch_terms(c_z, q_hat, d_e, c_z_dot, force[0] / q_S)
-        J_x, J_y, J_z, _ = base.card.inertia
-        coupled = base.card.known
-        measured = {
-            "X": force[0],
-            "L": J_x * s["p_dot"] + coupled * (J_z - J_y) * flow.q * flow.r,
-            "M": J_y * s["q_dot"] + coupled * (J_x - J_z) * flow.p * flow.r,
-            "N": J_z * s["r_dot"] + coupled * (J_y - J_x) * flow.p * flow.q,
-            "alpha": flow.alpha,
-            "beta": flow.beta,
-            "airspeed": s.get("Va", np.zeros_like(Va)),
-        }
-        intermediate = {"mass": mass, "force": force, "c_z": c_z, "apart": disagreement, "f": f}
-        intermediate["delta"] = np.array([d_a, d_e, d_r, d_t])
-        intermediate["Va_share"] = s.get("Va_share", np.ones_like(Va))
-        intermediate["baro"] = s.get("baro", s["h"]) - s.get("gnss", s["h"])
-        scale = {"X": q_S, "L": q_S * body.b, "N": q_S * body.b, "M": q_S * body.c}
+        measured = {"X": force[0]} | of_flow
+        intermediate = {"mass": mass, "force": force, "c_z": c_z} | unaffected
         return EquationTerms(self, flow, add, regressors, measured, intermediate, scale)
 
     def residuals(self, hypotheses: tuple[FaultHypothesis, ...] = ()) -> np.ndarray:
-        """Return measured less simulated, (n, channels)."""
+        """Return measured less simulated, (n, channels), read-only; recent results are reused."""
+        return self._recent_residuals.get(hypotheses, lambda: self._compute_residuals(hypotheses))
+
+    def _compute_residuals(self, hypotheses: tuple[FaultHypothesis, ...]) -> np.ndarray:
         terms = self.equation_terms(hypotheses)
         base, flow, add, measured = self.base, terms.flow, terms.add, terms.measured
         T = (base.coef["T"] @ terms.regressors["T"]) * (1.0 + add.get("thrust", 0.0))
@@ -246,6 +299,7 @@ class ModelledFlight:
         out[:, 7:13] = terms.intermediate["apart"]
         if "baro" in self.flight.readings:
             out[:, 13] = terms.intermediate["baro"] - self.baro_offset - add.get("baro", 0.0)
+        out.flags.writeable = False
         return out
 
 

@@ -112,9 +112,8 @@ def normal_equations(
     whitened: WhitenedResiduals, J: np.ndarray, gates: np.ndarray, kind: Onset
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sum the normal equations of slopes J, (n, c, k), per onset: (m, k, k), (m, k), (m, k, nuisances)."""
-    A = np.einsum("tci,tcj->tij", J, J)
-    b = -np.einsum("tci,tc->ti", J, whitened.e)
-    C = np.einsum("tci,tcj->tij", J, whitened.Jn)
+    rows = np.swapaxes(J, 1, 2)
+    A, b, C = rows @ J, -(rows @ whitened.e[..., None])[..., 0], rows @ whitened.Jn
     if kind is Onset.STEP:
         return tuple(np.cumsum(x[::-1], axis=0)[::-1][gates] for x in (A, b, C))  # type: ignore[return-value]
     flat = [x.reshape(len(x), -1) for x in (A, b, C)]

@@ -7,7 +7,7 @@ import numpy as np
 from fleet.effects import Onset, Stage
 from twin_worker.diagnosis.data.card import FaultHypothesis, OnsetProfile
 from twin_worker.diagnosis.inference.isolation.isolate import ScoredHypothesis
-from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
+from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals, project
 
 _ITERATIONS = 5
 _MIN_GAIN = 0.5  # gain below which fitting stops
@@ -65,10 +65,10 @@ def normal_at(whitened: WhitenedResiduals, hypothesis: FaultHypothesis) -> tuple
     """Return the normal equations at a hypothesis, nuisances profiled out, (k, k) and (k,)."""
     J = whitened.slopes(hypothesis, slope_steps(hypothesis))
     e = whitened.clipped((hypothesis,))
-    C = np.einsum("tci,tcj->ij", J, whitened.Jn)
-    A = np.einsum("tci,tcj->ij", J, J) - C @ np.linalg.solve(whitened.Ann, C.T)
-    bn = -np.einsum("tci,tc->i", whitened.Jn, e)
-    b = -np.einsum("tci,tc->i", J, e) - C @ np.linalg.solve(whitened.Ann, bn)
+    C = project(J, whitened.Jn)
+    A = project(J, J) - C @ np.linalg.solve(whitened.Ann, C.T)
+    bn = -project(whitened.Jn, e)
+    b = -project(J, e) - C @ np.linalg.solve(whitened.Ann, bn)
     return A, b
 
 

@@ -28,6 +28,11 @@ _AIR_CHANNELS = [CHANNELS.index(name) for name in ("force_x", "side", "lift", "r
 _AIR_CHANNELS += [CHANNELS.index(name) for name in ("gps_x", "gps_y", "gps_z")]
 
 
+def project(J: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return the products of slopes J, (n, c, k), and series x, (n, c) or (n, c, m), over rows and channels."""
+    return J.reshape(-1, J.shape[2]).T @ x.reshape(-1, *x.shape[2:])  # type: ignore[no-any-return]
+
+
 class WhitenedResiduals:
     """Whitened residuals of one flight, conditioned on hypotheses.
 
@@ -86,7 +91,8 @@ class WhitenedResiduals:
 
     def clipped(self, hypotheses: Sequence[FaultHypothesis]) -> np.ndarray:
         """Return `residuals` limited to `clip`, (n, c)."""
-        return np.clip(self.residuals(hypotheses), -self.clip, self.clip)
+        e = self.residuals(hypotheses)
+        return np.minimum(np.maximum(e, -self.clip, out=e), self.clip, out=e)
 
     def condition_on(self, conditions: tuple[FaultHypothesis, ...]) -> None:
         """Set the hypotheses that all following residuals include."""
@@ -142,13 +148,13 @@ class WhitenedResiduals:
     def cost(self, hypotheses: Sequence[FaultHypothesis]) -> float:
         """Return the sum of squares with these hypotheses, the nuisances profiled out."""
         e = self.clipped(hypotheses)
-        b = -np.einsum("tci,tc->i", self.Jn, e)
+        b = project(self.Jn, e)
         return float((e * e).sum() - b @ np.linalg.solve(self.Ann, b))
 
     def channel_cost(self, hypotheses: Sequence[FaultHypothesis]) -> np.ndarray:
         """Return the sum of squares of each channel with these hypotheses, the nuisances profiled out, (c,)."""
         e = self.clipped(hypotheses)
-        profiled = e - self.Jn @ np.linalg.solve(self.Ann, np.einsum("tci,tc->i", self.Jn, e))
+        profiled = e - self.Jn @ np.linalg.solve(self.Ann, project(self.Jn, e))
         return np.asarray((profiled * profiled).sum(axis=0))
 
     def slopes(self, hypothesis: FaultHypothesis, step: np.ndarray) -> np.ndarray:
@@ -171,7 +177,8 @@ class WhitenedResiduals:
 
     def residual_slopes(self, hypothesis: FaultHypothesis, step: np.ndarray) -> np.ndarray:
         """Return the derivative of the raw residuals with respect to the parameters of a hypothesis, (n, c, k)."""
-        reference = self.modelled.residuals((*self.conditions, hypothesis))
+        acting = any(hypothesis.par) or hypothesis.effect.takes_lag  # otherwise it changes nothing
+        reference = self.modelled.residuals((*self.conditions, hypothesis) if acting else self.conditions)
         out = []
         for k, h in enumerate(step):
             par = np.array(hypothesis.par)

@@ -5,6 +5,7 @@ the rolling or yawing moment; dynamic pressure from velocity, or from the airspe
 acts: the combination of sources is selected on the blocks of the fit and evaluated on the others.
 """
 
+from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
@@ -105,27 +106,33 @@ FREE_RUN_S = 5.0  # length of a free run
 _MAX_ERROR = np.pi  # limit of the attitude error [rad]
 
 
-def free_run_error(modelled: ModelledFlight, hypotheses: tuple[FaultHypothesis, ...]) -> float:
-    """Return the rms attitude error of free runs from measured states, on held-out blocks [rad].
+def free_run_errors(modelled: ModelledFlight, hypotheses: Sequence[tuple[FaultHypothesis, ...]]) -> list[float]:
+    """Return the rms attitude error of free runs from measured states, on held-out blocks [rad], all run in parallel.
 
     Args:
         modelled: the flight with its baseline
-        hypotheses: effects active in the simulation, and sensor faults corrected in the recording
+        hypotheses: for each error, the effects active in the simulation, and sensor faults corrected in the recording
     """
-    s, t = modelled.corrected_readings(hypotheses), modelled.flight.t
+    t = modelled.flight.t
     n = int(FREE_RUN_S / DT)
     starts = np.arange(0, len(t) - n, n)
     starts = starts[
         blocks(t[starts], odd=True) & modelled.ok[starts // DECIMATION] & modelled.ok[(starts + n) // DECIMATION]
     ]
     if not len(starts):
-        return float("nan")
-    measured = np.stack([s[name] for name in STATE])
-    acting = [g for g in hypotheses if g.effect.stage is not Stage.SENSOR]
-    sim = Simulation(modelled.base, [acting] * len(starts), t[starts], modelled.flight.ground)
+        return [float("nan")] * len(hypotheses)
+    readings = [modelled.corrected_readings(acting) for acting in hypotheses]
+    measured = [np.stack([s[name] for name in STATE]) for s in readings]
+    acting = [[g for g in group if g.effect.stage is not Stage.SENSOR] for group in hypotheses for _ in starts]
+    sim = Simulation(modelled.base, acting, np.tile(t[starts], len(hypotheses)), modelled.flight.ground)
+    rows = np.tile(starts, len(hypotheses))
     commands = modelled.flight.commands
-    runs = sim.simulate(measured[:, starts // DECIMATION], lambda k, _: commands[starts + k].T, n)
+    x = np.concatenate([m[:, starts // DECIMATION] for m in measured], axis=1)
+    runs = sim.simulate(x, lambda k, _: commands[rows + k].T, n)
     steps = np.arange(0, n, DECIMATION)
-    measured_attitude = measured[6:9, (starts[None, :] + steps[:, None]) // DECIMATION].transpose(1, 0, 2)
-    error = np.clip(runs.states[steps, 6:9] - measured_attitude, -_MAX_ERROR, _MAX_ERROR)
-    return float(np.sqrt((error**2).mean()))
+    errors = []
+    for simulated, m in zip(np.split(runs.states[steps, 6:9], len(hypotheses), axis=2), measured, strict=True):
+        attitude = m[6:9, (starts[None, :] + steps[:, None]) // DECIMATION].transpose(1, 0, 2)
+        error = np.clip(simulated - attitude, -_MAX_ERROR, _MAX_ERROR)
+        errors.append(float(np.sqrt((error**2).mean())))
+    return errors
