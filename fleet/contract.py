@@ -29,6 +29,7 @@ than 5 minutes ahead of their own clock and accept the highest of the others per
 Time `t` is seconds since 1970 on the fleet clock. Angles in rad, SI throughout, NED and FRD frames.
 """
 
+from collections.abc import Sequence
 from enum import StrEnum
 from math import prod
 from typing import Annotated, Any, ClassVar
@@ -191,6 +192,16 @@ class Item(msgspec.Struct, frozen=True, kw_only=True):
     lat_e7: Annotated[int, about("[1e-7 deg]")] = 0
     lon_e7: Annotated[int, about("[1e-7 deg]")] = 0
     alt_m: Annotated[float, about("altitude in the item's frame [m]")] = 0.0
+
+    @classmethod
+    def at(
+        cls, position: tuple[float, float, float], *, seq: int, command: int, frame: int, params: Sequence[float] = ()
+    ) -> "Item":
+        """Return an item at latitude, longitude [deg] and altitude [m], with its first parameters."""
+        p1, p2, p3, p4 = (*params, 0.0, 0.0, 0.0, 0.0)[:4]
+        lat_e7, lon_e7 = (round(x * 1e7) for x in position[:2])
+        place = {"lat_e7": lat_e7, "lon_e7": lon_e7, "alt_m": position[2]}
+        return cls(seq=seq, command=command, frame=frame, param1=p1, param2=p2, param3=p3, param4=p4, **place)  # type: ignore[arg-type]
 
 
 class Mission(Message, frozen=True, kw_only=True):

@@ -133,29 +133,8 @@ def _logged_item(values: tuple[float, ...]) -> Item | None:
         _LOITER_TIME: (inside, heading, radius),
         _LOITER_TO_ALT: (heading, radius, 0.0),
     }.get(int(command), (0.0, 0.0, 0.0))
-    return _item(int(seq), int(command), (lat, lon, alt), parameters, _RELATIVE if relative else _ABSOLUTE)
-
-
-def _item(
-    seq: int,
-    command: int,
-    position: tuple[float, float, float],
-    parameters: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    frame: int = _ABSOLUTE,
-) -> Item:
-    lat, lon, alt = position
-    p1, p2, p3 = parameters
-    return Item(
-        seq=seq,
-        command=command,
-        frame=frame,
-        param1=p1,
-        param2=p2,
-        param3=p3,
-        lat_e7=round(lat * 1e7),
-        lon_e7=round(lon * 1e7),
-        alt_m=alt,
-    )
+    frame = _RELATIVE if relative else _ABSOLUTE
+    return Item.at((lat, lon, alt), seq=int(seq), command=int(command), frame=frame, params=parameters)
 
 
 # --- set points ------------------------------------------------------------------------------------------------------
@@ -199,7 +178,8 @@ def _point_item(seq: int, point: np.ndarray) -> Item:
     command = _COMMAND_OF_TYPE[int(point[_KIND])]
     parameters = {_WAYPOINT: (0.0, float(point[_ACCEPTANCE]), 0.0), _LOITER: (0.0, 0.0, float(point[_RADIUS]))}
     lat, lon, alt = point[_LAT : _ALT + 1].tolist()
-    return _item(seq, command, (lat, lon, alt), parameters.get(command, (0.0, 0.0, 0.0)))
+    params = parameters.get(command, ())
+    return Item.at((lat, lon, alt), seq=seq, command=command, frame=_ABSOLUTE, params=params)
 
 
 def _mission_of_set_points(

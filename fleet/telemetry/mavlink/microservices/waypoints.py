@@ -42,9 +42,9 @@ def read_waypoints(path: Path) -> tuple[Item, ...]:
 def _item(name: str, number: int, line: str) -> Item:
     columns = line.split()
     try:
-        seq, _, frame, command, *numbers = columns
+        seq_text, _, frame_text, command_text, *numbers = columns
         p1, p2, p3, p4, lat, lon, alt, _ = map(float, numbers)
-        integers = int(seq), int(frame), int(float(command))
+        seq, frame, command = int(seq_text), int(frame_text), int(float(command_text))
     except (ValueError, OverflowError):
         raise ValueError(
             f"{name} line {number}: found {line[:60]!r}, expected {_COLUMNS} numbers; save the mission again"
@@ -53,15 +53,4 @@ def _item(name: str, number: int, line: str) -> Item:
         raise ValueError(
             f"{name} line {number}: found {lat}, {lon} at {alt} m, expected a position on earth; correct it"
         )
-    return Item(
-        seq=integers[0],
-        frame=integers[1],
-        command=integers[2],
-        param1=p1,
-        param2=p2,
-        param3=p3,
-        param4=p4,
-        lat_e7=round(lat * 1e7),
-        lon_e7=round(lon * 1e7),
-        alt_m=alt,
-    )
+    return Item.at((lat, lon, alt), seq=seq, frame=frame, command=command, params=(p1, p2, p3, p4))

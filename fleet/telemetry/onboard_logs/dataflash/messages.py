@@ -264,16 +264,5 @@ def _item(values: tuple[Any, ...]) -> Item | None:
         return None
     if frame is None:  # not logged before 2016: home is absolute, other items are relative
         frame = _ABSOLUTE if seq == 0 else _RELATIVE
-    p1, p2, p3, p4 = (0.0 if param is None or not math.isfinite(param) else param for param in params)
-    return Item(
-        seq=int(seq),
-        command=int(command),
-        frame=int(frame),
-        param1=p1,
-        param2=p2,
-        param3=p3,
-        param4=p4,
-        lat_e7=round(lat * 1e7),
-        lon_e7=round(lon * 1e7),
-        alt_m=alt,
-    )
+    finite = [0.0 if param is None or not math.isfinite(param) else param for param in params]
+    return Item.at((lat, lon, alt), seq=int(seq), command=int(command), frame=int(frame), params=finite)

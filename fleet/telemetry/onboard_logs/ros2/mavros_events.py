@@ -55,22 +55,9 @@ class MavrosEvents:
 
 
 def _item(seq: int, waypoint: Any) -> Item:
-    p1, p2, p3, p4 = (
-        float(value) if isfinite(value) else 0.0
-        for value in (waypoint.param1, waypoint.param2, waypoint.param3, waypoint.param4)
-    )
+    logged = (waypoint.param1, waypoint.param2, waypoint.param3, waypoint.param4)
+    params = [float(value) if isfinite(value) else 0.0 for value in logged]
     lat, lon, alt = float(waypoint.x_lat), float(waypoint.y_long), float(waypoint.z_alt)
     if not (abs(lat) <= 90 and abs(lon) <= 180 and isfinite(alt)):
         raise ValueError(f"mission item {seq}: found {lat}, {lon}, {alt}, expected a position on earth")
-    return Item(
-        seq=seq,
-        command=int(waypoint.command),
-        frame=int(waypoint.frame),
-        param1=p1,
-        param2=p2,
-        param3=p3,
-        param4=p4,
-        lat_e7=round(lat * 1e7),
-        lon_e7=round(lon * 1e7),
-        alt_m=alt,
-    )
+    return Item.at((lat, lon, alt), seq=seq, command=int(waypoint.command), frame=int(waypoint.frame), params=params)
