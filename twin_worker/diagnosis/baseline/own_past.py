@@ -11,6 +11,7 @@ from twin_worker.diagnosis.baseline.past import CONTEXT_S, calibrate_past, part_
 from twin_worker.diagnosis.data.card import AircraftCard
 from twin_worker.diagnosis.data.flight import DT, FlightData
 from twin_worker.diagnosis.inference.diagnose import diagnose
+from twin_worker.diagnosis.inference.output_faults import find_frozen_outputs, with_frozen_outputs
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome, with_sentence
 from twin_worker.diagnosis.model.baseline import Baseline, exclude_equations
 
@@ -28,6 +29,12 @@ def find_tracking_loss(flight: FlightData, until: float) -> tuple[str, float] | 
     onsets = {name: _loss_onset(name, x, flight, until) for name, x in _signals(flight).items()}
     lost = [(name, onset) for name, onset in onsets.items() if onset is not None]
     return min(lost, key=lambda loss: loss[1], default=None)
+
+
+def find_loss_onset(name: str, flight: FlightData, until: float) -> float | None:
+    """Return when one signal permanently left its range before `until` [s]; None if it did not, or is not recorded."""
+    signal = _signals(flight).get(name)
+    return None if signal is None else _loss_onset(name, signal, flight, until)
 
 
 def _signals(flight: FlightData) -> dict[str, np.ndarray]:
@@ -105,7 +112,11 @@ class OwnPast:
         )
         later = part_after(visible, self.until - CONTEXT_S)
         report = diagnose(replace(later, limitations=(*visible.limitations, limitation)), base, progress)
-        return only_new_findings(report, find_tracking_loss(flight, self.until), self.until)
+        report = only_new_findings(report, find_tracking_loss(flight, self.until), self.until)
+        if visible.outputs is None:
+            return report
+        energy_loss = find_loss_onset(ENERGY, flight, self.until)
+        return with_frozen_outputs(report, find_frozen_outputs(visible.outputs, self.until, energy_loss))
 
 
 def only_new_findings(report: Report, tracking_loss: tuple[str, float] | None, until: float) -> Report:
@@ -167,7 +178,8 @@ def conceal_channels(flight: FlightData, names: Sequence[str], typical: FlightDa
     for column in (_COMMANDS[name] for name in names if name in _COMMANDS):
         commands[:, column] = np.median(typical.commands[typical.ok, column])
     limitations = (f"concealed: {', '.join(names)}", *flight.limitations)
-    return replace(flight, readings=readings, commands=commands, limitations=limitations)
+    outputs = None if set(names) & set(_COMMANDS) else flight.outputs
+    return replace(flight, readings=readings, commands=commands, limitations=limitations, outputs=outputs)
 
 
 def exclude_concealed(base: Baseline, names: Iterable[str]) -> Baseline:

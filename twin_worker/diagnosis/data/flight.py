@@ -14,6 +14,7 @@ from fleet.telemetry.recording.options import NO_OPTIONS, RecordingOptions
 from fleet.telemetry.recording.recordings import replay_messages
 from fleet.vehicles import vehicle_class
 from twin_worker.diagnosis.data.card import AircraftCard
+from twin_worker.diagnosis.data.outputs import ServoOutputs, read_outputs
 from twin_worker.telemetry.history import TelemetryHistory
 
 DT = 0.04  # grid of a flight [s]
@@ -93,6 +94,7 @@ class FlightData:
         ok: valid rows, (n,) bool
         vane: the accelerometer is fast enough to measure flow angles (`VANE_HZ`)
         limitations: detection power lost because of missing data, in sentences
+        outputs: servo outputs at their own times; None where the control errors are not recorded
     """
 
     name: str
@@ -105,6 +107,7 @@ class FlightData:
     ok: np.ndarray
     vane: bool
     limitations: tuple[str, ...] = ()
+    outputs: ServoOutputs | None = None
 
     @property
     def seconds(self) -> float:
@@ -175,7 +178,8 @@ def resample_flight(name: str, history: TelemetryHistory, params: dict[str, floa
     commands[:, 3] = np.clip(commands[:, 3], 0.0, 1.0)
     ground = _ground_height(history, readings["h"], t, t_start)
     ok = _valid_rows(series, readings, t, t_start, ground)
-    flight = FlightData(name, t, t_start, readings, commands, horizontal, ground, ok, vane, tuple(limitations))
+    outputs = read_outputs(history, params, t_start)
+    flight = FlightData(name, t, t_start, readings, commands, horizontal, ground, ok, vane, tuple(limitations), outputs)
     _check_length(name, flight.seconds, "s in the air", "s at least; check that the aircraft flew")
     return flight
 

@@ -9,6 +9,8 @@ from fleet.effects import Onset
 from twin_worker.diagnosis.data.card import FaultHypothesis, OnsetProfile
 from twin_worker.diagnosis.inference.validation.cross_validate import MIN_RMS_DROP
 
+OUTPUT_CHANNEL = "autopilot output"  # the fault is in the output of the controller, not in the airframe
+
 
 class ReportOutcome(StrEnum):
     """Outcome of a diagnosis."""
@@ -142,6 +144,8 @@ def _sentence(report: Report) -> str:
 
 
 def _describe_finding(finding: DiagnosisFinding) -> str:
+    if finding.channel == OUTPUT_CHANNEL:
+        return _describe_output(finding)
     numbers = ", ".join(
         f"{name} {x:.3g} ± {finding.sigma.get(name, 0.0):.2g}"
         for name, x in finding.reported.items()
@@ -150,6 +154,14 @@ def _describe_finding(finding: DiagnosisFinding) -> str:
     surface = f" of the {finding.surface}" if finding.surface else ""
     rivals = f"; not separable from {' or '.join(finding.rivals)}" if finding.rivals else ""
     return f"{finding.hypothesis.effect.name}{surface} {describe_onset(finding.hypothesis.onset)} ({numbers}{rivals})"
+
+
+def _describe_output(finding: DiagnosisFinding) -> str:
+    number, pulse = int(finding.reported["output"]), finding.reported["pulse_us"]
+    name, since = finding.hypothesis.effect.name, finding.segments[0][0]
+    if finding.surface == "throttle":
+        return f"{name}: throttle output {number} is cut to {pulse:.0f} us since {since:.0f} s while energy is short"
+    return f"{name}: {finding.surface} output {number} is frozen at {pulse:.0f} us since {since:.0f} s"
 
 
 def describe_onset(onset: OnsetProfile) -> str:
@@ -162,6 +174,11 @@ def describe_onset(onset: OnsetProfile) -> str:
 
 
 def _describe_validation(report: Report) -> str:
+    if report.findings[0].channel == OUTPUT_CHANNEL:
+        return (
+            f"the autopilot's own output no longer answers its control errors: it differs by {report.fit_before:.0f} "
+            "times its usual error from what they demand"
+        )
     if not report.fit_before > 0:
         return "detected in the variance of the air data"
     before, after, of_what, unit = report.fit_before, report.fit_after, "residual", ""

@@ -1,0 +1,252 @@
+"""Find outputs that no longer answer the controller: a pulse that is constant while the control errors change.
+
+A logged output is the answer of the autopilot to its control errors. In trusted flight a regression on these errors
+predicts each output, and a logistic regression the probability that an output repeats its last pulse, from
+
+    whether it repeated before, the change of the predicted output, and its distance from the predicted output.
+
+A frozen output repeats always. The log likelihood ratio of a run of repeats is -sum log P(repeat | healthy), less the
+logarithm of the number of possible pulses. Predictors are limited to the range of trusted flight: no evidence is
+extrapolated. An output at a limit in the direction of its control error is saturated, and that is no evidence. An
+energy deficit with a throttle output at its minimum is a cut throttle.
+Source: Agresti 2013, Categorical Data Analysis, chapter 5; Lambregts 1983 (total energy control).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from fleet.airframes.airframe import ServoMap
+from fleet.effects import SURFACES, Onset, catalogue
+from twin_worker.diagnosis.data.card import FaultHypothesis, OnsetProfile
+from twin_worker.diagnosis.data.outputs import ServoOutputs
+from twin_worker.diagnosis.inference.report import (
+    OUTPUT_CHANNEL,
+    DiagnosisFinding,
+    Report,
+    ReportOutcome,
+    with_sentence,
+)
+
+PRIOR = 1e-3  # probability that an output of a flight freezes [-]
+POSTERIOR = 0.95  # least probability of a reported fault [-]
+MIN_R2 = 0.5  # share of an output's variance that the control errors must explain in trusted flight [-]
+_MIN_ROWS = 60
+_MIN_RANGE_US = 10.0  # an output that moves less is not in use [us]
+_PULSE_RANGE_US = 1000.0
+_RIDGE = 0.01
+_PRIOR_MEAN, _PRIOR_STD = np.array([-1.0, 1.0, -0.5, -1.0]), np.array([2.0, 1.0, 1.0, 1.0])
+_AXIS = {"aileron": 0, "elevator": 1, "rudder": 0, "throttle": 2}
+_NAMES = (*SURFACES, "throttle")
+_IDLE_SHARE = 0.7  # least share of the time after an energy loss at which a cut throttle is at its minimum [-]
+_IDLE_PERCENTILE = 2.0
+
+
+@dataclass(frozen=True)
+class FrozenOutput:
+    """One output that no longer answers the controller.
+
+    Attributes:
+        number: of the output, from 1
+        surface: that it moves: aileron, elevator, rudder or throttle
+        pulse: [us]; position: of full deflection, or of full throttle [-]
+        since, until: [s]
+        evidence: log likelihood ratio [-]
+        error_before, error_after: rms of the output less its prediction, over that of trusted flight, from the law and
+            from the frozen pulse [-]
+    """
+
+    number: int
+    surface: str
+    pulse: float
+    position: float
+    since: float
+    until: float
+    evidence: float
+    error_before: float
+    error_after: float = 0.0
+
+
+def find_frozen_outputs(outputs: ServoOutputs, trusted_until: float, energy_loss: float | None) -> list[FrozenOutput]:
+    """Return the frozen outputs after the trusted part of a flight, earliest first.
+
+    Args:
+        outputs: of the flight
+        trusted_until: end of the trusted part [s]
+        energy_loss: since when the flight does not hold its energy [s]; None: it does
+    """
+    trusted = outputs.flying & (outputs.t < trusted_until)
+    if trusted.sum() < _MIN_ROWS:
+        return []
+    used_map = outputs.servo_map(trusted)
+    n_hypotheses = outputs.pulses.shape[1] * int((outputs.flying & ~trusted).sum())
+    least = np.log(max(n_hypotheses, 1) / PRIOR) + np.log(POSTERIOR / (1.0 - POSTERIOR))
+    found = []
+    used = _used_outputs(outputs, used_map, trusted)
+    ailerons = [k for k, surface in used if surface == "aileron"]
+    for k, surface in used:
+        output = _ModelledOutput(outputs, k, surface, trusted, ailerons)
+        frozen = output.cut(energy_loss) if surface == "throttle" and energy_loss is not None else None
+        frozen = frozen or output.longest_run(trusted_until)
+        if frozen is not None and frozen.evidence > least:
+            found.append(replace(frozen, position=_position(used_map, k, frozen)))
+    return sorted(found, key=lambda one: one.since)
+
+
+def _used_outputs(outputs: ServoOutputs, used_map: ServoMap, trusted: np.ndarray) -> list[tuple[int, str]]:
+    """Return index and surface of every output that moves in trusted flight."""
+    used = []
+    for k in np.flatnonzero(np.ptp(outputs.pulses[trusted], axis=0) >= _MIN_RANGE_US):
+        gain = np.abs(used_map.gain_up[k]) + np.abs(used_map.gain_down[k])
+        if gain.any() and (outputs.pulses[trusted, k] > 0).mean() > 0.9:
+            used.append((int(k), _NAMES[int(np.argmax(gain))]))
+    return used
+
+
+def _position(used_map: ServoMap, k: int, frozen: FrozenOutput) -> float:
+    """Return the position that the pulse commands, as a share of full deflection or throttle."""
+    offset = frozen.pulse - used_map.trim[k]
+    gain = (used_map.gain_up if offset > 0 else used_map.gain_down)[k]
+    column = _NAMES.index(frozen.surface)
+    share = np.sum(np.abs(used_map.gain_up[:, column]) > 0)  # outputs that move this surface together
+    return float(np.clip(offset * gain[column] * max(share, 1), 0.0 if frozen.surface == "throttle" else -1.0, 1.0))
+
+
+class _ModelledOutput:
+    """One output with its law and its probability of repetition, fitted to trusted flight."""
+
+    def __init__(
+        self, outputs: ServoOutputs, k: int, surface: str, trusted: np.ndarray, ailerons: Sequence[int] = ()
+    ) -> None:
+        self._outputs, self._k, self._surface, self._trusted = outputs, k, surface, trusted
+        self._y = y = outputs.pulses[:, k]
+        axis = _AXIS[surface]
+        x = outputs.signals[axis]
+        if surface == "rudder":  # mixed with the ailerons
+            x = np.column_stack([x, *(outputs.pulses[:, n] for n in ailerons)])
+        mean = y[trusted].mean()
+        x = (x - x[trusted].mean(axis=0)) / (x[trusted].std(axis=0) + 1e-9)
+        gram = x[trusted].T @ x[trusted] + _RIDGE * trusted.sum() * np.eye(x.shape[1])
+        self._predicted = mean + x @ np.linalg.solve(gram, x[trusted].T @ (y[trusted] - mean))
+        self._scale = max(float(np.sqrt(np.mean((y - self._predicted)[trusted] ** 2))), 1.0)
+        self.r2 = 1.0 - self._scale**2 / float(y[trusted].var())
+        steps = np.abs(np.diff(y[trusted]))
+        self._step = float(steps[steps > 0].min())
+        self._low, self._high = float(y[trusted].min()), float(y[trusted].max())
+        self._idle = float(np.percentile(y[trusted], _IDLE_PERCENTILE))
+        self._error = outputs.errors[:, axis] * np.sign(np.corrcoef(outputs.errors[trusted, axis], y[trusted])[0, 1])
+        self._repeats = np.concatenate([[False], np.diff(y) == 0])
+        self._surprise = self._fit_surprise(trusted)
+
+    def _fit_surprise(self, trusted: np.ndarray) -> np.ndarray:
+        """Return -log P(repeat | healthy) of every row, zero where the output is saturated, (n,)."""
+        y = self._y
+        expected = np.clip(self._predicted, np.minimum(self._low, y), np.maximum(self._high, y))
+        change = np.log1p(np.abs(np.diff(expected, prepend=expected[0])) / self._step)
+        distance = np.log1p(np.abs(y - expected) / self._scale)
+        at_limit = (y <= self._low) | (y >= self._high)
+        rows = trusted & ~at_limit
+        rows[:2] = False
+        repeated_before = np.concatenate([[False], self._repeats[:-1]])
+        if self._surface == "throttle":  # the level of its integrator is arbitrary
+            distance = np.zeros(len(y))
+        limited = [np.minimum(x, x[trusted].max()) for x in (change, distance)]
+        X = np.column_stack([np.ones(len(y)), repeated_before, *limited])
+        repeats = self._repeats[rows]
+
+        def cost(b: np.ndarray) -> tuple[float, np.ndarray]:
+            z, offset = X[rows] @ b, (b - _PRIOR_MEAN) / _PRIOR_STD
+            value = np.logaddexp(0.0, z).sum() - z[repeats].sum() + 0.5 * offset @ offset
+            return float(value), X[rows].T @ (1.0 / (1.0 + np.exp(-z)) - repeats) + offset / _PRIOR_STD
+
+        b = minimize(cost, _PRIOR_MEAN, jac=True).x
+        upward = y >= self._high
+        saturated = at_limit & (np.where(upward, 1.0, -1.0) * self._error > 0.0)
+        if self._surface == "throttle":  # energy rates, which also saturate it, are not reported
+            saturated |= at_limit
+        return np.where(saturated, 0.0, np.logaddexp(0.0, -(X @ b)))
+
+    def longest_run(self, trusted_until: float) -> FrozenOutput | None:
+        """Return the run of repeats with the most evidence; None where the law does not explain the output."""
+        if self.r2 < MIN_R2:
+            return None
+        outputs = self._outputs
+        in_run = self._repeats & outputs.flying & (outputs.t > trusted_until)
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], in_run, [False]]).astype(int)))
+        runs = [
+            (float(self._surprise[a:b].sum()) - np.log(_PULSE_RANGE_US / self._step), a - 1, b)
+            for a, b in zip(edges[::2], edges[1::2], strict=True)
+        ]
+        return self._frozen(*max(runs)) if runs else None
+
+    def cut(self, energy_loss: float) -> FrozenOutput | None:
+        """Return the throttle as cut where it is at its minimum while the energy is short since `energy_loss` [s]."""
+        t, flying = self._outputs.t, self._outputs.flying
+        after = np.flatnonzero(flying & (t > energy_loss))
+        idle = self._y <= self._idle
+        if len(after) < 2 or idle[after].mean() < _IDLE_SHARE or not (self._error[after[-1]] > 0.0):
+            return None
+        first = int(after[np.argmax(idle[after])])
+        while first > 0 and idle[first - 1]:
+            first -= 1
+        short = self._trusted & (self._error > np.median(self._error[self._trusted]))
+        usual = (1.0 + (idle & short).sum()) / (2.0 + short.sum())  # of idle rows, Laplace rule
+        seconds = float(t[after[-1]] - t[first]) * float(idle[after].mean())
+        return self._frozen(-np.log(usual) * seconds, first, int(after[-1]) + 1)  # rows within 1 s are not independent
+
+    def _frozen(self, evidence: float, first: int, end: int) -> FrozenOutput:
+        t, y = self._outputs.t, self._y
+        misfit = float(np.sqrt(np.mean((y - self._predicted)[first + 1 : end] ** 2))) / self._scale
+        last = min(end - 1, len(t) - 1)
+        return FrozenOutput(
+            self._k + 1, self._surface, float(y[last]), 0.0, float(t[first]), float(t[last]), evidence, misfit
+        )
+
+
+def with_frozen_outputs(report: Report, frozen: list[FrozenOutput]) -> Report:
+    """Return the report with the frozen outputs as its first findings.
+
+    Effects on the airframe remain where they began before: afterwards the flight leaves what was calibrated.
+    """
+    if not frozen:
+        return report
+    first = frozen[0].since
+    earlier = tuple(
+        f for f in report.findings if report.outcome is ReportOutcome.NAMED and f.segments[0][0] < first - 5.0
+    )
+    findings = tuple(map(_finding, frozen))
+    misfit = float(np.sqrt(np.mean([one.error_before**2 for one in frozen])))
+    return with_sentence(
+        replace(
+            report,
+            outcome=ReportOutcome.NAMED,
+            findings=(*findings, *earlier),
+            where=("", ()),
+            terms={},
+            fit_before=misfit,
+            fit_after=0.0,
+        )
+    )
+
+
+def _finding(frozen: FrozenOutput) -> DiagnosisFinding:
+    onset = OnsetProfile(Onset.STEP, frozen.since)
+    if frozen.surface == "throttle":
+        hypothesis = FaultHypothesis(catalogue()["thrust_loss"], "", (1.0 - frozen.position,), onset)
+    else:
+        hypothesis = FaultHypothesis(catalogue()["actuator_stuck"], frozen.surface, (1.0, frozen.position), onset)
+    return DiagnosisFinding(
+        hypothesis=hypothesis,
+        gain=2.0 * frozen.evidence,
+        reported={"output": float(frozen.number), "pulse_us": frozen.pulse, "position": frozen.position},
+        sigma={"output": 0.0, "pulse_us": 0.0, "position": 0.0},
+        parameter_sigma=(0.0,) * len(hypothesis.par),
+        rivals=(),
+        manoeuvres=(),
+        channel=OUTPUT_CHANNEL,
+        surface=frozen.surface,
+        segments=((frozen.since, frozen.until),),
+        held_out_share=1.0,
+    )
