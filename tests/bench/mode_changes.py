@@ -2,8 +2,9 @@
 
     python -m tests.bench.mode_changes s03_nominal_modes.tlog.xz
 
-For each change to a mode that the autopilot flies by itself: the delay until the first prediction along the route of the
-new mode, and its error 10 s later over the median error of predictions made in undisturbed flight (none within 30 s).
+For each change to a mode that the autopilot flies by itself: the delay until the first prediction along the route of
+the new mode, and its error 10 s later over the median error of predictions in undisturbed flight (no change within
+40 s).
 """
 
 import argparse

@@ -83,7 +83,7 @@ def find_frozen_outputs(outputs: ServoOutputs, trusted_until: float, energy_loss
     used_map = outputs.servo_map(trusted)
     n_hypotheses = outputs.pulses.shape[1] * int((outputs.flying & ~trusted).sum())
     least = np.log(max(n_hypotheses, 1) / PRIOR) + np.log(POSTERIOR / (1.0 - POSTERIOR))
-    found = []
+    detected = []
     used = _used_outputs(outputs, used_map, trusted)
     ailerons = [k for k, surface in used if surface == "aileron"]
     for k, surface in used:
@@ -91,8 +91,8 @@ def find_frozen_outputs(outputs: ServoOutputs, trusted_until: float, energy_loss
         frozen = output.cut(energy_loss) if surface == "throttle" and energy_loss is not None else None
         frozen = frozen or output.longest_run(trusted_until)
         if frozen is not None and frozen.evidence > least:
-            found.append(replace(frozen, position=_position(used_map, k, frozen)))
-    return sorted(found, key=lambda one: one.since)
+            detected.append(replace(frozen, position=_position(used_map, k, frozen)))
+    return sorted(detected, key=lambda one: one.since)
 
 
 def _used_outputs(outputs: ServoOutputs, used_map: ServoMap, trusted: np.ndarray) -> list[tuple[int, str]]:
