@@ -142,8 +142,10 @@ def main(argv: list[str] | None = None) -> int:
         "  fleet up --uavs 8\n  fleet status --json\n  fleet schema prediction\n",
     )
     verbs = parser.add_subparsers(title="verbs", dest="verb", metavar="VERB", required=True)
-    for name, path in sorted(command_modules().items()):
-        module = importlib.import_module(path)
+    listed = command_modules()
+    asked = (sys.argv[1:] if argv is None else argv)[:1]
+    for name in asked if asked and asked[0] in listed else sorted(listed):  # a verb needs no import of the others
+        module = importlib.import_module(listed[name])
         summary = (module.__doc__ or "").strip().splitlines()[0]
         verb = verbs.add_parser(
             name,

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import median_filter
 
 MAX_INTERPOLATION_S = 1.5  # maximum gap for interpolation [s]
 _MAX_STAMP_ERROR_S = 1.0  # maximum difference of a stamp from its neighbours in the file [s]
@@ -82,6 +81,8 @@ def time_order(stamp_us: np.ndarray) -> np.ndarray:
     """Return row indices in time order, without duplicate or outlying stamps."""
     if len(stamp_us) < 2 or (np.diff(stamp_us) > 0).all():
         return np.arange(len(stamp_us))
+    from scipy.ndimage import median_filter  # deferred import: stamps are seldom out of order
+
     near = np.abs(stamp_us - median_filter(stamp_us, 5, mode="nearest")) < _MAX_STAMP_ERROR_S * 1e6
     valid = np.flatnonzero(near)
     order = valid[np.argsort(stamp_us[valid], kind="stable")]

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from typing import IO, Any
 
 import numpy as np
-from scipy.io import loadmat
 
 from fleet.telemetry.onboard_logs.columns.column_map import ColumnMap
 from fleet.telemetry.onboard_logs.columns.text_tables import MAX_VALUES, Table
@@ -41,6 +40,8 @@ def read_matlab(stream: IO[bytes], column_map: ColumnMap, skipped: list[str]) ->
     if data.startswith(_HDF5) or b"MATLAB 7.3" in data[:_HEADER]:
         raise ValueError("found a MATLAB 7.3 file (HDF5), expected version 5 to 7; save it with -v7")
     _check(data)
+    from scipy.io import loadmat  # deferred import: few recordings are MATLAB files
+
     try:
         variables = loadmat(io.BytesIO(data), squeeze_me=True, struct_as_record=False, mat_dtype=True)
     except Exception as error:  # the format has no end of invalid contents; a reader must never raise another error
