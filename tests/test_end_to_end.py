@@ -134,7 +134,8 @@ def test_a_fleet_whose_parent_is_killed_ends_all_the_same() -> None:
 
 
 def test_an_orphan_that_hangs_ends_too() -> None:
-    hangs = "import threading; from fleet import cli; cli.GRACE_S = 0.1; cli.stop_on_signal(); threading.Event().wait()"
+    soon = "from fleet import cli; assert cli.ORPHAN_GRACE_S > 0.1; cli.ORPHAN_GRACE_S = 0.1"
+    hangs = f"{soon}; cli.stop_on_signal(); import threading; threading.Event().wait()"
     done = subprocess.run(
         [sys.executable, "-c", hangs], cwd=ROOT, env=os.environ | {cli.PARENT: "1"}, timeout=PATIENCE_S, check=False
     )

@@ -1,6 +1,7 @@
 """The project around the house: tracked files, dependencies and their lock, console commands."""
 
 import ast
+import functools
 import importlib
 import importlib.metadata
 import re
@@ -54,6 +55,12 @@ def bare(requirement: str) -> str:
     return re.split(r"[^A-Za-z0-9._-]", requirement)[0].lower().replace("_", "-")
 
 
+@functools.cache
+def tops(path: str) -> set[str]:
+    """Top names of everything a file imports."""
+    return {name.split(".")[0] for _, name in imported(path, ast.parse((ROOT / path).read_text()))}
+
+
 def third_party(*folders: str) -> set[str]:
     """Distributions that the sources of some folders import."""
     offered = importlib.metadata.packages_distributions()
@@ -61,8 +68,7 @@ def third_party(*folders: str) -> set[str]:
     local = {*PACKAGES, "tests", "docs", *(path.stem for path in (ROOT / "tests").rglob("*.py"))}
     for path in sources():
         if path.startswith(folders):
-            tops = {name.split(".")[0] for _, name in imported(path, ast.parse((ROOT / path).read_text()))}
-            for top in tops - set(sys.stdlib_module_names) - local:
+            for top in tops(path) - set(sys.stdlib_module_names) - local:
                 if bare(top) in PEERS:
                     found.add(bare(top))
                     continue
