@@ -143,8 +143,9 @@ def main(argv: list[str] | None = None) -> int:
     )
     verbs = parser.add_subparsers(title="verbs", dest="verb", metavar="VERB", required=True)
     listed = command_modules()
-    asked = (sys.argv[1:] if argv is None else argv)[:1]
-    for name in asked if asked and asked[0] in listed else sorted(listed):  # a verb needs no import of the others
+    requested = (sys.argv[1:] if argv is None else argv)[:1]
+    # one verb needs no import of the others
+    for name in requested if requested and requested[0] in listed else sorted(listed):
         module = importlib.import_module(listed[name])
         summary = (module.__doc__ or "").strip().splitlines()[0]
         verb = verbs.add_parser(
