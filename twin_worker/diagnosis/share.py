@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fleet.telemetry.recording.options import RecordingOptions
-from twin_worker.diagnosis.baseline.own_past import OwnPast, conceal_channels, exclude_concealed
+from twin_worker.diagnosis.baseline.own_past import OwnPast, conceal_channels, exclude_concealed, with_output_faults
 from twin_worker.diagnosis.data.flight import FlightData, read_flights
 from twin_worker.diagnosis.inference.diagnose import diagnose
 from twin_worker.diagnosis.inference.report import Report
@@ -67,7 +67,8 @@ def _diagnose_task(
                 reports.append(reference.diagnose(flight, progress, conceal))
             else:
                 visible = conceal_channels(flight, conceal, flight)
-                reports.append(diagnose(visible, exclude_concealed(reference, conceal), progress))
+                report = diagnose(visible, exclude_concealed(reference, conceal), progress)
+                reports.append(with_output_faults(report, visible))
     except (ValueError, OSError) as error:
         return reports, str(error)
     return reports, ""

@@ -32,7 +32,7 @@ def find_tracking_loss(flight: FlightData, until: float) -> tuple[str, float] | 
 
 
 def find_loss_onset(name: str, flight: FlightData, until: float) -> float | None:
-    """Return when one signal permanently left its range before `until` [s]; None if it did not, or is not recorded."""
+    """Return when one signal left its range of before `until` for good [s]; None if not, or not recorded."""
     signal = _signals(flight).get(name)
     return None if signal is None else _loss_onset(name, signal, flight, until)
 
@@ -56,6 +56,8 @@ def _loss_onset(name: str, x: np.ndarray, flight: FlightData, until: float) -> f
     """Return when a signal, (n,), permanently left its range [s]; None if it did not."""
     t, ok = flight.t, flight.ok
     past, later = ok & (t < until), t >= until
+    if not past.any():
+        return None
     low, middle, high = np.percentile(x[past], [_RANGE_PERCENTILES[0], 50.0, _RANGE_PERCENTILES[1]])
     margin = max(_MARGIN_SHARE * (high - low), _MIN_MARGIN[name])
     excess = np.where(x > high, (x - high) / margin, np.where(x < low, (low - x) / margin, 0.0))
@@ -73,6 +75,7 @@ def _loss_onset(name: str, x: np.ndarray, flight: FlightData, until: float) -> f
 
 
 MIN_AFTER_S = 10.0  # least length of valid flight to diagnose
+LAW_S = 40.0  # flight from which the controller's law is learnt where no past is trusted [s]
 _ONSET_MARGIN_S = 5.0  # onsets may precede the end of the trusted past by this
 
 ReportProgress = Callable[[str], None]
@@ -113,10 +116,24 @@ class OwnPast:
         later = part_after(visible, self.until - CONTEXT_S)
         report = diagnose(replace(later, limitations=(*visible.limitations, limitation)), base, progress)
         report = only_new_findings(report, find_tracking_loss(flight, self.until), self.until)
-        if visible.outputs is None:
-            return report
-        energy_loss = find_loss_onset(ENERGY, flight, self.until)
-        return with_frozen_outputs(report, find_frozen_outputs(visible.outputs, self.until, energy_loss))
+        return with_output_faults(report, visible, self.until)
+
+
+def with_output_faults(report: Report, flight: FlightData, until: float | None = None) -> Report:
+    """Return the report with outputs that no longer answer the controller; see `inference.output_faults`.
+
+    Args:
+        report: of the airframe
+        flight: with the outputs, if recorded
+        until: end of the trusted flight that shows the controller's law [s]; None: the first `LAW_S` in the air
+    """
+    outputs = flight.outputs
+    if outputs is None:
+        return report
+    if until is None:
+        flying = outputs.t[outputs.flying]
+        until = float(flying[0]) + LAW_S if len(flying) else float("inf")
+    return with_frozen_outputs(report, find_frozen_outputs(outputs, until, find_loss_onset(ENERGY, flight, until)))
 
 
 def only_new_findings(report: Report, tracking_loss: tuple[str, float] | None, until: float) -> Report:

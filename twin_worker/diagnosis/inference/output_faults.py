@@ -6,9 +6,10 @@ predicts each output, and a logistic regression the probability that an output r
     whether it repeated before, the change of the predicted output, and its distance from the predicted output.
 
 A frozen output repeats always. The log likelihood ratio of a run of repeats is -sum log P(repeat | healthy), less the
-logarithm of the number of possible pulses. Predictors are limited to the range of trusted flight: no evidence is
-extrapolated. An output at a limit in the direction of its control error is saturated, and that is no evidence. An
-energy deficit with a throttle output at its minimum is a cut throttle.
+logarithm of the number of possible pulses, plus once the distance from the predicted output under a Student
+distribution. The other predictors are limited to the range of trusted flight: no evidence is extrapolated. An output
+at a limit in the direction of its control error is saturated, which is no evidence. A throttle output at its minimum
+while the energy is short is cut.
 Source: Agresti 2013, Categorical Data Analysis, chapter 5; Lambregts 1983 (total energy control).
 """
 
@@ -37,6 +38,7 @@ _MIN_ROWS = 60
 _MIN_RANGE_US = 10.0  # an output that moves less is not in use [us]
 _PULSE_RANGE_US = 1000.0
 _RIDGE = 0.01
+_NU = 4.0  # degrees of freedom of the distance from the predicted output: heavy tails
 _PRIOR_MEAN, _PRIOR_STD = np.array([-1.0, 1.0, -0.5, -1.0]), np.array([2.0, 1.0, 1.0, 1.0])
 _AXIS = {"aileron": 0, "elevator": 1, "rudder": 0, "throttle": 2}
 _NAMES = (*SURFACES, "throttle")
@@ -143,7 +145,7 @@ class _ModelledOutput:
     def _fit_surprise(self, trusted: np.ndarray) -> np.ndarray:
         """Return -log P(repeat | healthy) of every row, zero where the output is saturated, (n,)."""
         y = self._y
-        expected = np.clip(self._predicted, np.minimum(self._low, y), np.maximum(self._high, y))
+        self._expected = expected = np.clip(self._predicted, np.minimum(self._low, y), np.maximum(self._high, y))
         change = np.log1p(np.abs(np.diff(expected, prepend=expected[0])) / self._step)
         distance = np.log1p(np.abs(y - expected) / self._scale)
         at_limit = (y <= self._low) | (y >= self._high)
@@ -175,11 +177,17 @@ class _ModelledOutput:
         outputs = self._outputs
         in_run = self._repeats & outputs.flying & (outputs.t > trusted_until)
         edges = np.flatnonzero(np.diff(np.concatenate([[False], in_run, [False]]).astype(int)))
-        runs = [
-            (float(self._surprise[a:b].sum()) - np.log(_PULSE_RANGE_US / self._step), a - 1, b)
-            for a, b in zip(edges[::2], edges[1::2], strict=True)
-        ]
+        runs = [(self._evidence(a, b), a - 1, b) for a, b in zip(edges[::2], edges[1::2], strict=True)]
         return self._frozen(*max(runs)) if runs else None
+
+    def _evidence(self, first: int, end: int) -> float:
+        """Return the log likelihood ratio of a run of repeats: each repeat, the pulse, and once its distance."""
+        repeats = float(self._surprise[first:end].sum())
+        distance = float(np.median(np.abs(self._y - self._expected)[first:end])) / self._scale
+        if not repeats or self._surface == "throttle":  # saturated, or the level of its integrator is arbitrary
+            distance = 0.0
+        level = 0.5 * (_NU + 1.0) * np.log1p(distance**2 / _NU)
+        return repeats + float(level - np.log(_PULSE_RANGE_US / self._step))
 
     def cut(self, energy_loss: float) -> FrozenOutput | None:
         """Return the throttle as cut where it is at its minimum while the energy is short since `energy_loss` [s]."""
