@@ -63,6 +63,9 @@ class ControlLaw(NamedTuple):
 LAWS = {
     "arduplane": ControlLaw(arduplane.LAW, ARDUPLANE, arduplane.parameters, arduplane.NAMES, arduplane.TABLE),
     "px4": ControlLaw(px4_fixedwing.LAW, PX4, px4_fixedwing.parameters, px4_fixedwing.NAMES, px4_fixedwing.TABLE),
+    "px4_l1": ControlLaw(
+        px4_fixedwing.LAW_L1, PX4, px4_fixedwing.l1_parameters, px4_fixedwing.L1_NAMES, px4_fixedwing.L1_TABLE
+    ),
     "textbook": ControlLaw(textbook.LAW, TEXTBOOK, textbook.parameters, textbook.NAMES, textbook.TABLE),
 }
 NAMES = frozenset(name for law in LAWS.values() for name in law.names)

@@ -3,7 +3,7 @@
 from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass
-from math import atan2, cos, exp, hypot, inf, isfinite, sin, sqrt
+from math import atan2, cos, exp, hypot, inf, isfinite, log, sin, sqrt
 
 import numpy as np
 
@@ -13,6 +13,12 @@ from twin_worker.telemetry.history import TelemetryHistory
 DRIFT, DRIFT_S = 0.6, 60.0  # slow change of the wind: standard deviation, correlation time [m/s, s]
 GUST, GUST_S = 0.8, 7.0  # turbulence along the flight: the same two numbers
 _RANDOM_WALK = 0.01  # random walk of the mean [m/s per sqrt(s)]
+_HEADING_WALKS = (
+    0.0,
+    0.02,
+)  # random walk of the heading bias: constant, drifting [rad per sqrt(s)]
+_EVIDENCE_S = 60.0  # time constant of the log-likelihood ratio of the two [s]
+_EVIDENCE = 3.0  # log-likelihood ratio from which the bias drifts: 20 to 1
 _SIGMA = 1.0  # sideslip and sensors in one ground-velocity component [m/s]
 _GATE = 25.0  # normalised innovation squared (NIS) from which a row is rejected
 _NIS_AVERAGE_S = 60.0  # time constant of the mean NIS [s]
@@ -24,8 +30,16 @@ _INITIAL_SIGMA = np.array([0.03, 0.03, 6.0, 6.0, DRIFT, DRIFT, GUST, GUST])
 
 @kernel
 def _predict_and_correct(
-    x: np.ndarray, P: np.ndarray, dt: float, c: float, s: float, north: float, east: float, gate: float
-) -> float:
+    x: np.ndarray,
+    P: np.ndarray,
+    dt: float,
+    c: float,
+    s: float,
+    north: float,
+    east: float,
+    gate: float,
+    heading_walk: float,
+) -> tuple[float, float]:
     """Predict state and covariance by dt and correct them with one ground velocity that passes the gate.
 
     Args:
@@ -34,8 +48,9 @@ def _predict_and_correct(
         c, s: horizontal reported air velocity along north and east, by the heading [m/s]
         north, east: ground velocity [m/s]
         gate: NIS from which the correction is skipped
+        heading_walk: random walk of the heading bias [rad per sqrt(s)]
     Returns:
-        the normalised innovation squared (NIS)
+        the normalised innovation squared (NIS); the log-likelihood of the row without its constant
     Source: Bar-Shalom 2001, 5.2.4 (Joseph form).
     """
     decay, H, HP, y = np.ones(8), np.zeros((2, 8)), np.zeros((2, 8)), np.empty(2)
@@ -50,6 +65,10 @@ def _predict_and_correct(
             P[i, j] *= decay[i] * decay[j]
         walk = 1e-8 if i < 2 else _RANDOM_WALK**2 * dt if i < 4 else _INITIAL_SIGMA[i] ** 2 * (1.0 - decay[i] ** 2)
         P[i, i] += walk
+    P[0, 0] += (heading_walk * x[1]) ** 2 * dt  # the walk turns (a, b)
+    P[1, 1] += (heading_walk * x[0]) ** 2 * dt
+    P[0, 1] -= heading_walk**2 * x[0] * x[1] * dt
+    P[1, 0] -= heading_walk**2 * x[0] * x[1] * dt
     for k in range(2):
         for i in range(8):
             y[k] -= H[k, i] * x[i]
@@ -64,7 +83,7 @@ def _predict_and_correct(
     nis = y[0] * a + y[1] * b
     if nis < gate:
         _correct(x, P, H, HP, np.array((a, b)), np.array((S11 / det, -S01 / det, S00 / det)))
-    return nis
+    return nis, -0.5 * (min(nis, _GATE) + log(det))
 
 
 @kernel
@@ -93,19 +112,36 @@ class WindFilter:
     """Estimate a, b, mean, drift, gust of  v = Va cos(gamma) (a e(psi) + b e(psi + 90 deg)) + mean + drift + gust.
 
     a, b are airspeed scale times cosine and sine of the heading bias. The mean is a random walk. Drift and gust are
-    first-order Gauss-Markov processes, which separates gusts from wind.
-    Source: Beard & McLain 2012, sec. 2.4 (wind triangle); Bar-Shalom 2001, 5.4 (gating), 8.2 (coloured noise).
+    first-order Gauss-Markov processes, which separates gusts from wind. The heading bias is constant, or drifts as that
+    of an attitude estimate in a long turn does: both hypotheses are filtered, and the likelihood of the flight selects.
+    Source: Beard & McLain 2012, sec. 2.4 (wind triangle); Bar-Shalom 2001, 5.4 (gating), 8.2 (coloured noise), 11.6.2
+    (static multiple-model estimator).
     """
 
     t: float
-    x: np.ndarray
-    P: np.ndarray
+    _x: np.ndarray  # of each hypothesis, (2, 8)
+    _P: np.ndarray  # (2, 8, 8)
+    _evidence: float  # log-likelihood ratio of the drifting over the constant heading bias
     _row_count: int
-    _mean_nis: float
+    _mean_nis: np.ndarray  # (2,)
 
     def __init__(self) -> None:
         self.t = -np.inf
         self._reset()
+
+    @property
+    def _selected(self) -> int:
+        return int(self._evidence > _EVIDENCE)
+
+    @property
+    def x(self) -> np.ndarray:
+        """Return the state of the likelier hypothesis, (8,)."""
+        return self._x[self._selected]
+
+    @property
+    def P(self) -> np.ndarray:
+        """Return its covariance, (8, 8)."""
+        return self._P[self._selected]
 
     def update(self, t: float, ground: Iterable[float], Va: float, psi: float) -> None:
         """Update with one row: ground velocity NED (3,) [m/s], reported airspeed [m/s], heading [rad]."""
@@ -118,26 +154,32 @@ class WindFilter:
         self._row_count += 1
         gate = inf if self._row_count < 50 else _GATE
         along, across = level * cos(psi), level * sin(psi)
-        nis = _predict_and_correct(self.x, self.P, dt, along, across, north, east, gate)  # type: ignore[call-arg]
-        self._mean_nis += dt / _NIS_AVERAGE_S * (min(nis, _GATE) / 2 - self._mean_nis)
+        likelihood = [0.0, 0.0]
+        for i, walk in enumerate(_HEADING_WALKS):
+            row = (self._x[i], self._P[i], dt, along, across, north, east, gate, walk)
+            nis, likelihood[i] = _predict_and_correct(*row)  # type: ignore[call-arg]
+            self._mean_nis[i] += dt / _NIS_AVERAGE_S * (min(nis, _GATE) / 2 - self._mean_nis[i])
+        self._evidence += likelihood[1] - likelihood[0] - min(dt / _EVIDENCE_S, 1.0) * self._evidence
         if not self._is_plausible():
             self._reset()
 
     def _is_plausible(self) -> bool:
-        """Return whether the wind estimate is plausible; false for nan."""
-        return hypot(self.x[2] + self.x[4], self.x[3] + self.x[5]) < _MAX_WIND and bool(np.isfinite(self.P).all())
+        """Return whether the wind estimates are plausible; false for nan."""
+        total = self._x[:, 2:4] + self._x[:, 4:6]
+        return bool((np.hypot(*total.T) < _MAX_WIND).all() and np.isfinite(self._P).all())
 
     def _reset(self) -> None:
-        """Reset the estimate to zero wind; the time stays."""
-        self.x, self.P = np.array([1.0, *np.zeros(7)]), np.diag(_INITIAL_SIGMA**2)
-        self._row_count, self._mean_nis = 0, 1.0
+        """Reset the estimates to zero wind; the time stays."""
+        self._x = np.tile([1.0, *np.zeros(7)], (2, 1))
+        self._P = np.tile(np.diag(_INITIAL_SIGMA**2), (2, 1, 1))
+        self._row_count, self._mean_nis, self._evidence = 0, np.ones(2), 0.0
 
     def reset_wind(self, t: float, wind: np.ndarray) -> None:
         """Set the wind at time `t` [s since 1970], NED, (3,) [m/s]; ignore an implausible wind."""
         if not hypot(*wind[:2]) < _MAX_WIND:
             return
         self.t = t
-        self.x[2:6] = *wind[:2], 0.0, 0.0  # mean; zero drift
+        self._x[:, 2:6] = *wind[:2], 0.0, 0.0  # mean; zero drift
 
     def inflate_after_step(self, wind: np.ndarray, scale: float, relative_sigma: float) -> None:
         """Apply a step of wind and airspeed scale and inflate the covariance by `relative_sigma` of the step.
@@ -151,11 +193,11 @@ class WindFilter:
         """
         if not (hypot(*wind[:2]) < _MAX_WIND and 0.0 < scale < inf):
             return
-        x, P = self.x, self.P
-        x[2:4] += wind[:2]
-        P[[2, 3], [2, 3]] += (relative_sigma * wind[:2]) ** 2
-        P[[0, 1], [0, 1]] += (relative_sigma * (scale - 1.0) * x[:2]) ** 2
-        x[:2] *= scale
+        for x, P in zip(self._x, self._P, strict=True):
+            x[2:4] += wind[:2]
+            P[[2, 3], [2, 3]] += (relative_sigma * wind[:2]) ** 2
+            P[[0, 1], [0, 1]] += (relative_sigma * (scale - 1.0) * x[:2]) ** 2
+            x[:2] *= scale
 
     @property
     def state(self) -> tuple[np.ndarray, np.ndarray]:
@@ -171,7 +213,7 @@ class WindFilter:
     @property
     def innovation_ratio(self) -> float:
         """Return the root of the mean NIS of the last minute: measured over assumed innovation [-]."""
-        return sqrt(min(max(self._mean_nis, _MIN_NIS), _MAX_NIS))
+        return sqrt(min(max(float(self._mean_nis[self._selected]), _MIN_NIS), _MAX_NIS))
 
     @property
     def scale(self) -> float:

@@ -1,6 +1,7 @@
 """Identification of the control law and of missing autopilot parameters by replay of the flight.
 
-A known autopilot has a known law. For any other autopilot the law with the smallest error to the commanded banks is
+A known autopilot has a known law; the guidance of PX4 depends on its release, which the received parameters tell, and
+without them the replay. For any other autopilot the law with the smallest error to the commanded banks is
 selected. Turn parameters are estimated by a search over several values, scored over all replays. Bank limit, airspeed
 and waypoint radius are read from the flight. Parameters that cannot be identified keep their default and are reported
 as defaults.
@@ -21,7 +22,9 @@ from twin_worker.prediction.autopilot_parameters import CRUISE_OF, fixed_wing_co
 from twin_worker.prediction.closed_loop import autopilot_wind
 from twin_worker.prediction.replay_window import MAX_BANK_ERROR, PredictionContext, ReplayWindow, replay_inputs
 
-LAW_OF_AUTOPILOT = {"ardupilot": "arduplane", "px4": "px4"}
+LAW_OF_AUTOPILOT = {"ardupilot": "arduplane", "px4": "px4"}  # in current releases
+_RELEASES = {"px4": ("px4", "px4_l1")}  # laws of an autopilot by release, newest first
+_ANY = ("arduplane", "px4", "textbook")  # laws tried for any other autopilot
 REPLAY_INTERVAL_S = 10.0  # interval of replays [s]
 _MIN_REPLAY_S = 5.0  # shortest flight on the present route that is replayed [s]
 _MIN_TURN_BANK = radians(12.0)  # smaller banks do not distinguish laws [rad]
@@ -35,12 +38,22 @@ _TURN_PARAMETERS: dict[str, dict[str, tuple[float, ...]]] = {  # turn parameters
         "NAVL1_DAMPING": (0.65, 0.7, 0.75, 0.8, 0.85, 0.95),
     },
     "px4": {"NPFG_PERIOD": (6.0, 8.0, 10.0, 12.0, 14.0, 17.0, 20.0, 25.0)},
+    "px4_l1": {
+        "FW_L1_PERIOD": (10.0, 12.0, 14.0, 15.0, 16.0, 17.0, 18.0, 20.0, 22.0, 25.0, 30.0),
+        "FW_L1_DAMPING": (0.65, 0.7, 0.75, 0.8, 0.85, 0.95),
+    },
     "textbook": {"k_path": (0.01, 0.015, 0.02, 0.03, 0.04, 0.06, 0.08)},
 }
-_BANK_LIMIT = {"arduplane": ("ROLL_LIMIT_DEG", 1.0), "px4": ("FW_R_LIM", 1.0), "textbook": ("phi_max", radians(1.0))}
+_BANK_LIMIT = {
+    "arduplane": ("ROLL_LIMIT_DEG", 1.0),
+    "px4": ("FW_R_LIM", 1.0),
+    "px4_l1": ("FW_R_LIM", 1.0),
+    "textbook": ("phi_max", radians(1.0)),
+}
 _SPEED_LIMITS: dict[str, tuple[str, ...]] = {
     "arduplane": ("AIRSPEED_MIN", "AIRSPEED_MAX"),
     "px4": ("FW_AIRSPD_MIN", "FW_AIRSPD_MAX"),
+    "px4_l1": ("FW_AIRSPD_MIN", "FW_AIRSPD_MAX"),
     "textbook": (),
 }
 
@@ -78,10 +91,9 @@ def identify_autopilot(estimate: AutopilotEstimate, autopilot: str, context: Pre
         autopilot: reported autopilot type
         context: newest telemetry; its law and values are ignored
     """
-    own_law = LAW_OF_AUTOPILOT.get(autopilot)
-    missing = {
-        law: laws.parameters(law, context.onboard.params)[1] for law in ((own_law,) if own_law else _TURN_PARAMETERS)
-    }
+    own_law = _received_law(autopilot, context.onboard.params)
+    candidates = (own_law,) if own_law else _RELEASES.get(autopilot, _ANY)
+    missing = {law: laws.parameters(law, context.onboard.params)[1] for law in candidates}
     if own_law:
         estimate.law, estimate.reason = own_law, ""
     if own_law and not any(missing.values()):
@@ -97,11 +109,28 @@ def identify_autopilot(estimate: AutopilotEstimate, autopilot: str, context: Pre
     if has_turns:
         for law, absent in missing.items():
             _fit_turn_parameters(estimate, law, absent, (context, replay), values[law])
-    if own_law is None:
+    if not own_law:
         received = [law for law, absent in missing.items() if next(iter(_TURN_PARAMETERS[law])) not in absent]
         _select_law(estimate, autopilot, received)
     if estimate.law:
         estimate.values = values[estimate.law]
+
+
+def law_in_force(autopilot: str, params: Mapping[str, float], identified: str) -> str:
+    """Return the law of an autopilot: by received parameters, else identified, else of its current release."""
+    newest = LAW_OF_AUTOPILOT.get(autopilot, identified)
+    released = identified if identified in _RELEASES.get(autopilot, ()) else newest
+    return _received_law(autopilot, params) or released
+
+
+def _received_law(autopilot: str, params: Mapping[str, float]) -> str:
+    """Return the law of an autopilot, by received parameters where it depends on the release; empty if unknown."""
+    releases = _RELEASES.get(autopilot)
+    if releases is None:
+        return LAW_OF_AUTOPILOT.get(autopilot, "")
+    if params.get("FW_USE_NPFG") == 0.0:  # PX4 1.13 has both
+        return "px4_l1"
+    return next((law for law in releases if next(iter(_TURN_PARAMETERS[law])) in params), "")
 
 
 def _update_banks(estimate: AutopilotEstimate, phi_c: np.ndarray) -> None:
@@ -201,8 +230,10 @@ def _bank_rms(law: str, replay_data: tuple[PredictionContext, ReplayWindow], val
 
 def _select_law(estimate: AutopilotEstimate, autopilot: str, received: Sequence[str]) -> None:
     """Select the law with the smallest bank error if it is below the limit; first of those whose parameters came."""
+    newest = LAW_OF_AUTOPILOT.get(autopilot, "")
     if not estimate.bank_error:
-        estimate.reason = f"autopilot {autopilot}: no commanded bank received in a turn yet, control law unknown"
+        unknown = f"autopilot {autopilot}: no commanded bank received in a turn yet, control law unknown"
+        estimate.law, estimate.reason = newest, "" if newest else unknown
         return
     matching = {law: error for law, error in estimate.bank_error.items() if error < MAX_BANK_ERROR}
     own = {law: error for law, error in matching.items() if law in received}
@@ -212,5 +243,5 @@ def _select_law(estimate: AutopilotEstimate, autopilot: str, received: Sequence[
         estimate.law = law
         estimate.reason = f"autopilot {autopilot}: control law {laws.LAWS[law].description} matches {within}"
     else:
-        estimate.law = ""
+        estimate.law = newest
         estimate.reason = f"autopilot {autopilot}: no known control law matches {within}"

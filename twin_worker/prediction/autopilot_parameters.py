@@ -26,15 +26,16 @@ _PX4 = (
     "FW_AIRSPD_MIN", "FW_AIRSPD_MAX", "FW_T_CLMB_MAX", "FW_T_SINK_MIN", "FW_T_SINK_MAX", "FW_T_CLMB_R_SP",
     "FW_T_SINK_R_SP", "FW_T_ALT_TC", "FW_T_TAS_TC", "FW_THR_TRIM", "FW_P_LIM_MAX", "FW_P_LIM_MIN",
 )  # fmt: skip
+_PX4_L1 = ("FW_L1_PERIOD", "FW_L1_DAMPING", *_PX4[3:])
 _TEXTBOOK = ("chi_inf", "k_path", "k_orbit", "R_fillet", "R_orbit", "phi_max", "Va_c", "climb_max", "sink_max")
-PUBLISHED_OF = {"arduplane": _ARDUPLANE, "px4": _PX4, "textbook": _TEXTBOOK}
+PUBLISHED_OF = {"arduplane": _ARDUPLANE, "px4": _PX4, "px4_l1": _PX4_L1, "textbook": _TEXTBOOK}
 """Published parameters by law: those that shape the path."""
 PUBLISHED_OF_GUIDANCE = (*_ARDUPLANE[:5], "AIRSPEED_CRUISE", "TECS_CLMB_MAX", "TECS_SINK_MAX")
 _CACHE_SIZE = 1024  # cached fixed-wing controllers
 _Items = tuple[tuple[str, float], ...]
-CRUISE_OF = {"arduplane": "AIRSPEED_CRUISE", "px4": "FW_AIRSPD_TRIM", "textbook": "Va_c"}
+CRUISE_OF = {"arduplane": "AIRSPEED_CRUISE", "px4": "FW_AIRSPD_TRIM", "px4_l1": "FW_AIRSPD_TRIM", "textbook": "Va_c"}
 # parameters that a speed override replaces
-SPEED_PARAMETERS = (*CRUISE_OF.values(), "WP_SPD", "MPC_XY_CRUISE", "Q_WP_SPD")
+SPEED_PARAMETERS = (*dict.fromkeys(CRUISE_OF.values()), "WP_SPD", "MPC_XY_CRUISE", "Q_WP_SPD")
 
 
 def range_error(name: str, value: float) -> str:

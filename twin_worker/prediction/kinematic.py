@@ -4,7 +4,8 @@ Airspeed and wind come from the wind filter; without an airspeed sensor they com
 course. A guidance period that is not received is the one with the smallest error over the last minute.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from math import atan2
 
 import numpy as np
@@ -31,6 +32,7 @@ from twin_worker.prediction.replay_window import MAX_EARLY_S, items_since_entry,
 from twin_worker.prediction.route_cache import cached_route
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.track import STEP, Track
+from twin_worker.telemetry.velocity import present_velocity
 
 MIN_TRACK_S = 5.0  # minimum track without gaps [s]
 _SYNC_S = 60.0  # flight for the synchronisation of the guidance [s]
@@ -73,6 +75,7 @@ class KinematicConfig:
     mode_route: Route | None = None  # of a mode without mission, which replaces the items
     history: TelemetryHistory | None = None  # reported mission items
     failsafe: FailsafePlan | None = None  # after a link loss
+    identified: Mapping[str, float] = field(default_factory=dict)  # turn parameters, used if not received
 
 
 @dataclass(frozen=True)
@@ -139,7 +142,7 @@ def _fly_route(
     """Predict from the end of `flight`, which is on the present route from row `first` on, with the items `seq`."""
     config, model = options
     recent = flight.part(first, len(flight))
-    controller = fixed_wing_controller(config.params, model.identified, sentence=law.LAW)
+    controller = fixed_wing_controller(config.params, {**config.identified, **model.identified}, sentence=law.LAW)
     par = controller.par(_altitude(recent, config))
     mission_route = config.mode_route or cached_route(
         config.items, int(seq[0]), config.origin, config.params, config.first_item
@@ -203,7 +206,9 @@ def _apply_override(
     guidance: _RouteGuidance, recent: Track, config: KinematicConfig, model: KinematicModel, override: RouteOverride
 ) -> _RouteGuidance:
     """Transfer the synchronised guidance to a what-if query; its lags and speed ratio stay."""
-    controller = fixed_wing_controller(config.params, model.identified, override.parameters, sentence=law.LAW)
+    controller = fixed_wing_controller(
+        config.params, {**config.identified, **model.identified}, override.parameters, sentence=law.LAW
+    )
     new_route, par, lags = (
         override.to_route(config.origin, config.params),
         controller.par(_altitude(recent, config)),
@@ -243,7 +248,7 @@ def _banks(recent: Track, air: np.ndarray) -> np.ndarray:
 
 
 def _state(recent: Track, w: np.ndarray) -> np.ndarray:
-    air = recent.v[-5:].mean(axis=0) - [*w, 0.0]
+    air = present_velocity(recent.p, recent.v, STEP, 5) - [*w, 0.0]
     phi = float(_banks(recent.part(max(len(recent) - 40, 0), len(recent)), recent.v[-40:] - [*w, 0.0])[-3:].mean())
     return np.array([*recent.p[-1], np.linalg.norm(air), phi, atan2(air[1], air[0]), -air[2]])
 
@@ -287,7 +292,8 @@ def fit_model(track: Track, seq: np.ndarray, config: KinematicConfig, model: Kin
         return float(np.mean(valid)) if len(valid) >= 2 else np.inf
 
     _, absent = arduplane.parameters(config.params)
-    unknown = "NAVL1_PERIOD" in absent
+    unknown = "NAVL1_PERIOD" in absent and "NAVL1_PERIOD" not in config.identified
+    model = model if unknown else replace(model, period=0.0)
     for name, trials in (("period", _PERIOD_VALUES if unknown else ()), ("tau_phi", _LAG_VALUES)):
         options = [replace(model, **{name: value}) for value in dict.fromkeys((getattr(model, name), *trials))]
         model = min(options, key=error_of)

@@ -1,4 +1,4 @@
-"""PX4 fixed-wing control law from its equations: NPFG guidance, TECS for energy, rate loops for attitude.
+"""PX4 fixed-wing control law from its equations: NPFG or L1 guidance, TECS for energy, rate loops for attitude.
 
     route --path--> line or circle --npfg--> phi_c ----------------+
       +--path--> height and speed --tecs--> theta_c, delta_t --------+--attitude--> delta_a, delta_e, delta_r
@@ -17,14 +17,18 @@ Source: see `npfg`, `tecs`; PX4 1.13 to 1.16 for the implementation.
 """
 
 from fleet.autopilots.px4_fixedwing.guide import align_integrators, fly, init, stabilise
-from fleet.autopilots.px4_fixedwing.params import DEFAULTS, NAMES, TABLE, parameters
+from fleet.autopilots.px4_fixedwing.params import DEFAULTS, L1_NAMES, L1_TABLE, NAMES, TABLE, l1_parameters, parameters
 from fleet.autopilots.px4_fixedwing.path import begin, height_demand
 
 LAW = "px4: NPFG + TECS"
+LAW_L1 = "px4 before 1.13: L1 + TECS"
 
 __all__ = [
     "DEFAULTS",
+    "L1_NAMES",
+    "L1_TABLE",
     "LAW",
+    "LAW_L1",
     "NAMES",
     "TABLE",
     "align_integrators",
@@ -32,6 +36,7 @@ __all__ = [
     "fly",
     "height_demand",
     "init",
+    "l1_parameters",
     "parameters",
     "stabilise",
 ]

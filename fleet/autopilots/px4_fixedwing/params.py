@@ -1,6 +1,6 @@
-"""PX4 fixed-wing parameters as one SI vector for the compiled controller.
+"""PX4 fixed-wing parameters as one SI vector for the compiled controller; guidance by NPFG, before 1.13 by L1.
 
-Source: PX4 parameter reference 1.13 to 1.16 (names, defaults, units); older names from its release notes.
+Source: PX4 parameter reference 1.6 to 1.16 (names, defaults, units); older names from its release notes.
 """
 
 from collections.abc import Mapping
@@ -82,8 +82,18 @@ TABLE = (
     ROLL_FF, ROLL_P, ROLL_I, ROLL_IMAX, PITCH_FF, PITCH_P, PITCH_I, PITCH_IMAX, YAW_FF, YAW_P, YAW_I, YAW_IMAX,
 ) = range(len(TABLE))  # fmt: skip
 EAS2TAS = len(TABLE)  # ratio of true to equivalent airspeed [-]
+USES_L1 = len(TABLE) + 1  # 1: guidance by L1 instead of NPFG
+
+_NPFG_ONLY = (NPFG_TC, SWITCH, PERIOD_SF, LB_PERIOD)
+L1_TABLE = (
+    ParameterSpec("FW_L1_PERIOD", 20, 1, 1, 100),
+    ParameterSpec("FW_L1_DAMPING", 0.75, 1, 0.1, 1),
+    *(row for i, row in enumerate(TABLE) if i not in (PERIOD, DAMPING, *_NPFG_ONLY)),
+)
+"""Parameters with guidance by L1: period and damping of its own, none of NPFG."""
 
 NAMES = tuple(row.name for row in TABLE)
+L1_NAMES = tuple(row.name for row in L1_TABLE)
 DEFAULTS: dict[str, float] = {row.name: float(row.default) for row in TABLE}
 _CONSISTENT_GROUPS = (  # lower limit, upper limit, value: all reset to defaults if inconsistent
     (VA_MIN, VA_MAX, VA_CRUISE),
@@ -92,7 +102,7 @@ _CONSISTENT_GROUPS = (  # lower limit, upper limit, value: all reset to defaults
 
 
 def parameters(values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Convert autopilot parameters to the vector for the kernels.
+    """Convert autopilot parameters to the vector for the kernels, with guidance by NPFG.
 
     Args:
         values: parameters in the names (current or older) and units of the autopilot
@@ -101,21 +111,37 @@ def parameters(values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np
         par: SI and rad, throttles 0..1, no wind, (N_PAR,)
         absent: names that are missing, not finite or out of range; `par` contains their defaults
     """
+    return _vector(TABLE, values, altitude_m, uses_l1=False)
+
+
+def l1_parameters(values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Convert autopilot parameters to the vector for the kernels, with guidance by L1; see `parameters`."""
+    slots = [i for i in range(len(TABLE)) if i not in _NPFG_ONLY]
+    rows = list(TABLE)
+    for i, row in zip(slots, L1_TABLE, strict=True):
+        rows[i] = row
+    par, absent = _vector(tuple(rows), values, altitude_m, uses_l1=True)
+    return par, tuple(name for name in absent if name in L1_NAMES)
+
+
+def _vector(
+    rows: tuple[ParameterSpec, ...], values: Mapping[str, float], altitude_m: float, *, uses_l1: bool
+) -> tuple[np.ndarray, tuple[str, ...]]:
     inputs = {name: float(value) for name, value in values.items()}
-    matches = [lookup(row, inputs) for row in TABLE]
-    absent = [row.name for row, value in zip(TABLE, matches, strict=True) if value is None]
-    values_si = np.array(
-        [(row.default if v is None else v) * row.factor for row, v in zip(TABLE, matches, strict=True)]
-    )
+    matches = [lookup(row, inputs) for row in rows]
+    absent = [row.name for row, value in zip(rows, matches, strict=True) if value is None]
+    values_si = np.array([(row.default if v is None else v) * row.factor for row, v in zip(rows, matches, strict=True)])
     for group in _CONSISTENT_GROUPS:
         if not values_si[group[0]] < values_si[group[1]]:
-            values_si[list(group)] = [TABLE[i].default * TABLE[i].factor for i in group]
-            absent += [TABLE[i].name for i in group]
-    return padded(np.append(values_si, eas2tas(altitude_m)), PX4), tuple(dict.fromkeys(absent))
+            values_si[list(group)] = [rows[i].default * rows[i].factor for i in group]
+            absent += [rows[i].name for i in group]
+    par = np.concatenate([values_si, [eas2tas(altitude_m), float(uses_l1)]])
+    return padded(par, PX4), tuple(dict.fromkeys(absent))
 
 
 MIN_DISTANCE = 10  # minimum distance to the waypoint so far, -1 before [m]
 PHI = 12  # roll demand, slew-limited [rad]
+ON_CIRCLE = 13  # L1: 1 on a circle, 0 approaching its centre
 H_REF, H_DOT_REF = 25, 26  # height reference, up positive [m], and its rate [m/s]
 STE_DOT = 31  # filtered total energy rate [m2/s3]
 I_THETA = 33  # pitch integrator [rad]

@@ -1,4 +1,4 @@
-"""Path, leg sequencing and height demand of PX4; lateral guidance by NPFG.
+"""Path, leg sequencing and height demand of PX4; lateral guidance by NPFG, or by L1 before PX4 1.13.
 
 A waypoint is reached within the switch distance and the height tolerance; a missed waypoint is approached again.
 Source: PX4 navigator (mission items) and its fixed-wing mode manager (lines, circles, first-order altitude hold).
@@ -11,6 +11,7 @@ import numpy as np
 from fleet.autopilots import control_law as S
 from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.control_law import W_E, W_N, angle_to, clip, kernel
+from fleet.autopilots.px4_fixedwing import l1
 from fleet.autopilots.px4_fixedwing import params as P
 from fleet.autopilots.px4_fixedwing import params as X
 from fleet.frames import G, wrap
@@ -95,8 +96,18 @@ def steer(
     if kind in (WAYPOINT, LAND):
         return _along_line(par, ctl, leg, p, v, psi, V, reach, radius)
     _update_circle(ctl, par, leg, p, radius, reach, dt)
+    return _follow_circle(ctl, par, leg, p, v, psi, V, radius), _circle_done(ctl, legs, i, p, v)
+
+
+@kernel
+def _follow_circle(
+    ctl: np.ndarray, par: np.ndarray, leg: np.ndarray, p: np.ndarray, v: np.ndarray, psi: float, V: float, radius: float
+) -> float:
+    """Return the lateral acceleration to follow a circle, right positive [m/s2]."""
+    if par[P.USES_L1] > 0.0:
+        return l1.follow_circle(ctl, par, leg, p, v, radius)
     t_n, t_e, e, kappa = _circle(leg, p, radius)
-    return follow(par, t_n, t_e, e, kappa, v, psi, V), _circle_done(ctl, legs, i, p, v)
+    return follow(par, t_n, t_e, e, kappa, v, psi, V)
 
 
 @kernel
@@ -117,10 +128,11 @@ def _along_line(
     elif alt_error < par[P.ALT_RAD]:
         ctl[S.CIRCLING] = 0.0
     if ctl[S.CIRCLING] > 0.0:
-        t_n, t_e, e, kappa = _circle(leg, p, radius)
-        return follow(par, t_n, t_e, e, kappa, v, psi, V), False
+        return _follow_circle(ctl, par, leg, p, v, psi, V, radius), False
     t_n, t_e, e = _line(ctl, leg, p, reach)
     leg_done = waypoint and to_go <= max(reach, leg[ACCEPT_RADIUS]) and alt_error <= par[P.ALT_RAD]
+    if par[P.USES_L1] > 0.0:
+        return l1.follow_line(par, t_n, t_e, e, v), leg_done
     return follow(par, t_n, t_e, e, 0.0, v, psi, V), leg_done
 
 
@@ -202,7 +214,8 @@ def error_bound(par: np.ndarray, speed: float) -> float:
 @kernel
 def switch_distance(par: np.ndarray, speed: float) -> float:
     """Return the distance to a waypoint at which the next leg starts [m]."""
-    return max(min(par[P.SWITCH] * error_bound(par, speed), _MAX_SWITCH_DISTANCE), par[P.ACC_RAD])
+    reach = l1.distance(par, speed) if par[P.USES_L1] > 0.0 else par[P.SWITCH] * error_bound(par, speed)
+    return max(min(reach, _MAX_SWITCH_DISTANCE), par[P.ACC_RAD])
 
 
 @kernel

@@ -137,19 +137,21 @@ def _tecs_errors(altitude_sp: str, airspeed_sp: str, airspeed: str) -> Columns:
 _ERRORS_1_11 = _tecs_errors("altitude_sp", "true_airspeed_sp", "true_airspeed_filtered")
 _ERRORS_1_8 = _tecs_errors("altitude_sp", "airspeed_sp", "airspeed_filtered")
 _ERRORS_1_6 = _tecs_errors("altitudeSp", "airspeedSp", "airspeed_filtered")
-_COMMAND_SOURCES: tuple[tuple[Columns, str, Columns], ...] = (  # roll and pitch, path topic, errors
+_COMMAND_SOURCES: tuple[tuple[Columns, str, Columns], ...] = (  # roll and pitch, path topic or none, errors
     (_setpoint_euler, "position_controller_status", _estimator_errors),  # 1.16 has no roll_body
     (_setpoint_angles, "position_controller_status", _estimator_errors),  # 1.14, 1.15: TECS logs no altitude
     (_setpoint_angles, "position_controller_status", _ERRORS_1_11),  # 1.11 to 1.13
     (_setpoint_angles, "position_controller_status", _ERRORS_1_8),  # 1.9, 1.10
     (_setpoint_angles, "fw_pos_ctrl_status", _ERRORS_1_8),  # 1.8
     (_setpoint_angles, "fw_pos_ctrl_status", _ERRORS_1_6),  # 1.6, 1.7
+    *((_setpoint_angles, "", errors) for errors in (_ERRORS_1_11, _ERRORS_1_8, _ERRORS_1_6)),  # path topic not logged
 )
 
 
 def _command_row(attitude: Columns, path: str, errors: Columns, rank: int) -> FieldSource:
     def columns(m: Any) -> tuple[Any, ...]:
-        return (*attitude(m), m.interpolated(path).xtrack_error, *errors(m))
+        xtrack_error = m.interpolated(path).xtrack_error if path else np.full(len(m), np.nan)
+        return (*attitude(m), xtrack_error, *errors(m))
 
     return FieldSource("vehicle_attitude_setpoint", "command", columns, rank=rank)
 

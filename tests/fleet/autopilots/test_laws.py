@@ -11,6 +11,7 @@ from fleet import mission as m
 from fleet.autopilots import arduplane, laws
 from fleet.autopilots import control_law as S
 from fleet.autopilots import control_law as parameter_vector
+from fleet.autopilots.px4_fixedwing import l1
 from fleet.autopilots.px4_fixedwing import params as P
 from fleet.autopilots.px4_fixedwing import path as npfg
 from fleet.autopilots.shadow import replay_controller
@@ -21,9 +22,10 @@ from tests.support.point_mass import HERE, PLANE, TRIM_ALPHA, Plane, begin, fly,
 OURS = {  # what a plane of 20 m/s needs of each law
     "arduplane": PLANE,
     "px4": {"FW_AIRSPD_TRIM": 20, "FW_AIRSPD_MIN": 12, "FW_AIRSPD_MAX": 28, "FW_THR_TRIM": 0.5},
+    "px4_l1": {"FW_AIRSPD_TRIM": 20, "FW_AIRSPD_MIN": 12, "FW_AIRSPD_MAX": 28, "FW_THR_TRIM": 0.5, "FW_L1_PERIOD": 15},
     "textbook": {"Va_c": 20},
 }
-NEW = ("px4", "textbook")
+NEW = ("px4", "px4_l1", "textbook")
 
 
 def par_of(law, wind=(0.0, 0.0), **more):
@@ -121,6 +123,25 @@ def test_npfg_looks_ahead_as_its_equations_say():
     assert npfg.period(slow) == pytest.approx(pi * 0.5 / 0.7071 * 1.5)
 
 
+def test_l1_of_px4_flies_straight_on_against_the_direction_of_a_circle_and_towards_a_far_one():
+    legs, par = route(leg(m.LOITER_UNLIMITED, radius=100.0)), par_of("px4_l1")
+    omega, zeta = 2 * pi / 15, 0.75
+    east = np.array([0.0, 18.0, 0.0])
+
+    def a_lat(p, v, on_circle):
+        ctl = np.zeros(S.N_CTL)
+        ctl[P.ON_CIRCLE] = on_circle
+        return l1.follow_circle(ctl, par, legs[0], np.array([*p, -100.0]), v, 100.0), ctl[P.ON_CIRCLE]
+
+    inside, outside = 90.0 * omega**2, 18.0**2 / 110
+    assert a_lat((110.0, 0.0), east, 1.0)[0] == pytest.approx(10 * omega**2 + outside)  # the right way round, 10 m out
+    assert a_lat((10.0, 0.0), east, 1.0)[0] == pytest.approx(-inside + 18.0**2 / 50)
+    assert a_lat((10.0, 0.0), -east, 1.0)[0] == pytest.approx(18.0**2 / 50)  # the wrong way: no turn inwards
+    assert a_lat((10.0, 0.0), -east, 0.0)[0] == pytest.approx(-inside + 18.0**2 / 50)
+    far, on_circle = a_lat((-500.0, 0.0), east, 1.0)  # the centre is abeam on the left
+    assert far == pytest.approx(-4 * zeta**2 * 18.0**2 / (zeta * 15 * 18.0 / pi)) and on_circle == 0.0
+
+
 def test_npfg_crabs_into_the_wind_it_believes_in_and_gives_up_into_a_storm():
     v = np.array([20.0, 0.0, 0.0])
     crabbing = npfg.follow(par_of("px4", (0.0, 5.0)), 1.0, 0.0, 0.0, 0.0, v, 0.0, 20.0)
@@ -134,9 +155,9 @@ def test_npfg_crabs_into_the_wind_it_believes_in_and_gives_up_into_a_storm():
 def test_phi_is_limited(law):
     plane = Plane((0.0, 500.0, -100.0), psi=pi / 2)
     rows, _ = fly(route(leg(n=3000.0)), plane, 20, par_of(law), start=(0, 0, -100))
-    most = radians(50) if law == "px4" else T.DEFAULTS["phi_max"]
+    most = radians(50) if law in ("px4", "px4_l1") else T.DEFAULTS["phi_max"]
     assert abs(rows[:, 11]).max() == pytest.approx(most)
-    if law == "px4":
+    if law in ("px4", "px4_l1"):
         assert abs(np.diff(rows[:, 11])).max() <= radians(90) * 0.1 + 1e-9  # FW_PN_R_SLEW_MAX
 
 

@@ -37,6 +37,18 @@ def test_a_circle_tells_the_heading_bias():
     assert flown(120.0, bias=0.08).heading_bias == pytest.approx(0.08, abs=0.015)
 
 
+def test_a_drifting_heading_is_no_wind():
+    filt, reported = WindFilter(), []
+    rng = np.random.default_rng(3)
+    for k in range(600):
+        psi, drift = RATE * k / 5, 0.008 * max(k / 5 - 60.0, 0.0)  # 27 deg in a minute
+        air = VA * np.array([cos(psi), sin(psi)])
+        filt.update(k / 5, np.array([*(air + WIND + 0.5 * rng.standard_normal(2)), 0.0]), VA, psi - drift)
+        reported.append(filt.wind[:2])
+    assert np.abs(np.array(reported)[400:] - WIND).max() < 1.0
+    assert filt.heading_bias == pytest.approx(0.48, abs=0.06)
+
+
 def test_doubt_shrinks_with_turns_only():
     straight, circle = flown(60.0, rate=0.0), flown(60.0)
     assert circle.sigma < 0.7 * straight.sigma < WindFilter().sigma

@@ -11,12 +11,13 @@ from tests.support.flights import HERE, remembered
 from tests.support.point_mass import PLANE, Plane, begin, fly, leg, route
 from twin_worker.estimation.wind_filter import WindFilter
 from twin_worker.prediction import autopilot_identification as learning
-from twin_worker.prediction.autopilot_identification import AutopilotEstimate, identify_autopilot
+from twin_worker.prediction.autopilot_identification import AutopilotEstimate, identify_autopilot, law_in_force
 from twin_worker.prediction.replay_window import AutopilotConfig, PredictionContext, ReplayWindow
 
 OURS = {
     "arduplane": PLANE | {"NAVL1_PERIOD": 15},
     "px4": {"FW_AIRSPD_TRIM": 20, "FW_AIRSPD_MIN": 12, "FW_AIRSPD_MAX": 28, "FW_THR_TRIM": 0.5, "NPFG_PERIOD": 12},
+    "px4_l1": {"FW_AIRSPD_TRIM": 20, "FW_AIRSPD_MIN": 12, "FW_AIRSPD_MAX": 28, "FW_THR_TRIM": 0.5, "FW_L1_PERIOD": 16},
     "textbook": {"Va_c": 20.0, "k_path": 0.03},
 }
 LAP = [(700.0, 0.0), (700.0, 500.0), (0.0, 500.0), (0.0, 0.0), (700.0, 0.0), (700.0, 900.0)]
@@ -53,7 +54,7 @@ def learn(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize("with_params", [True, False])
-@pytest.mark.parametrize("law", tuple(laws.LAWS))
+@pytest.mark.parametrize("law", ["arduplane", "px4", "textbook"])
 def test_a_stranger_is_given_the_law_that_asks_for_its_banks(learn, law, with_params):
     found = learn(flown(law), "generic", OURS[law] if with_params else {})
     assert found.law == law
@@ -73,6 +74,30 @@ def test_parameters_not_received_are_read_off_the_flight(learn):
 def test_an_autopilot_that_says_what_it_is_flies_its_own_law(learn, autopilot, law):
     found = learn(flown("textbook"), autopilot, OURS[law])  # whatever it did
     assert (found.law, found.reason) == (law, "")
+
+
+@pytest.mark.parametrize("law", ["px4", "px4_l1"])
+def test_without_parameters_the_banks_tell_the_release_of_px4(learn, law):
+    found = learn(flown(law), "px4", {})
+    period = next(name for name in OURS[law] if name.endswith("PERIOD"))
+    assert found.law == law
+    assert found.values[period] == pytest.approx(OURS[law][period], abs=2)
+    assert law_in_force("px4", {}, found.law) == law
+
+
+@pytest.mark.parametrize(
+    ("params", "law"),
+    [
+        ({"FW_L1_PERIOD": 18.0}, "px4_l1"),
+        ({"NPFG_PERIOD": 10.0}, "px4"),
+        ({"NPFG_PERIOD": 10.0, "FW_L1_PERIOD": 18.0}, "px4"),
+        ({"NPFG_PERIOD": 10.0, "FW_L1_PERIOD": 18.0, "FW_USE_NPFG": 0.0}, "px4_l1"),
+        ({}, "px4"),
+    ],
+)
+def test_received_parameters_tell_the_release_of_px4(learn, params, law):
+    assert law_in_force("px4", params, "") == law
+    assert learn(flown("px4", banks=lambda t: np.full(len(t), np.nan)), "px4", params).law == law
 
 
 def test_banks_that_no_law_asks_for_leave_none(learn):

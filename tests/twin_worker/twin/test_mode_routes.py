@@ -6,9 +6,12 @@ import msgspec
 import numpy as np
 import pytest
 
+from fleet.autopilots.control_law import eas2tas
 from fleet.contract import Event, Prediction, TwinState
 from fleet.frames import to_geodetic, to_ned
+from fleet.mission import RADIUS
 from tests.support.flights import ROUTE, drive, predictions, sample, status
+from twin_worker.twin.state.routes import identified_radius, present_route
 from twin_worker.twin.step import Twin, advance
 
 MODELS = (*ROUTE, "greybox")
@@ -70,6 +73,25 @@ def test_guided_flies_to_each_new_target(winged):
         assert (results[-1].event is Event.TARGET) == (k > 1)
         late = path[ahead >= 150]
         assert np.linalg.norm(late[:, :2] - target[:2], axis=1) == pytest.approx(radius_of(winged), abs=40.0)
+
+
+@pytest.mark.parametrize("bank", [-0.4, 0.4])
+def test_the_crosstrack_error_of_a_guided_circle_tells_its_radius(winged, bank):
+    origin, start = winged.telemetry.origin, winged.telemetry.history.newest + 0.2
+    entered(winged, "GUIDED")
+    assert np.isnan(identified_radius(winged))
+    target = np.array([400.0, 100.0, -140.0])
+    t = start + 0.2 * np.arange(60)
+    r, angle = 75.0 + 20.0 * np.sin(0.1 * (t - start)), 0.3 * np.sign(bank) * (t - start)
+    p = target + np.column_stack([r * np.cos(angle), r * np.sin(angle), 0.0 * t])
+    commands = np.column_stack([np.full(60, bank), 0.0 * t, r - 70.0, 0.0 * t, 0.0 * t])
+    centre = np.repeat(to_geodetic(origin, target)[None], 60, axis=0)
+    rows = {"target": (t, centre), "position": (t, to_geodetic(origin, p)), "command": (t, commands)}
+    advance(winged, (sample(1, t[-1], **rows),))
+    widened = eas2tas(float(centre[0, 2]) * 1e-3) ** 2
+    assert identified_radius(winged) == pytest.approx(np.sign(bank) * 70.0 / widened, abs=0.5)
+    (circle,) = present_route(winged).legs
+    assert circle[RADIUS] == identified_radius(winged)
 
 
 def test_cruise_keeps_its_course(winged):

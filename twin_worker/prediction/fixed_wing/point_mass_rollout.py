@@ -10,6 +10,7 @@ from twin_worker.estimation.wind_filter import DRIFT, DRIFT_S, GUST, GUST_S
 from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel, airspeed_of
 from twin_worker.prediction.closed_loop import InitialCondition, sample_rollout
 from twin_worker.prediction.replay_window import PredictionContext, Rollout
+from twin_worker.telemetry.velocity import present_velocity
 
 _AIRSPEED_ROWS = 8  # rows of 0.1 s in the mean airspeed at the start
 _WINDOW_ROWS = 60  # rows of the window that they use
@@ -63,7 +64,7 @@ def unexplained_velocity(start: np.ndarray, air: np.ndarray, v: np.ndarray) -> n
 
 def ground_velocity(window: Window) -> np.ndarray:
     """Return the newest ground velocity, north and east, (2,) [m/s]."""
-    return window.v[-_GROUND_ROWS:, :2].mean(axis=0)
+    return present_velocity(window.p, window.v, window.dt, _GROUND_ROWS)[:2]
 
 
 def start_and_air(context: PredictionContext, window: Window) -> tuple[np.ndarray, np.ndarray]:

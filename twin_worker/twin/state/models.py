@@ -164,6 +164,12 @@ class VerifiedModel(msgspec.Struct):
         return (True, -self.t) if np.isnan(error) else (False, error)
 
 
+def _smoothed(before: float, error: float) -> float:
+    if not np.isfinite(error):
+        return before
+    return before + _NEWEST_WEIGHT * (error - before) if np.isfinite(before) else error
+
+
 class ModelBank(msgspec.Struct):
     """Every model that may predict.
 
@@ -175,6 +181,7 @@ class ModelBank(msgspec.Struct):
         point_mass: verified point-mass model; None before any
         point_mass_warm_start: newest, verified or not
         point_mass_holdout_error: end error over held-out flight, of the path length [-]
+        active_holdout_error: the same of the active model, where the point mass was above the limit [-]
         point_mass_timer: of its identification
         holdout_timer: of rollouts over held-out flight
         active_effect: missing physics that was added to the models
@@ -189,6 +196,7 @@ class ModelBank(msgspec.Struct):
     point_mass: PointMassModel | None = None
     point_mass_warm_start: PointMassModel | None = None
     point_mass_holdout_error: float = float("nan")
+    active_holdout_error: float = float("nan")
     point_mass_timer: Timer = msgspec.field(default_factory=Timer)
     holdout_timer: Timer = msgspec.field(default_factory=Timer)
     active_effect: ActiveEffects | None = None
@@ -222,11 +230,19 @@ class ModelBank(msgspec.Struct):
         self.point_mass, self.point_mass_warm_start = other.point_mass, other.point_mass_warm_start
         self.active_effect = effect
 
-    def update_holdout_error(self, error: float) -> None:
-        """Include the error of one more rollout of the point mass [-]; nan changes nothing."""
-        if np.isfinite(error):
-            before = self.point_mass_holdout_error if np.isfinite(self.point_mass_holdout_error) else error
-            self.point_mass_holdout_error = before + _NEWEST_WEIGHT * (error - before)
+    def update_holdout_errors(self, point_mass: float, active: float) -> None:
+        """Include the errors of one more rollout of the point mass and of the active model [-]; nan changes nothing."""
+        self.point_mass_holdout_error = _smoothed(self.point_mass_holdout_error, point_mass)
+        self.active_holdout_error = _smoothed(self.active_holdout_error, active)
+
+    @property
+    def average_is_better(self) -> bool:
+        """Return whether the mean of both models has a smaller error than the point mass; true where unknown.
+
+        The mean of two independent errors, squares e1 and e2, is (e1 + e2) / 4: smaller than e1 where e2 < 3 e1.
+        Source: Bates & Granger 1969, "The combination of forecasts".
+        """
+        return not self.active_holdout_error**2 > 3.0 * self.point_mass_holdout_error**2
 
     def store_point_mass(self, model: PointMassModel, *, verified: bool) -> None:
         """Store the newest point-mass model; it predicts where it is verified."""

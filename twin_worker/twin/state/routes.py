@@ -1,11 +1,13 @@
 """Routes that no mission describes: of the present mode, and of the failsafe after a link loss."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import atan2, isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fleet.autopilots.control_law import eas2tas
 from fleet.autopilots.failsafe import link_loss_steps
 from fleet.autopilots.modes import (
     HEADING_HOLD_MODES,
@@ -18,7 +20,7 @@ from fleet.autopilots.modes import (
 )
 from fleet.contract import Event
 from fleet.frames import Origin, to_geodetic, to_ned
-from fleet.mission import FIRST_ITEM, Route, unroll_route
+from fleet.mission import FIRST_ITEM, KIND, LOITER_UNLIMITED, RADIUS, Route, unroll_route
 from twin_worker.prediction.autopilot_identification import LAW_OF_AUTOPILOT
 from twin_worker.prediction.failsafe_route import FailsafePlan
 from twin_worker.prediction.multirotor.rollout import item_in_force
@@ -30,6 +32,8 @@ if TYPE_CHECKING:
 ROUTE_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
 _MAX_ENTRY_AGE_S = 2.0  # maximum age of the position where a mode was entered [s]
 _TARGET_MOVED_M = 2.0  # a guidance target that moves further is a new one [m]
+_RADIUS_S, _MIN_RADIUS_ROWS = 20.0, 10  # newest flight, and reports in it, that tell the radius of a circle [s]
+_MIN_RADIUS, _RADIUS_SPREAD = 10.0, 0.1  # smallest radius [m], and largest median deviation from it [-]
 _FAILSAFE_PARAMETERS = {"arduplane": ("FS_LONG_ACTN", "FS_GCS_ENABL"), "px4": ("NAV_DLL_ACT",)}
 
 
@@ -49,8 +53,40 @@ def present_route(twin: "Twin") -> Route | None:
         situation = _course_hold(twin, entered) if twin.mode in HEADING_HOLD_MODES else entered
         route = None if situation is None else mode_route(law, twin.mode, situation, twin.received_params)
         if route is not None:
-            return route
+            return _with_radius(route, identified_radius(twin))
     return _manual_until_failsafe(twin, law)
+
+
+def _with_radius(route: Route, radius: float) -> Route:
+    """Return the route with a radius [m] for circles that have none of their own; nan: unchanged."""
+    if not isfinite(radius):
+        return route
+    legs = route.legs.copy()
+    legs[(legs[:, KIND] == LOITER_UNLIMITED) & (legs[:, RADIUS] == 0.0), RADIUS] = radius
+    return replace(route, legs=legs)
+
+
+def identified_radius(twin: "Twin") -> float:
+    """Return the radius of the circle that ArduPlane flies about its target, positive clockwise; nan: unknown [m].
+
+    The reported crosstrack error is the distance to the target minus the radius, which grows with the square of true
+    over equivalent airspeed. The sign is that of the commanded banks.
+    """
+    target, entry, newest = twin.onboard.target, twin.onboard.entry, twin.telemetry.history.newest
+    if twin.mode not in TARGET_MODES or twin.autopilot != "ardupilot" or target is None or entry is None:
+        return float("nan")
+    assert twin.telemetry.origin is not None
+    t, commands = twin.telemetry.history.rows_since("command", max(newest - _RADIUS_S, entry.t))
+    t_p, positions = twin.telemetry.history.rows_since("position", newest - _RADIUS_S - 1.0)
+    if len(t) < _MIN_RADIUS_ROWS or len(t_p) < 2 or not np.isfinite(commands[:, 2]).all():
+        return float("nan")
+    offset = to_ned(twin.telemetry.origin, *positions.T)[:, :2] - _ned(twin.telemetry.origin, target)[:2]
+    radius = np.interp(t, t_p, np.linalg.norm(offset, axis=1)) - commands[:, 2]
+    middle = float(np.median(radius))
+    if middle < _MIN_RADIUS or np.median(np.abs(radius - middle)) > _RADIUS_SPREAD * middle:  # no circle about it
+        return float("nan")
+    widened = eas2tas(target[2] * 1e-3) ** 2
+    return float(np.copysign(middle / widened, np.median(commands[:, 0])))
 
 
 def _course_hold(twin: "Twin", situation: ModeSituation) -> ModeSituation | None:

@@ -23,7 +23,7 @@ from fleet.frames import Origin
 from fleet.mission import FIRST_ITEM, extends, route_items
 from fleet.vehicles import UNKNOWN, VehicleClass, vehicle_class
 from fleet.window import Window
-from twin_worker.prediction.autopilot_identification import LAW_OF_AUTOPILOT
+from twin_worker.prediction.autopilot_identification import law_in_force
 from twin_worker.prediction.replay_window import AutopilotConfig, PredictionContext
 from twin_worker.twin.state.budget import ComputeBudget, Schedule, Work
 from twin_worker.twin.state.events import invalidate_prediction
@@ -169,7 +169,7 @@ class Twin(msgspec.Struct):
         """Return the initial data of a prediction from the end of `window`."""
         assert self.telemetry.origin is not None
         items = route_items(self.onboard.mission)
-        law = LAW_OF_AUTOPILOT.get(self.autopilot, self.environment.autopilot.law)
+        law = law_in_force(self.autopilot, self.received_params, self.environment.autopilot.law)
         autopilot_config = AutopilotConfig(
             items,
             self.received_params,

@@ -17,6 +17,12 @@ from twin_worker.twin.state.state import Twin
 
 _FIT_WINDOW_S = 130.0  # flight time used to fit the kinematic models [s]
 _VTOL_COMMANDS = (84, 85)  # MAV_CMD: NAV_VTOL_TAKEOFF, NAV_VTOL_LAND
+_WIND_MAX_AGE_S = 10.0  # maximum age of the autopilot's wind estimate [s]
+_TURN_NAMES = {  # parameters of L1 with other autopilots, by their names with ArduPlane
+    "NAVL1_PERIOD": ("NAVL1_PERIOD", "FW_L1_PERIOD"),
+    "NAVL1_DAMPING": ("NAVL1_DAMPING", "FW_L1_DAMPING"),
+    "ROLL_LIMIT_DEG": ("ROLL_LIMIT_DEG", "FW_R_LIM"),
+}
 _VELOCITY_ROWS = 11  # rows used for a multirotor's velocity and acceleration
 _MANUAL_AFTER_S = 6.0  # a multirotor in a hold mode that still moves after this time is under manual control [s]
 
@@ -105,7 +111,7 @@ def _multirotor_config(twin: Twin, recent: Track, override: RouteOverride | None
 def _fixed_wing_config(twin: Twin) -> kinematic.KinematicConfig:
     assert twin.telemetry.origin is not None
     items = route_items(twin.onboard.mission)
-    wind = twin.environment.wind.wind if np.isfinite(twin.environment.wind.t) else None
+    wind = twin.environment.wind.wind if np.isfinite(twin.environment.wind.t) else _reported_wind(twin)
     return kinematic.KinematicConfig(
         items,
         twin.received_params,
@@ -118,7 +124,24 @@ def _fixed_wing_config(twin: Twin) -> kinematic.KinematicConfig:
         present_route(twin),
         twin.telemetry.history,
         failsafe_plan(twin),
+        _turn_parameters(twin),
     )
+
+
+def _reported_wind(twin: Twin) -> np.ndarray | None:
+    """Return the wind that the autopilot estimates, NED, (3,) [m/s]; None without a recent report."""
+    _, rows = twin.telemetry.history.rows_since("wind", twin.telemetry.history.newest - _WIND_MAX_AGE_S)
+    return np.array([*rows[-1, :2], 0.0]) if len(rows) else None
+
+
+def _turn_parameters(twin: Twin) -> dict[str, float]:
+    """Return what is known of L1 and the bank limit beside the parameters of ArduPlane, by their names there."""
+    known = twin.environment.autopilot.values | twin.received_params
+    return {
+        name: known[other]
+        for name, others in _TURN_NAMES.items()
+        if (other := next((other for other in others if other in known), None)) is not None
+    }
 
 
 def fit_kinematic_models(twin: Twin) -> None:

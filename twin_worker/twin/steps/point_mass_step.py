@@ -6,7 +6,7 @@ from fleet.window import Window
 from twin_worker.identification.fixed_wing.plant import PAPER
 from twin_worker.identification.fixed_wing.point_mass_model import FIT_WINDOW_S, MIN_FIT_S, identify
 from twin_worker.prediction.autopilot_identification import REPLAY_INTERVAL_S, identify_autopilot
-from twin_worker.prediction.closed_loop import synchronise_controller
+from twin_worker.prediction.closed_loop import fly_from, synchronise_controller
 from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_point_mass
 from twin_worker.prediction.replay_window import Rollout
 from twin_worker.twin.state.state import Twin
@@ -15,11 +15,14 @@ IDENTIFY_PERIOD_S = 5.0  # between identifications [s]
 _HOLD_OUT_S = 20.0  # newest flight, held out [s]
 _REPLACE_AFTER_S = 60.0  # flight after a fault onset before the model adapted by a diagnosis is replaced [s]
 _CHECK_PERIOD_S = 10.0  # between checks on held-out flight [s]
-_MAX_ERROR = 0.10  # maximum final error over path length for an active model [-]
+_MAX_ERROR = 0.10  # final error over path length below which the model predicts, and below that of the active one [-]
 
 
 def update_point_mass(twin: Twin) -> None:
-    """Identify the point-mass model if it is due; `twin.models.point_mass` is None until its error is low enough."""
+    """Identify the point-mass model if it is due; `twin.models.point_mass` is None until its error is low enough.
+
+    Low enough is an error below the limit, or below that of the active model over the same flight.
+    """
     newest = twin.telemetry.history.newest
     if twin.no_route_reason() or not twin.models.point_mass_timer.due(newest, IDENTIFY_PERIOD_S):
         return
@@ -34,10 +37,11 @@ def update_point_mass(twin: Twin) -> None:
     twin.models.point_mass_timer.restart(newest)
     if twin.models.holdout_timer.due(newest, _CHECK_PERIOD_S):
         twin.models.holdout_timer.restart(newest)
-        twin.models.update_holdout_error(_holdout_error(twin, unbroken))
+        twin.models.update_holdout_errors(*_holdout_errors(twin, unbroken))
     warm_start = twin.models.point_mass_warm_start
     model = identify(unbroken, twin.telemetry.history, twin.environment.wind.scale, warm_start)
-    twin.models.store_point_mass(model, verified=twin.models.point_mass_holdout_error < _MAX_ERROR)
+    limit = max(_MAX_ERROR, np.nan_to_num(twin.models.active_holdout_error))
+    twin.models.store_point_mass(model, verified=twin.models.point_mass_holdout_error < limit)
 
 
 def _unbroken_part(window: Window, since: float) -> Window:
@@ -46,17 +50,27 @@ def _unbroken_part(window: Window, since: float) -> Window:
     return window.part(int(gaps[-1]) + 1 if len(gaps) else 0, len(window))
 
 
-def _holdout_error(twin: Twin, window: Window) -> float:
-    """Return the final error of a rollout over held-out flight, divided by its path length [-]."""
+def _holdout_errors(twin: Twin, window: Window) -> tuple[float, float]:
+    """Return the final errors over held-out flight, divided by its path length [-]: of the point mass and of the
+    active model; nan: not known.
+    """
     n_held_out = int(_HOLD_OUT_S / window.dt)
     training = window.part(0, len(window) - n_held_out)
     situation = twin.situation(training)
     initial = synchronise_controller(situation)
     if isinstance(initial, Rollout):
-        return float("nan")
+        return float("nan"), float("nan")
     model = identify(training, twin.telemetry.history, twin.environment.wind.scale, twin.models.point_mass_warm_start)
-    rollout = fly_point_mass(situation, initial, model, np.array([0.0, _HOLD_OUT_S]))
-    if rollout.path is None:
-        return 1.0
+    ahead = np.array([0.0, _HOLD_OUT_S])
     path_length = float(np.linalg.norm(np.diff(window.p[-n_held_out:], axis=0), axis=1).sum())
-    return float(np.linalg.norm(rollout.path[-1] - window.p[-1])) / max(path_length, 1.0)
+
+    def error_of(rollout: Rollout) -> float:
+        if rollout.path is None:
+            return 1.0
+        return float(np.linalg.norm(rollout.path[-1] - window.p[-1])) / max(path_length, 1.0)
+
+    error = error_of(fly_point_mass(situation, initial, model, ahead))
+    active = twin.models.active_model
+    if active is None or error < _MAX_ERROR:  # then the active model does not matter
+        return error, float("nan")
+    return error, error_of(fly_from(initial, active, ahead))

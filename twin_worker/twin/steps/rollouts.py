@@ -111,7 +111,7 @@ def method_paths(
         if rollout.path is not None:
             path = _extend_path(rollout.path, by_method[HYBRID]) if by_method else rollout.path
             by_method = {**by_method, method(twin.models.active_model): path}
-    if len(by_method) > 1:
+    if len(by_method) > 1 and twin.models.average_is_better:
         by_method[BOTH] = 0.5 * (by_method[HYBRID] + by_method[method(twin.models.active_model)])  # type: ignore[arg-type]
     return by_method, reason
 

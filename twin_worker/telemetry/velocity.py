@@ -1,0 +1,36 @@
+"""Present ground velocity: reported, or from the positions where the reported one contradicts them."""
+
+import numpy as np
+
+_FIT_S = 1.0  # newest positions in the fit of a parabola [s]
+_COMPARED_S = 20.0  # flight over which both are compared [s]
+_CLEARLY = 0.7  # ratio of the errors below which the velocity from positions replaces the reported one [-]
+
+
+def present_velocity(p: np.ndarray, v: np.ndarray, dt: float, rows: int) -> np.ndarray:
+    """Return the ground velocity at the end of gap-free flight, NED, (3,) [m/s].
+
+    An estimator with a wrong attitude reports a velocity that is not the derivative of its positions. Both are compared
+    with the displacement over a second around each row.
+
+    Args:
+        p, v: positions and reported velocities, newest last, NED, (n, 3) [m, m/s]
+        dt: interval of the rows [s]
+        rows: newest rows in the mean of the reported velocity
+    """
+    n, half = round(_FIT_S / dt), round(0.5 / dt)
+    p, v = p[-round(_COMPARED_S / dt) :], v[-round(_COMPARED_S / dt) :]
+    reported = v[-rows:].mean(axis=0)
+    if len(p) < 4 * n or not np.isfinite(p).all():
+        return reported
+    ages = dt * np.arange(-n, 1)
+    slope = np.linalg.pinv(np.vander(ages, 3, increasing=True))[1]  # of the parabola at its end, by position
+    fitted = np.stack([np.convolve(column, slope[::-1], "valid") for column in p.T], axis=-1)  # from row n on
+    displaced = (p[2 * half :] - p[: -2 * half]) / (2 * half * dt)  # around row `half` and later
+    integral = np.vstack([np.zeros(3), np.cumsum(0.5 * dt * (v[1:] + v[:-1]), axis=0)])
+    mean_reported = (integral[2 * half :] - integral[: -2 * half]) / (2 * half * dt)
+    error_reported = np.linalg.norm((mean_reported - displaced)[:, :2], axis=1)
+    error_fitted = np.linalg.norm((fitted[:-half] - displaced[n - half :])[:, :2], axis=1)
+    if np.sqrt(np.mean(error_fitted**2)) < _CLEARLY * np.sqrt(np.mean(error_reported**2)):
+        return np.array([*fitted[-1, :2], reported[2]])
+    return reported
