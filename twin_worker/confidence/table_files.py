@@ -13,6 +13,7 @@ from twin_worker.confidence.calibration_table import ATOMS, KNOTS, CalibrationTa
 from twin_worker.numerics.prediction_errors import NOMINAL_COVERAGE
 
 ANY = "*"
+INCOMPLETE = "incomplete"
 _FAMILY = dict.fromkeys(("hybrid", "both", "dynamics"), "route")  # selected in flight; they share one ensemble
 _FAST_SPEED = 40.0  # usual speed above which a fixed wing forms a class of its own: well above small ones [m/s]
 
@@ -24,7 +25,7 @@ def group_name(method: str, law: str, airframe: str, parameters: str) -> str:
         method: as in `Prediction`
         law: controller twin, e.g. arduplane: L1 + TECS; only the part before the colon is used
         airframe: class of aircraft, from `airframe_class`
-        parameters: known, identified or absent
+        parameters: known, identified or absent; `INCOMPLETE` where mission items are missing
     """
     parts = (method, law.partition(":")[0], airframe, parameters)
     return "/".join(part.strip().replace("/", " ") or "none" for part in parts)
@@ -87,6 +88,8 @@ class TableSet:
     def choose(self, group: str) -> tuple[CalibrationTable, str]:
         """Return the narrowest table for a group, and a description of it."""
         method = group.partition("/")[0]
+        if group.endswith(f"/{INCOMPLETE}"):  # every table is fitted to flights whose route is known
+            return default_table("greybox"), f"{UNCALIBRATED}: mission items are missing, the default is used"
         for name in group_chain(group):
             if (table := self.by_group.get(name)) is not None:
                 fallback = "" if name == group else f", none for {group}"

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 
 from fleet.contract import EVENT_TEXTS, Array, Controller, Event, Message, Outcome, Prediction, TwinState
-from twin_worker.confidence.table_files import airframe_class, group_name
+from twin_worker.confidence.table_files import INCOMPLETE, airframe_class, group_name
 from twin_worker.confidence.tube_and_horizon import AHEAD, NOMINAL_COVERAGE, Confidence, PointForecast
 from twin_worker.identification.fixed_wing.plant import DYNAMICS
 from twin_worker.prediction.autopilot_parameters import IDENTIFIED, ControllerTwin
@@ -215,6 +215,9 @@ def _group(twin: Twin, path_forecast: PathForecast, recent: Track) -> str:
     provenance = "known"
     if control is not None and len(control.default_names) > _MAX_ABSENT:
         provenance = "identified" if IDENTIFIED in control.provenance.values() else "absent"
+    mission = twin.onboard.mission
+    if path_forecast.method != "imm" and mission is not None and mission.items and not mission.complete:
+        provenance = INCOMPLETE
     return group_name(
         path_forecast.method, path_forecast.law, airframe_class(twin.vehicle, _median_speed(recent.v)), provenance
     )
