@@ -101,9 +101,10 @@ class OwnershipProtocol:
                 self.state.record(uav, FencingToken(stamp.epoch, f"{stamp.writer:016x}"))
 
     def claim(self, *, with_highest: bool = False) -> Claim:
-        """Return this worker's claim; `with_highest` adds the highest known claims of others."""
+        """Return this worker's claim with the highest known claims of others: all, or those above announced ones."""
         with self._lock:
-            highest = ((uav, *rank) for uav, rank in self.state.highest.items()) if with_highest else ()
+            known = self.state.highest if with_highest else self.state.superseding_claims()
+            highest = ((uav, *rank) for uav, rank in known.items())
             not_publishing = self._store.not_publishing
             owned = tuple((uav, epoch) for uav, epoch in self.state.owned.items() if uav not in not_publishing)
             return Claim(

@@ -119,6 +119,7 @@ class OwnershipState:
         self.known: set[int] = set()  # ids in range that were seen
         self.leaving = False
         self.unsynchronised = True
+        self._superseded: set[int] = set()  # ids that a live worker claims below the claim of one that is gone
         self.receiving = False  # anything received since the last tick
         self._received_t = float("-inf")  # tick of the last reception
         self._silence: dict[str, float] = {}  # of each peer [s]
@@ -153,10 +154,21 @@ class OwnershipState:
         for uav, epoch in claimed.items():
             token = FencingToken(epoch, worker)
             self.record(uav, token)
+            if uav in self.highest and token < self.highest[uav] and not self.is_live(self.highest[uav].worker):
+                self._superseded.add(uav)
             if uav in self.owned and worker != self.worker_id and token > FencingToken(self.owned[uav], self.worker_id):
                 del self.owned[uav]
                 lost.append(uav)
         return lost
+
+    def superseding_claims(self) -> dict[int, FencingToken]:
+        """Return the claims that readers still prefer to those announced since the last call, by UAV id.
+
+        A worker that was disconnected may have missed the last claim of one that is gone; it then claims anew.
+        """
+        claims = {uav: self.highest[uav] for uav in self._superseded if uav in self.highest}
+        self._superseded.clear()
+        return claims
 
     def record(self, uav: int, token: FencingToken) -> None:
         """Record a claim of another worker, e.g. from its results; owned aircraft stay owned."""

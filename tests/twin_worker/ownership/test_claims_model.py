@@ -245,10 +245,17 @@ class Fleet(RuleBasedStateMachine):
             self._take(node, uav)
         if plan.acquire or self.now - node.said >= ANNOUNCE_S:
             node.said = self.now
-            held, leaving = dict(claims.owned), claims.leaving
+            held, leaving, known = dict(claims.owned), claims.leaving, claims.superseding_claims()
             for other in self.nodes.values():
                 if other is not node:
-                    self._send(other, lambda o=other: o.claims.on_claim(claims.worker_id, held, leaving))
+                    self._send(other, lambda o=other: self._hear(o, claims.worker_id, held, leaving, known))
+
+    def _hear(
+        self, node: Node, worker: str, held: dict[int, int], leaving: bool, known: dict[int, FencingToken]
+    ) -> None:
+        node.claims.on_claim(worker, held, leaving)
+        for uav, rank in known.items():
+            node.claims.record(uav, rank)
 
     def _synchronise(self, node: Node) -> None:
         for other in self.nodes.values():
