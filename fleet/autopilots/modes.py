@@ -8,7 +8,7 @@ ArduPlane                                         PX4 fixed wing
     GUIDED    circle about the commanded point        TAKEOFF  circle at the end of the take-off
     TAKEOFF   circle at the end of the take-off
     CIRCLE    a third of the bank limit
-    CRUISE    the course and height of the entry
+    CRUISE    the height of the entry; the course 0.5 s after it, once the wings are level
 
 A reported guidance target (POSITION_TARGET_GLOBAL_INT) replaces the assumed centre. Assumptions: home is no rally
 point, no terrain is followed, RTL_CLIMB_MIN is 0, and the pilot does not move the sticks.
@@ -58,11 +58,13 @@ class ModeEntry(msgspec.Struct, frozen=True):
         t: time [s since 1970]
         position: latitude, longitude, height above mean sea level [1e-7 deg, 1e-7 deg, mm]
         course: over ground [rad]
+        locked: position and course are those that a heading-hold mode has locked
     """
 
     t: float
     position: tuple[float, float, float]
     course: float
+    locked: bool = False
 
     def ned(self, origin: Origin) -> np.ndarray:
         """Return the position, NED, (3,) [m]."""
@@ -257,6 +259,8 @@ MODES: dict[str, dict[str, _Rule]] = {
 """Rules by law, as in `fleet.autopilots.laws.LAWS`, and mode, as in `Status.mode`."""
 HEADING_HOLD_MODES = ("CRUISE",)
 """Modes that hold course and height until the pilot steers."""
+COURSE_LOCK_S = 0.5
+"""Time with level wings after which ArduPlane locks the course of a heading-hold mode [s]."""
 TARGET_MODES = ("RTL", "LOITER", "GUIDED", "AVOID_ADSB", "TAKEOFF")
 """Modes whose reported guidance target is the point they fly to."""
 
