@@ -143,8 +143,9 @@ def _arduplane_return(situation: ModeSituation, params: Mapping[str, float]) -> 
     landing = _landing_legs(situation, params) if autoland in (1, 2) else ()
     if autoland == 2 and len(landing):
         return _route(situation, *landing)
-    kind = LOITER_TO_ALT if len(landing) else LOITER_UNLIMITED
-    return _route(situation, make_leg(kind, centre, radius=radius), *landing)
+    # a return, which proceeds as soon as it circles near its altitude, without regard to the direction of the landing
+    circle = make_leg(LOITER_UNLIMITED, centre, radius=radius, turns=float(len(landing) > 0))
+    return _route(situation, circle, *landing)
 
 
 def _landing_legs(situation: ModeSituation, params: Mapping[str, float]) -> np.ndarray:
