@@ -8,7 +8,7 @@ ArduPlane                                         PX4 fixed wing
     GUIDED    circle about the commanded point        TAKEOFF  circle at the end of the take-off
     TAKEOFF   circle at the end of the take-off
     CIRCLE    a third of the bank limit
-    CRUISE    the course and height of the entry
+    CRUISE    the height of the entry; the course 0.5 s after it, once the wings are level
 
 A reported guidance target (POSITION_TARGET_GLOBAL_INT) replaces the assumed centre. Assumptions: home is no rally
 point, no terrain is followed, RTL_CLIMB_MIN is 0, and the pilot does not move the sticks.
@@ -58,11 +58,13 @@ class ModeEntry(msgspec.Struct, frozen=True):
         t: time [s since 1970]
         position: latitude, longitude, height above mean sea level [1e-7 deg, 1e-7 deg, mm]
         course: over ground [rad]
+        locked: position and course are those that a heading-hold mode has locked
     """
 
     t: float
     position: tuple[float, float, float]
     course: float
+    locked: bool = False
 
     def ned(self, origin: Origin) -> np.ndarray:
         """Return the position, NED, (3,) [m]."""
@@ -141,8 +143,9 @@ def _arduplane_return(situation: ModeSituation, params: Mapping[str, float]) -> 
     landing = _landing_legs(situation, params) if autoland in (1, 2) else ()
     if autoland == 2 and len(landing):
         return _route(situation, *landing)
-    kind = LOITER_TO_ALT if len(landing) else LOITER_UNLIMITED
-    return _route(situation, make_leg(kind, centre, radius=radius), *landing)
+    # a return, which proceeds as soon as it circles near its altitude, without regard to the direction of the landing
+    circle = make_leg(LOITER_UNLIMITED, centre, radius=radius, turns=float(len(landing) > 0))
+    return _route(situation, circle, *landing)
 
 
 def _landing_legs(situation: ModeSituation, params: Mapping[str, float]) -> np.ndarray:
@@ -257,6 +260,8 @@ MODES: dict[str, dict[str, _Rule]] = {
 """Rules by law, as in `fleet.autopilots.laws.LAWS`, and mode, as in `Status.mode`."""
 HEADING_HOLD_MODES = ("CRUISE",)
 """Modes that hold course and height until the pilot steers."""
+COURSE_LOCK_S = 0.5
+"""Time with level wings after which ArduPlane locks the course of a heading-hold mode [s]."""
 TARGET_MODES = ("RTL", "LOITER", "GUIDED", "AVOID_ADSB", "TAKEOFF")
 """Modes whose reported guidance target is the point they fly to."""
 

@@ -7,6 +7,7 @@ import pytest
 
 from fleet import mission as m
 from fleet.autopilots import modes
+from fleet.autopilots.arduplane.legs import is_return
 from fleet.autopilots.failsafe import link_loss_steps
 from fleet.contract import Item
 from fleet.frames import Origin, to_geodetic
@@ -98,8 +99,9 @@ def landing_mission() -> tuple[Item, ...]:
 
 
 def test_rtl_lands_by_the_landing_sequence_where_the_parameters_say_so():
-    kinds = legs_of("arduplane", "RTL", {"RTL_AUTOLAND": 1.0}, items=landing_mission())[:, m.KIND]
-    assert kinds.tolist() == [m.LOITER_TO_ALT, m.WAYPOINT, m.LAND]
+    home = legs_of("arduplane", "RTL", {"RTL_AUTOLAND": 1.0}, items=landing_mission())
+    assert home[:, m.KIND].tolist() == [m.LOITER_UNLIMITED, m.WAYPOINT, m.LAND]
+    assert is_return(home[0]) and home[0, m.TURNS] == 1.0  # proceeds to the landing as soon as it circles
     direct = legs_of("arduplane", "RTL", {"RTL_AUTOLAND": 2.0}, items=landing_mission())
     assert direct[:, m.KIND].tolist() == [m.WAYPOINT, m.LAND] and direct[0, m.SEQ] == 3
     assert len(legs_of("arduplane", "RTL", {"RTL_AUTOLAND": 0.0}, items=landing_mission())) == 1

@@ -8,7 +8,7 @@ import pytest
 
 from fleet.autopilots.control_law import eas2tas
 from fleet.contract import Event, Prediction, TwinState
-from fleet.frames import to_geodetic, to_ned
+from fleet.frames import Origin, to_geodetic, to_ned
 from fleet.mission import RADIUS
 from tests.support.flights import ROUTE, drive, predictions, sample, status
 from twin_worker.twin.state.routes import identified_radius, present_route
@@ -101,6 +101,26 @@ def test_cruise_keeps_its_course(winged):
     moved = path[ahead >= 60][:, :2] - path[0, :2]
     assert abs(moved[:, 0] * course[1] - moved[:, 1] * course[0]).max() < 60.0
     assert (moved @ course).min() > 800.0
+
+
+def test_cruise_entered_in_a_turn_keeps_the_course_at_which_its_wings_were_level(winged):
+    entered(winged, "CRUISE")
+    history, before = winged.telemetry.history, winged.onboard.entry
+    (t_p, positions), (_, velocities) = history.rows_since("position"), history.rows_since("velocity")
+    t, v, here = float(t_p[-1]), velocities[-1].copy(), positions[-1].copy()
+    origin = Origin(*(int(x) for x in here))
+    turned = np.array([[np.cos(0.12), -np.sin(0.12), 0.0], [np.sin(0.12), np.cos(0.12), 0.0], [0.0, 0.0, 1.0]]) @ v
+    for k in range(1, 8):
+        at = t + 0.1 * k
+        rows = to_geodetic(origin, 0.1 * k * turned)[None]
+        advance(winged, (sample(1, at, position=(np.array([at]), rows), velocity=(np.array([at]), turned[None])),))
+        assert winged.onboard.entry.locked == (at >= before.t + 0.5)
+    entry = winged.onboard.entry
+    assert entry.course == pytest.approx(np.arctan2(turned[1], turned[0])) and entry.t == before.t
+    assert entry.position[2] == before.position[2]  # the height is that of the mode change
+    moved = entry.ned(origin)[:2]
+    assert np.linalg.norm(moved) == pytest.approx(np.linalg.norm(v[:2]) * (before.t + 0.55 - t), rel=0.15)
+    assert winged.onboard.plan_changed_t == before.t + 0.5
 
 
 def test_circle_holds_its_bank(twin):

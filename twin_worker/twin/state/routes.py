@@ -5,11 +5,13 @@ from dataclasses import replace
 from math import atan2, isfinite
 from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
 
 from fleet.autopilots.control_law import eas2tas
 from fleet.autopilots.failsafe import link_loss_steps
 from fleet.autopilots.modes import (
+    COURSE_LOCK_S,
     HEADING_HOLD_MODES,
     TARGET_MODES,
     ModeEntry,
@@ -177,6 +179,26 @@ def mode_entry(twin: "Twin", t: float) -> ModeEntry | None:
     v, since = velocities[-1], min(max(t - float(t_p[-1]), 0.0), _MAX_ENTRY_AGE_S)
     lat, lon, alt = to_geodetic(Origin(*(int(x) for x in positions[-1])), v * since)
     return ModeEntry(t, (float(lat), float(lon), float(alt)), atan2(v[1], v[0]))
+
+
+def lock_course(twin: "Twin") -> None:
+    """Move the line of a heading-hold mode to where the autopilot locks its course; that invalidates the prediction.
+
+    A mode entered in a turn rolls out first, and holds the course after that.
+    """
+    entry = twin.onboard.entry
+    if twin.mode not in HEADING_HOLD_MODES or entry is None or entry.locked:
+        return
+    lock_t, history = entry.t + COURSE_LOCK_S, twin.telemetry.history
+    (t_p, positions), (t_v, velocities) = (history.rows_since(name, lock_t) for name in ("position", "velocity"))
+    if not len(t_p) or not len(t_v):
+        return
+    position, v = positions[0], velocities[0]
+    locked = (float(position[0]), float(position[1]), entry.position[2])  # the height is that of the mode change
+    twin.onboard.enter_mode(
+        msgspec.structs.replace(entry, position=locked, course=atan2(v[1], v[0]), locked=True),
+    )
+    invalidate_prediction(twin, None, lock_t)
 
 
 def update_target(twin: "Twin") -> None:

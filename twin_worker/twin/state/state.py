@@ -31,7 +31,14 @@ from twin_worker.twin.state.home import complete_home
 from twin_worker.twin.state.inputs import Environment, OnboardState, Telemetry
 from twin_worker.twin.state.models import Identification, ModelBank
 from twin_worker.twin.state.outputs import AlertingState, ConfidenceState, PredictionState
-from twin_worker.twin.state.routes import ROUTE_MODES, failsafe_plan, mode_entry, present_route, update_target
+from twin_worker.twin.state.routes import (
+    ROUTE_MODES,
+    failsafe_plan,
+    lock_course,
+    mode_entry,
+    present_route,
+    update_target,
+)
 from twin_worker.validation.verify import FIT_THRESHOLD
 
 _CONTROLLER_PREFIXES = ("FW_", "MPC_", "NAV_", "NPFG_", "Q_WP_", "RTL_", "WPNAV_", "WP_")  # not ArduPlane
@@ -223,6 +230,7 @@ def ingest(twin: Twin, message: Message) -> None:
     """Ingest one message from the gateway."""
     if isinstance(message, Sample):
         twin.telemetry.add(message)
+        lock_course(twin)
         if message.target is not None:
             update_target(twin)
     elif isinstance(message, Status):
