@@ -48,6 +48,7 @@ _TARGET_TOLERANCE_M = 5.0  # distance at which two points are the same [m]
 _PX4_ALT_TOLERANCE_M = 10.0  # NAV_FW_ALT_RAD: height error at which a climb is complete [m]
 _STEERED_M, _STEERED_RAD = 50.0, radians(10.0)  # off the line or off its course by more: the pilot has steered
 _STEERING_BANK = radians(10.0)  # a steered aircraft with more bank is still being steered [rad]
+_SHORT_GLIDE = 2  # FS_SHORT_ACTN
 _LAND_START = 189  # MAV_CMD_DO_LAND_START
 
 
@@ -234,8 +235,12 @@ def _level_flight(situation: ModeSituation, params: Mapping[str, float]) -> Rout
 
 
 def _glide(situation: ModeSituation, params: Mapping[str, float]) -> Route:
-    """Glide wings level at idle, nose down by STAB_PITCH_DOWN: FBWA without remote control."""
-    pitch = -radians(_parameter(params, (("STAB_PITCH_DOWN", 1.0),), 2.0))
+    """Glide wings level at idle: FBWA without remote control.
+
+    The pitch is 0 where the short action is this glide, else neutral sticks and idle: nose down by STAB_PITCH_DOWN.
+    """
+    demands_glide = params.get("FS_SHORT_ACTN") == _SHORT_GLIDE and params.get("THR_FAILSAFE") == 1
+    pitch = 0.0 if demands_glide else -radians(_parameter(params, (("STAB_PITCH_DOWN", 1.0),), 2.0))
     return _route(situation, make_leg(GLIDE, situation.entry, radius=pitch))
 
 

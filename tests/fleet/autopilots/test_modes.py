@@ -137,6 +137,17 @@ def test_cruise_keeps_its_line_until_the_pilot_has_steered():
     assert aside is not None and aside.entry[0] == ENTRY[0] + 90.0
 
 
+def test_a_glide_is_level_where_it_is_the_short_action_and_nose_down_otherwise():
+    def pitch_of(**params: float) -> float:
+        route = modes.mode_route("arduplane", "FBWA", situation(), {"STAB_PITCH_DOWN": 4.0, **params}, failsafe=True)
+        assert route is not None and route.legs[0, m.KIND] == m.GLIDE
+        return degrees(route.legs[0, m.RADIUS])
+
+    assert pitch_of(FS_SHORT_ACTN=2.0, THR_FAILSAFE=1.0) == 0.0
+    assert pitch_of(FS_SHORT_ACTN=0.0, THR_FAILSAFE=1.0) == pytest.approx(-4.0)
+    assert pitch_of(FS_SHORT_ACTN=2.0, THR_FAILSAFE=0.0) == pytest.approx(-4.0)
+
+
 # --- link loss -------------------------------------------------------------------------------------------------------
 
 
