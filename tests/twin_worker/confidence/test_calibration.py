@@ -242,8 +242,8 @@ def test_the_narrowest_table_is_chosen_and_said(table):
     assert tables.choose("dynamics/arduplane/fixed_wing/known")[0].group == names[1]
     found, said = tables.choose("paper/arduplane/fixed_wing/known")
     assert found.starts == 0 and "not calibrated: no table for paper/" in said
-    found, said = tables.choose("hybrid/arduplane/c172p/incomplete")
-    assert found.starts == 0 and "mission items are missing" in said
+    table, description = tables.choose("hybrid/arduplane/c172p/incomplete")
+    assert table.starts == 0 and "mission items are missing" in description
 
 
 @pytest.mark.parametrize("method", ["dynamics", "hybrid", "paper", "copter", "greybox", "imm", "unheard of"])

@@ -41,7 +41,7 @@ def ordinary(flown) -> Twin:
 def foreseen(ordinary) -> Callable[[Twin], Prediction]:
     """Predict; one of a few tries must take no more than so many ordinary predictions, on whatever machine."""
 
-    def foresee(twin: Twin) -> Prediction:
+    def predict_once(twin: Twin) -> Prediction:
         times = []
         for _ in range(TRIES):
             _, usual = timed(ordinary)
@@ -54,7 +54,7 @@ def foreseen(ordinary) -> Callable[[Twin], Prediction]:
         assert np.isfinite(made.horizon_s) and len(made.sentence) < MOST_WORDS
         return made
 
-    return foresee
+    return predict_once
 
 
 def onto(twin: Twin, name: str, seq: int) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 from fleet.airframes.airframe import ASSUMED, ServoMap, servo_map
 from fleet.airframes.servo_learning import learn_servo_map
 from fleet.frames import G
+from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.telemetry.history import TelemetryHistory
 
 _KINDS = ("servo", "attitude", "velocity", "command", "air", "height")
@@ -56,7 +57,11 @@ def read_outputs(history: TelemetryHistory, params: dict[str, float], t_start: f
     if any(len(series[kind][0]) < _MIN_ROWS for kind in ("servo", "attitude", "velocity", "command")):
         return None
     t, pulses = _thinned(*series["servo"])
-    attitude, velocity, command = (_newest_before(t, series[kind]) for kind in ("attitude", "velocity", "command"))
+    begun = t >= max(series[kind][0][0] for kind in ("attitude", "velocity", "command"))
+    t, pulses = t[begun], pulses[begun]
+    attitude, velocity, command = (
+        zero_order_hold(*series[kind], t, np.inf) for kind in ("attitude", "velocity", "command")
+    )
     phi, theta, p, q, r = attitude[:, [0, 1, 3, 4, 5]].T
     phi_c, theta_c, low, slow = command[:, [0, 1, 3, 4]].T
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
@@ -64,7 +69,11 @@ def read_outputs(history: TelemetryHistory, params: dict[str, float], t_start: f
     load = np.abs(np.tan(np.clip(phi, -1.0, 1.0)))
     energy = np.nan_to_num(low) + speed / G * slow
     air, height = series["air"], series["height"]
-    is_high = _newest_before(t, height)[:, 0] > _MIN_HEIGHT_M if len(height[0]) >= _MIN_ROWS else np.ones(len(t), bool)
+    is_high = (
+        zero_order_hold(*height, t, np.inf)[:, 0] > _MIN_HEIGHT_M
+        if len(height[0]) >= _MIN_ROWS
+        else np.ones(len(t), bool)
+    )
     return ServoOutputs(
         t=t - t_start,
         pulses=pulses[:, :8],
@@ -74,7 +83,7 @@ def read_outputs(history: TelemetryHistory, params: dict[str, float], t_start: f
             np.column_stack([theta_c - theta, q, load, theta_c, speed]),
             np.column_stack([energy, velocity[:, 2], theta_c, load, slow]),
         ),
-        throttle=_newest_before(t, air)[:, 1] if len(air[0]) >= _MIN_ROWS else np.full(len(t), np.nan),
+        throttle=zero_order_hold(*air, t, np.inf)[:, 1] if len(air[0]) >= _MIN_ROWS else np.full(len(t), np.nan),
         flying=(speed > _MIN_SPEED) & is_high,
         params=params,
     )
@@ -88,8 +97,3 @@ def _thinned(t: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             chosen.append(k)
             last = time
     return t[chosen], x[chosen]
-
-
-def _newest_before(t: np.ndarray, rows: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    times, x = rows
-    return x[np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 1)]
