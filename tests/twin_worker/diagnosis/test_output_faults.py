@@ -87,6 +87,18 @@ def test_an_output_saturated_by_its_control_error_is_no_fault_and_a_stuck_one_at
     assert find_frozen_outputs(replace(stuck, errors=errors, signals=signals), TRUSTED_S, None) == []
 
 
+def test_an_output_that_reaches_its_limit_where_the_law_had_failed_before_is_saturated() -> None:
+    """An autopilot far from its calibrated flight demands more than the regression predicts, up to the limit."""
+    outputs = flown(2)
+    pulses = outputs.pulses.copy()
+    after = outputs.t >= FAULT_S
+    offset = 60.0 * (outputs.t[after] - FAULT_S)
+    pulses[after, 0] = np.minimum(pulses[after, 0] + offset, 2000.0)
+    assert (pulses[:, 0] == 2000.0).sum() > 10
+    assert find_frozen_outputs(replace(outputs, pulses=pulses), TRUSTED_S, None) == []
+    assert [one.number for one in find_frozen_outputs(frozen_at(outputs, 0, 2000.0), TRUSTED_S, None)] == [1]
+
+
 def test_a_throttle_at_idle_is_cut_only_while_energy_is_short() -> None:
     outputs = frozen_at(flown(3), 2, 1000.0)
     errors = outputs.errors.copy()

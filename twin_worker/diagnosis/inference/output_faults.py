@@ -8,8 +8,9 @@ predicts each output, and a logistic regression the probability that an output r
 A frozen output repeats always. The log likelihood ratio of a run of repeats is -sum log P(repeat | healthy), less the
 logarithm of the number of possible pulses, plus once the distance from the predicted output under a Student
 distribution. The other predictors are limited to the range of trusted flight: no evidence is extrapolated. An output
-at a limit in the direction of its control error is saturated, which is no evidence. A throttle output at its minimum
-while the energy is short is cut.
+at a limit is saturated, which is no evidence, where its control error points there or where the law had failed before:
+the limit is within the law's error of the last seconds. A throttle output at its minimum while the energy is short is
+cut.
 Source: Agresti 2013, Categorical Data Analysis, chapter 5; Lambregts 1983 (total energy control).
 """
 
@@ -38,6 +39,8 @@ _MIN_ROWS = 60
 _MIN_RANGE_US = 10.0  # an output that moves less is not in use [us]
 _PULSE_RANGE_US = 1000.0
 _RIDGE = 0.01
+_RECENT_S = 2.0  # before a run of repeats, for the law's present error [s]
+_SATURATED_SIGMAS = 3.0  # a limit within so many present errors of the predicted output may be demanded [-]
 _NU = 4.0  # degrees of freedom of the distance from the predicted output: heavy tails
 _PRIOR_MEAN, _PRIOR_STD = np.array([-1.0, 1.0, -0.5, -1.0]), np.array([2.0, 1.0, 1.0, 1.0])
 _AXIS = {"aileron": 0, "elevator": 1, "rudder": 0, "throttle": 2}
@@ -182,8 +185,14 @@ class _ModelledOutput:
 
     def _evidence(self, first: int, end: int) -> float:
         """Return the log likelihood ratio of a run of repeats: each repeat, the pulse, and once its distance."""
+        t, error = self._outputs.t, np.abs(self._y - self._expected)
+        recent = error[np.searchsorted(t, t[first - 1] - _RECENT_S) : first - 1]
+        present = float(np.sqrt(np.mean(recent**2))) if len(recent) else 0.0
         repeats = float(self._surprise[first:end].sum())
-        distance = float(np.median(np.abs(self._y - self._expected)[first:end])) / self._scale
+        distance = float(np.median(error[first:end])) / self._scale
+        at_limit = not self._low < self._y[first] < self._high
+        if at_limit and distance * self._scale < _SATURATED_SIGMAS * present:
+            return 0.0
         if not repeats or self._surface == "throttle":  # saturated, or the level of its integrator is arbitrary
             distance = 0.0
         level = 0.5 * (_NU + 1.0) * np.log1p(distance**2 / _NU)
