@@ -7,10 +7,10 @@ predicts each output, and a logistic regression the probability that an output r
 
 A frozen output repeats always. The log likelihood ratio of a run of repeats is -sum log P(repeat | healthy), less the
 logarithm of the number of possible pulses, plus once the distance from the predicted output under a Student
-distribution. The other predictors are limited to the range of trusted flight: no evidence is extrapolated. An output
-at a limit is saturated, which is no evidence, where its control error points there or where the law had failed before:
-the limit is within the law's error of the last seconds. A throttle output at its minimum while the energy is short is
-cut.
+distribution whose scale is the law's error in trusted flight or in the seconds before the run, whichever is larger.
+The other predictors are limited to the range of trusted flight: no evidence is extrapolated. An output at a limit is
+saturated, which is no evidence, where its control error points there or where the law had failed before: the limit is
+within the law's error of the last seconds. A throttle output at its minimum while the energy is short is cut.
 Source: Agresti 2013, Categorical Data Analysis, chapter 5; Lambregts 1983 (total energy control).
 """
 
@@ -189,9 +189,9 @@ class _ModelledOutput:
         recent = error[np.searchsorted(t, t[first - 1] - _RECENT_S) : first - 1]
         present = float(np.sqrt(np.mean(recent**2))) if len(recent) else 0.0
         repeats = float(self._surprise[first:end].sum())
-        distance = float(np.median(error[first:end])) / self._scale
+        distance = float(np.median(error[first:end])) / max(self._scale, present)
         at_limit = not self._low < self._y[first] < self._high
-        if at_limit and distance * self._scale < _SATURATED_SIGMAS * present:
+        if at_limit and present > self._scale and distance < _SATURATED_SIGMAS:
             return 0.0
         if not repeats or self._surface == "throttle":  # saturated, or the level of its integrator is arbitrary
             distance = 0.0
