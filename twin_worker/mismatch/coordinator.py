@@ -50,7 +50,7 @@ class DiagnosisState:
     Attributes:
         card: the aircraft, or `card.UNKNOWN`
         baseline: comparison model; None: the aircraft's own past
-        past: telemetry of that past; None until it is long enough
+        past: telemetry of the own past, which also shows the controller's law; None until it is long enough
         published: newest published mismatch
         reason: why there is no baseline or no diagnosis
         defect: internal error of the newest diagnosis, or empty
@@ -88,12 +88,12 @@ class DiagnosisState:
             or twin.telemetry.origin is None
         ):
             return None
-        if self.baseline is None and self.past is None:
-            if self._mission_flight_s(twin) < BASELINE_S:
-                self.next_t = newest + CHECK_PERIOD_S
-                return None
+        if self.past is None and not self._is_suspicious and self._mission_flight_s(twin) >= BASELINE_S:
             self.past = telemetry_rows(twin.telemetry.history, newest - BASELINE_S)
             self.past_t = newest
+        if self.past is None and self.baseline is None:
+            self.next_t = newest + CHECK_PERIOD_S
+            return None
         if newest < (self.first_t + MIN_FLIGHT_S if self.baseline is not None else self.past_t + CHECK_PERIOD_S):
             return None
         return (
@@ -110,8 +110,13 @@ class DiagnosisState:
             newest - self.diagnosed_t >= DIAGNOSIS_PERIOD_S or not self._model_valid(twin) or self._needs_confirmation
         )
         rows = telemetry_rows(twin.telemetry.history, newest - FLIGHT_S, self.past)
+        past_end = None if self.past is None else self.past_t
         params = dict(twin.received_params)
-        return DiagnosisJob(twin.config.uav, rows, params, self.card, self.baseline, self.past_t, full)
+        return DiagnosisJob(twin.config.uav, rows, params, self.card, self.baseline, past_end, newest - FLIGHT_S, full)
+
+    @property
+    def _is_suspicious(self) -> bool:
+        return self.published is not None and self.published.outcome is not DiagnosisOutcome.NONE
 
     @property
     def _needs_confirmation(self) -> bool:

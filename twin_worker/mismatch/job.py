@@ -8,12 +8,13 @@ import msgspec
 import numpy as np
 
 from fleet.contract import COLUMNS, Cause, DiagnosisOutcome, Mismatch
-from twin_worker.diagnosis.baseline.own_past import only_new_findings
+from twin_worker.diagnosis.baseline.own_past import find_output_faults, only_new_findings
 from twin_worker.diagnosis.baseline.past import CONTEXT_S, calibrate_past, part_after
 from twin_worker.diagnosis.data.card import AircraftCard
 from twin_worker.diagnosis.data.flight import STEP_S, FlightData, resample_flight
 from twin_worker.diagnosis.inference.diagnose import diagnose
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
+from twin_worker.diagnosis.inference.output_faults import with_frozen_outputs
 from twin_worker.diagnosis.inference.report import DiagnosisFinding, Report, ReportOutcome, with_sentence
 from twin_worker.diagnosis.model.baseline import Baseline
 from twin_worker.diagnosis.model.residual import ModelledFlight
@@ -38,7 +39,8 @@ class DiagnosisJob:
         params: autopilot parameters
         card: the aircraft
         baseline: comparison model; None: the aircraft's own past
-        past_end: end of that past [s since 1970]
+        past_end: end of the past in `rows` [s since 1970]; None: `rows` have none
+        recent_start: start of the newest flight in `rows`, which is diagnosed with a comparison model [s since 1970]
         full: diagnose without a residual check
     """
 
@@ -47,7 +49,8 @@ class DiagnosisJob:
     params: dict[str, float]
     card: AircraftCard
     baseline: Baseline | None
-    past_end: float = 0.0
+    past_end: float | None = None
+    recent_start: float = -inf
     full: bool = False
 
 
@@ -118,17 +121,24 @@ def _run(job: DiagnosisJob, result: DiagnosisResult) -> DiagnosisResult:
     for kind, (t, x) in job.rows.items():
         history.replace_rows(kind, t, x)
     flight = resample_flight(f"uav-{job.uav}", history, job.params, job.card)
-    baseline, past_end = job.baseline, job.past_end - flight.t_start
-    if baseline is None:
+    past_end = None if job.past_end is None else job.past_end - flight.t_start
+    output_faults = find_output_faults(flight, past_end)
+    baseline = job.baseline
+    if baseline is not None:
+        flight = part_after(flight, job.recent_start - flight.t_start)
+    elif past_end is not None:
         baseline = calibrate_past(flight, past_end, job.card)
         flight = part_after(flight, past_end - CONTEXT_S)
+    else:
+        raise ValueError(f"{flight.name}: found neither a model nor a past, expected one of them; fly longer")
     result = replace(result, begin=flight.t_start, residual_growth=residual_growth(flight, baseline))
-    if not (job.full or result.residual_growth > MIN_GROWTH):
+    if not (job.full or output_faults or result.residual_growth > MIN_GROWTH):
         return result
     report = diagnose(flight, baseline)
-    if job.baseline is None:
+    if job.baseline is None and past_end is not None:
         report = only_new_findings(report, None, past_end)  # the newest seconds can be a climb: no permanent loss yet
-    return replace(result, report=report, effect_outputs=effect_outputs(flight, baseline, report))
+    outputs = effect_outputs(flight, baseline, report)  # of the airframe: the recorded outputs contain their faults
+    return replace(result, report=with_frozen_outputs(report, output_faults), effect_outputs=outputs)
 
 
 def residual_growth(flight: FlightData, baseline: Baseline) -> float:

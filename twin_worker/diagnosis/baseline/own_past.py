@@ -11,7 +11,11 @@ from twin_worker.diagnosis.baseline.past import CONTEXT_S, calibrate_past, part_
 from twin_worker.diagnosis.data.card import AircraftCard
 from twin_worker.diagnosis.data.flight import DT, FlightData
 from twin_worker.diagnosis.inference.diagnose import diagnose
-from twin_worker.diagnosis.inference.output_faults import find_frozen_outputs, with_frozen_outputs
+from twin_worker.diagnosis.inference.output_faults import (
+    FrozenOutput,
+    find_frozen_outputs,
+    with_frozen_outputs,
+)
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome, with_sentence
 from twin_worker.diagnosis.model.baseline import Baseline, exclude_equations
 
@@ -120,20 +124,24 @@ class OwnPast:
 
 
 def with_output_faults(report: Report, flight: FlightData, until: float | None = None) -> Report:
-    """Return the report with outputs that no longer answer the controller; see `inference.output_faults`.
+    """Return the report with the outputs of `find_output_faults` as its first findings."""
+    return with_frozen_outputs(report, find_output_faults(flight, until))
+
+
+def find_output_faults(flight: FlightData, until: float | None = None) -> list[FrozenOutput]:
+    """Return the outputs that no longer answer the controller; see `inference.output_faults`.
 
     Args:
-        report: of the airframe
         flight: with the outputs, if recorded
         until: end of the trusted flight that shows the controller's law [s]; None: the first `LAW_S` in the air
     """
     outputs = flight.outputs
     if outputs is None:
-        return report
+        return []
     if until is None:
         flying = outputs.t[outputs.flying]
         until = float(flying[0]) + LAW_S if len(flying) else float("inf")
-    return with_frozen_outputs(report, find_frozen_outputs(outputs, until, find_loss_onset(ENERGY, flight, until)))
+    return find_frozen_outputs(outputs, until, find_loss_onset(ENERGY, flight, until))
 
 
 def only_new_findings(report: Report, tracking_loss: tuple[str, float] | None, until: float) -> Report:
