@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Callable, Iterable
+from math import nan
 from pathlib import Path
 from typing import NamedTuple
 
@@ -46,9 +47,10 @@ def fly(
     """Simulate with `faults`, into a recording if a path is given; call `observe` with the aircraft at 10 Hz.
 
     Returns:
-        the log, and the time of the first recorded ATTITUDE since simulation start [s]
+        the log, and the time of the first recorded ATTITUDE since simulation start [s]; nan without a recording
     """
     uav = planned.build_uav(faults)
+    uav.silent = path is None
     uav.step(SETTLE_S)
     link = RadioLink(np.random.default_rng((planned.flight_seed, 6)), LOSS, FADES_S)
     rows: list[_LogRow] = []
@@ -63,7 +65,8 @@ def fly(
     if path is not None:
         with path.open("wb") as file:
             write(file, arrived)
-    return _to_log(rows), first_attitude(frame for _, frame in arrived) - uav.boot_s
+    first_s = nan if path is None else first_attitude(frame for _, frame in arrived) - uav.boot_s
+    return _to_log(rows), first_s
 
 
 def _to_log(rows: list[_LogRow]) -> ExamFlightLog:

@@ -86,6 +86,7 @@ class SimulatedUav:
         self.boot_s = float(rng.uniform(60, 600))  # time since boot at simulation start [s]
         self.tick = 0
         self.crashed = False  # reached the ground
+        self.silent = False  # sends no telemetry, which saves most of the time of a flight
         self._wind = setup.weather.wind(rng, DT * _OUTER)
         scale_rng = altitude_rng = self._jitter = None
         dialect = DIALECTS[autopilot]
@@ -107,6 +108,7 @@ class SimulatedUav:
         self.fault_set = FaultSet(faults, self.aircraft, DT, DT * _INNER) if faults else None
         self.pulses = servo_pulses(0.0, delta_e, 0.0, self._delta_t)
         self.estimate: Estimate = self._measure()
+        self._newest_state: TelemetryState | None = None
         self._engage(start.seq)
 
     def _engage(self, seq: int) -> None:
@@ -153,7 +155,7 @@ class SimulatedUav:
         if self.fault_set is not None:
             self.fault_set.apply_to_physics(self.tick * DT)
             self.aircraft.set_controls(*self.fault_set.apply_to_commands(self.tick * DT, servo_commands(self.pulses)))
-        frames = self._endpoint.telemetry(self.tick, self._telemetry_state)
+        frames = [] if self.silent else self._endpoint.telemetry(self.tick, self._telemetry_state)
         self.aircraft.step()
         self.tick += 1
         return frames
@@ -201,13 +203,16 @@ class SimulatedUav:
         self.aircraft.set_controls(*servo_commands(self.pulses))
 
     def _telemetry_state(self) -> TelemetryState:
+        time_jitter = 0.0 if self._jitter is None else float(self._jitter.uniform(-JITTER_S, JITTER_S))
+        t = self.boot_s + self.tick * DT + time_jitter
+        if self._newest_state is not None and self._newest_state.estimate is self.estimate:  # no control step since
+            return self._newest_state._replace(t=t, wind=self._wind_estimate)
         e, leg = self.estimate, self.leg
         target = leg[legs_of.P_N : legs_of.P_D + 1] - e.p
         commanded = leg[legs_of.VA_C] if leg[legs_of.VA_C] > 0 else self.setup.kind.cruise
         position = to_geodetic(self.origin, e.p)
-        time_jitter = 0.0 if self._jitter is None else float(self._jitter.uniform(-JITTER_S, JITTER_S))
-        return TelemetryState(
-            t=self.boot_s + self.tick * DT + time_jitter,
+        self._newest_state = TelemetryState(
+            t=t,
             estimate=e,
             position=(int(position[0]), int(position[1]), int(position[2])),
             height=float(-e.p[2]),
@@ -224,6 +229,7 @@ class SimulatedUav:
             home=(self.origin.lat_e7, self.origin.lon_e7, self.origin.alt_mm),
             wind=self._wind_estimate,
         )
+        return self._newest_state
 
     def _xtrack(self) -> float:
         """Return the distance to the right of the line, or outside the circle [m]."""

@@ -1,6 +1,5 @@
 """Figures of a diagnosis: location on the path, residuals, measured against simulated force, candidates."""
 
-import io
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,6 +8,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from PIL import Image
@@ -65,11 +65,17 @@ def draw(report: Report, folder: Path, stem: str = "") -> list[Path]:
     with matplotlib.rc_context(_STYLE), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a letter without a glyph becomes a box
         for path, draw_figure in zip(paths, (_path, residuals, simulated, _candidates), strict=True):
-            drawn = io.BytesIO()
-            draw_figure(shown).savefig(drawn, dpi=_DPI)
-            with Image.open(drawn) as picture:
-                picture.convert("RGB").quantize(_N_COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
+            picture = _rendered(draw_figure(shown))
+            picture.quantize(_N_COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
     return paths
+
+
+def _rendered(figure: Figure) -> Image.Image:
+    """Render a figure once; `Figure.savefig` lays it out and draws it twice."""
+    figure.set_dpi(_DPI)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
 
 
 def stems(flights: Sequence[str]) -> list[str]:
