@@ -41,6 +41,7 @@ from fleet.mission import (
     Route,
     unroll_route,
 )
+from fleet.mission_jumps import nearest_landing
 
 NO_ITEM = -1.0  # mission item of a leg that belongs to no mission
 _HOLD_LEG_M = 1e5  # length of the line of a heading-hold mode [m]
@@ -49,7 +50,6 @@ _PX4_ALT_TOLERANCE_M = 10.0  # NAV_FW_ALT_RAD: height error at which a climb is 
 _STEERED_M, _STEERED_RAD = 50.0, radians(10.0)  # off the line or off its course by more: the pilot has steered
 _STEERING_BANK = radians(10.0)  # a steered aircraft with more bank is still being steered [rad]
 _SHORT_GLIDE = 2  # FS_SHORT_ACTN
-_LAND_START = 189  # MAV_CMD_DO_LAND_START
 
 
 class ModeEntry(msgspec.Struct, frozen=True):
@@ -141,7 +141,8 @@ def _arduplane_return(situation: ModeSituation, params: Mapping[str, float]) -> 
         centre[2] = situation.home[2] - height if height >= 0 else situation.entry[2]
     radius = _parameter(params, (("RTL_RADIUS", 1.0),), 0.0)
     autoland = params.get("RTL_AUTOLAND", 0)
-    landing = _landing_legs(situation, params) if autoland in (1, 2) else ()
+    near = situation.entry if autoland == 2 else centre
+    landing = _landing_legs(situation, params, near) if autoland in (1, 2) else ()
     if autoland == 2 and len(landing):
         return _route(situation, *landing)
     # a return, which proceeds as soon as it circles near its altitude, without regard to the direction of the landing
@@ -149,12 +150,15 @@ def _arduplane_return(situation: ModeSituation, params: Mapping[str, float]) -> 
     return _route(situation, circle, *landing)
 
 
-def _landing_legs(situation: ModeSituation, params: Mapping[str, float]) -> np.ndarray:
-    """Return the legs from DO_LAND_START on, (k, N_COLUMNS)."""
-    starts = [item.seq for item in situation.items if item.command == _LAND_START]
-    if not starts:
+def _landing_legs(situation: ModeSituation, params: Mapping[str, float], near: np.ndarray) -> np.ndarray:
+    """Return the legs from the DO_LAND_START on that is nearest to a point, NED, (3,) [m]; (k, N_COLUMNS)."""
+    items = {item.seq: item for item in situation.items}
+    lat_lon = np.array([(item.lat_e7, item.lon_e7) for item in situation.items], float).reshape(-1, 2)
+    positions = to_ned(situation.origin, lat_lon[:, 0], lat_lon[:, 1], np.zeros(len(lat_lon)))
+    start = nearest_landing(items, dict(zip(items, positions, strict=True)), near, 0)
+    if start < 0:
         return np.empty((0, N_COLUMNS))
-    return unroll_route(situation.items, seq=starts[0], origin=situation.origin, params=params).legs
+    return unroll_route(situation.items, seq=start, origin=situation.origin, params=params).legs
 
 
 def _arduplane_takeoff(situation: ModeSituation, params: Mapping[str, float]) -> Route:

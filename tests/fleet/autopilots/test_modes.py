@@ -2,6 +2,7 @@
 
 from math import degrees, pi
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -105,6 +106,20 @@ def test_rtl_lands_by_the_landing_sequence_where_the_parameters_say_so():
     direct = legs_of("arduplane", "RTL", {"RTL_AUTOLAND": 2.0}, items=landing_mission())
     assert direct[:, m.KIND].tolist() == [m.WAYPOINT, m.LAND] and direct[0, m.SEQ] == 3
     assert len(legs_of("arduplane", "RTL", {"RTL_AUTOLAND": 0.0}, items=landing_mission())) == 1
+
+
+def test_rtl_lands_by_the_landing_sequence_nearest_to_where_it_begins():
+    far, *_ = landing_mission()[2:3]
+    lat, lon, _ = to_geodetic(HERE, np.array([5000.0, 0.0, 0.0]))
+    there = {"lat_e7": int(lat), "lon_e7": int(lon)}
+    sequence = [(1, 189, there), (2, 16, there), (3, 21, there)]
+    elsewhere = [msgspec.structs.replace(far, seq=seq, command=command, **place) for seq, command, place in sequence]
+    near = [msgspec.structs.replace(item, seq=item.seq + 2) for item in landing_mission()[2:]]
+    items = (landing_mission()[0], *elsewhere, *near)
+    direct = legs_of("arduplane", "RTL", {"RTL_AUTOLAND": 2.0}, items=items)
+    assert direct[:, m.SEQ].tolist() == [5, 6]
+    home = legs_of("arduplane", "RTL", {"RTL_AUTOLAND": 1.0}, items=items)
+    assert home[1:, m.SEQ].tolist() == [5, 6]
 
 
 def test_px4_returns_by_climb_flight_home_and_descent():
