@@ -42,8 +42,9 @@ def read(loaded_mb: float, path: str, columns: str) -> dict[str, Any]:
     return {"cpu_s": cpu, "mb": loaded_mb + peak_mb() - before_mb, "news": news, "said": said}
 
 
-def read_within(out: int, loaded_mb: float, path: str, columns: str, cpu_s: int, memory: int) -> NoReturn:
+def read_within(out: int, loaded_mb: float, request: tuple[str, str, int, int]) -> NoReturn:
     """Read a file within bounds, write the answer, and end the process."""
+    path, columns, cpu_s, memory = request
     code = 1
     try:
         resource.setrlimit(resource.RLIMIT_CPU, (cpu_s, cpu_s + 1))
@@ -64,7 +65,7 @@ def main() -> None:
         answers, out = os.pipe()
         child = os.fork()
         if not child:
-            read_within(out, loaded_mb, *json.loads(line))
+            read_within(out, loaded_mb, json.loads(line))
         os.close(out)
         with open(answers, "rb") as pipe:
             answer = json.loads(pipe.read() or "{}")
