@@ -41,7 +41,7 @@ from msgspec import Meta
 from fleet.frames import Origin
 
 DTYPES = ("<f4", "<f8", "<i4", "<i8", "|u1")
-_SIZES = {name: np.dtype(name).itemsize for name in DTYPES}
+_DTYPES = {name: np.dtype(name) for name in DTYPES}
 MAX_ITEMS = 1_000  # mission items accepted from outside
 
 
@@ -69,13 +69,13 @@ class Array(msgspec.Struct, frozen=True, gc=False):  # numbers form no reference
         Raises:
             ValueError: when dtype, shape and byte count disagree; the sender must correct it.
         """
-        size, shape = _SIZES.get(self.dtype), self.shape
-        if size is None or len(shape) > 4 or (shape and not 0 <= min(shape) <= max(shape) < 2**31):
+        dtype, shape = _DTYPES.get(self.dtype), self.shape
+        if dtype is None or len(shape) > 4 or (shape and not 0 <= min(shape) <= max(shape) < 2**31):
             raise ValueError(f"array: found dtype {self.dtype!r} shape {self.shape}, expected one of {DTYPES}; resend")
-        n_bytes = prod(shape) * size
+        n_bytes = prod(shape) * dtype.itemsize
         if n_bytes != len(self.data):
             raise ValueError(f"array: found {len(self.data)} bytes, shape {self.shape} needs {n_bytes}; resend")
-        return np.frombuffer(self.data, self.dtype).reshape(self.shape)
+        return np.frombuffer(self.data, dtype).reshape(shape)
 
 
 class Rows(msgspec.Struct, frozen=True, gc=False):

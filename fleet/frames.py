@@ -79,11 +79,12 @@ def to_geodetic(origin: Origin, ned: np.ndarray) -> np.ndarray:
     """Map local NED positions to geodetic: (n, 3) [m] -> (n, 3) integers [1e-7 deg, 1e-7 deg, mm]."""
     m, n = _radii(origin)
     ned = np.asarray(ned, float)
-    lat = origin.lat_e7 + np.degrees(ned[..., 0] / m) * 1e7
     lon = origin.lon_e7 + np.degrees(ned[..., 1] / n) * 1e7
-    lon = (lon + 1.8e9) % 3.6e9 - 1.8e9
-    alt = origin.alt_mm - ned[..., 2] * 1e3
-    return np.rint(np.stack([lat, lon, alt], axis=-1)).astype(np.int64)
+    out = np.empty((*ned.shape[:-1], 3))
+    out[..., 0] = origin.lat_e7 + np.degrees(ned[..., 0] / m) * 1e7
+    out[..., 1] = (lon + 1.8e9) % 3.6e9 - 1.8e9
+    out[..., 2] = origin.alt_mm - ned[..., 2] * 1e3
+    return np.rint(out, out=out).astype(np.int64)
 
 
 def body_to_ned(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray, body: np.ndarray) -> np.ndarray:

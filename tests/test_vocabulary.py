@@ -1,6 +1,7 @@
 """Names and texts: standard terms only, one name for one class, and one module that writes each part of the state."""
 
 import ast
+import functools
 import re
 from collections import defaultdict
 from collections.abc import Iterator
@@ -47,23 +48,50 @@ def sources() -> Iterator[tuple[str, str]]:
             yield str(path.relative_to(ROOT)), path.read_text()
 
 
-def defined(tree: ast.AST) -> Iterator[tuple[str, int]]:
-    """All identifiers that a module defines, with their lines."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-            yield node.name, node.lineno
-        elif isinstance(node, ast.arg):
-            yield node.arg, node.lineno
-        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
-            yield node.id, node.lineno
-        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
-            yield node.attr, node.lineno
-        elif isinstance(node, ast.ExceptHandler | ast.MatchAs) and node.name:
-            yield node.name, node.lineno
-        elif isinstance(node, ast.alias) and node.asname:
-            yield node.asname, node.lineno
+class Facts:
+    """What the rules ask of the text of a module, collected in one walk through its tree."""
+
+    def __init__(self, text: str) -> None:
+        self.identifiers: list[tuple[str, int]] = []  # that it defines, with their lines
+        self.giving: list[str] = []  # what has a docstring that begins with Give
+        self.classes: list[str] = []
+        self.written: list[tuple[str, str]] = []  # part of the state, and the assignment to a field of it
+        for node in ast.walk(ast.parse(text)):
+            self.identifiers += defined(node)
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+                if (ast.get_docstring(node) or "").startswith("Give"):
+                    self.giving.append(getattr(node, "name", "module"))
+                if isinstance(node, ast.ClassDef):
+                    self.classes.append(node.name)
+            elif (
+                isinstance(node, ast.Attribute)
+                and isinstance(node.ctx, ast.Store | ast.Del)
+                and isinstance(node.value, ast.Attribute)
+                and isinstance(node.value.value, ast.Name)
+            ):
+                self.written.append((node.value.attr, f"{node.lineno} {ast.unparse(node)}"))
 
 
+facts = functools.cache(Facts)
+
+
+def defined(node: ast.AST) -> Iterator[tuple[str, int]]:
+    """The identifiers that a node defines, with their lines."""
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+        yield node.name, node.lineno
+    elif isinstance(node, ast.arg):
+        yield node.arg, node.lineno
+    elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+        yield node.id, node.lineno
+    elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+        yield node.attr, node.lineno
+    elif isinstance(node, ast.ExceptHandler | ast.MatchAs) and node.name:
+        yield node.name, node.lineno
+    elif isinstance(node, ast.alias) and node.asname:
+        yield node.asname, node.lineno
+
+
+@functools.cache
 def words(identifier: str) -> list[str]:
     identifier = re.sub(r"held_?out", "", identifier, flags=re.IGNORECASE)  # held-out data is a term of statistics
     return [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", identifier)]
@@ -73,42 +101,30 @@ def everyday(files: dict[str, str]) -> list[str]:
     return [
         f"{name}:{line} {identifier}"
         for name, text in files.items()
-        for identifier, line in defined(ast.parse(text))
+        for identifier, line in facts(text).identifiers
         if f"{name} {identifier}" not in WORDS_ALLOWED and EVERYDAY.intersection(words(identifier))
     ]
 
 
 def giving(files: dict[str, str]) -> list[str]:
-    kinds = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
-    return [
-        f"{name}: {getattr(node, 'name', 'module')}"
-        for name, text in files.items()
-        for node in ast.walk(ast.parse(text))
-        if isinstance(node, kinds) and (ast.get_docstring(node) or "").startswith("Give")
-    ]
+    return [f"{name}: {what}" for name, text in files.items() for what in facts(text).giving]
 
 
 def repeated(files: dict[str, str]) -> dict[str, list[str]]:
     where = defaultdict(list)
     for name, text in files.items():
-        for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.ClassDef):
-                where[node.name].append(name)
+        for kind in facts(text).classes:
+            where[kind].append(name)
     return {name: places for name, places in where.items() if len(places) > 1 and name not in CLASSES_ALLOWED}
 
 
 def written_elsewhere(files: dict[str, str]) -> list[str]:
     """Assignments to a field of a part, as in `twin.models.point_mass = …`, outside of the part's module."""
     return [
-        f"{name}:{node.lineno} {ast.unparse(node)}"
+        f"{name}:{assignment}"
         for name, text in files.items()
-        for node in ast.walk(ast.parse(text))
-        if isinstance(node, ast.Attribute)
-        and isinstance(node.ctx, ast.Store | ast.Del)
-        and isinstance(node.value, ast.Attribute)
-        and name.startswith("twin_worker/")
-        and PARTS.get(node.value.attr, name) != name
-        and isinstance(node.value.value, ast.Name)
+        for part, assignment in facts(text).written
+        if name.startswith("twin_worker/") and PARTS.get(part, name) != name
     ]
 
 
@@ -141,7 +157,7 @@ def test_every_part_of_the_state_is_written_by_one_module() -> None:
 
 
 def test_every_exception_is_needed() -> None:
-    names = {f"{name} {identifier}" for name, text in sources() for identifier, _ in defined(ast.parse(text))}
+    names = {f"{name} {identifier}" for name, text in sources() for identifier, _ in facts(text).identifiers}
     assert set(WORDS_ALLOWED) <= names and len(WORDS_ALLOWED) <= 10
     assert set(CLASSES_ALLOWED) <= {name.partition(" ")[2] for name in names}
     assert all(WORDS_ALLOWED.values()) and all(CLASSES_ALLOWED.values())

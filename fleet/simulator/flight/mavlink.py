@@ -6,6 +6,7 @@ Source: MAVLink common and ardupilotmega dialects.
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from math import lcm
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
@@ -51,6 +52,11 @@ class MavlinkEndpoint:
         self._names = sorted(params)
         self._params, self._dialect = params, dialect
         self._pending_params: deque[int] = deque()  # indices of parameters to send
+        schedule = [(round(TICK_HZ / rate), phase, build) for rate, phase, build in dialect.telemetry]
+        self._due = [  # message functions of each tick, repeated
+            [build for period, phase, build in schedule if (tick - phase) % period == 0]
+            for tick in range(lcm(*(period for period, _, _ in schedule)))
+        ]
 
     def _pack(self, message: Any) -> bytes:
         packed = bytes(message.pack(self._out))
@@ -59,7 +65,7 @@ class MavlinkEndpoint:
 
     def telemetry(self, tick: int, state: Callable[[], TelemetryState]) -> list[bytes]:
         """Return the frames due at this tick of 10 ms; `state` is called only if one is due."""
-        due = [build for rate, phase, build in self._dialect.telemetry if (tick - phase) % round(TICK_HZ / rate) == 0]
+        due = self._due[tick % len(self._due)]
         snapshot = state() if due else None
         frames = [self._pack(make(snapshot)) for make in due if snapshot is not None]
         return frames + self.stream_parameters(_PARAMS_PER_TICK)

@@ -1,7 +1,9 @@
 """MAVLink state of one aircraft: rows, mode, losses, parameters, mission; received in batches, returned in steps."""
 
+import bisect
 from collections import deque
 from collections.abc import Callable, Hashable
+from operator import itemgetter
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -24,6 +26,7 @@ MISSION_RECEIVED = "Flight plan received"  # text of ArduPilot after an upload b
 MAX_TEXTS = 2_000
 _FIRMWARE_TEXTS = ("ArduPlane V", "ArduCopter V", "APM:", "PX4 v", "Blimp V", "ArduRover V")  # autopilot and version
 _MISSION_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
+_ARRIVAL: Callable[[tuple[Any, ...]], float] = itemgetter(0)  # of an entry of the queue
 _ABSOLUTE_FRAMES = (0, 5)  # MAV_FRAME: altitude above sea level
 
 
@@ -84,10 +87,7 @@ class AircraftLink:
         if self._queue_done:
             del self._queue[: self._queue_done]
             self._queue_done = 0
-        in_order = not self._queue or arrival >= self._queue[-1][0]
-        self._queue.append((arrival, callback, arguments))
-        if not in_order:
-            self._queue.sort(key=lambda waiting: waiting[0])
+        bisect.insort(self._queue, (arrival, callback, arguments), key=_ARRIVAL)
         self.arrays.next_due_t[self.number] = min(arrival, self.arrays.next_due_t[self.number])
 
     def collect(self, now: float) -> list[Status | Mission | Params]:

@@ -6,7 +6,6 @@ from math import sqrt
 from typing import Any
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
 
 from fleet.telemetry.mavlink.parsing.decode import IDS, Frames
 from fleet.telemetry.mavlink.parsing.scan import ID
@@ -32,7 +31,7 @@ class LinkTiming:
 
     def __init__(self, clocks: Callable[[], np.ndarray]) -> None:
         self._clocks = clocks
-        self._filter: KalmanFilter | None = None
+        self._filter: OffsetFilter | None = None
         self._updated_t = float("-inf")
         self._steps = 0.0  # clock jumps plus total re-anchoring
         self._gps_offset_s: float | None = None
@@ -73,7 +72,7 @@ class LinkTiming:
         return float(self._filter.x[1, 0])
 
     def _update_drift(self, boot: np.ndarray, now: float) -> None:
-        """Update the Kalman filter of offset and drift: x = (offset, drift), x' = F x, z = offset."""
+        """Update the filter of offset and drift; start it anew after a step of the clock."""
         elapsed = now - self._updated_t
         if 0 <= elapsed < UPDATE_PERIOD_S or np.isnan(boot[c.NEWEST_OWN]):
             return
@@ -81,20 +80,33 @@ class LinkTiming:
         steps = float(boot[c.JUMPS] + boot[c.ADVANCE])
         if self._filter is None or steps != self._steps or not elapsed < 10 * UPDATE_PERIOD_S:
             self._steps, self._gps_offset_s = steps, None
-            self._filter = _new_filter(float(boot[c.OFFSET]))
+            self._filter = OffsetFilter(float(boot[c.OFFSET]))
             return
-        transition = np.array([[1.0, elapsed], [0.0, 1.0]])
-        noise = np.array([[elapsed**3 / 3, elapsed**2 / 2], [elapsed**2 / 2, elapsed]]) * DRIFT_NOISE**2
-        self._filter.predict(F=transition, Q=noise)
-        self._filter.update(float(boot[c.OFFSET]))
+        self._filter.update(elapsed, float(boot[c.OFFSET]))
 
 
-def _new_filter(offset_s: float) -> KalmanFilter:
-    kalman = KalmanFilter(dim_x=2, dim_z=1)
-    kalman.x = np.array([[offset_s], [0.0]])
-    kalman.P = np.diag([OFFSET_SIGMA_S**2, DRIFT_SIGMA**2])
-    kalman.H, kalman.R = np.array([[1.0, 0.0]]), np.array([[OFFSET_SIGMA_S**2]])
-    return kalman
+class OffsetFilter:
+    """Kalman filter of offset and drift: x = (offset, drift), x' = F x, z = offset.
+
+    The same operations as `filterpy.kalman.KalmanFilter`, whose import takes a second (scipy.stats).
+
+    Args:
+        offset_s: first offset [s]
+    """
+
+    def __init__(self, offset_s: float) -> None:
+        self.x = np.array([[offset_s], [0.0]])
+        self.P = np.diag([OFFSET_SIGMA_S**2, DRIFT_SIGMA**2])
+
+    def update(self, elapsed: float, offset_s: float) -> None:
+        """Predict over `elapsed` [s] and update with a measured offset [s]."""
+        F, H, R = np.array([[1.0, elapsed], [0.0, 1.0]]), np.array([[1.0, 0.0]]), np.array([[OFFSET_SIGMA_S**2]])
+        Q = np.array([[elapsed**3 / 3, elapsed**2 / 2], [elapsed**2 / 2, elapsed]]) * DRIFT_NOISE**2
+        x, P = F @ self.x, F @ self.P @ F.T + Q
+        K = P @ H.T @ np.linalg.inv(H @ (P @ H.T) + R)
+        self.x = x + K @ (offset_s - H @ x)
+        I_KH = np.eye(2) - K @ H
+        self.P = I_KH @ P @ I_KH.T + K @ R @ K.T
 
 
 def update_timings(frames: Frames, owner: np.ndarray, timings: Sequence[LinkTiming]) -> None:

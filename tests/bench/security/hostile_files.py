@@ -3,6 +3,7 @@
 python -m tests.bench.security.hostile_files        the table: file → CPU s, MB, sentence
 """
 
+import atexit
 import functools
 import gzip
 import io
@@ -10,38 +11,22 @@ import json
 import lzma
 import os
 import struct
+import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import IO
 
+import numpy as np
+
+from fleet.telemetry.mavlink.parsing import scan
+from fleet.telemetry.replay.offset_copies import write_checksums
 from tests.bench.security import hostile_tables as tables
 from tests.support.ulog_writer import flight, ulog
 
 CPU_S, MEMORY_MB = 30.0, 300.0
 _ROW = "vehicle_attitude"
-_READ = """
-import json, resource, sys
-from fleet.telemetry.recording.options import RecordingOptions
-from fleet.telemetry.recording.recordings import Recording
-from fleet.telemetry.mavlink.warm import warm_up
-from tests.bench.peak_memory import peak_mb
-warm_up()
-begun = resource.getrusage(resource.RUSAGE_SELF)
-said, news = "", 0
-try:
-    recording = Recording(sys.argv[1], options=RecordingOptions(columns=sys.argv[2]))
-    for _, heard in recording.steps():
-        news += len(heard)
-    said = "; ".join(recording.skipped)
-except (ValueError, OSError) as error:
-    said = str(error)
-ended = resource.getrusage(resource.RUSAGE_SELF)
-cpu = ended.ru_utime + ended.ru_stime - begun.ru_utime - begun.ru_stime
-print(json.dumps({"cpu_s": cpu, "mb": peak_mb(), "news": news, "said": said}))
-"""
-
-
 _COLUMNS = """
 [tables.all]
 time = "t"
@@ -56,30 +41,27 @@ def read_apart(path: Path, cpu_s: float = 60.0, memory_mb: float = 4000.0) -> di
 
     A reader that takes more than the bounds given is ended by the system, and said to be.
     """
-    import resource
-    import subprocess
-
-    def bound() -> None:
-        resource.setrlimit(resource.RLIMIT_CPU, (int(cpu_s), int(cpu_s) + 1))
-        resource.setrlimit(resource.RLIMIT_DATA, (int(memory_mb * 2**20), int(memory_mb * 2**20)))
-
-    _compile_once()
     columns = path.parent / "columns.toml"
     columns.write_text(_COLUMNS)
-    command = [sys.executable, "-c", _READ, str(path), str(columns)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, preexec_fn=bound)
-    if done.returncode:
-        words = done.stderr.strip().splitlines()[-1:] or ["ended by the system"]
-        return {"cpu_s": cpu_s, "mb": memory_mb, "news": 0, "said": f"DIED ({done.returncode}): {words[0]}"}
-    return json.loads(done.stdout.splitlines()[-1])
+    request = json.dumps([str(path), str(columns), int(cpu_s), int(memory_mb * 2**20)])
+    requests, answers = _reader()
+    requests.write(request + "\n")
+    requests.flush()
+    answer = json.loads(answers.readline())
+    if code := answer.pop("code"):
+        words = answer.get("died", "ended by the system")
+        return {"cpu_s": cpu_s, "mb": memory_mb, "news": 0, "said": f"DIED ({code}): {words}"}
+    return answer
 
 
 @functools.cache
-def _compile_once() -> None:
-    """Fill the compile cache, so that no reader measured is also the compiler."""
-    import subprocess
-
-    subprocess.run([sys.executable, "-c", "import fleet.telemetry.mavlink.warm as w; w.warm_up()"], check=True)
+def _reader() -> tuple[IO[str], IO[str]]:
+    """Start the process whose children read; it ends with this one."""
+    command = [sys.executable, "-m", "tests.bench.security.file_reader"]
+    reader = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert reader.stdin and reader.stdout
+    atexit.register(reader.communicate)
+    return reader.stdin, reader.stdout
 
 
 # --- ULog ------------------------------------------------------------------------------------------------------------
@@ -153,18 +135,24 @@ def rows_unfolding() -> bytes:
 
 
 def _frames(n: int, step_us: int = 10_000, system: int = 1) -> bytes:
-    """Give frames of one aircraft: every tenth a heartbeat, the others attitude."""
+    """Give frames of one aircraft, in tens: a heartbeat and nine of attitude."""
     from pymavlink.dialects.v20 import ardupilotmega as mav
 
     talker = mav.MAVLink(io.BytesIO(), system, 1)
     beat = mav.MAVLink_heartbeat_message(mav.MAV_TYPE_FIXED_WING, mav.MAV_AUTOPILOT_ARDUPILOTMEGA, 0, 0, 4, 3)
-    out = []
-    for k in range(n):
-        message = (
-            mav.MAVLink_attitude_message(k * step_us // 1000 % 2**32, 0.1, 0.1, 0.1, 0.0, 0.0, 0.0) if k % 10 else beat
-        )
-        out.append(struct.pack(">Q", 1_600_000_000_000_000 + k * step_us) + message.pack(talker))
-    return b"".join(out)
+    attitude = mav.MAVLink_attitude_message(0, 0.1, 0.1, 0.1, 0.0, 0.0, 0.0)
+    ten = [beat.pack(talker), *[attitude.pack(talker)] * 9]
+    start = np.cumsum([8, *(8 + len(frame) for frame in ten[:-1])])
+    out = np.tile(np.frombuffer(b"".join(bytes(8) + frame for frame in ten), np.uint8), (n // 10, 1))
+    number = np.arange(n).reshape(-1, 10)
+    us, ms = 1_600_000_000_000_000 + number * step_us, number * step_us // 1000 % 2**32
+    for k, at in enumerate(start.tolist()):
+        out[:, at - 8 : at] = us[:, k : k + 1].astype(">u8").view(np.uint8)
+        if k:
+            out[:, at + 10 : at + 14] = ms[:, k : k + 1].astype("<u4").view(np.uint8)
+    extra = np.array([beat.crc_extra, *[attitude.crc_extra] * 9], np.uint8)
+    write_checksums(out, start, start + 10, np.array([len(frame) - 12 for frame in ten]), extra, scan.CRC)
+    return out.tobytes()
 
 
 def fd_everywhere() -> bytes:

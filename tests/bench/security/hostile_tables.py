@@ -34,7 +34,10 @@ def matlab_that_unfolds() -> bytes:
     """A MATLAB file of one variable that decompresses a thousandfold."""
     import zlib
 
-    packed = zlib.compress(bytes(1 << 29))
+    engine = zlib.compressobj(wbits=-15)
+    block = engine.compress(bytes(1 << 20)) + engine.flush(zlib.Z_FULL_FLUSH)  # needs nothing before it
+    checksum = (1 << 29) % 65_521 << 16 | 1  # Adler-32 of so many zeros
+    packed = b"\x78\x9c" + block * (1 << 9) + b"\x03\x00" + checksum.to_bytes(4, "big")
     return b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM" + struct.pack("<II", 15, len(packed)) + packed
 
 

@@ -34,19 +34,29 @@ def test_every_pair_is_tuned_and_can_be_asked_for() -> None:
     assert set(AIRCRAFT) == set(TYPES)
 
 
+class Silent:
+    """In place of an endpoint, where the frames between two looks at an aircraft are read by nobody."""
+
+    def telemetry(self, tick: int, state: object) -> list[bytes]:
+        return []
+
+
 @pytest.mark.parametrize(("autopilot", "aircraft"), KINDS)
 def test_it_holds_height_speed_bank_and_line_for_ten_minutes(autopilot: str, aircraft: str) -> None:
     uav = SimulatedUav(1, seed=77, wind=5.0, turbulence=2, autopilot=autopilot, aircraft=aircraft)
-    rows, seqs = [], []
+    endpoint, uav._endpoint = uav._endpoint, Silent()
+    rows, seqs, sent = [], [], []
     for k in range(1, 2_000):
         uav.step(k * 0.3)
         f, x = uav._telemetry_state(), uav.aircraft.truth()
+        sent += endpoint.telemetry(k, lambda state=f: state)  # every message in its turn
         errors = (f.alt_error, f.Va_error, degrees(f.phi_c - x.euler[0]), degrees(f.theta_c - x.euler[1]))
         rows.append((*errors, f.xtrack_error if uav.leg[KIND] == WAYPOINT else np.nan))
         seqs.append(f.seq)
     alt, Va, phi, theta, _ = np.sqrt(np.mean(np.square(rows), axis=0))
     size = TYPES[aircraft].geometry
     assert not uav.crashed
+    assert len({message.get_type() for message in heard(sent)}) >= 9
     assert np.count_nonzero(np.diff(seqs)) >= 8
     assert alt < 10 * size.height and np.quantile(np.abs(rows)[:, 0], 0.9) < 14 * size.height
     assert Va < 2 and phi < 10 and theta < 3

@@ -28,6 +28,7 @@ class MessageCounters:
         self._rates_hz = np.empty((0, len(names)))  # smoothed rate of each kind; nan: never received
         self._kind_index = {name: k for k, name in enumerate(names)}
         self._pending = (np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0))
+        self._counted = 0  # the first pending messages, which are counted
 
     def add_aircraft(self) -> None:
         """Add one aircraft."""
@@ -60,12 +61,14 @@ class MessageCounters:
         missed = np.empty(len(owner))
         _count_missed(self.state, owner, arrival, np.empty(0, np.int64) if seq is None else seq, missed)
         batch = owner, kind, arrival, missed
-        self._pending = tuple(map(np.concatenate, zip(self._pending, batch, strict=True)))  # type: ignore[assignment]
+        pending = (column[self._counted :] for column in self._pending)
+        self._pending = tuple(map(np.concatenate, zip(pending, batch, strict=True)))  # type: ignore[assignment]
+        self._counted = 0
 
     def count_until(self, now: float) -> None:
         """Count the messages that arrived up to `now` [s since 1970]."""
-        if len(self._pending[0]) and (counted := _count_until(self.state, self._kind_counts, *self._pending, now)):
-            self._pending = tuple(column[counted:] for column in self._pending)  # type: ignore[assignment]
+        if self._counted < len(self._pending[0]):
+            self._counted = _count_until(self.state, self._kind_counts, *self._pending, self._counted, now)
 
     def rates(self, number: int, elapsed: float) -> dict[str, float]:
         """Return the smoothed message rates of one aircraft [Hz]; `elapsed` since the last call [s]."""
@@ -101,9 +104,9 @@ def _count_missed(state, owner, arrival, seq, missed):
 
 
 @nb.njit(cache=True, nogil=True)
-def _count_until(state, kind_counts, owner, kind, arrival, missed, now):
-    """Count messages up to `now`; return their number."""
-    i = 0
+def _count_until(state, kind_counts, owner, kind, arrival, missed, first, now):
+    """Count messages up to `now`, beginning with number `first`; return the number of the next one."""
+    i = first
     while i < len(owner) and arrival[i] <= now:
         counters = state[owner[i]]
         counters[RECEIVED] += 1

@@ -128,6 +128,21 @@ def _write_samples(
     return owners[:n], ends[:n], sample_t[:n]
 
 
+@nb.njit(cache=True, nogil=True)
+def _max_size(start, stop, widths):
+    """Return an upper limit of the bytes of all samples."""
+    size = 0
+    for owner in range(len(start)):
+        has_rows = False
+        for field in range(len(widths)):
+            rows = stop[owner, field] - start[owner, field]
+            size += rows * (8 + 4 * widths[field])
+            has_rows = has_rows or rows > 0
+        if has_rows:
+            size += 64 + _MAX_FIELD_HEADER * len(widths)
+    return size
+
+
 def pack_samples(
     uavs: np.ndarray, start: np.ndarray, stop: np.ndarray, t: np.ndarray, values: np.ndarray
 ) -> list[Packed]:
@@ -139,10 +154,7 @@ def pack_samples(
         t: fleet times, increasing within a field, (n,) [s since 1970]
         values: columns, (n, 8)
     """
-    rows = stop - start
-    headers = int((rows > 0).any(axis=1).sum()) * (64 + _MAX_FIELD_HEADER * len(FIELDS))
-    size = int((rows * (8 + 4 * WIDTHS)).sum()) + headers
-    out = np.empty(size, np.uint8)
+    out = np.empty(_max_size(start, stop, WIDTHS), np.uint8)
     owners, ends, sample_t = _write_samples(
         out, uavs, start, stop, t, values, WIDTHS, IS_INTEGER, _PREFIX, *_FIELD_NAMES, *_FRAGMENTS
     )

@@ -49,10 +49,8 @@ class PendingRows:
         """Return the pending rows received up to `now`, encoded as samples."""
         if self._next_arrival > now:
             return []
-        stop = self._start.copy()
-        self._next_arrival = _find_arrived(self._start, self._end, self._arrival, now, stop)
-        limited = np.minimum(stop, self._start + MAX_ROWS)
-        self.dropped += (stop - limited).sum(axis=1)
+        stop, limited = np.empty_like(self._start), np.empty_like(self._start)
+        self._next_arrival = _find_arrived(self._start, self._end, self._arrival, now, stop, limited, self.dropped)
         start, self._start = self._start, stop
         packed = pack_samples(self.uavs, start, limited, self._t, self._x)
         if self._next_arrival == np.inf:
@@ -63,8 +61,17 @@ class PendingRows:
 
 
 @nb.njit(cache=True, nogil=True)
-def _find_arrived(start, end, arrival, now, stop):
-    """Fill `stop` with the end of the rows that arrived up to `now`; return the next arrival."""
+def _find_arrived(start, end, arrival, now, stop, limited, dropped):
+    """Return the next arrival after `now`.
+
+    Args:
+        start, end: range of the pending rows, (m, fields)
+        arrival: arrival times, (n,) [s since 1970]
+        now: fleet time [s since 1970]
+        stop: filled with the end of the rows that arrived up to `now`, (m, fields)
+        limited: filled with the same, at most `MAX_ROWS` after `start`, (m, fields)
+        dropped: increased by the number of rows beyond `MAX_ROWS`, (m,)
+    """
     next_arrival = np.inf
     for owner in range(len(start)):
         for field in range(start.shape[1]):
@@ -72,6 +79,8 @@ def _find_arrived(start, end, arrival, now, stop):
             while row < end[owner, field] and arrival[row] <= now:
                 row += 1
             stop[owner, field] = row
+            limited[owner, field] = min(row, start[owner, field] + MAX_ROWS)
+            dropped[owner] += row - limited[owner, field]
             if row < end[owner, field]:
                 next_arrival = min(next_arrival, arrival[row])
     return next_arrival

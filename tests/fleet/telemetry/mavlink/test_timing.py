@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from filterpy.kalman import KalmanFilter
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from fleet.contract import Status
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
-from fleet.telemetry.mavlink.timing import LinkTiming
+from fleet.telemetry.mavlink.timing import DRIFT_NOISE, OFFSET_SIGMA_S, LinkTiming, OffsetFilter
 from fleet.telemetry.tables import clock as c
 from tests.support.talker import T0, Talker, of
 
@@ -87,3 +88,17 @@ def test_a_satellite_time_that_is_none_is_no_time():
     timing.add_round_trip(T0 + 1, T0)
     told = timing.status_fields(T0)
     assert told["gps_offset_s"] is None is told["round_trip_s"] is told["clock_drift"]
+
+
+def test_the_filter_of_offset_and_drift_is_that_of_filterpy():
+    ours, theirs = OffsetFilter(5.0), KalmanFilter(dim_x=2, dim_z=1)
+    theirs.x, theirs.P = ours.x.copy(), ours.P.copy()
+    theirs.H, theirs.R = np.array([[1.0, 0.0]]), np.array([[OFFSET_SIGMA_S**2]])
+    rng = np.random.default_rng(1)
+    for k in range(200):
+        dt, offset_s = float(rng.uniform(10, 90)), 5.0 + 3e-5 * k + 3e-3 * rng.standard_normal()
+        noise = np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]) * DRIFT_NOISE**2
+        theirs.predict(F=np.array([[1.0, dt], [0.0, 1.0]]), Q=noise)
+        theirs.update(offset_s)
+        ours.update(dt, offset_s)
+        assert (ours.x == theirs.x).all() and (ours.P == theirs.P).all()
