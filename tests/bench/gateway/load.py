@@ -66,8 +66,8 @@ def measure(path: Path, uavs: int, seconds: float, from_s: float) -> dict[str, A
     router = open_router(where)
     links = [f"--link=udpin:127.0.0.1:{port}#offset={k * A_LINK}" for k, port in enumerate(ports)]
     gateway = start("gateway", "--router", where, "--listen-only", *links)
+    ear = Ear(where)
     try:
-        ear = Ear(where)
         first = ear.accounts.get(timeout=LONG_S)
         to = [f"--to=udpout:127.0.0.1:{port}" for port in ports]
         sender = start("fleet.cli", "replay", str(path), "--copies", str(uavs), *to)
@@ -78,6 +78,7 @@ def measure(path: Path, uavs: int, seconds: float, from_s: float) -> dict[str, A
     finally:
         gateway.terminate()
         gateway.communicate()
+        ear.bus.close()
         router.close()
 
 
