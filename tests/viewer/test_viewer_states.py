@@ -4,6 +4,7 @@ import threading
 from pathlib import Path
 from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -138,3 +139,15 @@ def test_an_empty_page_looks_at_the_ground_and_its_first_ring() -> None:
     ring = RINGS_M[0] / UNIT_M * np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=-1)
     spots, depth = CameraView(start.position, start.look_at, start.fov, 1.0).project(ring)
     assert (depth > 0).all() and (np.abs(spots) < 0.5).all() and np.ptp(spots[:, 0]) > 0.3
+
+
+def test_the_newest_verification_says_which_fit_the_predictions_use(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 1)
+    model = PretendUav(0).model(T + 1)
+    assert model.active_verdict is not None
+    bus.publish(model, STAMP)
+    assert "earlier model" not in status_html(feed.vehicles[0], DARK, clock.now)
+    earlier = msgspec.structs.replace(model.active_verdict, fit={"u": 2.0, "w": 4.0})
+    bus.publish(msgspec.structs.replace(model, t=T + 2, active_verdict=earlier), STAMP)
+    page = status_html(feed.vehicles[0], DARK, clock.now)
+    assert "predictions use an earlier model with fit 3 %" in page and "3 %" in page.split("newest verification")[0]

@@ -79,12 +79,14 @@ def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
     texts = limitations(vehicle, now)
     cards += [f'<div class="say">{escape(clip(text, MAX_TEXT))}</div>' for text in texts]
     verdict = vehicle.model.verdict if vehicle.model is not None else None
-    if verdict is not None:
+    if vehicle.model is not None and verdict is not None:
+        mean, is_active = fit(vehicle), vehicle.model.active_verdict in (None, verdict)
+        active = "" if is_active or mean is None else f"; predictions use an earlier model with fit {mean:.0f} %"
         colour = palette.verified if verdict.outcome is Outcome.VERIFIED else palette.identifying
         least = f", threshold {verdict.threshold:.0f} %" if verdict.threshold > 0 else ""
         cards.append(
             f'<div class="say" style="border-color:{colour}"><b>{escape(verdict.outcome.value.replace("_", " "))}</b> '
-            f'<span class="soft">newest verification, number {verdict.attempts}{least}</span><br>'
+            f'<span class="soft">newest verification, number {verdict.attempts}{least}{active}</span><br>'
             f"{escape(clip(verdict.sentence, MAX_TEXT))}</div>"
         )
     elif vehicle.row is not None and not any(vehicle.row.verdict in text for text in ("", *texts)):
