@@ -37,9 +37,9 @@ units = ["deg", "deg", "m"]
 
 
 def read_apart(path: Path, cpu_s: float = 60.0, memory_mb: float = 4000.0) -> dict[str, object]:
-    """Read a file in a process of its own; give CPU time [s], memory at most [MB], messages, and what was said of it.
+    """Read a file in its own process; return CPU time [s], peak memory [MB], number of messages, error or warning.
 
-    A reader that takes more than the bounds given is ended by the system, and said to be.
+    The system ends a reader that exceeds the bounds; the sentence reports it.
     """
     columns = path.parent / "columns.toml"
     columns.write_text(_COLUMNS)
@@ -50,7 +50,7 @@ def read_apart(path: Path, cpu_s: float = 60.0, memory_mb: float = 4000.0) -> di
     answer = json.loads(answers.readline())
     if code := answer.pop("code"):
         words = answer.get("died", "ended by the system")
-        return {"cpu_s": cpu_s, "mb": memory_mb, "news": 0, "said": f"DIED ({code}): {words}"}
+        return {"cpu_s": cpu_s, "mb": memory_mb, "news": 0, "sentence": f"DIED ({code}): {words}"}
     return answer
 
 
@@ -135,7 +135,7 @@ def rows_unfolding() -> bytes:
 
 
 def _frames(n: int, step_us: int = 10_000, system: int = 1) -> bytes:
-    """Give frames of one aircraft, in tens: a heartbeat and nine of attitude."""
+    """Return frames of one aircraft, in tens: a heartbeat and nine of attitude."""
     from pymavlink.dialects.v20 import ardupilotmega as mav
 
     talker = mav.MAVLink(io.BytesIO(), system, 1)
@@ -277,7 +277,7 @@ def _attempt(what: str) -> Callable[[], str]:
 
     def read() -> str:
         ((_, size, cost),) = table([what])
-        words = f"{size:,} B: {cost['cpu_s']:.1f} s, {cost['mb']:.0f} MB; {cost['said']}"[:200]
+        words = f"{size:,} B: {cost['cpu_s']:.1f} s, {cost['mb']:.0f} MB; {cost['sentence']}"[:200]
         assert float(cost["cpu_s"]) <= CPU_S and float(cost["mb"]) <= MEMORY_MB, words  # type: ignore[arg-type]
         return words
 
@@ -293,7 +293,7 @@ def rightful_files() -> str:
             path = Path(folder) / name
             path.write_bytes(data)
             cost = read_apart(path)
-            assert cost["news"], f"{name}: {cost['said']}"
+            assert cost["news"], f"{name}: {cost['sentence']}"
     return f"{', '.join(made)}: read"
 
 
@@ -308,7 +308,7 @@ def main() -> int:
     for what, size, cost in table([name for name in FILES if not sys.argv[1:] or name in sys.argv[1:]]):
         bad = float(cost["cpu_s"]) > CPU_S or float(cost["mb"]) > MEMORY_MB  # type: ignore[arg-type]
         over += bad
-        words = str(cost["said"])[:150]
+        words = str(cost["sentence"])[:150]
         costs = f"{cost['cpu_s']:6.2f} s {cost['mb']:6.0f} MB"
         print(f"{'OVER' if bad else 'held':5}{what:34}{size:>14,} B {costs}  {words}", flush=True)
     return int(over > 0)

@@ -59,8 +59,7 @@ class FrozenOutput:
         pulse: [us]; position: of full deflection, or of full throttle [-]
         since, until: [s]
         evidence: log likelihood ratio [-]
-        error_before, error_after: rms of the output less its prediction, over that of trusted flight, from the law and
-            from the frozen pulse [-]
+        error_before: rms of the output less its prediction, over that of trusted flight [-]
     """
 
     number: int
@@ -71,7 +70,6 @@ class FrozenOutput:
     until: float
     evidence: float
     error_before: float
-    error_after: float = 0.0
 
 
 def find_frozen_outputs(outputs: ServoOutputs, trusted_until: float, energy_loss: float | None) -> list[FrozenOutput]:
