@@ -4,6 +4,7 @@ msgspec encodes and checks everything by the annotations of the state; hooks con
 Untrusted bytes give a snapshot of these types or a `ValueError`.
 """
 
+import threading
 from collections import deque
 from dataclasses import dataclass, field
 from typing import Any, get_args, get_origin
@@ -38,6 +39,9 @@ class Snapshot:
 
 
 _Encoded = tuple[Twin, list[tuple[str, msgspec.Raw]], AlertState, Mismatch | None]  # queued messages with their topics
+_decoding = (
+    threading.Lock()
+)  # msgspec prepares a class at its first use, and crashes if a second thread decodes it then
 
 
 def encode_snapshot(snapshot: Snapshot) -> bytes:
@@ -59,7 +63,8 @@ def decode_snapshot(data: bytes, uav: int) -> Snapshot:
         ValueError: when the bytes are not a twin of this aircraft; start it from published data instead.
     """
     try:
-        twin, queued, *rest = msgspec.msgpack.decode(data, type=_Encoded, dec_hook=_from_parts)
+        with _decoding:
+            twin, queued, *rest = _DECODER.decode(data)
         inbox: list[Message] = [msgspec.msgpack.decode(message, type=TOPICS[topic]) for topic, message in queued]
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         raise ValueError(
@@ -123,3 +128,6 @@ def _array(dtype: str, shape: tuple[int, ...], data: bytes | list[str]) -> np.nd
     if np.dtype(dtype).kind not in "biuf" or min(shape, default=0) < 0:
         raise ValueError(f"an array of {dtype!r} {shape}")
     return np.frombuffer(data, dtype).reshape(shape).copy()
+
+
+_DECODER = msgspec.msgpack.Decoder(_Encoded, dec_hook=_from_parts)

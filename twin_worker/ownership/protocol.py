@@ -41,6 +41,7 @@ _SNAPSHOT_TIMEOUT_S = (
 )
 _LEAVE_TIMEOUT_S = 5.0  # for the other workers to acquire everything at shutdown [s]
 _REPAIR_PERIOD_S = 1.0  # between checks for incomplete acquisitions [s]
+_REQUEST_DECODER = msgspec.msgpack.Decoder(HandoverRequest)
 _MAX_CLOCK_WARNINGS = 100  # maximum number of workers with a clock warning
 
 
@@ -146,7 +147,7 @@ class OwnershipProtocol:
     def _on_handover_query(self, payload: bytes) -> Iterator[tuple[Handover, None]]:
         """Yield snapshots of owned aircraft, one by one; the requester acquires them and announces it."""
         try:
-            wanted = msgspec.msgpack.decode(payload, type=HandoverRequest).uavs if payload else ()
+            wanted = _REQUEST_DECODER.decode(payload).uavs if payload else ()
         except (msgspec.DecodeError, RecursionError) as error:
             raise ValueError(f"handover: found no Wanted ({error}); see `fleet schema @handover`") from None
         for uav in wanted:

@@ -1,10 +1,13 @@
 """A twin on its way to another worker: it goes on exactly as it would have, and hostile bytes become no twin."""
 
 import copy
+import subprocess
+import sys
 
 import msgspec
 import numpy as np
 import pytest
+from conftest import ROOT
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -14,6 +17,29 @@ from twin_worker.ownership.cold_start import continue_prediction, restore_model
 from twin_worker.ownership.handover import Snapshot, decode_snapshot, encode_snapshot
 from twin_worker.twin.state.state import Twin, ingest
 from twin_worker.twin.step import advance
+
+DECODE_AT_ONCE = """
+import sys, threading
+from fleet.airframes import GENERIC, load
+from twin_worker.ownership.handover import Snapshot, decode_snapshot, encode_snapshot
+from twin_worker.twin.state.budget import Schedule
+from twin_worker.twin.state.state import AUTO, Twin, TwinConfig
+sys.setswitchinterval(1e-6)
+data = encode_snapshot(Snapshot(Twin(TwinConfig(3, 0.0, AUTO, load(GENERIC), Schedule()))))
+barrier, uavs = threading.Barrier(8), []
+def decode():
+    barrier.wait()
+    uavs.append(decode_snapshot(data, 3).twin.config.uav)
+threads = [threading.Thread(target=decode) for _ in range(8)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+print(uavs)
+"""
+
+
+def test_the_first_snapshots_may_come_from_several_workers_at_once() -> None:
+    done = subprocess.run([sys.executable, "-c", DECODE_AT_ONCE], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stdout.strip()) == (0, str([3] * 8)), done.stderr
 
 
 def later(heard: tuple[Message, ...], by: float = 20.0) -> list[Message]:
