@@ -197,6 +197,18 @@ def test_the_last_prediction_of_another_is_said_to_be_that_and_trusted_less(twin
     assert not continue_prediction(fresh, msgspec.structs.replace(last, prediction_region_half_axes=last.ahead))
 
 
+def test_a_first_mission_ends_no_prediction_that_another_worker_made_with_it(twin: Twin) -> None:
+    last, mission, params = twin.prediction.latest, twin.onboard.mission, twin.onboard.params
+    assert last is not None and mission is not None and params is not None and len(mission.items) > 3
+    fresh = Twin.of(1)
+    assert continue_prediction(fresh, last)
+    for message in (params, mission):
+        ingest(fresh, message)
+        assert fresh.prediction.last_rollout is not None and fresh.prediction.predict_timer.due(last.t, 60.0)
+    ingest(fresh, msgspec.structs.replace(mission, items=mission.items[:-1]))  # another mission
+    assert fresh.prediction.last_rollout is None
+
+
 def test_a_model_that_cannot_be_is_not_believed(twin: Twin, cold: Twin) -> None:
     model, told = twin.identification.message, twin.identification.message.derivatives
     replace = msgspec.structs.replace

@@ -24,10 +24,12 @@ def record_event(twin: "Twin", event: Event, t: float, details: str = "") -> Non
     twin.prediction.predict_timer.expire()
 
 
-def invalidate_prediction(twin: "Twin", event: Event | None, t: float, details: str = "") -> None:
+def invalidate_prediction(
+    twin: "Twin", event: Event | None, t: float, details: str = "", *, keep_rollout: bool = False
+) -> None:
     """Invalidate the running prediction as of time `t`; record `event` unless it is None."""
     twin.onboard.plan_changed(t)
-    twin.prediction.invalidate()
+    twin.prediction.invalidate(keep_rollout=keep_rollout)
     twin.confidence.tracker.censor_open()
     twin.prediction.selector.clear()
     if event is not None:

@@ -76,9 +76,13 @@ class PredictionState(msgspec.Struct):
         self.predict_timer.expire()
         self.ensemble_timer.expire()
 
-    def invalidate(self) -> None:
-        """End the running prediction: mode, mission or parameters changed."""
-        self.last_rollout = None
+    def invalidate(self, *, keep_rollout: bool = False) -> None:
+        """End the running prediction: mode, mission or parameters changed.
+
+        Args:
+            keep_rollout: extrapolate the last rollout until the next one: nothing that it assumed changed
+        """
+        self.last_rollout = self.last_rollout if keep_rollout else None
         self.expire()
 
     def add_event(self, event: Event, t: float, message: str) -> None:

@@ -227,7 +227,11 @@ class Twin(msgspec.Struct):
 
 
 def ingest(twin: Twin, message: Message) -> None:
-    """Ingest one message from the gateway."""
+    """Ingest one message from the gateway.
+
+    The first mission and the first parameters change no plan: a twin that continues another worker's prediction, which
+    was made with them, extrapolates it until its own first rollout.
+    """
     if isinstance(message, Sample):
         twin.telemetry.add(message)
         lock_course(twin)
@@ -238,14 +242,16 @@ def ingest(twin: Twin, message: Message) -> None:
     elif isinstance(message, Mission):
         first = twin.first_item  # item 0 of a mission that contains home is no change: home moves, e.g. at arming
         if not _is_same_mission(twin.onboard, message, first):
-            invalidate_prediction(twin, Event.MISSION, message.t, describe_mission(twin.onboard.mission, message))
+            text, is_first = describe_mission(twin.onboard.mission, message), twin.onboard.mission is None
+            invalidate_prediction(twin, Event.MISSION, message.t, text, keep_rollout=is_first)
         twin.onboard.set_mission(message, first)
         complete_home(twin)
     elif isinstance(message, Params):
         names = changed_parameters(twin.received_params, message.values)
         if names or twin.onboard.params is None:
             text = describe_parameters(names, twin.received_params, message.values)
-            invalidate_prediction(twin, Event.PARAMETERS if names else None, message.t, text)
+            event = Event.PARAMETERS if names else None
+            invalidate_prediction(twin, event, message.t, text, keep_rollout=twin.onboard.params is None)
         twin.onboard.set_params(message)
         twin.telemetry.set_servo_map(message.values)
 
