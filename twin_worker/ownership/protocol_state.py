@@ -8,7 +8,7 @@ predictions continue.
 
 A worker with a token is live, however late its announcements arrive. The router withdraws the token of a frozen or
 disconnected process when its lease expires. A process with little CPU time keeps its token, since session keep-alives
-need almost none. A worker with a token but without announcements for seconds, while others announce, counts as dead.
+need almost none. A worker with a token but without announcements for `SILENT_S`, while others announce, counts as dead.
 
     unsynchronised  after a pause, and without a router: publishes and claims nothing until it has queried the claims
                     of the others
@@ -75,7 +75,9 @@ def _mixed(x: np.ndarray) -> np.ndarray:
 
 PAUSE_S = 0.8  # a worker that paused longer may have been replaced [s]
 CLAIM_DELAY_S = 2.5  # from reconnection to the first claim: tokens arrive late on a busy machine [s]
-SILENT_S = 5.0  # without an announcement from a worker with a token while others announce; above any usual delay [s]
+# Without an announcement from a worker with a token while others announce [s]. An overloaded machine was measured to
+# stop all threads of a live process for up to 10.3 s; a frozen or disconnected one loses its token much earlier.
+SILENT_S = 20.0
 _MAX_SILENCE_STEP_S = 0.3  # maximum silence counted between two ticks; a delayed tick is not silence of others [s]
 
 
