@@ -4,7 +4,7 @@ import ctypes
 import platform
 import threading
 
-_M_MMAP_THRESHOLD, _M_MMAP_MAX = -3, -4  # of mallopt(3)
+_M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD, _M_MMAP_MAX, _M_ARENA_MAX = -1, -2, -3, -4, -8  # of mallopt(3)
 _MAX_MMAPS = 32_768  # mapped blocks; Linux allows 65,530 mappings per process, also for threads and files
 _TRIM_PERIOD_S = 20.0
 
@@ -26,6 +26,28 @@ def enable_malloc_trim(mmap_threshold: int) -> None:
     libc.mallopt(_M_MMAP_THRESHOLD, mmap_threshold)
     libc.mallopt(_M_MMAP_MAX, _MAX_MMAPS)
     threading.Thread(target=_trim, args=(libc,), name="heap", daemon=True).start()
+
+
+def limit_mapping_calls(mmap_threshold: int, reserve: int) -> None:
+    """As `enable_malloc_trim`, with few system calls that change the memory map, at the cost of some memory.
+
+    Such a call waits for all others of the process and for the kernel's page reclaim. On an overloaded machine single
+    calls waited for up to 10 s, and with them every thread that needs memory or the interpreter.
+
+    Args:
+        mmap_threshold: size from which a block is mapped separately and unmapped when freed [bytes]
+        reserve: the heap grows by an eighth of this, and shrinks between two trims only above it [bytes]
+    Source: mallopt(3), M_ARENA_MAX, M_TOP_PAD and M_TRIM_THRESHOLD.
+    """
+    if platform.libc_ver()[0] == "glibc":
+        libc = ctypes.CDLL(None)
+        for parameter, value in (
+            (_M_ARENA_MAX, 1),  # the heap of a thread grows by pages
+            (_M_TOP_PAD, reserve // 8),
+            (_M_TRIM_THRESHOLD, reserve),
+        ):
+            libc.mallopt(parameter, value)
+    enable_malloc_trim(mmap_threshold)
 
 
 def _trim(libc: ctypes.CDLL) -> None:
