@@ -28,7 +28,7 @@ def enable_malloc_trim(mmap_threshold: int) -> None:
     threading.Thread(target=_trim, args=(libc,), name="heap", daemon=True).start()
 
 
-def limit_mapping_calls(mmap_threshold: int, reserve: int) -> None:
+def limit_mapping_calls(mmap_threshold: int, trim_threshold: int) -> None:
     """As `enable_malloc_trim`, with few system calls that change the memory map, at the cost of some memory.
 
     Such a call waits for all others of the process and for the kernel's page reclaim. On an overloaded machine single
@@ -36,15 +36,15 @@ def limit_mapping_calls(mmap_threshold: int, reserve: int) -> None:
 
     Args:
         mmap_threshold: size from which a block is mapped separately and unmapped when freed [bytes]
-        reserve: the heap grows by an eighth of this, and shrinks between two trims only above it [bytes]
+        trim_threshold: the heap grows by an eighth of this, and shrinks between two trims only above it [bytes]
     Source: mallopt(3), M_ARENA_MAX, M_TOP_PAD and M_TRIM_THRESHOLD.
     """
     if platform.libc_ver()[0] == "glibc":
         libc = ctypes.CDLL(None)
         for parameter, value in (
             (_M_ARENA_MAX, 1),  # the heap of a thread grows by pages
-            (_M_TOP_PAD, reserve // 8),
-            (_M_TRIM_THRESHOLD, reserve),
+            (_M_TOP_PAD, trim_threshold // 8),
+            (_M_TRIM_THRESHOLD, trim_threshold),
         ):
             libc.mallopt(parameter, value)
     enable_malloc_trim(mmap_threshold)
