@@ -84,7 +84,6 @@ class Worker:
         self.cpu_share = CpuShareLimiter()
         self.identifier = IdentificationThread(self._with_history, self._publish, self.rates, self.cpu_share)
         self._sweep_start = float("-inf")  # start of the last sweep [s, monotonic]
-        self._first_index = 0  # index of the first aircraft of the next sweep
         self.traffic = TrafficMonitor(separation or Separation())
         self._twins = TwinStore(bus, uavs, self._create_twin, self)
         self._twins.run_paced = self.cpu_share.run
@@ -212,13 +211,11 @@ class Worker:
         return ingested
 
     def _sweep_order(self) -> list[OwnedTwin]:
-        """Return all twins: those without a prediction first, then those with an outdated one, then in rotating order.
+        """Return all twins: those without a prediction first, then those with an outdated one, then the oldest rollout.
 
         The budget may allow heavy work for the first twins only, and a twin that cannot be propagated needs a rollout.
         """
         ordered = self.owned_twins()
-        self._first_index = (self._first_index + 1) % max(len(ordered), 1)
-        ordered = ordered[self._first_index :] + ordered[: self._first_index]
         new = [
             owned
             for owned in ordered
@@ -227,7 +224,13 @@ class Worker:
         self._update_budget()
         self.quota.begin_sweep(first_prediction_pending=bool(new))
         now = time.monotonic()
-        ordered.sort(key=lambda owned: (owned not in new, not lacks_prediction(owned, now)))
+        ordered.sort(
+            key=lambda owned: (
+                owned not in new,
+                not lacks_prediction(owned, now),
+                owned.twin.prediction.predict_timer.last,
+            )
+        )
         return ordered
 
     def _update_budget(self) -> None:
