@@ -1,6 +1,6 @@
 """A hostile session of a whole gateway: its memory before, at most and after, and whether the live link is served.
 
-    python -m tests.bench.security.hostile
+    python -m tests.bench.security.hostile --json hostile.json
 
 A gateway process with two UDP links and a TCP port. On one UDP link a rightful aircraft speaks ten times a second all
 the time. Against the other links, in this order: 64 silent callers of the TCP port, beside whom a rightful one calls;
@@ -9,7 +9,9 @@ missions without a heartbeat, then with one, then fly; 3,000 datagrams of 65 kB.
 rightful ones.
 """
 
+import argparse
 import contextlib
+import json
 import re
 import socket
 import subprocess
@@ -21,6 +23,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fleet.bus.session import connect, open_router
+from fleet.cli import make_parser, run_command
 from fleet.contract import GatewayCounters, Sample
 from gateway.links.tcp_listener import MOST
 from tests.bench.gateway.fuzz import blocks
@@ -260,5 +263,20 @@ def _fly_by_tcp(held: contextlib.ExitStack, port: int, watch: Watch) -> bool:
     return until(told)
 
 
+def _run(args: argparse.Namespace) -> int:
+    found = session()
+    print(found)
+    if args.json:
+        args.json.write_text(json.dumps(found._asdict(), indent=1) + "\n")
+    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Attack one gateway."""
+    parser = make_parser("python -m tests.bench.security.hostile", "Attack one gateway.", __doc__ or "")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write what was measured")
+    return run_command("bench.hostile", _run, parser.parse_args(argv))
+
+
 if __name__ == "__main__":
-    print(session())
+    sys.exit(main())
