@@ -20,7 +20,7 @@ from fleet.contract import FleetState
 from fleet.metrics import parse_address, serve
 from fleet.process.children import Children
 from fleet.process.logs import log_arguments, report_progress, report_status
-from fleet.process.malloc_trim import limit_mapping_calls
+from fleet.process.malloc_trim import enable_malloc_trim
 from twin_worker.twin.state.budget import parse_schedule
 
 _POLL_S = 0.5
@@ -35,7 +35,7 @@ EXIT_TIMEOUT_S = 10.0  # time from a stop signal to a forced exit [s]
 NICE_INCREMENT = 5  # increment of the nice value of the warm-up thread
 GC_THRESHOLD = 50_000  # allocations between garbage collections
 MMAP_THRESHOLD_B = 16 << 20  # malloc blocks above this are mapped separately [bytes]
-MALLOC_TRIM_THRESHOLD_B = 64 << 20  # free memory that the heap keeps until it is trimmed [bytes]
+MALLOC_TRIM_THRESHOLD_B = 64 << 20  # free memory that the heap keeps between trims [bytes]
 EXAMPLES = """
   twin_worker --uavs 0-49
   twin_worker --uavs 0-199 --pace identify=5,predict=5,ensemble=5,renew=0.1       many aircraft, 10 Hz extrapolation
@@ -99,7 +99,7 @@ def _prepare() -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    limit_mapping_calls(MMAP_THRESHOLD_B, MALLOC_TRIM_THRESHOLD_B)  # before other threads have heaps of their own
+    enable_malloc_trim(MMAP_THRESHOLD_B, MALLOC_TRIM_THRESHOLD_B)  # before other threads have heaps of their own
     airframe, baselines = load(args.airframe), _load_baselines(args.baseline)
     stop = stop_on_signal()
     threading.Thread(target=_force_exit, args=(stop,), daemon=True).start()

@@ -148,7 +148,7 @@ def continue_prediction(twin: Twin, prediction: Prediction) -> bool:
     )
     twin.telemetry.set_origin(prediction.ned_origin())
     twin.prediction.publish(prediction)
-    twin.prediction.set_rollout(prediction)
+    twin.prediction.set_rollout(prediction, is_continued=True)
     twin.prediction.predict_timer.restart(prediction.t)
     return True
 

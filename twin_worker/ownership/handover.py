@@ -39,9 +39,9 @@ class Snapshot:
 
 
 _Encoded = tuple[Twin, list[tuple[str, msgspec.Raw]], AlertState, Mismatch | None]  # queued messages with their topics
-_decoding = (
-    threading.Lock()
-)  # msgspec prepares a class at its first use, and crashes if a second thread decodes it then
+# msgspec prepares a class at its first use, and crashes if a second thread decodes one meanwhile. The decoder prepares
+# most classes, at import; the hooks prepare the items of deques.
+_decoding = threading.Lock()
 
 
 def encode_snapshot(snapshot: Snapshot) -> bytes:

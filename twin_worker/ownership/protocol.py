@@ -41,8 +41,8 @@ _SNAPSHOT_TIMEOUT_S = (
 )
 _LEAVE_TIMEOUT_S = 5.0  # for the other workers to acquire everything at shutdown [s]
 _REPAIR_PERIOD_S = 1.0  # between checks for incomplete acquisitions [s]
-_REQUEST_DECODER = msgspec.msgpack.Decoder(HandoverRequest)
 _MAX_CLOCK_WARNINGS = 100  # maximum number of workers with a clock warning
+_REQUEST_DECODER = msgspec.msgpack.Decoder(HandoverRequest)
 
 
 class OwnershipProtocol:

@@ -198,11 +198,11 @@ class TwinStore:
             return
         model = self._models.pop(uav, None)
         with owned.lock:
-            rollout = twin.prediction.last_rollout
+            rollout, is_continued = twin.prediction.last_rollout, twin.prediction.is_continued
             for message in past:
                 ingest(twin, message)
             # mission and parameters are new only to this twin: the continued path used them already
-            twin.prediction.set_rollout(rollout)
+            twin.prediction.set_rollout(rollout, is_continued=is_continued)
             restored = model is not None and restore_model(twin, model)
             stagger_work(
                 twin, phase, has_prediction=owned.ready and isfinite(twin.config.schedule.renew), has_model=restored

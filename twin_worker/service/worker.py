@@ -41,7 +41,7 @@ from twin_worker.service.queries import QueryHandlers
 from twin_worker.service.work_rates import WorkRates
 from twin_worker.twin.state.budget import ComputeBudget, Schedule, Work
 from twin_worker.twin.state.state import AUTO, Twin, TwinConfig
-from twin_worker.twin.step import advance, catch_up, fleet_row
+from twin_worker.twin.step import advance, catch_up, fleet_row, rollout_age_s
 
 _log = logging.getLogger(__name__)
 _SILENT_S = 1.0  # wall time without a sample after which data time follows the wall clock [s]
@@ -224,13 +224,7 @@ class Worker:
         self._update_budget()
         self.quota.begin_sweep(first_prediction_pending=bool(new))
         now = time.monotonic()
-        ordered.sort(
-            key=lambda owned: (
-                owned not in new,
-                not lacks_prediction(owned, now),
-                owned.twin.prediction.predict_timer.last,
-            )
-        )
+        ordered.sort(key=lambda one: (one not in new, not lacks_prediction(one, now), -rollout_age_s(one.twin)))
         return ordered
 
     def _update_budget(self) -> None:

@@ -1,7 +1,7 @@
 """Step one aircraft's twin: `advance(twin, messages, now)`. Uses data time only: no bus, thread or wall clock."""
 
 from collections.abc import Iterable, Iterator
-from math import isfinite
+from math import inf, isfinite
 
 import numpy as np
 from msgspec.structs import replace
@@ -163,9 +163,10 @@ def _step(twin: Twin, now: float) -> list[Message]:
         twin.prediction.restart_periods(now)
         messages = predict(twin, now)
         prediction = twin.prediction.latest if messages else None
-        if prediction is None:  # telemetry has a gap, or is too short
+        if prediction is None:  # telemetry has a gap, or is too short: the last rollout stays until it expires
             _retry_prediction(twin, now)
-        twin.prediction.set_rollout(prediction or twin.prediction.last_rollout)  # which expires
+        else:
+            twin.prediction.set_rollout(prediction)
         results += [*messages, *prediction_alerts(twin, now, prediction)]
     elif _extrapolation_due(twin, now) and twin.budget_allows(Work.RENEW):
         twin.prediction.renew_timer.restart(now)
@@ -179,6 +180,12 @@ def _step(twin: Twin, now: float) -> list[Message]:
     ):
         run_deferred_ensemble(twin, LOOK_BACK_S)
     return results
+
+
+def rollout_age_s(twin: Twin) -> float:
+    """Return the time since the last rollout on the clock of the aircraft [s]; inf without a rollout or a step."""
+    age = twin.telemetry.last_step_t - twin.prediction.predict_timer.last
+    return age if isfinite(age) else inf
 
 
 def _extrapolation_due(twin: Twin, now: float) -> bool:

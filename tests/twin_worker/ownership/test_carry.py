@@ -207,6 +207,11 @@ def test_a_first_mission_ends_no_prediction_that_another_worker_made_with_it(twi
         assert fresh.prediction.last_rollout is not None and fresh.prediction.predict_timer.due(last.t, 60.0)
     ingest(fresh, msgspec.structs.replace(mission, items=mission.items[:-1]))  # another mission
     assert fresh.prediction.last_rollout is None
+    for message in (params, mission):
+        own = Twin.of(1)  # one that flew ahead by itself, without them
+        own.prediction.set_rollout(last)
+        ingest(own, message)
+        assert own.prediction.last_rollout is None
 
 
 def test_a_model_that_cannot_be_is_not_believed(twin: Twin, cold: Twin) -> None:

@@ -325,9 +325,12 @@ def test_who_could_not_even_be_renewed_is_the_first_to_be_flown_ahead() -> None:
         held = worker._owned[uav]
         held.ready, held.published_at = True, now - (60.0 if uav == 2 else 0.0)
     found = []
-    for turn in range(4):  # the budget of each sweep is enough for the first two
+    for turn in range(4):  # the budget of each sweep is enough for the first two, and each aircraft has its own clock
+        for uav, held in worker._owned.items():
+            held.twin.telemetry.step(1e9 / (uav + 1) + turn)
         found.append([held.twin.config.uav for held in worker._sweep_order()])
         for uav in found[-1][:2]:
-            worker._owned[uav].twin.prediction.predict_timer.restart(float(turn))
+            twin = worker._owned[uav].twin
+            twin.prediction.predict_timer.restart(twin.telemetry.last_step_t)
     assert [order[0] for order in found] == [2] * 4
     assert [order[1] for order in found] == [0, 1, 3, 0]  # then whoever waits longest

@@ -25,11 +25,15 @@ def record_event(twin: "Twin", event: Event, t: float, details: str = "") -> Non
 
 
 def invalidate_prediction(
-    twin: "Twin", event: Event | None, t: float, details: str = "", *, keep_rollout: bool = False
+    twin: "Twin", event: Event | None, t: float, details: str = "", *, is_first: bool = False
 ) -> None:
-    """Invalidate the running prediction as of time `t`; record `event` unless it is None."""
+    """Invalidate the running prediction as of time `t`; record `event` unless it is None.
+
+    A twin that continues another worker's rollout keeps it if `is_first`: the twin receives its first mission or its
+    first parameters, with which that worker made the rollout.
+    """
     twin.onboard.plan_changed(t)
-    twin.prediction.invalidate(keep_rollout=keep_rollout)
+    twin.prediction.invalidate(is_first=is_first)
     twin.confidence.tracker.censor_open()
     twin.prediction.selector.clear()
     if event is not None:

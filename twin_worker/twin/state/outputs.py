@@ -20,6 +20,7 @@ class PredictionState(msgspec.Struct):
         state: of the twin, as published
         latest: newest prediction, extrapolated or not
         last_rollout: newest prediction that is not extrapolated
+        is_continued: another worker made that rollout, with the mission and parameters that it knew
         latest_event: what the next prediction reports
         selector: of the method, by past errors
         ensemble_spread: of the newest ensemble, along, cross, vertical, (k, 3) [m]
@@ -35,6 +36,7 @@ class PredictionState(msgspec.Struct):
     state: TwinState = TwinState.WAITING
     latest: Prediction | None = None
     last_rollout: Prediction | None = None
+    is_continued: bool = False
     latest_event: FlightEvent | None = None
     selector: MethodSelector = msgspec.field(default_factory=MethodSelector)
     ensemble_spread: np.ndarray | None = None
@@ -61,9 +63,9 @@ class PredictionState(msgspec.Struct):
         """Store a prediction."""
         self.latest = prediction
 
-    def set_rollout(self, rollout: Prediction | None) -> None:
+    def set_rollout(self, rollout: Prediction | None, *, is_continued: bool = False) -> None:
         """Store what is extrapolated until the next rollout; None: nothing."""
-        self.last_rollout = rollout
+        self.last_rollout, self.is_continued = rollout, is_continued
 
     def restart_periods(self, now: float) -> None:
         """Start the periods of rollouts and extrapolations."""
@@ -76,13 +78,14 @@ class PredictionState(msgspec.Struct):
         self.predict_timer.expire()
         self.ensemble_timer.expire()
 
-    def invalidate(self, *, keep_rollout: bool = False) -> None:
+    def invalidate(self, *, is_first: bool = False) -> None:
         """End the running prediction: mode, mission or parameters changed.
 
         Args:
-            keep_rollout: extrapolate the last rollout until the next one: nothing that it assumed changed
+            is_first: this twin had none before; the worker whose rollout is continued had it
         """
-        self.last_rollout = self.last_rollout if keep_rollout else None
+        if not (is_first and self.is_continued):
+            self.set_rollout(None)
         self.expire()
 
     def add_event(self, event: Event, t: float, message: str) -> None:

@@ -227,11 +227,7 @@ class Twin(msgspec.Struct):
 
 
 def ingest(twin: Twin, message: Message) -> None:
-    """Ingest one message from the gateway.
-
-    The first mission and the first parameters change no plan: a twin that continues another worker's prediction, which
-    was made with them, extrapolates it until its own first rollout.
-    """
+    """Ingest one message from the gateway."""
     if isinstance(message, Sample):
         twin.telemetry.add(message)
         lock_course(twin)
@@ -243,7 +239,7 @@ def ingest(twin: Twin, message: Message) -> None:
         first = twin.first_item  # item 0 of a mission that contains home is no change: home moves, e.g. at arming
         if not _is_same_mission(twin.onboard, message, first):
             text, is_first = describe_mission(twin.onboard.mission, message), twin.onboard.mission is None
-            invalidate_prediction(twin, Event.MISSION, message.t, text, keep_rollout=is_first)
+            invalidate_prediction(twin, Event.MISSION, message.t, text, is_first=is_first)
         twin.onboard.set_mission(message, first)
         complete_home(twin)
     elif isinstance(message, Params):
@@ -251,7 +247,7 @@ def ingest(twin: Twin, message: Message) -> None:
         if names or twin.onboard.params is None:
             text = describe_parameters(names, twin.received_params, message.values)
             event = Event.PARAMETERS if names else None
-            invalidate_prediction(twin, event, message.t, text, keep_rollout=twin.onboard.params is None)
+            invalidate_prediction(twin, event, message.t, text, is_first=twin.onboard.params is None)
         twin.onboard.set_params(message)
         twin.telemetry.set_servo_map(message.values)
 
