@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -46,9 +47,9 @@ ARRIVALS = {
 }
 
 
-def flight(seconds: float, seed: int = 1) -> list[Datagram]:
+def flight(seconds: float, seed: int = 1, uav_id: int = 0) -> list[Datagram]:
     """Simulate one fixed wing: what it sends, and when [s]."""
-    uav = SimulatedUav(0, seed)
+    uav = SimulatedUav(uav_id, seed)
     sent = [(0.0, frame) for frame in uav.initial_frames()]
     for k in range(1, int(seconds / 0.05)):
         sent += [(0.05 * k, frame) for frame in uav.step(0.05 * k)]
@@ -95,6 +96,16 @@ class Outcome:
     predictions: int = 0
     methods: dict[str, int] = field(default_factory=dict)
     steps: list[float] = field(default_factory=list)
+
+    def figures(self) -> dict[str, Any]:
+        """Give it as numbers for programs."""
+        return {
+            "lost_by_mistake": len(self.false_losses),
+            "lost": len(self.losses),
+            "longest_gap_s": round(self.gap_s, 2),
+            "back_after_s": round(max(self.recovery_s), 2) if self.recovery_s else None,
+            "predictions": self.predictions,
+        }
 
     def row(self) -> str:
         """Give it as cells of a table."""
