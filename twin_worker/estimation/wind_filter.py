@@ -10,14 +10,17 @@ import numpy as np
 from fleet.physics.kernel import kernel
 from twin_worker.telemetry.history import TelemetryHistory
 
-DRIFT, DRIFT_S = 0.6, 60.0  # slow change of the wind: standard deviation, correlation time [m/s, s]
-GUST, GUST_S = 0.8, 7.0  # turbulence along the flight: the same two numbers
+DRIFT_S = 60.0  # correlation time of slow changes of the wind [s]
+GUST, GUST_S = 0.8, 7.0  # turbulence along the flight: standard deviation, correlation time [m/s, s]
+_DRIFTS = np.array([0.15, 0.6, 2.4])  # hypotheses on their standard deviation [m/s]
+_TYPICAL = 1  # index of the hypothesis whose state is used
+_DRIFT_EVIDENCE_S = 300.0  # time constant of their log-likelihoods: weather changes within minutes
 _RANDOM_WALK = 0.01  # random walk of the mean [m/s per sqrt(s)]
 _HEADING_WALKS = (
     0.0,
     0.02,
 )  # random walk of the heading bias: constant, drifting [rad per sqrt(s)]
-_EVIDENCE_S = 60.0  # time constant of the log-likelihood ratio of the two [s]
+_EVIDENCE_S = 60.0  # time constant of the log-likelihood ratio of the two walks [s]
 _EVIDENCE = 3.0  # log-likelihood ratio from which the bias drifts: 20 to 1
 _SIGMA = 1.0  # sideslip and sensors in one ground-velocity component [m/s]
 _GATE = 25.0  # normalised innovation squared (NIS) from which a row is rejected
@@ -25,7 +28,7 @@ _NIS_AVERAGE_S = 60.0  # time constant of the mean NIS [s]
 _MIN_NIS, _MAX_NIS = 0.05, 10.0  # bounds of the mean NIS [-]
 _MAX_SPEED = 1e3  # larger airspeeds and ground speeds are noise [m/s]
 _MAX_WIND = 150.0  # a larger wind is invalid: the filter restarts [m/s]
-_INITIAL_SIGMA = np.array([0.03, 0.03, 6.0, 6.0, DRIFT, DRIFT, GUST, GUST])
+_INITIAL_SIGMA = np.array([0.03, 0.03, 6.0, 6.0, 0.0, 0.0, GUST, GUST])  # without the drift
 
 
 @kernel
@@ -38,6 +41,7 @@ def _predict_and_correct(
     north: float,
     east: float,
     gate: float,
+    drift: float,
     heading_walk: float,
 ) -> tuple[float, float]:
     """Predict state and covariance by dt and correct them with one ground velocity that passes the gate.
@@ -48,6 +52,7 @@ def _predict_and_correct(
         c, s: horizontal reported air velocity along north and east, by the heading [m/s]
         north, east: ground velocity [m/s]
         gate: NIS from which the correction is skipped
+        drift: standard deviation of the slow changes of the wind [m/s]
         heading_walk: random walk of the heading bias [rad per sqrt(s)]
     Returns:
         the normalised innovation squared (NIS); the log-likelihood of the row without its constant
@@ -63,7 +68,8 @@ def _predict_and_correct(
         x[i] *= decay[i]
         for j in range(8):
             P[i, j] *= decay[i] * decay[j]
-        walk = 1e-8 if i < 2 else _RANDOM_WALK**2 * dt if i < 4 else _INITIAL_SIGMA[i] ** 2 * (1.0 - decay[i] ** 2)
+        sigma = drift if i < 6 else GUST
+        walk = 1e-8 if i < 2 else _RANDOM_WALK**2 * dt if i < 4 else sigma**2 * (1.0 - decay[i] ** 2)
         P[i, i] += walk
     P[0, 0] += (heading_walk * x[1]) ** 2 * dt  # the walk turns (a, b)
     P[1, 1] += (heading_walk * x[0]) ** 2 * dt
@@ -114,28 +120,36 @@ class WindFilter:
     a, b are airspeed scale times cosine and sine of the heading bias. The mean is a random walk. Drift and gust are
     first-order Gauss-Markov processes, which separates gusts from wind. The heading bias is constant, or drifts as that
     of an attitude estimate in a long turn does: both hypotheses are filtered, and the likelihood of the flight selects.
+    How much the wind drifts depends on the weather: three standard deviations are filtered, and their posterior mean
+    variance tells how much the wind may change in the next minutes. The state is that of the middle one.
     Source: Beard & McLain 2012, sec. 2.4 (wind triangle); Bar-Shalom 2001, 5.4 (gating), 8.2 (coloured noise), 11.6.2
     (static multiple-model estimator).
     """
 
     t: float
-    _x: np.ndarray  # of each hypothesis, (2, 8)
-    _P: np.ndarray  # (2, 8, 8)
-    _evidence: float  # log-likelihood ratio of the drifting over the constant heading bias
+    _x: np.ndarray  # of each hypothesis: drift, heading walk, (3, 2, 8)
+    _P: np.ndarray  # (3, 2, 8, 8)
+    _walk_evidence: np.ndarray  # log-likelihood ratio of the drifting over the constant heading bias, (3,)
+    _drift_evidence: np.ndarray  # log-likelihood of each drift, without their mean, (3,)
     _row_count: int
-    _mean_nis: np.ndarray  # (2,)
+    _mean_nis: np.ndarray  # (3, 2)
 
     def __init__(self) -> None:
         self.t = -np.inf
         self._reset()
 
     @property
-    def _selected(self) -> int:
-        return int(self._evidence > _EVIDENCE)
+    def _selected_walks(self) -> np.ndarray:
+        """Return the selected hypothesis on the heading bias for each drift, (3,)."""
+        return (self._walk_evidence > _EVIDENCE).astype(int)
+
+    @property
+    def _selected(self) -> tuple[int, int]:
+        return _TYPICAL, int(self._selected_walks[_TYPICAL])
 
     @property
     def x(self) -> np.ndarray:
-        """Return the state of the likelier hypothesis, (8,)."""
+        """Return the state of typical drift and the likelier heading bias, (8,)."""
         return self._x[self._selected]
 
     @property
@@ -154,32 +168,40 @@ class WindFilter:
         self._row_count += 1
         gate = inf if self._row_count < 50 else _GATE
         along, across = level * cos(psi), level * sin(psi)
-        likelihood = [0.0, 0.0]
-        for i, walk in enumerate(_HEADING_WALKS):
-            row = (self._x[i], self._P[i], dt, along, across, north, east, gate, walk)
-            nis, likelihood[i] = _predict_and_correct(*row)  # type: ignore[call-arg]
-            self._mean_nis[i] += dt / _NIS_AVERAGE_S * (min(nis, _GATE) / 2 - self._mean_nis[i])
-        self._evidence += likelihood[1] - likelihood[0] - min(dt / _EVIDENCE_S, 1.0) * self._evidence
+        likelihood = np.empty((len(_DRIFTS), 2))
+        for i, drift in enumerate(_DRIFTS.tolist()):
+            for j, walk in enumerate(_HEADING_WALKS):
+                row = (self._x[i, j], self._P[i, j], dt, along, across, north, east, gate, drift, walk)
+                nis, likelihood[i, j] = _predict_and_correct(*row)  # type: ignore[call-arg]
+                self._mean_nis[i, j] += dt / _NIS_AVERAGE_S * (min(nis, _GATE) / 2 - self._mean_nis[i, j])
+        ratio = likelihood[:, 1] - likelihood[:, 0]
+        self._walk_evidence += ratio - min(dt / _EVIDENCE_S, 1.0) * self._walk_evidence
+        likeliest = likelihood[range(len(_DRIFTS)), self._selected_walks]
+        forgotten = min(dt / _DRIFT_EVIDENCE_S, 1.0) * self._drift_evidence
+        self._drift_evidence += likeliest - likeliest.mean() - forgotten
         if not self._is_plausible():
             self._reset()
 
     def _is_plausible(self) -> bool:
         """Return whether the wind estimates are plausible; false for nan."""
-        total = self._x[:, 2:4] + self._x[:, 4:6]
-        return bool((np.hypot(*total.T) < _MAX_WIND).all() and np.isfinite(self._P).all())
+        total = self._x[..., 2:4] + self._x[..., 4:6]
+        return bool((np.hypot(total[..., 0], total[..., 1]) < _MAX_WIND).all() and np.isfinite(self._P).all())
 
     def _reset(self) -> None:
         """Reset the estimates to zero wind; the time stays."""
-        self._x = np.tile([1.0, *np.zeros(7)], (2, 1))
-        self._P = np.tile(np.diag(_INITIAL_SIGMA**2), (2, 1, 1))
-        self._row_count, self._mean_nis, self._evidence = 0, np.ones(2), 0.0
+        drifts, walks = len(_DRIFTS), len(_HEADING_WALKS)
+        self._x = np.tile([1.0, *np.zeros(7)], (drifts, walks, 1))
+        self._P = np.tile(np.diag(_INITIAL_SIGMA**2), (drifts, walks, 1, 1))
+        self._P[..., [4, 5], [4, 5]] = (_DRIFTS**2)[:, None, None]
+        self._row_count, self._mean_nis = 0, np.ones((drifts, walks))
+        self._walk_evidence, self._drift_evidence = np.zeros(drifts), np.zeros(drifts)
 
     def reset_wind(self, t: float, wind: np.ndarray) -> None:
         """Set the wind at time `t` [s since 1970], NED, (3,) [m/s]; ignore an implausible wind."""
         if not hypot(*wind[:2]) < _MAX_WIND:
             return
         self.t = t
-        self._x[:, 2:6] = *wind[:2], 0.0, 0.0  # mean; zero drift
+        self._x[..., 2:6] = *wind[:2], 0.0, 0.0  # mean; zero drift
 
     def inflate_after_step(self, wind: np.ndarray, scale: float, relative_sigma: float) -> None:
         """Apply a step of wind and airspeed scale and inflate the covariance by `relative_sigma` of the step.
@@ -193,7 +215,7 @@ class WindFilter:
         """
         if not (hypot(*wind[:2]) < _MAX_WIND and 0.0 < scale < inf):
             return
-        for x, P in zip(self._x, self._P, strict=True):
+        for x, P in zip(self._x.reshape(-1, 8), self._P.reshape(-1, 8, 8), strict=True):  # views
             x[2:4] += wind[:2]
             P[[2, 3], [2, 3]] += (relative_sigma * wind[:2]) ** 2
             P[[0, 1], [0, 1]] += (relative_sigma * (scale - 1.0) * x[:2]) ** 2
@@ -209,6 +231,12 @@ class WindFilter:
         """Return the wind without gusts, NED, the direction it blows to, (3,) [m/s]."""
         x = self.x
         return np.array([x[2] + x[4], x[3] + x[5], 0.0])
+
+    @property
+    def drift_sigma(self) -> float:
+        """Return the standard deviation of slow changes of the wind: root of the posterior mean variance [m/s]."""
+        weight = np.exp(self._drift_evidence - self._drift_evidence.max())
+        return sqrt(float(weight @ _DRIFTS**2 / weight.sum()))
 
     @property
     def innovation_ratio(self) -> float:

@@ -54,6 +54,22 @@ def test_doubt_shrinks_with_turns_only():
     assert circle.sigma < 0.7 * straight.sigma < WindFilter().sigma
 
 
+@pytest.mark.parametrize(("drift", "least", "most"), [(0.0, 0.15, 0.35), (0.6, 0.2, 0.9), (2.4, 1.2, 2.4)])
+def test_the_flight_tells_how_much_the_wind_drifts(drift, least, most):
+    found = []
+    for seed in range(4):
+        rng, filt, slow, gust = np.random.default_rng(seed), WindFilter(), np.zeros(2), np.zeros(2)
+        assert filt.drift_sigma == pytest.approx(1.43, abs=0.01)  # nothing is known yet
+        for k in range(5 * 400):
+            psi = 0.02 * k / 5 + 0.8 * np.sin(0.05 * k / 5)
+            slow = slow * np.exp(-0.2 / 60.0) + drift * np.sqrt(1 - np.exp(-0.4 / 60.0)) * rng.standard_normal(2)
+            gust = gust * np.exp(-0.2 / 7.0) + 0.8 * np.sqrt(1 - np.exp(-0.4 / 7.0)) * rng.standard_normal(2)
+            air = VA * np.array([cos(psi), sin(psi)])
+            filt.update(k / 5, np.array([*(air + WIND + slow + gust + rng.standard_normal(2)), 0.0]), VA, psi)
+        found.append(filt.drift_sigma)
+    assert least <= np.median(found) <= most
+
+
 def test_spikes_are_gated():
     assert np.allclose(flown(120.0, spikes=20).wind, [*WIND, 0.0], atol=0.3)
 

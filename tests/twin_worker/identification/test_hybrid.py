@@ -198,9 +198,9 @@ def test_the_spread_grows_and_rougher_air_widens_it():
     assert isinstance(start, InitialCondition)
     ahead = np.arange(0.0, 61.0)
     now.wind_filter._P *= 1e-3  # as after minutes of flight
-    now.wind_filter._mean_nis = np.full(2, 0.2)
+    now.wind_filter._mean_nis = np.full((3, 2), 0.2)
     one = ensemble.ensemble_std(now, start, known(), ahead, np.random.default_rng(0))
-    now.wind_filter._mean_nis = np.full(2, 9.0)
+    now.wind_filter._mean_nis = np.full((3, 2), 9.0)
     rough = ensemble.ensemble_std(now, start, known(), ahead, np.random.default_rng(0))
     assert one is not None and rough is not None and one.shape == (61, 3)
     assert one[60, 0] > 3 * one[5, 0] > 0.0 and one[60, 0] > one[60, 1] and rough[60, 0] > 1.3 * one[60, 0]

@@ -50,7 +50,7 @@ def draw_members(
         np.arctan2(wind_state[:, 1], wind_state[:, 0]),
     )
     airs[:, H.W_N : H.DRIFT_E + 1] = wind_state[:, 2:6]
-    airs[:, [H.DRIFT, H.REST]] *= _TURBULENCE_FACTOR * context.wind_filter.innovation_ratio
+    airs[:, H.REST] *= _TURBULENCE_FACTOR * context.wind_filter.innovation_ratio
     states[:, :3] += _POSITION_SIGMA * z[:, 8:11]
     states[:, H.V] = states[:, H.V] / air[H.SCALE] * airs[:, H.SCALE] + _AIRSPEED_SIGMA * z[:, 11]
     v = model_ground_velocity(state, air) + _VELOCITY_SIGMA * z[:, 12:14]

@@ -6,7 +6,7 @@ import numpy as np
 
 from fleet.physics import point_mass as H
 from fleet.window import Window
-from twin_worker.estimation.wind_filter import DRIFT, DRIFT_S, GUST, GUST_S
+from twin_worker.estimation.wind_filter import DRIFT_S, GUST, GUST_S
 from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel, airspeed_of
 from twin_worker.prediction.closed_loop import InitialCondition, sample_rollout
 from twin_worker.prediction.replay_window import PredictionContext, Rollout
@@ -40,7 +40,7 @@ def air_state(context: PredictionContext, start: np.ndarray) -> np.ndarray:
     air = np.zeros(H.N_AIR)
     air[H.W_N : H.DRIFT_E + 1] = context.wind_filter.state[0][2:6]
     air[H.SCALE], air[H.D_PSI] = context.wind_filter.scale, context.wind_filter.heading_bias
-    air[[H.DRIFT, H.DRIFT_S, H.REST, H.REST_S]] = DRIFT, DRIFT_S, GUST, GUST_S
+    air[[H.DRIFT, H.DRIFT_S, H.REST, H.REST_S]] = context.wind_filter.drift_sigma, DRIFT_S, GUST, GUST_S
     home = next((item for item in context.onboard.items if item.seq == 0), None)
     if home is not None:
         air[H.GROUND] = context.origin.alt_mm * 1e-3 - home.alt_m
