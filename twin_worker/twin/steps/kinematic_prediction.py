@@ -12,7 +12,7 @@ from twin_worker.prediction import kinematic
 from twin_worker.prediction.autopilot_parameters import ControllerTwin, RouteOverride, multirotor_controller
 from twin_worker.prediction.multirotor import fit, rollout
 from twin_worker.telemetry.track import SETTLING_S, Track, hovering_mask, resample_track
-from twin_worker.twin.state.routes import ROUTE_MODES, failsafe_plan, present_route
+from twin_worker.twin.state.routes import ROUTE_MODES, failsafe_plan, present_route, reported_path
 from twin_worker.twin.state.state import Twin
 
 _FIT_WINDOW_S = 130.0  # flight time used to fit the kinematic models [s]
@@ -112,19 +112,20 @@ def _fixed_wing_config(twin: Twin) -> kinematic.KinematicConfig:
     assert twin.telemetry.origin is not None
     items = route_items(twin.onboard.mission)
     wind = twin.environment.wind.wind if np.isfinite(twin.environment.wind.t) else _reported_wind(twin)
+    path = reported_path(twin)
     return kinematic.KinematicConfig(
         items,
         twin.received_params,
-        twin.onboard.plan_changed_t,
+        twin.onboard.plan_changed_t if path is None else path.since,
         twin.telemetry.origin,
         wind,
         twin.prediction.override,
         twin.first_item,
         twin.onboard.entry,
-        present_route(twin),
+        present_route(twin) if path is None else path.route,
         twin.telemetry.history,
         failsafe_plan(twin),
-        _turn_parameters(twin),
+        _turn_parameters(twin) if path is None else path.law,
     )
 
 
