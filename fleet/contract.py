@@ -140,7 +140,9 @@ class Sample(Message, frozen=True, kw_only=True, gc=False):
     pressure: Annotated[Rows | None, about("raw barometer reading [Pa]")] = None
     gnss: Annotated[Rows | None, about("raw reading of the satellite receiver")] = None
     height: Annotated[Rows | None, about("above home, as reported by the autopilot [m]")] = None
-    bearing: Annotated[Rows | None, about("to the guidance target, or course of the path that is followed [rad]")] = None
+    bearing: Annotated[Rows | None, about("to the guidance target, or course of the path that is followed [rad]")] = (
+        None
+    )
 
 
 class Link(StrEnum):

@@ -19,7 +19,14 @@ from twin_worker.prediction.closed_loop import fly_ahead
 from twin_worker.prediction.method_selection import constant_turn_prediction
 from twin_worker.telemetry.track import Track
 from twin_worker.twin.state.state import Twin
-from twin_worker.twin.steps.route_lines import ROUTE_SPEED, ROUTE_WIND, constant_turn, constant_velocity, route_lines
+from twin_worker.twin.steps.route_lines import (
+    ROUTE_SPEED,
+    ROUTE_WIND,
+    constant_turn,
+    constant_velocity,
+    present_velocity,
+    route_lines,
+)
 
 _HISTORY_S = 62.0  # telemetry before a closed-loop prediction [s]
 
@@ -37,6 +44,16 @@ class BaselineInput:
     twin: Twin
     track: Track
     ahead: np.ndarray
+
+    @property
+    def position(self) -> np.ndarray:
+        """Return the newest position, NED, (3,) [m]."""
+        return self.track.p[-1]
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """Return the present velocity, NED, (3,) [m/s]."""
+        return present_velocity(self.track)
 
 
 def _route_line(method: str) -> Callable[[BaselineInput], np.ndarray | None]:

@@ -5,7 +5,7 @@ Source: Bates & Granger 1969, "The combination of forecasts" (the mean of two fo
 
 from collections import deque
 from dataclasses import dataclass, field
-from math import cos, sin
+from math import cos, log, sin
 
 import numpy as np
 from filterpy.kalman import IMMEstimator, KalmanFilter
@@ -36,7 +36,7 @@ Median errors over path length of 288 starts of 16 simulated flights of the cali
 assumptions: slightly below its better part, and below the route lines.
 """
 _LOG_PRIOR = {name: np.log(np.interp(SCORE_AHEAD[1:], _PRIOR_AHEAD, row)) for name, row in PRIOR_ERRORS.items()}
-_PRIOR_WEIGHT = 1.0  # weight of the prior, in completely scored predictions [-]
+_PRIOR_WEIGHT = 0.25  # weight of the prior, in completely scored predictions: three look-aheads [-]
 _MIN_ERROR = 0.003  # smaller relative errors are as good as this [-]
 _SMOOTHING = 0.1  # smoothing weight of the newest score
 _SWITCH_RATIO = 0.85  # another method replaces the preferred one below this ratio of errors [-]
@@ -121,8 +121,10 @@ class MethodSelector:
     def _update(self, method: str, log_ratio: float, weight: float) -> None:
         n = self.n_scored[method] = self.n_scored.get(method, 0.0) + weight
         log_error = log_ratio + _log_prior_error(method)
-        previous = float(np.log(self.mean_error.get(method, np.exp(log_error))))
-        self.mean_error[method] = float(np.exp(previous + max(_SMOOTHING * weight, weight / n) * (log_error - previous)))
+        previous = log(self.mean_error[method]) if method in self.mean_error else log_error
+        self.mean_error[method] = float(
+            np.exp(previous + max(_SMOOTHING * weight, weight / n) * (log_error - previous))
+        )
 
     def expected_error(self, method: str) -> float:
         """Return the relative error expected of a method, from prior and scores [-]."""

@@ -110,7 +110,9 @@ TABLE: tuple[FieldSource, ...] = (
         NONE,
         autopilots=("generic",),
     ),
-    FieldSource("NAV_CONTROLLER_OUTPUT", "bearing", lambda m: (m.target_bearing * DEG,), NONE, autopilots=("ardupilot",)),
+    FieldSource(
+        "NAV_CONTROLLER_OUTPUT", "bearing", lambda m: (m.target_bearing * DEG,), NONE, autopilots=("ardupilot",)
+    ),
     FieldSource(
         "ATTITUDE_TARGET",
         "command",

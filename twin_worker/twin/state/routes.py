@@ -91,8 +91,10 @@ def reported_path(twin: "Twin") -> ReportedPath | None:
     history, origin, newest = twin.telemetry.history, twin.telemetry.origin, twin.telemetry.history.newest
     if twin.mode != "GUIDED" or twin.autopilot != "ardupilot" or origin is None or twin.prediction.override is not None:
         return None
-    t, bearings = history.rows_since("bearing", newest - _PATH_FIT_S)
-    (t_c, commands), (t_p, positions) = (history.rows_since(name, t[0] - 2.0 if len(t) else 0.0) for name in ("command", "position"))
+    t, bearings = history.rows_since("bearing", max(newest - _PATH_FIT_S, twin.onboard.plan_changed_t))
+    (t_c, commands), (t_p, positions) = (
+        history.rows_since(name, t[0] - 2.0 if len(t) else 0.0) for name in ("command", "position")
+    )
     t_v, velocities = history.rows_since("velocity", t[0] - 2.0 if len(t) else 0.0)
     if len(t) < _MIN_RADIUS_ROWS or newest - t[-1] > _MAX_ENTRY_AGE_S or min(len(t_p), len(t_v), len(t_c)) < 2:
         return None
@@ -116,7 +118,9 @@ def reported_path(twin: "Twin") -> ReportedPath | None:
         step = copysign(_ARC_STEP, rate)
         for _ in range(_ARC_STEPS):
             chord, course = 2.0 * speed / rate * np.sin(0.5 * step), course + step
-            points.append(points[-1] + chord * np.array([np.cos(course - 0.5 * step), np.sin(course - 0.5 * step), 0.0]))
+            points.append(
+                points[-1] + chord * np.array([np.cos(course - 0.5 * step), np.sin(course - 0.5 * step), 0.0])
+            )
     points.append(points[-1] + _PATH_M * np.array([np.cos(course), np.sin(course), 0.0]))
     legs = np.array([make_leg(WAYPOINT, point) for point in points[1:]])
     remark = ("the path beyond the reported course is not known",)

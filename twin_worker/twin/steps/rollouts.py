@@ -7,7 +7,7 @@ import numpy as np
 from fleet.window import Window
 from twin_worker.confidence.calibration_table import error_growth
 from twin_worker.confidence.tube_and_horizon import AHEAD
-from twin_worker.identification.fixed_wing.plant import DYNAMICS, method
+from twin_worker.identification.fixed_wing.plant import DYNAMICS, PAPER, method
 from twin_worker.numerics.interpolation import interpolate_rows
 from twin_worker.prediction.closed_loop import InitialCondition, fly_from, synchronise_controller
 from twin_worker.prediction.failsafe_route import with_failsafe
@@ -16,7 +16,6 @@ from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_point_mass
 from twin_worker.prediction.replay_window import PredictionContext, Rollout
 from twin_worker.telemetry.track import Track
 from twin_worker.twin.state.budget import EARLY_FRACTION, Work
-from twin_worker.twin.state.routes import present_route
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.kinematic_prediction import PathForecast, no_prediction, predict_without_model
 from twin_worker.twin.steps.route_lines import SIMPLE_METHODS, simple_paths
@@ -49,8 +48,10 @@ def predict_route(twin: Twin, window: Window, recent: Track, ahead: np.ndarray) 
     forecasts = {
         name: PathForecast(path, name, control.law, initial.seq, sentence, control) for name, path in candidates.items()
     }
-    if due or twin.prediction.selector.best((*forecasts, GREYBOX)) == GREYBOX:
-        kinematic = predict_without_model(twin, recent.with_attitude(twin.telemetry.history), ahead + (t - recent.t[-1]))
+    if twin.config.method != PAPER and (due or twin.prediction.selector.best((*forecasts, GREYBOX)) == GREYBOX):
+        kinematic = predict_without_model(
+            twin, recent.with_attitude(twin.telemetry.history), ahead + (t - recent.t[-1])
+        )
         if kinematic.path is not None and not twin.telemetry.link_lost:
             forecasts[GREYBOX] = kinematic
     return select_method(twin, t, forecasts, recent, ahead)
@@ -59,7 +60,7 @@ def predict_route(twin: Twin, window: Window, recent: Track, ahead: np.ndarray) 
 def select_method(
     twin: Twin, t: float, forecasts: dict[str, PathForecast], recent: Track, ahead: np.ndarray
 ) -> PathForecast:
-    """Return the forecast of the method with the smallest expected error; simple methods compete on a route.
+    """Return the forecast of the method with the smallest expected error; simple methods compete in a mission.
 
     Args:
         twin: its method selection is updated
@@ -70,8 +71,8 @@ def select_method(
     """
     selector, newest = twin.prediction.selector, next(iter(forecasts.values()))
     due = not twin.telemetry.link_lost and selector.is_due(t)
-    follows_route = newest.seq >= 0 or present_route(twin) is not None
-    competes = follows_route and not twin.telemetry.link_lost and twin.prediction.override is None
+    competes = newest.seq >= 0 and not twin.telemetry.link_lost and twin.prediction.override is None
+    competes = competes and twin.config.method != PAPER  # which was selected
     if competes and (due or selector.best((*forecasts, *SIMPLE_METHODS)) in SIMPLE_METHODS):
         simple = simple_paths(twin, recent.unbroken_tail(), ahead + (t - recent.t[-1]))
         forecasts = forecasts | {
