@@ -21,7 +21,7 @@ _PRIOR_AHEAD = np.array([5.0, 16.0, 30.0, 60.0])  # look-ahead of the prior erro
 PRIOR_ERRORS: dict[str, tuple[float, float, float, float]] = {
     "both": (0.025, 0.021, 0.020, 0.016),
     "hybrid": (0.026, 0.022, 0.021, 0.017),
-    "dynamics": (0.035, 0.040, 0.041, 0.037),
+    "dynamics": (0.028, 0.023, 0.022, 0.018),
     "paper": (0.038, 0.051, 0.052, 0.049),
     "greybox": (0.030, 0.024, 0.023, 0.020),
     "copter": (0.05, 0.05, 0.05, 0.05),
@@ -32,12 +32,12 @@ PRIOR_ERRORS: dict[str, tuple[float, float, float, float]] = {
 }
 """Expected relative error of each method at `_PRIOR_AHEAD` before any score [-].
 
-Median errors over path length of 288 starts of 16 simulated flights of the calibration set; `both` and `copter` are
-assumptions: slightly below its better part, and below the route lines.
+Median errors over path length of 288 starts of 16 simulated flights of the calibration set. `both`, `dynamics` and
+`copter` are assumptions: slightly below its better part, between `hybrid` and `greybox`, and below the route lines.
 """
 _LOG_PRIOR = {name: np.log(np.interp(SCORE_AHEAD[1:], _PRIOR_AHEAD, row)) for name, row in PRIOR_ERRORS.items()}
 _PRIOR_WEIGHT = 0.25  # weight of the prior, in completely scored predictions: three look-aheads [-]
-_MIN_ERROR = 0.003  # smaller relative errors are as good as this [-]
+_MIN_ERROR = 0.01  # smaller relative errors are as good as this: a tenth of the limit of the horizon [-]
 _SMOOTHING = 0.1  # smoothing weight of the newest score
 _SWITCH_RATIO = 0.85  # another method replaces the preferred one below this ratio of errors [-]
 _MIN_DESCRIBED = 1.0  # completely scored predictions from which errors are described [-]
