@@ -157,7 +157,7 @@ def test_a_recorded_quadplane_hangs_flies_and_lands(recordings: Path):
         return {p.method for p in made if since < p.t - start < until}
 
     assert methods(40.0, 50.0) == {"copter"} and methods(180.0, 255.0) == {"copter"}
-    assert methods(70.0, 93.5) == {"greybox"} and "dynamics" in methods(100.0, 170.0)
+    assert methods(70.0, 93.5) == {"greybox"} and methods(100.0, 170.0) & {"dynamics", "hybrid", "both"}
     assert methods(264.0, 300.0) <= {"imm"}
     assert any("hovering on rotors" in p.sentence for p in made)
     models = [r for r in results if isinstance(r, Model)]
