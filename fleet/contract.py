@@ -105,6 +105,7 @@ COLUMNS: dict[str, tuple[tuple[str, str], ...]] = {
     "pressure": (("static", "Pa"),),
     "gnss": (("alt", "mm above mean sea level, as reported by the receiver"),),
     "height": (("above_home", "m"),),
+    "bearing": (("target_bearing", "rad"),),
 }
 """Columns of each `Rows` field of a `Sample`: name and unit, in wire order. Specific force and rates are FRD."""
 FIRST_OPTIONAL_COLUMN = {"command": 2}
@@ -139,6 +140,9 @@ class Sample(Message, frozen=True, kw_only=True, gc=False):
     pressure: Annotated[Rows | None, about("raw barometer reading [Pa]")] = None
     gnss: Annotated[Rows | None, about("raw reading of the satellite receiver")] = None
     height: Annotated[Rows | None, about("above home, as reported by the autopilot [m]")] = None
+    bearing: Annotated[Rows | None, about("to the guidance target, or course of the path that is followed [rad]")] = (
+        None
+    )
 
 
 class Link(StrEnum):
@@ -403,7 +407,8 @@ class Prediction(Message, frozen=True, kw_only=True):
             "copter (multirotor: the route at limited speed, acceleration and jerk behind a lag, or position hold), "
             "greybox (fixed wing without a model: L1 guidance and lags on the route), "
             "route_wind (the route at the commanded airspeed in the estimated wind), "
-            "route_speed (the route at the present ground speed) or imm (no route: turn rate only)"
+            "route_speed (the route at the present ground speed), constant_turn, constant_velocity (from the present "
+            "motion alone, where they were better on this route) or imm (no route: turn rate only)"
         ),
     ]
     law: Annotated[str, about("active controller twin, e.g. arduplane: L1 + TECS")] = ""

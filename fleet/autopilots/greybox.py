@@ -1,9 +1,10 @@
 """Generic fixed-wing autopilot model: L1 guidance on the route, first-order lags for attitude, speed and climb.
 
-    phi_c from L1 (`arduplane.legs`);  phi' = (phi_c - phi) / tau_phi;  psi' = g tan(phi) / V
+    phi_c from L1 (`arduplane.legs`);  phi' = (phi_c - phi) / tau_phi;  psi' = g tan(phi + b) / V
     V' = (V_c - V) / tau_V;  h_dot_c = clip((h_sp - h) / tau_h, climb, sink);  h_ddot = (h_dot_c - h_dot) / tau_climb
 
-It needs position and velocity only: no surfaces, rate loops or airspeed sensor.
+phi is the bank of the attitude estimate, which the autopilot controls; b is its error. The model needs position and
+velocity only: no surfaces, rate loops or airspeed sensor.
 Source: Park, Deyst & How (2004) for L1; lags as in Beard & McLain 2012, section 9.1 (autopilot design models).
 """
 
@@ -20,10 +21,10 @@ from fleet.mission import KIND, LAND, VA_C
 
 LAW = "greybox: L1 on the route, lags for the rest"
 
-TAU_PHI, TAU_V, TAU_H, TAU_CLIMB, CRUISE, TAS_RATIO, CLIMB, SINK = range(8)
-N_PAR = 8
+TAU_PHI, TAU_V, TAU_H, TAU_CLIMB, CRUISE, TAS_RATIO, CLIMB, SINK, B_PHI = range(9)
+N_PAR = 9
 """Time constants of bank, speed, height, climb [s]; default true airspeed [m/s]; true over commanded airspeed [-];
-maximum climb and sink rate [m/s]."""
+maximum climb and sink rate [m/s]; true minus estimated bank [rad]."""
 
 
 @array_kernel
@@ -65,7 +66,7 @@ def follow(
         i = leg_rules.current_leg(ctl, legs)
         Va_c = legs[i, VA_C] * lags[TAS_RATIO] if legs[i, VA_C] > 0.0 else lags[CRUISE]
         phi += (to_roll(par, a_lat, 0.0) - phi) * min(dt / lags[TAU_PHI], 1.0)
-        psi += G * tan(clip(phi, -1.2, 1.2)) / max(V, 3.0) * dt
+        psi += G * tan(clip(phi + lags[B_PHI], -1.2, 1.2)) / max(V, 3.0) * dt
         V += (Va_c - V) * min(dt / lags[TAU_V], 1.0)
         h_dot_c = clip((h_sp + p[2]) / lags[TAU_H], -lags[SINK], lags[CLIMB])
         h_dot += (h_dot_c - h_dot) * min(dt / lags[TAU_CLIMB], 1.0)

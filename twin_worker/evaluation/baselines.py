@@ -17,11 +17,17 @@ import numpy as np
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
 from twin_worker.prediction.closed_loop import fly_ahead
 from twin_worker.prediction.method_selection import constant_turn_prediction
-from twin_worker.telemetry.track import STEP, Track
+from twin_worker.telemetry.track import Track
 from twin_worker.twin.state.state import Twin
-from twin_worker.twin.steps.route_lines import ROUTE_SPEED, ROUTE_WIND, present_velocity, route_lines
+from twin_worker.twin.steps.route_lines import (
+    ROUTE_SPEED,
+    ROUTE_WIND,
+    constant_turn,
+    constant_velocity,
+    present_velocity,
+    route_lines,
+)
 
-_TURN_S = 1.5  # window of the turn rate fit [s]
 _HISTORY_S = 62.0  # telemetry before a closed-loop prediction [s]
 
 
@@ -50,24 +56,6 @@ class BaselineInput:
         return present_velocity(self.track)
 
 
-def constant_velocity(inputs: BaselineInput) -> np.ndarray:
-    """Predict at constant velocity, (k, 3) [m]."""
-    return inputs.position + np.outer(inputs.ahead, inputs.velocity)
-
-
-def constant_turn(inputs: BaselineInput) -> np.ndarray:
-    """Predict at constant turn rate and speed, (k, 3) [m]."""
-    recent = inputs.track.v[-round(_TURN_S / STEP) :]
-    course = np.unwrap(np.arctan2(recent[:, 1], recent[:, 0]))
-    rate = float(np.polyfit(STEP * np.arange(len(course)), course, 1)[0]) if len(course) > 3 else 0.0
-    half = 0.5 * rate * inputs.ahead
-    chord = np.hypot(*inputs.velocity[:2]) * inputs.ahead * np.sinc(half / np.pi)
-    direction = np.arctan2(inputs.velocity[1], inputs.velocity[0]) + half
-    return inputs.position + np.column_stack(
-        [chord * np.cos(direction), chord * np.sin(direction), inputs.ahead * inputs.velocity[2]]
-    )
-
-
 def _route_line(method: str) -> Callable[[BaselineInput], np.ndarray | None]:
     """Return the baseline of one route line; it predicts None without a mission."""
     return lambda inputs: route_lines(inputs.twin, inputs.track, inputs.ahead).get(method)
@@ -84,8 +72,8 @@ def closed_loop_dynamics(inputs: BaselineInput) -> np.ndarray | None:
 
 
 BASELINES: dict[str, Callable[[BaselineInput], np.ndarray | None]] = {
-    "cv": constant_velocity,
-    "ct": constant_turn,
+    "cv": lambda now: constant_velocity(now.track, now.ahead),
+    "ct": lambda now: constant_turn(now.track, now.ahead),
     "imm": lambda now: constant_turn_prediction(now.track, now.ahead),
     "route": _route_line(ROUTE_SPEED),
     "route_wind": _route_line(ROUTE_WIND),

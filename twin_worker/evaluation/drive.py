@@ -31,6 +31,8 @@ class EvaluationPlan:
         methods: names of the methods to compare with
         without_params: withhold the autopilot's parameters from every twin
         options: mission, parameters and column map from files
+        first_s: minimum time of a start since the first sample [s]
+        event_free_s: minimum flight without an event after a start [s]
     """
 
     every_s: float = 5.0
@@ -38,6 +40,8 @@ class EvaluationPlan:
     methods: tuple[str, ...] = (*BASELINES, PAPER)
     without_params: bool = False
     options: RecordingOptions = NO_OPTIONS
+    first_s: float = MIN_FIRST_S
+    event_free_s: float = MIN_EVENT_FREE_S
 
 
 @dataclass
@@ -92,14 +96,14 @@ class RecordingDriver:
             if isinstance(message, Status) and before is not None:
                 now, earlier = ((status.clock_jumps, status.clock_advance_s) for status in (message, before))
                 if now != earlier:
-                    yield from _resolve_starts(evaluated)
+                    yield from _resolve_starts(evaluated, self.plan)
                     evaluated.reference, evaluated.slot = ReferenceFlight(), -1
             evaluated.reference.add(message)
             if not (self.plan.without_params and isinstance(message, Params)):
                 _advance(evaluated, message, self.plan)
         for evaluated in self.uavs.values():
             if evaluated is not None:
-                yield from _resolve_starts(evaluated)
+                yield from _resolve_starts(evaluated, self.plan)
 
     @property
     def missed(self) -> int:
@@ -115,9 +119,9 @@ class RecordingDriver:
         return self.uavs[uav]
 
 
-def _resolve_starts(evaluated: EvaluatedUav) -> Iterator[EvaluationCase]:
+def _resolve_starts(evaluated: EvaluatedUav, plan: EvaluationPlan) -> Iterator[EvaluationCase]:
     """Yield every start so far, compared with the actual flight."""
-    yield from resolve_starts(evaluated.reference, evaluated.starts)
+    yield from resolve_starts(evaluated.reference, evaluated.starts, plan.first_s, plan.event_free_s)
     evaluated.starts.clear()
 
 
@@ -138,7 +142,7 @@ def _record_results(evaluated: EvaluatedUav, results: Iterable[Message], plan: E
         return
     slot = int((t - evaluated.reference.first_t) // plan.every_s)
     if slot > evaluated.slot:
-        late = evaluated.slot * plan.every_s >= MIN_FIRST_S
+        late = evaluated.slot * plan.every_s >= plan.first_s
         evaluated.missed += late and not evaluated.predicted and not evaluated.twin.no_route_reason()
         evaluated.slot, evaluated.predicted = slot, False
     if predictions and not evaluated.predicted:

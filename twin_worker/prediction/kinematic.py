@@ -40,6 +40,7 @@ _COMPARE_S, _START_INTERVAL_S, _RUN_S = 80.0, 8.0, 20.0  # compared flight, inte
 _PERIOD_VALUES = (9.0, 12.0, 16.0, 20.0, 26.0)  # NAVL1_PERIOD tried if not received [s]
 _LAG_VALUES = (0.4, 0.8, 1.4)  # tried bank lags [s]
 _SPEED_S = 20.0  # window of the mean airspeed [s]
+_BIAS_S = 20.0  # window of the bank error [s]
 _MIN_AIRSPEED = 5.0  # minimum airspeed of fixed-wing flight [m/s]
 CRUISE = CRUISE_OF["arduplane"]
 _WIND_PRIOR = 5.0  # prior standard deviation of the wind [m/s]
@@ -162,6 +163,7 @@ def _fly_route(
     lags = _lag_parameters(
         flight, mission_route.legs[int(ctl[arduplane.LEG])], par, controller.default_names, (model, V)
     )
+    lags[law.B_PHI] = _bank_error(flight, w)
     guidance = _RouteGuidance(ctl, par, mission_route, lags, controller)
     if config.override is not None:
         guidance = _apply_override(guidance, recent, config, model, config.override)
@@ -240,11 +242,23 @@ def _synchronise(
 
 def _banks(recent: Track, air: np.ndarray) -> np.ndarray:
     """Return the bank at each row: reported, else from the turn rate of the track [rad]."""
+    return np.where(np.isfinite(recent.euler[:, 0]), recent.euler[:, 0], _turn_banks(air))
+
+
+def _turn_banks(air: np.ndarray) -> np.ndarray:
+    """Return the bank of a coordinated turn at each row, from the air velocity, (n,) [rad]."""
     course = np.unwrap(np.arctan2(air[:, 1], air[:, 0]))
     rate = np.gradient(course, STEP)
     smooth = np.convolve(np.pad(rate, 5, mode="edge"), np.ones(11) / 11, mode="valid")
-    turn = np.arctan(np.clip(smooth * np.linalg.norm(air[:, :2], axis=1) / G, -1.5, 1.5))
-    return np.where(np.isfinite(recent.euler[:, 0]), recent.euler[:, 0], turn)
+    return np.arctan(np.clip(smooth * np.linalg.norm(air[:, :2], axis=1) / G, -1.5, 1.5))
+
+
+def _bank_error(flight: Track, w: np.ndarray) -> float:
+    """Return true minus reported bank: the mean difference to the turn rate lately; 0 if unknown [rad]."""
+    recent = flight.part(max(len(flight) - int(_BIAS_S / STEP), 0), len(flight))
+    error = _turn_banks(recent.v - [*w, 0.0]) - recent.euler[:, 0]
+    valid = np.isfinite(error)
+    return float(error[valid].mean()) if valid.sum() > int(MIN_TRACK_S / STEP) else 0.0
 
 
 def _state(recent: Track, w: np.ndarray) -> np.ndarray:
@@ -266,7 +280,7 @@ def _lag_parameters(
     commanded = leg[VA_C] if leg[VA_C] > 0 else par[P.VA_CRUISE] if cruise_known else 0.0
     speed_ratio = V / commanded if commanded > 0 and 0.7 < V / commanded < 1.5 else par[P.EAS2TAS]
     cruise = par[P.VA_CRUISE] * speed_ratio if cruise_known else V
-    out = np.empty(law.N_PAR)
+    out = np.zeros(law.N_PAR)
     out[law.TAU_PHI], out[law.TAU_V], out[law.TAU_H], out[law.TAU_CLIMB] = model.tau_phi, 4.0, 4.0, 1.5
     out[law.CRUISE], out[law.TAS_RATIO] = (V if not 0.7 < V / cruise < 1.5 else cruise), speed_ratio
     rise = -recent.v[:, 2]

@@ -1,11 +1,11 @@
-"""Selection of the prediction method with the smallest past error, all scored at the same times; turn-rate estimation.
+"""Selection of the prediction method with the smallest expected error, by prior and scores; turn-rate estimation.
 
 Source: Bates & Granger 1969, "The combination of forecasts" (the mean of two forecasts is one of the methods).
 """
 
 from collections import deque
 from dataclasses import dataclass, field
-from math import cos, sin
+from math import cos, log, sin
 
 import numpy as np
 from filterpy.kalman import IMMEstimator, KalmanFilter
@@ -17,34 +17,61 @@ from twin_worker.telemetry.track import Track
 
 SCORE_AHEAD = np.arange(0.0, 61.0, 5.0)  # look-ahead of the scores [s]
 SCORE_INTERVAL_S = 5.0  # interval of scored predictions [s]
-PREFERENCE = (
-    *("both", "hybrid", "dynamics", "paper", "greybox", "copter"),  # closed loop: best on the calibration flights
-    *("route_wind", "route_speed"),
-)
-"""Preference before any score, in the order of the median error on the calibration flights."""
+_PRIOR_AHEAD = np.array([5.0, 16.0, 30.0, 60.0])  # look-ahead of the prior errors [s]
+PRIOR_ERRORS: dict[str, tuple[float, float, float, float]] = {
+    "both": (0.025, 0.021, 0.020, 0.016),
+    "hybrid": (0.026, 0.022, 0.021, 0.017),
+    "dynamics": (0.028, 0.023, 0.022, 0.018),
+    "paper": (0.038, 0.051, 0.052, 0.049),
+    "greybox": (0.030, 0.024, 0.023, 0.020),
+    "copter": (0.05, 0.05, 0.05, 0.05),
+    "route_wind": (0.064, 0.060, 0.061, 0.052),
+    "route_speed": (0.082, 0.105, 0.112, 0.107),
+    "constant_turn": (0.12, 0.46, 0.68, 0.59),
+    "constant_velocity": (0.25, 0.55, 0.81, 0.92),
+}
+"""Expected relative error of each method at `_PRIOR_AHEAD` before any score [-].
+
+Median errors over path length of 288 starts of 16 simulated flights of the calibration set. `both`, `dynamics` and
+`copter` are assumptions: slightly below its better part, between `hybrid` and `greybox`, and below the route lines.
+"""
+_LOG_PRIOR = {name: np.log(np.interp(SCORE_AHEAD[1:], _PRIOR_AHEAD, row)) for name, row in PRIOR_ERRORS.items()}
+_PRIOR_WEIGHT = 0.25  # weight of the prior, in completely scored predictions: three look-aheads [-]
+_MIN_ERROR = 0.01  # smaller relative errors are as good as this: a tenth of the limit of the horizon [-]
 _SMOOTHING = 0.1  # smoothing weight of the newest score
 _SWITCH_RATIO = 0.85  # another method replaces the preferred one below this ratio of errors [-]
-_MIN_SCORED = 4  # minimum scored predictions
+_MIN_DESCRIBED = 1.0  # completely scored predictions from which errors are described [-]
 _MAX_GAP_S = 2.0  # predictions across a longer gap are not scored [s]
 
 
 @dataclass
 class MethodSelector:
-    """Score the predicted paths of every method against the flight.
+    """Score the predicted paths of every method against the flight, each look-ahead as soon as it is flown.
+
+    The relative error of method m at look-ahead h is modelled as the prior error times one factor for this aircraft:
+    log e_mh = log prior_mh + a_m + noise. The mean of the logarithms estimates a_m, shrunk to zero by the prior.
+    Source: Gelman et al. 2013, "Bayesian data analysis", 2.5 (normal mean with a normal prior).
 
     Attributes:
-        pending: predictions that are not scored yet: start time, ground speed, path by method
-        mean_error: smoothed mean relative error up to 60 s, by method [-]
-        n_scored: number of scored predictions, by method
+        pending: predictions that are not completely scored: start time, ground speed, path by method
+        scored_t: all look-aheads up to this time are scored [s since 1970]
+        mean_error: geometric mean of the relative error up to 60 s, by method [-]
+        n_scored: number of scored predictions, in which a part counts as a fraction, by method
     """
 
     pending: deque[tuple[float, float, dict[str, np.ndarray]]] = field(default_factory=deque)
+    scored_t: float = -np.inf
     mean_error: dict[str, float] = field(default_factory=dict)
-    n_scored: dict[str, int] = field(default_factory=dict)
+    n_scored: dict[str, float] = field(default_factory=dict)
 
     def is_due(self, t: float) -> bool:
         """Return whether predictions at `t` are scored, which requires a path of every method."""
         return not self.pending or not self.pending[-1][0] <= t < self.pending[-1][0] + SCORE_INTERVAL_S
+
+    def has_due_score(self, t: float) -> bool:
+        """Return whether a look-ahead of a pending prediction was flown until `t` and is not scored."""
+        first_t = self.pending[0][0] if self.pending else np.inf
+        return t >= max(first_t, self.scored_t) + SCORE_AHEAD[1]
 
     def add(self, t: float, speed: float, ahead: np.ndarray, paths: dict[str, np.ndarray]) -> None:
         """Add the predicted path of each method at `t`.
@@ -63,38 +90,64 @@ class MethodSelector:
         self.pending.clear()
 
     def score(self, t: np.ndarray, positions: np.ndarray) -> None:
-        """Score completed predictions with the flight: times (n,) [s since 1970], positions NED (n, 3) [m]."""
-        while self.pending and len(t) and self.pending[0][0] + SCORE_AHEAD[-1] <= t[-1]:
-            start_t, speed, paths = self.pending.popleft()
-            times = start_t + SCORE_AHEAD
-            time_gap = np.abs(t[np.clip(np.searchsorted(t, times), 0, len(t) - 1)] - times)
-            if start_t < t[0] or time_gap.max() > _MAX_GAP_S:
-                continue
-            actual = interpolate_rows(times, t, positions)
-            length = path_length(actual, speed)
-            for method, path in paths.items():
-                self._update(method, float(np.mean(np.linalg.norm(path - actual, axis=1)[1:] / length[1:])))
+        """Score what was flown of the predictions: times (n,) [s since 1970], positions NED (n, 3) [m]."""
+        if not len(t):
+            return
+        for start_t, speed, paths in self.pending:
+            self._score_prediction(start_t, speed, paths, (t, positions))
+        self.scored_t = float(t[-1])
+        while self.pending and self.pending[0][0] + SCORE_AHEAD[-1] <= t[-1]:
+            self.pending.popleft()
 
-    def _update(self, method: str, error: float) -> None:
-        n = self.n_scored[method] = self.n_scored.get(method, 0) + 1
-        previous = self.mean_error.get(method, error)
-        self.mean_error[method] = previous + max(_SMOOTHING, 1.0 / n) * (error - previous)
+    def _score_prediction(
+        self, start_t: float, speed: float, paths: dict[str, np.ndarray], flight: tuple[np.ndarray, np.ndarray]
+    ) -> None:
+        t, positions = flight
+        times = start_t + SCORE_AHEAD[start_t + SCORE_AHEAD <= t[-1]]
+        due = np.flatnonzero(times[1:] > self.scored_t)
+        if not len(due) or start_t < t[0]:
+            return
+        right = np.clip(np.searchsorted(t, times), 0, len(t) - 1)
+        time_gap = np.minimum(np.abs(t[right] - times), np.abs(t[np.maximum(right - 1, 0)] - times))
+        if time_gap.max() > _MAX_GAP_S:
+            return
+        actual = interpolate_rows(times, t, positions)
+        length = path_length(actual, speed)
+        for method, path in paths.items():
+            error = np.linalg.norm(path[: len(times)] - actual, axis=1)[1:] / length[1:]
+            log_error = np.log(np.maximum(error[due], _MIN_ERROR))
+            self._update(method, float(np.mean(log_error - _LOG_PRIOR[method][due])), len(due) / len(SCORE_AHEAD[1:]))
+
+    def _update(self, method: str, log_ratio: float, weight: float) -> None:
+        n = self.n_scored[method] = self.n_scored.get(method, 0.0) + weight
+        log_error = log_ratio + _log_prior_error(method)
+        previous = log(self.mean_error[method]) if method in self.mean_error else log_error
+        self.mean_error[method] = float(
+            np.exp(previous + max(_SMOOTHING * weight, weight / n) * (log_error - previous))
+        )
+
+    def expected_error(self, method: str) -> float:
+        """Return the relative error expected of a method, from prior and scores [-]."""
+        n, prior = self.n_scored.get(method, 0.0), _log_prior_error(method)
+        scored = float(np.log(self.mean_error[method])) if n > 0.0 else prior
+        return float(np.exp((n * scored + _PRIOR_WEIGHT * prior) / (n + _PRIOR_WEIGHT)))
 
     def best(self, methods: tuple[str, ...]) -> str:
-        """Return the first of `PREFERENCE` among methods, unless another has a clearly smaller error."""
-        scored = [method for method in methods if self.n_scored.get(method, 0) >= _MIN_SCORED]
-        preferred = min(methods, key=PREFERENCE.index)
-        if preferred not in scored:
-            return preferred
-        best_scored = min(scored, key=lambda method: self.mean_error[method])
-        return best_scored if self.mean_error[best_scored] < _SWITCH_RATIO * self.mean_error[preferred] else preferred
+        """Return the method with the smallest prior error, unless another has a clearly smaller expected error."""
+        preferred, best = (min(methods, key=error) for error in (_log_prior_error, self.expected_error))
+        return best if self.expected_error(best) < _SWITCH_RATIO * self.expected_error(preferred) else preferred
 
     def describe(self, method: str) -> str:
         """Describe the errors of all methods; empty before enough scores."""
-        if len(self.mean_error) < 2 or self.n_scored.get(method, 0) < _MIN_SCORED:
+        if len(self.mean_error) < 2 or self.n_scored.get(method, 0.0) < _MIN_DESCRIBED:
             return ""
         others = ", ".join(f"{name} {error:.1%}" for name, error in self.mean_error.items() if name != method)
         return f"{method}: mean error {self.mean_error[method]:.1%} of path length ({others})"
+
+
+def _log_prior_error(method: str) -> float:
+    """Return the logarithm of the prior error of a method, mean over the look-aheads."""
+    return float(_LOG_PRIOR[method].mean())
 
 
 STEP = 0.5  # filter step [s]

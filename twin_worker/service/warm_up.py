@@ -77,7 +77,7 @@ def _run_point_mass(control: tuple[np.ndarray, np.ndarray, np.ndarray], window: 
     )
     batch = [np.tile(row, (2, 1)) for row in (parameters, air, start)]
     point_mass.simulate_ensemble(control, *batch, noise, np.arange(0, 17, 4), np.empty((2, 5, 3)))  # type: ignore
-    fit_attitude_lag(window.x[:, 6], window.x[:, 6])
+    fit_attitude_lag(np.ascontiguousarray(window.x[:, 6]), window.x[:, 6])
 
 
 def _run_traffic() -> None:

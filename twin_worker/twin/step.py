@@ -8,7 +8,6 @@ from msgspec.structs import replace
 
 from fleet.contract import Alert, Event, FleetRow, Link, Message, Sample, Status, TwinState
 from fleet.frames import to_ned
-from twin_worker.prediction import method_selection
 from twin_worker.twin.state.budget import EARLY_FRACTION, Work
 from twin_worker.twin.state.events import record_event
 from twin_worker.twin.state.flight_phase import update_flight_phase
@@ -234,11 +233,11 @@ def _update_link(twin: Twin, now: float) -> list[Message]:
 
 
 def _score_predictions(twin: Twin) -> None:
-    pending, newest = twin.prediction.selector.pending, twin.telemetry.history.newest
-    if pending and newest >= pending[0][0] + method_selection.SCORE_AHEAD[-1]:
+    selector = twin.prediction.selector
+    if selector.has_due_score(twin.telemetry.history.newest):
         assert twin.telemetry.origin is not None
-        t, position = twin.telemetry.history.rows_since("position", twin.prediction.selector.pending[0][0] - _OVERLAP_S)
-        twin.prediction.selector.score(t, to_ned(twin.telemetry.origin, *position.T))
+        t, position = twin.telemetry.history.rows_since("position", selector.pending[0][0] - _OVERLAP_S)
+        selector.score(t, to_ned(twin.telemetry.origin, *position.T))
     if not twin.confidence.tracker.has_open:
         return
     assert twin.telemetry.origin is not None

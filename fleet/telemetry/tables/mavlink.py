@@ -111,6 +111,9 @@ TABLE: tuple[FieldSource, ...] = (
         autopilots=("generic",),
     ),
     FieldSource(
+        "NAV_CONTROLLER_OUTPUT", "bearing", lambda m: (m.target_bearing * DEG,), NONE, autopilots=("ardupilot",)
+    ),
+    FieldSource(
         "ATTITUDE_TARGET",
         "command",
         lambda m: (*euler(np.asarray(m.q, float).T)[:2], np.nan, np.nan, np.nan),

@@ -40,6 +40,7 @@ MAX_MAGNITUDE: dict[str, tuple[float, ...]] = {
     "pressure": (120_000.0,),
     "gnss": _MAX_POSITION[2:],
     "height": (9e4,),
+    "bearing": (7.0,),
 }
 """Maximum plausible magnitude per column in the units of `contract.COLUMNS`; other values are rejected."""
 

@@ -103,6 +103,39 @@ def test_a_flight_too_short_says_so():
         identify(now.window.part(0, 100), now.history, 1.0)
 
 
+def circling(bias: np.ndarray, noise: float = 0.01) -> PointMassData:
+    """Turns at 20 m/s whose bank is reported with an error that shows in the turn rate, (n,) [rad/s]."""
+    n, dt = len(bias), energy_balance.STEP
+    phi = 0.35 + 0.05 * np.sin(0.15 * np.arange(n) * dt)
+    rate = G * np.tan(phi) / 20.0 + bias + noise * np.random.default_rng(4).standard_normal(n)
+    level, V = np.zeros(n), np.full(n, 20.0)
+    return PointMassData(V, level, level, phi, level, np.cumsum(rate) * dt, level + 0.4, level, V, phi, level)
+
+
+def test_the_turn_rate_of_a_drifting_attitude_is_that_of_now():
+    """An attitude estimate that drifts in a long turn: the mean over two minutes was wrong by half of the drift."""
+    bias = np.linspace(-0.04, 0.06, 1200)
+    k, b = energy_balance.fit_turn_rate(circling(bias)).value
+    expected = bias[-1] + (1.0 - k) * G * np.tan(0.35) / 20.0
+    assert b == pytest.approx(expected, abs=0.012) and k == pytest.approx(1.0, abs=0.12)
+
+
+def test_a_constant_turn_bias_is_found_as_before():
+    k, b = energy_balance.fit_turn_rate(circling(np.full(1200, 0.02))).value
+    assert b + (k - 1.0) * G * np.tan(0.35) / 20.0 == pytest.approx(0.02, abs=0.004)
+
+
+def test_rows_in_a_gap_count_for_nothing():
+    flight = circling(np.full(900, 0.01))
+    valid = np.ones(900, bool)
+    valid[400:440] = False
+    psi = np.where(valid, flight.psi, 99.0)
+    broken = replace(flight, psi=psi, valid=valid)
+    assert not broken.measured[395:430].any() and broken.measured[:370].all() and broken.measured[450:].all()
+    whole, holed = (energy_balance.fit_turn_rate(one).value for one in (flight, broken))
+    assert np.allclose(whole, holed, atol=0.02)
+
+
 # --- how it flies ----------------------------------------------------------------------------------------------------
 
 

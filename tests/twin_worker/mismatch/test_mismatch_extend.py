@@ -154,8 +154,9 @@ def faulty(tmp_path_factory) -> tuple[Message, ...]:
 
 
 def test_with_what_was_named_predictions_are_nearer_than_without(faulty, monkeypatch):
-    """Both receive the same; one learns at 100 s what happened at 70 s. The route lines need no model: without them."""
-    monkeypatch.setattr(rollouts, "route_lines", lambda *_: {})
+    """Both receive the same; one learns at 100 s what happened at 70 s. Methods without identified model: left out."""
+    monkeypatch.setattr(rollouts, "simple_paths", lambda *_: {})
+    monkeypatch.setattr(rollouts, "predict_without_model", lambda *_: rollouts.no_prediction(""))
     begin = next(m.t for m in faulty if isinstance(m, Sample))
     twin, plain, said = Twin.of(1), None, {"with": [], "without": []}
     for message in faulty:

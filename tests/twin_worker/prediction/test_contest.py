@@ -22,15 +22,36 @@ def follow(contest: MethodSelector, off: dict[str, float], n: int, t0: float = 0
     contest.score(t, np.column_stack([20.0 * t, 0 * t, 0 * t]))
 
 
-def test_the_one_that_strays_least_is_used_once_enough_are_answered():
+def test_the_prior_of_the_calibration_flights_decides_before_any_score():
     contest = MethodSelector()
     assert contest.best(("hybrid", "dynamics", "both")) == "both" and contest.best(("dynamics", "hybrid")) == "hybrid"
-    follow(contest, {"hybrid": 1.0, "dynamics": 0.2, "both": 0.6}, 3)
-    assert contest.best(("hybrid", "dynamics", "both")) == "both" and contest.describe("both") == ""
-    follow(contest, {"hybrid": 1.0, "dynamics": 0.2, "both": 0.6}, 4, 100.0)
+    assert contest.best(("greybox", "constant_turn", "constant_velocity", "route_wind", "route_speed")) == "greybox"
+    assert contest.describe("both") == ""
+
+
+def test_the_one_that_strays_least_is_used_once_enough_is_flown():
+    contest = MethodSelector()
+    follow(contest, {"hybrid": 1.0, "dynamics": 0.2, "both": 0.6}, 4)
     assert contest.best(("hybrid", "dynamics", "both")) == "dynamics"
     assert contest.mean_error["hybrid"] == pytest.approx(0.05, rel=0.1)  # 1 of 20 m/s
     assert contest.describe("dynamics") == "dynamics: mean error 1.0% of path length (hybrid 5.0%, both 3.0%)"
+
+
+def test_a_model_that_fails_at_once_loses_within_seconds_to_the_simple_way():
+    """The first look-aheads count as soon as they are flown; waiting for a minute used to keep the worse method."""
+    contest, ahead = MethodSelector(), np.arange(0.0, 61.0)
+    t = np.arange(0.0, 16.0)
+    for at in (0.0, 5.0):
+        paths = {m: np.column_stack([20 * at + (20 + e) * ahead, 0 * ahead, 0 * ahead]) for m, e in OFF.items()}
+        contest.add(at, 20.0, ahead, paths)
+    contest.score(t, np.column_stack([20.0 * t, 0 * t, 0 * t]))
+    assert contest.best(tuple(OFF)) == "constant_turn" and len(contest.pending) == 2
+    n = dict(contest.n_scored)
+    contest.score(t, np.column_stack([20.0 * t, 0 * t, 0 * t]))
+    assert contest.n_scored == n  # nothing counts twice
+
+
+OFF = {"dynamics": 12.0, "constant_turn": 0.1}
 
 
 def test_what_an_event_made_meaningless_and_what_fell_into_a_hole_is_not_scored():

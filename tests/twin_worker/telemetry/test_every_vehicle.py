@@ -16,7 +16,7 @@ from twin_worker.evaluation.replay import run_offline
 from twin_worker.prediction.kinematic import wind_and_airspeed
 from twin_worker.telemetry.track import hovering_mask, lift_channels, resample_track
 from twin_worker.twin.step import Twin
-from twin_worker.twin.steps.route_lines import LINES
+from twin_worker.twin.steps.route_lines import SIMPLE_METHODS
 
 # --- positions alone -------------------------------------------------------------------------------------------------
 
@@ -95,7 +95,7 @@ def test_a_route_is_flown_without_a_model(heard, kinds):
     published(results)
     assert not [r for r in results if isinstance(r, Model)]
     made = [p for p in predictions(results) if p.t > T0 + 20.0]
-    assert made[0].method == "greybox" and {p.method for p in made} <= {"greybox", *LINES}
+    assert made[0].method == "greybox" and {p.method for p in made} <= {"greybox", *SIMPLE_METHODS}
     assert {p.law for p in made if p.method == "greybox"} == {greybox.LAW}
     assert all(p.state is TwinState.PREDICTING and p.seq >= 1 for p in made)
     reason = [p.sentence for p in made if p.method == "greybox"][-1]
@@ -157,7 +157,7 @@ def test_a_recorded_quadplane_hangs_flies_and_lands(recordings: Path):
         return {p.method for p in made if since < p.t - start < until}
 
     assert methods(40.0, 50.0) == {"copter"} and methods(180.0, 255.0) == {"copter"}
-    assert methods(70.0, 93.5) == {"greybox"} and "dynamics" in methods(100.0, 170.0)
+    assert methods(70.0, 93.5) == {"greybox"} and methods(100.0, 170.0) & {"dynamics", "hybrid", "both"}
     assert methods(264.0, 300.0) <= {"imm"}
     assert any("hovering on rotors" in p.sentence for p in made)
     models = [r for r in results if isinstance(r, Model)]

@@ -178,7 +178,8 @@ def scored(twin: Twin, **error: float) -> None:
         ({"greybox": 0.2, "route_wind": 0.1, "route_speed": 0.3}, "route_wind"),
         ({"greybox": 0.2, "route_wind": 0.3, "route_speed": 0.1}, "route_speed"),
         ({"greybox": 0.1, "route_wind": 0.09, "route_speed": 0.3}, "greybox"),  # not clearly better
-        ({"greybox": 0.1}, "greybox"),
+        ({"greybox": 0.04}, "greybox"),
+        ({"greybox": 0.1}, "route_wind"),  # by its prior, which is lower
     ],
 )
 def test_a_route_line_with_the_smaller_past_error_is_used(error, chosen):
@@ -189,7 +190,8 @@ def test_a_route_line_with_the_smaller_past_error_is_used(error, chosen):
     forecast = select_method(now.twin, t, {"greybox": wrong}, now.track, AHEAD)
     assert forecast.method == chosen
     assert forecast.path is not None and (forecast.path[60, 0] > now.position[0] + 1000.0) == (chosen != "greybox")
-    assert {"greybox", "route_wind", "route_speed"} == set(now.twin.prediction.selector.pending[-1][2])
+    expected = {"greybox", "route_wind", "route_speed", "constant_turn", "constant_velocity"}
+    assert expected == set(now.twin.prediction.selector.pending[-1][2])
 
 
 def test_no_route_line_competes_without_a_route():

@@ -161,7 +161,7 @@ def test_the_state_does_not_alternate_before_the_first_model(heard):
 
 def test_a_flight_that_does_not_follow_the_route_of_its_mode_is_a_turn_rate(winged):
     now = winged.telemetry.history.newest
-    entered(winged, "GUIDED")
+    entered(winged, "LOITER")
     away = to_geodetic(winged.telemetry.origin, np.array([3000.0, -9000.0, -140.0]))
     entry = msgspec.structs.replace(winged.onboard.entry, t=now - 40.0)
     winged.onboard.enter_mode(entry)  # as if it had flown there for 40 s, but it has flown its mission

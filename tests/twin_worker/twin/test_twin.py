@@ -20,7 +20,7 @@ from tests.support.flights import ROUTE, drive, predictions, published, shifted,
 from twin_worker.evaluation.replay import run_offline
 from twin_worker.twin.state import state
 from twin_worker.twin.step import Twin, advance, fleet_row
-from twin_worker.twin.steps.route_lines import LINES
+from twin_worker.twin.steps.route_lines import SIMPLE_METHODS
 
 FLOWN_S = 100.0
 
@@ -184,7 +184,7 @@ def test_what_has_no_wings_is_not_given_any(heard):
     methods = [p.method for p in predictions(results)]
     assert methods[0] == "copter" and set(methods) <= {
         "copter",
-        *LINES,
+        *SIMPLE_METHODS,
     }  # it flies like wings
     assert "multirotor has no wings to identify" in twin.identification.verdict.sentence
     assert "kinematic twin" in next(p.sentence for p in predictions(results) if p.method == "copter")

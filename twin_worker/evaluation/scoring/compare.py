@@ -23,16 +23,31 @@ _PHASE_S = 10.0  # flight after a start that determines its phase [s]
 _GROUND_SPEED = 3.0  # a slower fixed wing is on the ground [m/s]
 
 
-def resolve_starts(reference: ReferenceFlight, starts: Sequence[EvaluationStart]) -> list[EvaluationCase]:
-    """Attach the actual flight to all starts of a flight; a short mission is scored as far as it goes."""
-    cases = [resolve_start(reference, start) for start in starts]
+def resolve_starts(
+    reference: ReferenceFlight,
+    starts: Sequence[EvaluationStart],
+    first_s: float = MIN_FIRST_S,
+    event_free_s: float = MIN_EVENT_FREE_S,
+) -> list[EvaluationCase]:
+    """Attach the actual flight to all starts of a flight; a short mission is scored as far as it goes.
+
+    Args:
+        reference: the actual flight
+        starts: its starts
+        first_s: minimum time since the first sample [s]
+        event_free_s: minimum flight without an event after a start [s]
+    """
+    cases = [resolve_start(reference, start, event_free_s, first_s) for start in starts]
     if any(not case.exclusion for case in cases):
         return cases
-    return [resolve_start(reference, start, MIN_SHORT_S) for start in starts]
+    return [resolve_start(reference, start, MIN_SHORT_S, first_s) for start in starts]
 
 
 def resolve_start(
-    reference: ReferenceFlight, start: EvaluationStart, event_free_s: float = MIN_EVENT_FREE_S
+    reference: ReferenceFlight,
+    start: EvaluationStart,
+    event_free_s: float = MIN_EVENT_FREE_S,
+    first_s: float = MIN_FIRST_S,
 ) -> EvaluationCase:
     """Attach the actual flight to a start; look-aheads after an event or in a telemetry gap are unknown.
 
@@ -40,6 +55,7 @@ def resolve_start(
         reference: the actual flight
         start: the start
         event_free_s: minimum flight without an event after the start [s]
+        first_s: minimum time since the first sample [s]
     """
     end, reason = reference.next_event(start.t)
     instants = start.t + start.ahead
@@ -56,22 +72,23 @@ def resolve_start(
         length=np.interp(start.ahead, grid, length),
         phase=_phase(reference, start),
         route=legs[:, P_N : P_D + 1],
-        exclusion=_exclusion_reason(reference, start, (end, reason), event_free_s),
+        exclusion=_exclusion_reason(reference, start, (end, reason), (event_free_s, first_s)),
     )
 
 
 def _exclusion_reason(
-    reference: ReferenceFlight, start: EvaluationStart, next_event: tuple[float, str], event_free_s: float
+    reference: ReferenceFlight, start: EvaluationStart, next_event: tuple[float, str], limits: tuple[float, float]
 ) -> str:
-    """Return the reason for exclusion of a start; empty: included."""
+    """Return the reason for exclusion of a start; empty: included. limits: event-free flight, first start [s]."""
+    event_free_s, first_s = limits
     end, event = next_event
     fixed_wing = reference.status is not None and reference.status.vehicle == "fixed_wing"
     if start.no_route_reason:
         return start.no_route_reason
     if fixed_wing and start.speed < _GROUND_SPEED:
         return "on the ground"
-    if start.first_s < MIN_FIRST_S:
-        return f"within {MIN_FIRST_S:.0f} s of the first sample"
+    if start.first_s < first_s:
+        return f"within {first_s:.0f} s of the first sample"
     if end < start.t + event_free_s:
         return f"{event} within {event_free_s:.0f} s"
     if not reference.has_position(start.t + np.array([0.0, event_free_s])).all():
@@ -114,20 +131,20 @@ def compare(scores: dict[str, MethodScores]) -> dict[str, Any]:
 def _compare_with(own_scores: MethodScores, other_scores: MethodScores) -> dict[str, Any]:
     passages = [one.passages[LIMITS[0]][:, 0] for one in (own_scores, other_scores)]
     pairs = np.minimum(np.column_stack(passages), MIN_EVENT_FREE_S)
-    out: dict[str, Any] = {"t10_s": _difference(pairs, own_scores.flight, np.mean, better=1.0)}
+    out: dict[str, Any] = {"t10_s": paired_difference(pairs, own_scores.flight, np.mean, better=1.0)}
     for seconds in _ERRORS_S:
         column = own_scores.column_at(seconds)
         if column is None:
             continue
         pairs = np.column_stack([one.distance[:, column] for one in (own_scores, other_scores)])
         valid = np.isfinite(pairs).all(axis=1)
-        out[f"p50_{seconds}_m"] = _difference(pairs[valid], own_scores.flight[valid], np.median, better=-1.0)
+        out[f"p50_{seconds}_m"] = paired_difference(pairs[valid], own_scores.flight[valid], np.median, better=-1.0)
         medians = np.median(pairs[valid], axis=0) if valid.any() else np.array([np.nan, np.nan])
         out[f"skill_{seconds}"] = round(float(1 - medians[0] / medians[1]), 3) if medians[1] > 0 else None
     return out
 
 
-def _difference(
+def paired_difference(
     pairs: np.ndarray, flight: np.ndarray, statistic: Callable[..., Any], *, better: float
 ) -> dict[str, float | str | None]:
     """Return the difference of a statistic (ours minus other), its 95 % interval over flights, and the verdict.

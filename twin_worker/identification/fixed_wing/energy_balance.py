@@ -1,6 +1,6 @@
 """Turn rate, angle of attack and excess power, and attitude lags: regressions with priors on smoothed flight data.
 
-psi_dot = k g tan phi / V + b               theta - gamma = a_0 + a_n (n (V_0 / V)^2 - 1)
+psi_dot = k g tan phi / V + b(t)            theta - gamma = a_0 + a_n (n (V_0 / V)^2 - 1)
 V_dot + g h_dot / V = c_0 + c_t (delta_t - t_0) + c_v (V - V_0) + c_n (n^2 - 1)
 """
 
@@ -83,8 +83,11 @@ def _cost(residual: np.ndarray, lag: np.ndarray, weight: float) -> float:
 
 
 _WINDOW_ROWS = 20  # rows of each mean
-# mean of k [-] and b [rad/s], standard deviation, noise
-_TURN_PRIOR = np.array([1.0, 0.0]), np.array([0.1, 0.02]), 0.03
+_TURN_PRIOR = np.array([1.0, 0.0]), np.array([0.1, 0.02])  # mean of k [-] and b [rad/s], standard deviation
+# hypotheses on b, of equal prior probability: random walk [rad/s per sqrt(s)], noise of a row [rad/s]
+_TURN_WALK, _TURN_NOISE = (
+    values.ravel() for values in np.meshgrid((0.0, 0.002, 0.005, 0.01, 0.02), (0.005, 0.01, 0.02, 0.03, 0.05))
+)
 _LIFT_PRIOR = np.array([0.0, 0.06]), np.array([1e3, 0.1]), 0.02  # the same of a_0, a_n [rad]
 _POWER_PRIOR = np.array([0.0, np.nan, -0.10, -0.15]), np.array([30.0, 1.0, 0.03, 0.15]), 0.35  # the same of c, SI
 _GLIDE_RATIO, _THRUST_SLOPE = 9.0, 1.3  # lift-to-drag ratio; slope of thrust over throttle relative to proportional [-]
@@ -94,7 +97,8 @@ _MAX_BANK = 1.3  # bank limit: larger load factors are noise [rad]
 @dataclass(frozen=True)
 class PointMassData:
     """Data in rows of `STEP`, all (n,): true airspeed, height, climb rate, angles, throttle;
-    then commands: climb rate and airspeed of the route, angles of the autopilot [m/s, m, rad, 0..1].
+    then commands: climb rate and airspeed of the route, angles of the autopilot [m/s, m, rad, 0..1]; then whether a
+    row lies outside the gaps of telemetry, None: all do.
     """
 
     V: np.ndarray
@@ -108,9 +112,17 @@ class PointMassData:
     V_c: np.ndarray
     phi_c: np.ndarray
     theta_c: np.ndarray
+    valid: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.V)
+
+    @property
+    def measured(self) -> np.ndarray:
+        """Return which moving means and slopes contain no row in a gap, (n - _WINDOW_ROWS,) bool."""
+        invalid = np.zeros(len(self)) if self.valid is None else ~self.valid
+        total = np.concatenate([[0.0], np.cumsum(invalid)])
+        return total[_WINDOW_ROWS + 1 :] == total[: -_WINDOW_ROWS - 1]
 
 
 @dataclass(frozen=True)
@@ -147,16 +159,40 @@ def load_factor(phi: np.ndarray) -> np.ndarray:
 
 
 def fit_turn_rate(data: PointMassData) -> RegressionResult:
-    """Estimate k and b of the turn rate."""
-    X = moving_mean(G * np.tan(np.clip(data.phi, -_MAX_BANK, _MAX_BANK)) / np.maximum(data.V, 5.0))
-    return regress_with_prior(np.column_stack([X, np.ones(len(X))]), moving_slope(np.unwrap(data.psi)), _TURN_PRIOR)
+    """Estimate k, and b at the end of the data.
+
+    b is the error of the attitude estimate, which drifts in long turns: a random walk. Its size, zero included, and the
+    noise are hypotheses; each is filtered, and the estimates are averaged with the likelihood of the flight.
+    Source: Bar-Shalom 2001, 5.2 (Kalman filter), 11.6.2 (static multiple-model estimator).
+    """
+    rate = moving_mean(G * np.tan(np.clip(data.phi, -_MAX_BANK, _MAX_BANK)) / np.maximum(data.V, 5.0))
+    y, measured = moving_slope(np.unwrap(data.psi)), data.measured
+    prior_mean, prior_sigma = _TURN_PRIOR
+    n = len(_TURN_WALK)
+    x, P, log_likelihood = np.tile(prior_mean, (n, 1)), np.tile(np.diag(prior_sigma**2), (n, 1, 1)), np.zeros(n)
+    for i in range((len(y) - 1) % _WINDOW_ROWS, len(y), _WINDOW_ROWS):  # independent rows
+        P[:, 1, 1] += _TURN_WALK**2 * _WINDOW_ROWS * STEP
+        if not measured[i]:
+            continue
+        h = np.array([rate[i], 1.0])
+        PH, error = P @ h, y[i] - x @ h
+        variance = PH @ h + _TURN_NOISE**2
+        x += PH * (error / variance)[:, None]
+        P -= PH[:, :, None] * PH[:, None, :] / variance[:, None, None]
+        log_likelihood -= 0.5 * (error**2 / variance + np.log(variance))
+    weight = np.exp(log_likelihood - log_likelihood.max())
+    weight /= weight.sum()
+    value = weight @ x
+    spread = x - value
+    return RegressionResult(value, np.einsum("m,mij->ij", weight, P + spread[:, :, None] * spread[:, None, :]))
 
 
 def fit_angle_of_attack(data: PointMassData, V_0: float) -> RegressionResult:
     """Estimate a_0 and a_n of the angle of attack."""
     alpha = data.theta - np.arcsin(np.clip(data.h_dot / np.maximum(data.V, 5.0), -0.6, 0.6))
     X = moving_mean(load_factor(data.phi) * (V_0 / np.maximum(data.V, 5.0)) ** 2 - 1.0)
-    return regress_with_prior(np.column_stack([np.ones(len(X)), X]), moving_mean(alpha), _LIFT_PRIOR)
+    A, rows = np.column_stack([np.ones(len(X)), X]), data.measured
+    return regress_with_prior(A[rows], moving_mean(alpha)[rows], _LIFT_PRIOR)
 
 
 def _power_regression(data: PointMassData, t_0: float, V_0: float) -> tuple[np.ndarray, np.ndarray]:
@@ -170,7 +206,7 @@ def _power_regression(data: PointMassData, t_0: float, V_0: float) -> tuple[np.n
 def excess_power_residual(data: PointMassData, c: np.ndarray, t_0: float, V_0: float) -> np.ndarray:
     """Return measured minus predicted excess power for c, (4,), (n,) [m/s2]."""
     X, y = _power_regression(data, t_0, V_0)
-    return y - X @ c  # type: ignore[no-any-return]
+    return (y - X @ c)[data.measured]  # type: ignore[no-any-return]
 
 
 def fit_excess_power(data: PointMassData, t_0: float, V_0: float) -> RegressionResult:
@@ -182,14 +218,14 @@ def fit_excess_power(data: PointMassData, t_0: float, V_0: float) -> RegressionR
 
     Source: Soderstrom & Stoica 1989, chapter 8 (instrumental variables in closed loop).
     """
-    X, y = _power_regression(data, t_0, V_0)
+    (X, y), rows = _power_regression(data, t_0, V_0), data.measured
     instruments = np.column_stack([np.ones(len(y)), moving_mean(data.climb_c), moving_mean(data.V_c) - V_0, X[:, 3]])
     prior_mean, prior_sigma, noise = _POWER_PRIOR
     prior_mean = prior_mean.copy()
     # t_0 balances drag in level flight; thrust grows faster
     prior_mean[1] = _THRUST_SLOPE * G / _GLIDE_RATIO / max(t_0, 0.15)
-    if np.isfinite(instruments).all():
-        X = instruments @ np.linalg.lstsq(instruments, X, rcond=1e-6)[0]
+    if np.isfinite(instruments[rows]).all():
+        X = instruments @ np.linalg.lstsq(instruments[rows], X[rows], rcond=1e-6)[0]
     else:
         X[:, 1:] = 0.0
-    return regress_with_prior(X, y, (prior_mean, prior_sigma, noise))
+    return regress_with_prior(X[rows], y[rows], (prior_mean, prior_sigma, noise))

@@ -46,7 +46,7 @@ def point_mass_data(window: Window, history: TelemetryHistory, scale: float) -> 
     """Resample the flight in rows of `STEP`, newest last.
 
     Args:
-        window: telemetry without gaps
+        window: telemetry; rows in gaps are marked
         history: telemetry as received, with airspeed and commands
         scale: true over reported airspeed [-]
     """
@@ -56,6 +56,7 @@ def point_mass_data(window: Window, history: TelemetryHistory, scale: float) -> 
         return np.interp(times, window.t, x)
 
     commands = zero_order_hold(*history.rows_since("command", times[0] - 2.0), times, _MAX_COMMAND_AGE_S)
+    valid = window.ok[np.minimum(np.searchsorted(window.t, times), len(window) - 1)]
     h = -resampled(window.p[:, 2])
     V_c = commands[:, 4] + V / scale
     return PointMassData(
@@ -68,8 +69,9 @@ def point_mass_data(window: Window, history: TelemetryHistory, scale: float) -> 
         delta_t=resampled(window.u[:, 3]),
         climb_c=_climb_command(commands[:, 3] + h),
         V_c=V_c * scale,
-        phi_c=commands[:, 0],
-        theta_c=commands[:, 1],
+        phi_c=np.where(valid, commands[:, 0], np.nan),
+        theta_c=np.where(valid, commands[:, 1], np.nan),
+        valid=valid,
     )
 
 
@@ -92,7 +94,7 @@ def _climb_command(h_c: np.ndarray) -> np.ndarray:
 def identify(
     window: Window, history: TelemetryHistory, scale: float, warm_start: PointMassModel | None = None
 ) -> PointMassModel:
-    """Identify from the newest `FIT_WINDOW_S` of gap-free telemetry.
+    """Identify from the newest `FIT_WINDOW_S` of telemetry, without its gaps.
 
     Args:
         window, history, scale: as for `point_mass_data`
@@ -101,8 +103,9 @@ def identify(
         ValueError: with less than `MIN_FIT_S` of telemetry; wait for more.
     """
     window = window.part(max(len(window) - int(FIT_WINDOW_S / window.dt), 0), len(window))
-    if window.seconds < MIN_FIT_S:
-        raise ValueError(f"hybrid: found {window.seconds:.0f} s of flight, expected {MIN_FIT_S:.0f} s; wait")
+    seconds = min(window.seconds, float(window.ok.sum() * window.dt))
+    if seconds < MIN_FIT_S:
+        raise ValueError(f"hybrid: found {seconds:.0f} s of flight, expected {MIN_FIT_S:.0f} s; wait")
     data = point_mass_data(window, history, scale)
     parameters = np.empty(H.N_PARAMETERS)
     parameters[[H.T_0, H.V_0]] = data.delta_t.mean(), data.V.mean()

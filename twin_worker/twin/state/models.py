@@ -182,6 +182,7 @@ class ModelBank(msgspec.Struct):
         point_mass_warm_start: newest, verified or not
         point_mass_holdout_error: end error over held-out flight, of the path length [-]
         active_holdout_error: the same of the active model, where the point mass was above the limit [-]
+        newest_holdout_errors: of the newest rollouts of the point mass and of the active model [-]
         point_mass_timer: of its identification
         holdout_timer: of rollouts over held-out flight
         active_effect: missing physics that was added to the models
@@ -196,6 +197,7 @@ class ModelBank(msgspec.Struct):
     point_mass: PointMassModel | None = None
     point_mass_warm_start: PointMassModel | None = None
     point_mass_holdout_error: float = float("nan")
+    newest_holdout_errors: tuple[float, float] = (float("nan"), float("nan"))
     active_holdout_error: float = float("nan")
     point_mass_timer: Timer = msgspec.field(default_factory=Timer)
     holdout_timer: Timer = msgspec.field(default_factory=Timer)
@@ -232,8 +234,17 @@ class ModelBank(msgspec.Struct):
 
     def update_holdout_errors(self, point_mass: float, active: float) -> None:
         """Include the errors of one more rollout of the point mass and of the active model [-]; nan changes nothing."""
+        self.newest_holdout_errors = point_mass, active
         self.point_mass_holdout_error = _smoothed(self.point_mass_holdout_error, point_mass)
         self.active_holdout_error = _smoothed(self.active_holdout_error, active)
+
+    def point_mass_is_better_than(self, limit: float) -> bool:
+        """Return whether the hold-out error of the point mass, mean or newest, is below a limit or the active model's.
+
+        The newest counts alone too: a bad first rollout, in a manoeuvre, stays in the mean for a minute.
+        """
+        pairs = ((self.point_mass_holdout_error, self.active_holdout_error), self.newest_holdout_errors)
+        return any(error < max(limit, np.nan_to_num(active)) for error, active in pairs)
 
     @property
     def average_is_better(self) -> bool:

@@ -10,13 +10,15 @@ from fleet.contract import Mission
 from fleet.mission import route_items
 from twin_worker.prediction import kinematic
 from twin_worker.prediction.autopilot_parameters import ControllerTwin, RouteOverride, multirotor_controller
+from twin_worker.prediction.method_selection import STEP, imm
 from twin_worker.prediction.multirotor import fit, rollout
 from twin_worker.telemetry.track import SETTLING_S, Track, hovering_mask, resample_track
-from twin_worker.twin.state.routes import ROUTE_MODES, failsafe_plan, present_route
+from twin_worker.twin.state.routes import ROUTE_MODES, failsafe_plan, present_route, reported_path
 from twin_worker.twin.state.state import Twin
 
 _FIT_WINDOW_S = 130.0  # flight time used to fit the kinematic models [s]
 _VTOL_COMMANDS = (84, 85)  # MAV_CMD: NAV_VTOL_TAKEOFF, NAV_VTOL_LAND
+_KNOWN_PATH_S = 10.0  # part of a path that is commanded point by point which is predicted by its course [s]
 _WIND_MAX_AGE_S = 10.0  # maximum age of the autopilot's wind estimate [s]
 _TURN_NAMES = {  # parameters of L1 with other autopilots, by their names with ArduPlane
     "NAVL1_PERIOD": ("NAVL1_PERIOD", "FW_L1_PERIOD"),
@@ -112,19 +114,20 @@ def _fixed_wing_config(twin: Twin) -> kinematic.KinematicConfig:
     assert twin.telemetry.origin is not None
     items = route_items(twin.onboard.mission)
     wind = twin.environment.wind.wind if np.isfinite(twin.environment.wind.t) else _reported_wind(twin)
+    path = reported_path(twin)
     return kinematic.KinematicConfig(
         items,
         twin.received_params,
-        twin.onboard.plan_changed_t,
+        twin.onboard.plan_changed_t if path is None else path.since,
         twin.telemetry.origin,
         wind,
         twin.prediction.override,
         twin.first_item,
         twin.onboard.entry,
-        present_route(twin),
+        present_route(twin) if path is None else path.route,
         twin.telemetry.history,
         failsafe_plan(twin),
-        _turn_parameters(twin),
+        _turn_parameters(twin) if path is None else path.law,
     )
 
 
@@ -184,7 +187,23 @@ def predict_without_model(twin: Twin, recent: Track, ahead: np.ndarray) -> PathF
     if forecast.path is None:
         return no_prediction(forecast.sentence, forecast.seq)
     text = f"{kinematic.describe(twin.models.kinematic)}. {forecast.sentence}".strip(". ")
-    return PathForecast(forecast.path, "greybox", greybox.LAW, forecast.seq, text, forecast.controller)
+    path = forecast.path if reported_path(twin) is None else _turn_after(forecast.path, ahead)
+    return PathForecast(path, "greybox", greybox.LAW, forecast.seq, text, forecast.controller)
+
+
+def _turn_after(path: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+    """Return the path with the mean of straight flight and turns after the known part of a commanded path, (k, 3) [m].
+
+    Where nothing tells whether the aircraft turns, the expected distance from here grows ever more slowly.
+    """
+    times = ahead[0] + STEP * np.arange(int(_KNOWN_PATH_S / STEP) + 1)
+    known = np.column_stack([np.interp(times, ahead, column) for column in path.T])
+    after = ahead > times[-1]
+    if len(known) < 4 or not after.any() or not np.isfinite(known).all():
+        return path
+    out = path.copy()
+    out[after] = imm(known, np.gradient(known, STEP, axis=0), ahead[after] - times[-1])
+    return out
 
 
 def _with_speed_override(recent: Track, override: RouteOverride) -> Track:

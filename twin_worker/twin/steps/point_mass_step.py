@@ -30,24 +30,17 @@ def update_point_mass(twin: Twin) -> None:
     replay_t = twin.environment.autopilot.replay_t
     if window is not None and not replay_t <= newest < replay_t + REPLAY_INTERVAL_S:
         identify_autopilot(twin.environment.autopilot, twin.autopilot, twin.situation(window))
-    unbroken = window and _unbroken_part(window, twin.identification.data_from)
+    flight = window and window.part(int(np.searchsorted(window.t, twin.identification.data_from)), len(window))
     min_s = MIN_FIT_S + _HOLD_OUT_S if twin.models.active_effect is None else _REPLACE_AFTER_S
-    if window is None or unbroken is None or len(unbroken) < min_s / window.dt + 1 or twin.config.method == PAPER:
+    if window is None or flight is None or flight.ok.sum() < min_s / window.dt + 1 or twin.config.method == PAPER:
         return
     twin.models.point_mass_timer.restart(newest)
     if twin.models.holdout_timer.due(newest, _CHECK_PERIOD_S):
         twin.models.holdout_timer.restart(newest)
-        twin.models.update_holdout_errors(*_holdout_errors(twin, unbroken))
+        twin.models.update_holdout_errors(*_holdout_errors(twin, flight))
     warm_start = twin.models.point_mass_warm_start
-    model = identify(unbroken, twin.telemetry.history, twin.environment.wind.scale, warm_start)
-    limit = max(_MAX_ERROR, np.nan_to_num(twin.models.active_holdout_error))
-    twin.models.store_point_mass(model, verified=twin.models.point_mass_holdout_error < limit)
-
-
-def _unbroken_part(window: Window, since: float) -> Window:
-    """Return the last part of the window without gaps, from `since` on [s since 1970]."""
-    gaps = np.flatnonzero(~(window.ok & (window.t >= since)))
-    return window.part(int(gaps[-1]) + 1 if len(gaps) else 0, len(window))
+    model = identify(flight, twin.telemetry.history, twin.environment.wind.scale, warm_start)
+    twin.models.store_point_mass(model, verified=twin.models.point_mass_is_better_than(_MAX_ERROR))
 
 
 def _holdout_errors(twin: Twin, window: Window) -> tuple[float, float]:
@@ -56,6 +49,8 @@ def _holdout_errors(twin: Twin, window: Window) -> tuple[float, float]:
     """
     n_held_out = int(_HOLD_OUT_S / window.dt)
     training = window.part(0, len(window) - n_held_out)
+    if training.ok.sum() * window.dt < MIN_FIT_S:
+        return float("nan"), float("nan")
     situation = twin.situation(training)
     initial = synchronise_controller(situation)
     if isinstance(initial, Rollout):

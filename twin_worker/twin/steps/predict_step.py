@@ -15,6 +15,7 @@ from twin_worker.prediction.closed_loop import MIN_ROLLOUT_S
 from twin_worker.prediction.method_selection import constant_turn_prediction
 from twin_worker.telemetry.track import Track
 from twin_worker.twin.state.events import record_event
+from twin_worker.twin.state.routes import reported_path
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.kinematic_prediction import (
     PathForecast,
@@ -166,7 +167,8 @@ def _best_forecast(twin: Twin, recent: Track, ahead: np.ndarray) -> tuple[PathFo
         _set_state(twin, TwinState.VERIFIED if twin.models.active_model else TwinState.WAITING)
         resting_path = np.tile(recent.p[-1], (len(ahead), 1))
         return PathForecast(resting_path, "imm", _NO_LAW, -1, EVENT_TEXTS[Event.TOUCH_DOWN]), float(recent.t[-1])
-    if (twin.models.active_model is not None or twin.models.point_mass is not None) and not is_hovering(twin):
+    has_model = twin.models.active_model is not None or twin.models.point_mass is not None
+    if has_model and not is_hovering(twin) and reported_path(twin) is None:
         model_forecast = no_prediction(twin.no_route_reason() or "telemetry has gaps: no initial state for the model")
         if window is not None and usable and not twin.no_route_reason():
             model_forecast = predict_route(twin, window, recent, ahead)

@@ -7,7 +7,7 @@ import numpy as np
 from fleet.window import Window
 from twin_worker.confidence.calibration_table import error_growth
 from twin_worker.confidence.tube_and_horizon import AHEAD
-from twin_worker.identification.fixed_wing.plant import DYNAMICS, method
+from twin_worker.identification.fixed_wing.plant import DYNAMICS, PAPER, method
 from twin_worker.numerics.interpolation import interpolate_rows
 from twin_worker.prediction.closed_loop import InitialCondition, fly_from, synchronise_controller
 from twin_worker.prediction.failsafe_route import with_failsafe
@@ -17,10 +17,10 @@ from twin_worker.prediction.replay_window import PredictionContext, Rollout
 from twin_worker.telemetry.track import Track
 from twin_worker.twin.state.budget import EARLY_FRACTION, Work
 from twin_worker.twin.state.state import Twin
-from twin_worker.twin.steps.kinematic_prediction import PathForecast, no_prediction
-from twin_worker.twin.steps.route_lines import LAW, LINES, route_lines
+from twin_worker.twin.steps.kinematic_prediction import PathForecast, no_prediction, predict_without_model
+from twin_worker.twin.steps.route_lines import SIMPLE_METHODS, simple_paths
 
-HYBRID, BOTH = "hybrid", "both"
+HYBRID, BOTH, GREYBOX = "hybrid", "both", "greybox"
 _DYNAMICS_SPAN_S = 60.0  # look-ahead of the identified dynamics; beyond it the point-mass path continues [s]
 
 
@@ -48,13 +48,19 @@ def predict_route(twin: Twin, window: Window, recent: Track, ahead: np.ndarray) 
     forecasts = {
         name: PathForecast(path, name, control.law, initial.seq, sentence, control) for name, path in candidates.items()
     }
+    if twin.config.method != PAPER and (due or twin.prediction.selector.best((*forecasts, GREYBOX)) == GREYBOX):
+        kinematic = predict_without_model(
+            twin, recent.with_attitude(twin.telemetry.history), ahead + (t - recent.t[-1])
+        )
+        if kinematic.path is not None and not twin.telemetry.link_lost:
+            forecasts[GREYBOX] = kinematic
     return select_method(twin, t, forecasts, recent, ahead)
 
 
 def select_method(
     twin: Twin, t: float, forecasts: dict[str, PathForecast], recent: Track, ahead: np.ndarray
 ) -> PathForecast:
-    """Return the forecast of the method with the smallest past error; the route lines compete where there is a route.
+    """Return the forecast of the method with the smallest expected error; simple methods compete in a mission.
 
     Args:
         twin: its method selection is updated
@@ -65,10 +71,13 @@ def select_method(
     """
     selector, newest = twin.prediction.selector, next(iter(forecasts.values()))
     due = not twin.telemetry.link_lost and selector.is_due(t)
-    follows_mission = not twin.telemetry.link_lost and twin.prediction.override is None and newest.seq >= 0
-    if follows_mission and (due or selector.best((*forecasts, *LINES)) in LINES):
-        lines = route_lines(twin, recent.unbroken_tail(), ahead + (t - recent.t[-1]))
-        forecasts = forecasts | {name: PathForecast(path, name, LAW, newest.seq, "") for name, path in lines.items()}
+    competes = newest.seq >= 0 and not twin.telemetry.link_lost and twin.prediction.override is None
+    competes = competes and twin.config.method != PAPER  # which was selected
+    if competes and (due or selector.best((*forecasts, *SIMPLE_METHODS)) in SIMPLE_METHODS):
+        simple = simple_paths(twin, recent.unbroken_tail(), ahead + (t - recent.t[-1]))
+        forecasts = forecasts | {
+            name: PathForecast(path, name, SIMPLE_METHODS[name], newest.seq, "") for name, path in simple.items()
+        }
     paths = {name: forecast.path for name, forecast in forecasts.items() if forecast.path is not None}
     if due and len(paths) > 1:
         selector.add(t, float(np.linalg.norm(recent.v[-1])), ahead, paths)

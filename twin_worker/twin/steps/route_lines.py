@@ -1,7 +1,7 @@
-"""Route lines: the mission flown at the present ground speed, or at the commanded airspeed in the estimated wind.
+"""Simple methods: the route at the present ground speed or at the commanded airspeed in wind, and kinematics alone.
 
 They use neither model nor controller. Method selection scores them beside the closed-loop predictions, so that no
-prediction is worse than the plain route for long; `fleet assess` uses them as baselines.
+prediction is worse than the simple way for long; `fleet assess` uses them as baselines.
 """
 
 from collections.abc import Iterator
@@ -36,13 +36,16 @@ from twin_worker.twin.state.routes import present_route
 from twin_worker.twin.state.state import Twin
 
 ROUTE_SPEED, ROUTE_WIND = "route_speed", "route_wind"
-LINES = (ROUTE_WIND, ROUTE_SPEED)
-LAW = "none: route line"
+CONSTANT_TURN, CONSTANT_VELOCITY = "constant_turn", "constant_velocity"
+LAW, KINEMATIC_LAW = "none: route line", "none: turn rate only"
+SIMPLE_METHODS = {ROUTE_WIND: LAW, ROUTE_SPEED: LAW, CONSTANT_TURN: KINEMATIC_LAW, CONSTANT_VELOCITY: KINEMATIC_LAW}
+"""Law of each simple method."""
 _CIRCLES = (LOITER_TURNS, LOITER_UNLIMITED, LOITER_TIME, LOITER_TO_ALT)
 _STEP = 5.0  # between points [m]
 _CIRCLE_RADII = 1.3  # an aircraft within this many radii is on the circle [-]
 _EXIT_TOLERANCE = 0.6  # a circle is left at once if the exit direction was passed by less than this [rad]
 _CLIMB_RATE = 2.5  # climb while circling to an altitude [m/s]
+_TURN_S = 1.5  # window of the turn rate fit [s]
 _VELOCITY_S = 0.3  # averaging time of the present velocity [s]
 _OFFSET_S, _REJOIN_S = 6.0, 4.0  # time constants with which cross-track offset and speed decay [s]
 _ACCELERATION_S = 4.0  # time constant of the approach to the commanded speed [s]
@@ -159,6 +162,32 @@ def _angle_to_exit(angle: float, centre: np.ndarray, next_target: np.ndarray, ci
 def present_velocity(track: Track) -> np.ndarray:
     """Return the velocity at the end of a track, averaged over a few rows, NED, (3,) [m/s]."""
     return track.v[-round(_VELOCITY_S / STEP) :].mean(axis=0)
+
+
+def constant_velocity(track: Track, ahead: np.ndarray) -> np.ndarray:
+    """Predict at constant velocity from the end of a track, NED, (k, 3) [m]; ahead: look-ahead, (k,) [s]."""
+    return track.p[-1] + np.outer(ahead, present_velocity(track))
+
+
+def constant_turn(track: Track, ahead: np.ndarray) -> np.ndarray:
+    """Predict at constant turn rate and speed from the end of a track, NED, (k, 3) [m]; ahead: (k,) [s]."""
+    velocity = present_velocity(track)
+    recent = track.v[-round(_TURN_S / STEP) :]
+    course = np.unwrap(np.arctan2(recent[:, 1], recent[:, 0]))
+    rate = float(np.polyfit(STEP * np.arange(len(course)), course, 1)[0]) if len(course) > 3 else 0.0
+    half = 0.5 * rate * ahead
+    chord = np.hypot(*velocity[:2]) * ahead * np.sinc(half / np.pi)
+    direction = np.arctan2(velocity[1], velocity[0]) + half
+    return track.p[-1] + np.column_stack([chord * np.cos(direction), chord * np.sin(direction), ahead * velocity[2]])
+
+
+def simple_paths(twin: Twin, track: Track, ahead: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the path of each simple method, NED, (k, 3) [m]; arguments as for `route_lines`."""
+    by_method = route_lines(twin, track, ahead)
+    return by_method | {
+        CONSTANT_TURN: constant_turn(track, ahead),
+        CONSTANT_VELOCITY: constant_velocity(track, ahead),
+    }
 
 
 def route_lines(twin: Twin, track: Track, ahead: np.ndarray) -> dict[str, np.ndarray]:

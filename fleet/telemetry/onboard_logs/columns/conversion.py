@@ -51,6 +51,7 @@ WIDTHS = {
     "pressure": (1,),
     "gnss": (1,),
     "height": (1,),
+    "bearing": (1,),
     "mode": (1,),
     "armed": (1,),
 }

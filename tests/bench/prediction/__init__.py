@@ -1,0 +1,1 @@
+"""Prediction of every recording, beside the simple methods."""
