@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.contract import COLUMNS, Item, Link, Message, Mission, Params, Rows, Sample, Status
+from fleet.contract import COLUMNS, ROW_WIDTHS, Item, Link, Message, Mission, Params, Rows, Sample, Status
 from fleet.frames import Origin
 from fleet.telemetry.inspection.thinned import MAX_ROWS, DecimatedRows, TimeInterval, inside
 from fleet.vehicles import UNKNOWN, VehicleClass, vehicle_class
@@ -165,7 +165,7 @@ def _update_samples(survey: Survey, sample: Sample) -> None:
             continue
         try:
             t, x = rows.t.numpy(), rows.x.numpy()
-            valid = t.ndim == 1 and x.shape == (len(t), len(COLUMNS[name]))
+            valid = t.ndim == 1 and x.ndim == 2 and len(x) == len(t) and x.shape[1] in ROW_WIDTHS[name]
         except ValueError:
             valid = False
         if not valid:

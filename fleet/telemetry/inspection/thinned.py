@@ -145,7 +145,9 @@ class DecimatedRows:
 
 
 def _joined(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    return np.concatenate([t for t, _ in parts]), np.concatenate([x for _, x in parts])
+    width = max(x.shape[1] for _, x in parts)  # a column that some parts do not have is 0 in them
+    values = [x if x.shape[1] == width else np.pad(x, ((0, 0), (0, width - x.shape[1]))) for _, x in parts]
+    return np.concatenate([t for t, _ in parts]), np.concatenate(values)
 
 
 def _edges() -> np.ndarray:
