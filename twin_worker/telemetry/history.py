@@ -151,6 +151,8 @@ def _zero_if_tolerated(delay: float) -> float:
     return delay if _TOLERATED_S < delay < float("inf") else 0.0
 
 
+FROZEN_S = 6.0  # time for which a sensor repeats one reading until it is frozen: in flight the last digit varies [s]
+_MIN_FROZEN_ROWS = 5
 _MAX_FUTURE_S = 1.0  # rows further in the future of their message are rejected [s]
 _MAX_VALUE = 1e5  # larger values are invalid [m/s, rad, us, ...]
 _MAX_VALUE_OF = {"position": 2e9, "target": 2e9, "gnss": 2e9, "pressure": 1e6}  # exceptions [1e-7 deg, mm, Pa]
@@ -227,6 +229,25 @@ class TelemetryHistory:
     def replace_rows(self, name: str, t: np.ndarray, x: np.ndarray) -> None:
         """Replace all rows of one kind, (n,) and (n, k)."""
         self._buffers[name] = RowBuffer(np.array(t, float), np.array(x, float))
+
+    def blank_frozen(self, name: str, value: float) -> float:
+        """Set the first column to 0 where a sensor repeats one reading; return that reading, nan while it varies.
+
+        Args:
+            name: kind of row
+            value: reading that the sensor repeated at the previous call; nan: it did not
+        """
+        t, x = self.rows_since(name, self.newest - FROZEN_S)
+        readings = x[:, 0]
+        if not np.isfinite(value):
+            if len(t) < _MIN_FROZEN_ROWS or t[-1] - t[0] < 0.8 * FROZEN_S or not readings[0] or np.ptp(readings):
+                return float("nan")
+            value = float(readings[0])
+        _, every = self.rows_since(name)
+        others = np.flatnonzero((every[:, 0] != value) & (every[:, 0] != 0.0))
+        since = int(others[-1]) + 1 if len(others) else 0
+        every[since:, 0] = 0.0
+        return value if since < len(every) else float("nan")
 
     def shift_times(self, before_t: float, shift_s: float) -> None:
         """Shift rows before `before_t` [s since 1970] by `shift_s` [s], after a correction of their clock."""
