@@ -96,7 +96,7 @@ class DecimatedRows:
         self._process_pending()
         limit = self.longest_gap_s
         wide = sorted(TimeInterval(start, start + length) for length, start in self._wide_intervals if length > limit)
-        stretches = []
+        stretches: list[TimeInterval] = []
         for span in [*self._stretches, TimeInterval(float(self._stretch_start), float(self._newest_t))]:
             inner = [gap for gap in wide if span.start <= gap.start and gap.stop <= span.stop]
             edges = [span.start, *(t for gap in inner for t in gap), span.stop]
