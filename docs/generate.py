@@ -20,7 +20,18 @@ from fleet import cli
 from fleet.access.roles import TOPIC_RULES, topic_keys
 from fleet.bus.codec import encoding
 from fleet.commands.offline import schema
-from fleet.contract import COLUMNS, QUERIES, TOPICS, FleetState, GatewayCounters, Link, Sample, Status, meaning
+from fleet.contract import (
+    COLUMNS,
+    EXTRA_COLUMNS,
+    QUERIES,
+    TOPICS,
+    FleetState,
+    GatewayCounters,
+    Link,
+    Sample,
+    Status,
+    meaning,
+)
 from fleet.effects import catalogue
 from gateway import __main__ as gateway
 from gateway import status as gateway_metrics
@@ -89,6 +100,10 @@ def messages_page() -> str:
             text += enumerated(part) if issubclass(part, enum.Enum) else fields(part)
         if kind is Sample:
             rows = [(code(name), ", ".join(f"{n} [{unit}]" for n, unit in row)) for name, row in COLUMNS.items()]
+            rows += [
+                (f"{code(name)}, wide form", "the same, then " + ", ".join(f"{n} [{unit}]" for n, unit in row))
+                for name, row in EXTRA_COLUMNS.items()
+            ]
             text += "\n### Columns of each field\n\n" + table(("Field", "Columns, in order"), rows)
     return text
 

@@ -82,7 +82,7 @@ class Rows(msgspec.Struct, frozen=True, gc=False):
     """Measurements of one type, each row with its own time."""
 
     t: Annotated[Array, about("fleet time of each row, (n,) <f8 [s since 1970]")]
-    x: Annotated[Array, about("values, (n, k); columns as in COLUMNS")]
+    x: Annotated[Array, about("values, (n, k); columns as in COLUMNS, followed by those of EXTRA_COLUMNS or not")]
 
 
 COLUMNS: dict[str, tuple[tuple[str, str], ...]] = {
@@ -108,6 +108,13 @@ COLUMNS: dict[str, tuple[tuple[str, str], ...]] = {
     "bearing": (("target_bearing", "rad"),),
 }
 """Columns of each `Rows` field of a `Sample`: name and unit, in wire order. Specific force and rates are FRD."""
+EXTRA_COLUMNS = {"servo": tuple((f"servo{i}", "us pulse width, 0: no output") for i in range(9, 17))}
+"""Columns that follow those of `COLUMNS` in the messages in which at least one of them is not 0, by field."""
+ROW_WIDTHS: dict[str, tuple[int, ...]] = {
+    name: (len(columns), len(columns) + len(EXTRA_COLUMNS[name])) if name in EXTRA_COLUMNS else (len(columns),)
+    for name, columns in COLUMNS.items()
+}
+"""Possible numbers of columns of each field."""
 FIRST_OPTIONAL_COLUMN = {"command": 2}
 """Index of the first column that is nan where the autopilot does not report it, by field."""
 

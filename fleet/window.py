@@ -9,6 +9,20 @@ from fleet.frames import ned_to_body
 
 STATES = ("u", "v", "w", "p", "q", "r", "phi", "theta", "psi")
 INPUTS = ("delta_a", "delta_e", "delta_r", "delta_t")
+LONGEST_GAP = {"attitude": 0.5, "velocity": 1.0, "servo": 0.5, "position": 1.0}
+"""Longest gap that is filled in telemetry of usual rates, by field of `Sample` [s]."""
+MAX_GAP_S = 2.5  # longest gap that is filled at any rate: telemetry of 1 Hz with a lost row [s]
+_LOST_ROW = 2.5  # gap across one lost row with jitter, in usual intervals [-]
+
+
+def longest_gap(limit: float, interval: float) -> float:
+    """Return the longest gap that is filled [s]: at low rates a lost row is no longer gap than the rate itself.
+
+    Args:
+        limit: value of `LONGEST_GAP` [s]
+        interval: usual interval between rows [s]
+    """
+    return max(limit, min(_LOST_ROW * interval, MAX_GAP_S))
 
 
 @dataclass(frozen=True)

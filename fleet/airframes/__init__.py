@@ -4,10 +4,11 @@ Source: Beard & McLain 2012, section 5.5 (dimensional derivatives) and eq. 3.13 
 """
 
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
 
+from fleet.airframes.airframe import servo_parameters
 from fleet.frames import G
 
 RHO = 1.225  # air at sea level [kg/m3]
@@ -36,6 +37,7 @@ class Airframe:
         coefficient: per rad or per normalised rate [-]
         scale: True: the numbers describe a class and are scaled to the actual aircraft
         span: of the actual aircraft, where known [m]
+        servo_params: servo map as SERVOn_* parameters, which replaces that of the autopilot; empty: none given
     """
 
     name: str
@@ -45,6 +47,7 @@ class Airframe:
     coefficient: dict[str, float]
     scale: bool
     span: float | None = None
+    servo_params: dict[str, float] = field(default_factory=dict)
 
 
 def load(name_or_path: str) -> Airframe:
@@ -74,7 +77,8 @@ def load(name_or_path: str) -> Airframe:
     airframe_name = str(document.get("name", path.stem))
     span = _numbers(path.name, document, ("span",))["span"] if "span" in document else None
     source, scale = str(document.get("source", "")), bool(document.get("scale", False))
-    return Airframe(airframe_name, source, value, throw, coefficient, scale, span)
+    servo_params = servo_parameters(path.name, document["servo"]) if "servo" in document else {}
+    return Airframe(airframe_name, source, value, throw, coefficient, scale, span, servo_params)
 
 
 def _numbers(file: str, table: object, names: tuple[str, ...]) -> dict[str, float]:

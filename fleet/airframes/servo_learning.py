@@ -25,7 +25,7 @@ def learn_servo_map(pulses: np.ndarray, errors: np.ndarray, rates: np.ndarray, t
     """Return the servo map that flight shows; None where roll or pitch has no clear output.
 
     Args:
-        pulses: (n, 8) [us]
+        pulses: (n, 8) or (n, 16) [us]
         errors: commanded minus actual roll and pitch, (n, 2) [rad]
         rates: p, q, (n, 2) [rad/s]
         throttle: as reported, (n,) [-]
@@ -36,7 +36,8 @@ def learn_servo_map(pulses: np.ndarray, errors: np.ndarray, rates: np.ndarray, t
         return None
     scaled = signals[valid] - signals[valid].mean(axis=0)
     scaled /= np.maximum(scaled.std(axis=0), 1e-9)
-    weights = {n: weight for n in range(1, 9) if (weight := _weights(scaled, pulses[valid, n - 1])) is not None}
+    moved = {n: _weights(scaled, pulses[valid, n - 1]) for n in range(1, pulses.shape[1] + 1)}
+    weights = {n: weight for n, weight in moved.items() if weight is not None}
     functions = _functions(weights)
     if not {_AILERON, *_ELEVONS} & set(functions.values()) or not {_ELEVATOR, *_ELEVONS, *_V_TAIL} & set(
         functions.values()

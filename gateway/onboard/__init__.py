@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from fleet.contract import Link
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
 from gateway.onboard.parameter_cache_check import Cache
-from gateway.onboard.questions import WANTED_HZ, RequestScheduler, size_of
+from gateway.onboard.questions import DIAGNOSIS_HZ, IMU_HZ, WANTED_HZ, RequestScheduler, size_of
 from gateway.record.tape import format_size
 
 # Other ground stations use 255: they must not receive our answers, and an aircraft must detect the loss of theirs.
@@ -19,6 +19,9 @@ MIN_SHARE = 0.1  # minimum share of the wanted rates: lower rates are not useful
 _HYSTERESIS = 0.15  # smaller relative changes of the share are ignored
 WANTED_BYTES_S = sum(hz * size_of(name) for name, hz in WANTED_HZ.items())
 """Data rate of the wanted messages of one aircraft [bytes/s]."""
+DIAGNOSIS_BYTES_S = IMU_HZ * size_of("RAW_IMU") + DIAGNOSIS_HZ["LOCAL_POSITION_NED"] * size_of("LOCAL_POSITION_NED")
+"""Data rate of what only diagnosis needs, of one aircraft [bytes/s]."""
+MIN_DIAGNOSIS_SHARE = 0.4  # minimum share of the rates for diagnosis: 10 Hz of the IMU
 
 
 class RequestSender:
@@ -31,6 +34,7 @@ class RequestSender:
 
     def __init__(self, budget: float = float("inf"), cache: Cache | None = None) -> None:
         self.share = 1.0  # of the wanted rates that fits the link, the same for all of its aircraft
+        self.diagnosis_share = 0.0  # the same of the rates for diagnosis, which are the first to be reduced
         self.sentence = ""  # note for the operator if not all of them fit
         self._budget, self._cache = budget, cache
         self._mav = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
@@ -57,22 +61,28 @@ class RequestSender:
                 (source, self._pack(beat))
                 for source in dict.fromkeys([*known_peers, *(recipient.source for recipient in live)])
             ]
-        self._update_share(live)
+        self._update_shares(live)
+        shares = self.share, self.diagnosis_share
         for craft in live:
             scheduler = self._schedulers.get(craft.system)
             if scheduler is None or scheduler.aircraft is not craft:
                 scheduler = self._schedulers[craft.system] = RequestScheduler(craft, now, self._cache)
-            out += [(craft.source, self._pack(message)) for message in scheduler.requests(now, self.share)]
+            out += [(craft.source, self._pack(message)) for message in scheduler.requests(now, *shares)]
         return out
 
-    def _update_share(self, live: Sequence[AircraftLink]) -> None:
+    def _update_shares(self, live: Sequence[AircraftLink]) -> None:
         """Fit the wanted rates of these aircraft to the rest of the budget: they also send unrequested messages."""
+        requested = WANTED_HZ if self.diagnosis_share == 0.0 else {**WANTED_HZ, **DIAGNOSIS_HZ}
         unrequested = sum(
-            hz * size_of(name) for aircraft in live for name, hz in aircraft.rates.items() if name not in WANTED_HZ
+            hz * size_of(name) for aircraft in live for name, hz in aircraft.rates.items() if name not in requested
         )
-        wanted = WANTED_BYTES_S * len(live)
+        wanted, for_diagnosis = WANTED_BYTES_S * len(live), DIAGNOSIS_BYTES_S * len(live)
+        rest = float(np.clip((self._budget - unrequested - wanted) / for_diagnosis, 0.0, 1.0)) if live else 0.0
+        rest = rest if rest >= MIN_DIAGNOSIS_SHARE else 0.0
+        if _has_changed(rest, self.diagnosis_share):
+            self.diagnosis_share = rest
         fitting = float(np.clip((self._budget - unrequested) / wanted, MIN_SHARE, 1.0)) if live else 1.0
-        if abs(fitting - self.share) > _HYSTERESIS * self.share or (fitting == 1.0) != (self.share == 1.0):
+        if _has_changed(fitting, self.share):
             self.share = fitting
         self.sentence = ""
         if self.share < 1.0:
@@ -86,3 +96,9 @@ class RequestSender:
         packed = bytes(message.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256
         return packed
+
+
+def _has_changed(share: float, previous: float) -> bool:
+    """Return whether a share differs by more than the hysteresis, or starts or ceases to be 0 or 1."""
+    ends = (0.0, 1.0)
+    return abs(share - previous) > _HYSTERESIS * previous or any((share == end) != (previous == end) for end in ends)

@@ -21,6 +21,10 @@ WANTED_HZ: dict[str, float] = {  # [Hz]
     "NAV_CONTROLLER_OUTPUT": 5,
     "MISSION_CURRENT": 1,
 }
+IMU_HZ = 25.0  # for diagnosis [Hz]
+IMU_MESSAGES = {"ardupilot": "RAW_IMU", "px4": "SCALED_IMU"}  # requested, by autopilot
+DIAGNOSIS_HZ: dict[str, float] = {**dict.fromkeys(IMU_MESSAGES.values(), IMU_HZ), "LOCAL_POSITION_NED": 10}
+"""Rates that only diagnosis needs; an aircraft is asked for one of the IMU messages [Hz]."""
 DEFAULT_BUDGET = "1M"  # default rate that the aircraft of one link may send together [bytes/s]
 _FRAME_BYTES = 12  # bytes of a frame without payload
 _SERIAL_SHARE = 0.7  # share of a serial line that telemetry may fill
@@ -75,6 +79,7 @@ PARAMS_AT_ONCE = 10
 MAX_SINGLE_PARAMS = 200  # if more parameters are missing, the list is requested
 RATES_AFTER_S = 5.0  # before the first check of rates [s]
 RATE_TRIES = 3
+_STOP = -1.0  # interval of a message that is not to be sent
 TOO_LOW, TOO_HIGH = 0.4, 1.6  # bounds of received over fitting rate; the upper one applies only on a full link [-]
 
 
@@ -84,7 +89,8 @@ class RequestScheduler:
     def __init__(self, aircraft: AircraftLink, now: float, cache: Cache | None = None) -> None:
         self.aircraft = aircraft
         self._cache_check = None if cache is None else CacheCheck(aircraft, cache)
-        self._share = 1.0
+        self._shares = (1.0, 0.0)
+        self._requested: set[str] = set()  # messages for diagnosis that were requested
         self._watch_t = self._timesync_t = now
         self._store_t = now - STORE_S + FIRST_STORE_S
         self._watched_item = 0
@@ -97,12 +103,12 @@ class RequestScheduler:
         self._items_left: int | None = None
         self._item_tries = 0  # since the last item received
 
-    def requests(self, now: float, share: float = 1.0) -> list[Any]:
-        """Return the messages to send now; `share` of the wanted rates fits the link."""
+    def requests(self, now: float, share: float = 1.0, diagnosis_share: float = 0.0) -> list[Any]:
+        """Return the messages to send now; these shares of the wanted rates and of those for diagnosis fit the link."""
         if self._cache_check is not None and now - self._store_t >= STORE_S:
             self._store_t = now
             self._cache_check.store()
-        requests = self._mission(now) + self._home(now) + self._params(now) + self._rates(now, share)
+        requests = self._mission(now) + self._home(now) + self._params(now) + self._rates(now, share, diagnosis_share)
         if now - self._timesync_t >= TIMESYNC_S:  # to measure the round-trip time
             self._timesync_t = now
             requests.append(dialect.MAVLink_timesync_message(0, round(now * 1e9)))
@@ -173,23 +179,41 @@ class RequestScheduler:
         self._params_at = now
         return [dialect.MAVLink_param_request_read_message(*self._to, b"", index) for index in missing[:PARAMS_AT_ONCE]]
 
-    def _rates(self, now: float, share: float) -> list[Any]:
-        if share != self._share:
-            self._share, self._rate_tries = share, 0
+    def _diagnosis_hz(self, share: float) -> dict[str, float]:
+        """Return the rates for diagnosis to request [Hz]; 0 to stop a message that is not to be sent any more."""
+        received, imu = self.aircraft.rates, IMU_MESSAGES.get(self.aircraft.autopilot)
+        if imu is None or share == 0.0:
+            return dict.fromkeys(self._requested, 0.0)
+        has_other = received.get("HIGHRES_IMU", 0.0) >= TOO_LOW * IMU_HZ * share
+        return {name: DIAGNOSIS_HZ[name] * share for name in ("LOCAL_POSITION_NED", *([] if has_other else [imu]))}
+
+    def _rates(self, now: float, share: float, diagnosis_share: float) -> list[Any]:
+        if (share, diagnosis_share) != self._shares:
+            self._shares, self._rate_tries = (share, diagnosis_share), 0
             self._rate_wait.reset()
         if now - self._since < RATES_AFTER_S or self._rate_tries >= RATE_TRIES:
             return []
-        received, max_ratio = self.aircraft.rates, TOO_HIGH if share < 1.0 else float("inf")
-        fitting = {name: hz * share for name, hz in WANTED_HZ.items()}
-        wrong = [name for name, hz in fitting.items() if not TOO_LOW * hz <= received.get(name, 0.0) <= max_ratio * hz]
+        received = self.aircraft.rates
+        fitting = {name: hz * share for name, hz in WANTED_HZ.items()} | self._diagnosis_hz(diagnosis_share)
+        limited = {name: (diagnosis_share if name in DIAGNOSIS_HZ else share) < 1.0 for name in fitting}
+        wrong = [name for name, hz in fitting.items() if _is_wrong(received.get(name, 0.0), hz, limited[name])]
         if not wrong or not self._rate_wait.due(now):
             return []
         self._rate_tries += 1
+        self._requested.update(name for name in wrong if name in DIAGNOSIS_HZ and fitting[name])
         command, zeros = (*self._to, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0), (0, 0, 0, 0, 0)
+        intervals = {name: 1e6 / fitting[name] if fitting[name] else _STOP for name in wrong}
         requests = [
-            dialect.MAVLink_command_long_message(*command, IDS[name], 1e6 / fitting[name], *zeros) for name in wrong
+            dialect.MAVLink_command_long_message(*command, IDS[name], interval, *zeros)
+            for name, interval in intervals.items()
         ]
-        if self._rate_tries == RATE_TRIES and self._request_dialect.streams:
+        wrong = [name for name in wrong if name in STREAMS]  # the group of an IMU message has much more
+        if self._rate_tries == RATE_TRIES and self._request_dialect.streams and wrong:
             groups = {STREAMS[name]: round(max(fitting[name], 1.0)) for name in reversed(wrong)}
             requests += [dialect.MAVLink_request_data_stream_message(*self._to, *pair, 1) for pair in groups.items()]
         return requests
+
+
+def _is_wrong(received_hz: float, wanted_hz: float, is_limited: bool) -> bool:
+    """Return whether a rate is too low, or too high on a link that is limited to the wanted rates."""
+    return received_hz < TOO_LOW * wanted_hz or (is_limited and received_hz > TOO_HIGH * wanted_hz)

@@ -1,6 +1,7 @@
 """What aircraft told before is believed only once it is checked; other missions are noticed; links are not overrun."""
 
 import struct
+from types import SimpleNamespace
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
@@ -10,9 +11,9 @@ from fleet.simulator.flight.mavlink import MavlinkEndpoint
 from fleet.simulator.flight.mavlink_messages import DIALECTS
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
 from gateway.link_spec import read_spec
-from gateway.onboard import MIN_SHARE, WANTED_BYTES_S, RequestSender
+from gateway.onboard import DIAGNOSIS_BYTES_S, MIN_SHARE, WANTED_BYTES_S, RequestSender
 from gateway.onboard.parameter_cache_check import Cache
-from gateway.onboard.questions import WANTED_HZ, budget_of
+from gateway.onboard.questions import WANTED_HZ, RequestScheduler, budget_of
 from tests.support.talker import ITEMS, T0, Aircraft, of
 
 VALUES = {"NAVL1_PERIOD": 17.0, "STAT_RUNTIME": 1.0, **{f"P{k:03d}": k / 7 for k in range(300)}}
@@ -165,16 +166,51 @@ def rates_asked(count, budget):
 
 
 def test_what_does_not_fit_is_asked_for_in_proportion_and_that_is_said():
-    asked, told = rates_asked(1, WANTED_BYTES_S * 2)
+    asked, told = rates_asked(1, WANTED_BYTES_S + DIAGNOSIS_BYTES_S + 100.0)
+    assert asked[27] == {25.0} and asked[32] == {10.0}
     assert asked[30] == {WANTED_HZ["ATTITUDE"]} and told.sentence == ""
     asked, told = rates_asked(4, WANTED_BYTES_S)
     assert told.share == pytest.approx(0.25, abs=0.02)  # heartbeats count too
+    assert told.diagnosis_share == 0.0 and not {27, 32} & set(asked)
     assert {name: list(hz) for name, hz in asked.items() if name in (30, 42)} == {
         30: [pytest.approx(25 * told.share, abs=0.01)],
         42: [pytest.approx(told.share, abs=0.01)],
     }
     assert told.sentence.startswith("4 aircraft would send ") and told.sentence.endswith("link has more capacity")
     assert rates_asked(4, 10.0)[1].share == MIN_SHARE
+
+
+def test_what_only_diagnosis_needs_is_dropped_first():
+    for extra, share in ((1.0, 1.0), (0.6, 0.6), (0.3, 0.0), (0.0, 0.0)):
+        asked, told = rates_asked(2, 2 * (WANTED_BYTES_S + extra * DIAGNOSIS_BYTES_S) + 100.0)
+        assert told.share == 1.0 and told.sentence == "" and asked[30] == {25.0}
+        assert told.diagnosis_share == pytest.approx(share, abs=0.04)
+        wanted = [pytest.approx(25.0 * told.diagnosis_share, abs=0.01)] if share else []
+        assert list(asked.get(27, ())) == wanted
+
+
+def scheduled(autopilot: str, rates: dict[str, float]) -> RequestScheduler:
+    aircraft = SimpleNamespace(system=1, component=1, autopilot=autopilot, rates=rates)
+    return RequestScheduler(aircraft, T0)  # type: ignore[arg-type]
+
+
+def intervals(scheduler: RequestScheduler, t: float, *shares: float) -> dict[int, float]:
+    """The message intervals asked for at a time [us]."""
+    return {int(message.param1): message.param2 for message in scheduler._rates(t, *shares) if message.command == 511}
+
+
+def test_the_imu_message_is_the_autopilots_own_and_stops_when_the_link_gets_slow():
+    sent = dict(WANTED_HZ)
+    assert intervals(scheduled("ardupilot", sent), T0 + 9.0, 1.0, 1.0) == {27: 40_000.0, 32: 100_000.0}
+    assert intervals(scheduled("px4", sent), T0 + 9.0, 1.0, 0.5) == {26: 80_000.0, 32: 200_000.0}
+    assert intervals(scheduled("px4", sent | {"HIGHRES_IMU": 50.0}), T0 + 9.0, 1.0, 1.0) == {32: 100_000.0}
+    assert intervals(scheduled("generic", sent), T0 + 9.0, 1.0, 1.0) == {}
+    scheduler = scheduled("ardupilot", sent)
+    assert len(intervals(scheduler, T0 + 9.0, 1.0, 1.0)) == 2
+    sent |= {"RAW_IMU": 25.0, "LOCAL_POSITION_NED": 10.0}
+    assert intervals(scheduler, T0 + 30.0, 1.0, 1.0) == {}
+    assert intervals(scheduler, T0 + 60.0, 1.0, 0.0) == {27: -1.0, 32: -1.0}
+    assert intervals(scheduled("ardupilot", sent), T0 + 9.0, 1.0, 0.0) == {}  # another station asked for them
 
 
 def test_the_budget_suits_the_link_or_is_as_asked_for():

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from pymavlink import DFReader
 
-from fleet.contract import COLUMNS
+from fleet.contract import ROW_WIDTHS
 from fleet.telemetry.mavlink.onboard_log import FieldRows, OnboardEvent
 from fleet.telemetry.onboard_logs.dataflash.reader import DataflashLog
 
@@ -67,7 +67,7 @@ def read(log: DataflashLog) -> tuple[FieldRows, list[OnboardEvent], Counter]:
         said += chunk.events
         counts.update(chunk.counts)
         for field, (t, values) in chunk.rows.items():
-            assert len(t) == len(values) > 0 and values.shape[1] == len(COLUMNS[field])
+            assert len(t) == len(values) > 0 and (values.shape[1] in ROW_WIDTHS[field] or field == "servo")
             assert np.isfinite(values).all()
             parts.setdefault(field, []).append((t, values))
     rows = {f: (np.concatenate([t for t, _ in p]), np.concatenate([v for _, v in p])) for f, p in parts.items()}

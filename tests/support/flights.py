@@ -65,7 +65,7 @@ def turn(seconds: float, *, rate: float = 0.2, Va: float = 20.0, wind=(0.0, 0.0)
         "servo": np.column_stack([wide] * 8),
         "velocity": ground(t["velocity"]),
         "position": to_geodetic(HERE, track(t["position"])),
-        "air": np.column_stack([still["air"] + Va, still["air"] + 0.5, still["air"]]),
+        "air": np.column_stack([Va + 1e-3 * np.sin(7.0 * t["air"]), still["air"] + 0.5, still["air"]]),  # not frozen
         "command": np.column_stack([still["command"] + bank, *[still["command"]] * 4]),
         "leg": np.ones((len(t["leg"]), 1)),
     }

@@ -111,7 +111,7 @@ class DiagnosisState:
         )
         rows = telemetry_rows(twin.telemetry.history, newest - FLIGHT_S, self.past)
         past_end = None if self.past is None else self.past_t
-        params = dict(twin.received_params)
+        params = dict(twin.config.airframe.servo_params or twin.received_params)
         return DiagnosisJob(twin.config.uav, rows, params, self.card, self.baseline, past_end, newest - FLIGHT_S, full)
 
     @property

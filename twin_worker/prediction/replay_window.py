@@ -24,6 +24,8 @@ _MIN_COMPARED_S = 10.0  # shortest flight in which banks are compared [s]
 SHADOW_S = 60.0  # telemetry for the synchronisation of the controller twin [s]
 MIN_FLIGHT_S = 5.0  # shortest telemetry without gaps before a rollout [s]
 MAX_EARLY_S = 1.0  # a route that changed at most this long after the newest telemetry is flown from there [s]
+_AIRSPEED_MAX_AGE_S = 1.5  # reports of 1 Hz, with jitter [s]
+_MIN_AIRSPEED = 3.0  # a lower reading in flight is no airspeed [m/s]
 _ITEM_REPORT_S = 2.0  # longest period of reports of the current mission item [s]
 _ITEM_DELAY_S = 2.0  # between the mission and the telemetry that report the same item, at most [s]
 _SHADOW_STEP = 2  # window rows per shadow step
@@ -247,7 +249,8 @@ def _gap_free(window: Window) -> Window:
 def _replay_rows(window: Window, stride: slice, history: TelemetryHistory) -> tuple[np.ndarray, ...]:
     """Return the synchronisation data at some rows: t p v euler rates Va phi_c theta_c delta."""
     times = window.t[stride]
-    command, Va = reported(history, "command", times, 1.0), reported(history, "air", times, 1.0)[:, 0]
+    command, Va = reported(history, "command", times, 1.0), reported(history, "air", times, _AIRSPEED_MAX_AGE_S)[:, 0]
+    Va = np.where(Va < _MIN_AIRSPEED, np.nan, Va)
     euler, rates = window.x[stride, 6:9].copy(), window.x[stride, 3:6]
     euler[:, 2] = wrap(euler[:, 2])
     rows = (

@@ -6,7 +6,7 @@ from struct import Struct
 import numba as nb
 import numpy as np
 
-from fleet.contract import COLUMNS, DTYPES, FIRST_OPTIONAL_COLUMN, Array, Rows, Sample
+from fleet.contract import COLUMNS, DTYPES, FIRST_OPTIONAL_COLUMN, ROW_WIDTHS, Array, Rows, Sample
 
 _MIN_SPARE_ROWS = 40  # minimum spare capacity [rows]
 _MAX_PENDING_ROWS = 256  # largest number of undecoded rows
@@ -23,13 +23,13 @@ class RowBuffer:
         self.n, self.n_sorted = len(t), 0  # number of rows, and of sorted rows
         self._pending_t: list[bytes] = []
         self._pending_x: list[bytes] = []
-        self._pending_dtype, self._n_pending = "", 0  # type of pending values; number of pending rows
+        self._pending_form, self._n_pending = ("", 0), 0  # type and columns of pending values; number of pending rows
 
-    def add_bytes(self, t: bytes, x: bytes, dtype: str, since: float) -> None:
-        """Append undecoded rows of checked length: times <f8, values of `dtype`; `since` as for `add`."""
-        if dtype != self._pending_dtype or self._n_pending >= _MAX_PENDING_ROWS:
+    def add_bytes(self, t: bytes, x: bytes, form: tuple[str, int], since: float) -> None:
+        """Append undecoded rows of checked length: times <f8, values of a type and columns; `since` as for `add`."""
+        if form != self._pending_form or self._n_pending >= _MAX_PENDING_ROWS:
             self.flush(since)
-            self._pending_dtype = dtype
+            self._pending_form = form
         self._pending_t.append(t)
         self._pending_x.append(x)
         self._n_pending += len(t) >> 3
@@ -38,13 +38,18 @@ class RowBuffer:
         """Decode pending rows."""
         if self._n_pending:
             t = np.frombuffer(b"".join(self._pending_t), "<f8")
-            x = np.frombuffer(b"".join(self._pending_x), self._pending_dtype).reshape(len(t), -1)
+            x = np.frombuffer(b"".join(self._pending_x), self._pending_form[0]).reshape(len(t), -1)
             self._pending_t, self._pending_x, self._n_pending = [], [], 0
             self.add(t, x, since)
 
     def add(self, t: np.ndarray, x: np.ndarray, since: float) -> None:
-        """Append rows; if capacity is exhausted, drop rows before `since`."""
+        """Append rows; if capacity is exhausted, drop rows before `since`. Columns that a row does not have are 0."""
         self.flush(since)
+        width = self.x.shape[1]
+        if x.shape[1] > width:
+            self.x = np.pad(self.x[: self.n], ((0, len(self.t) - self.n), (0, x.shape[1] - width)))
+        elif x.shape[1] < width:
+            x = np.pad(x, ((0, 0), (0, width - x.shape[1])))
         end = self.n + len(t)
         if end > len(self.t):
             self._grow(len(t), since)
@@ -146,10 +151,12 @@ def _zero_if_tolerated(delay: float) -> float:
     return delay if _TOLERATED_S < delay < float("inf") else 0.0
 
 
+FROZEN_S = 6.0  # time for which a sensor repeats one reading until it is frozen: in flight the last digit varies [s]
+_MIN_FROZEN_ROWS = 5
 _MAX_FUTURE_S = 1.0  # rows further in the future of their message are rejected [s]
 _MAX_VALUE = 1e5  # larger values are invalid [m/s, rad, us, ...]
 _MAX_VALUE_OF = {"position": 2e9, "target": 2e9, "gnss": 2e9, "pressure": 1e6}  # exceptions [1e-7 deg, mm, Pa]
-_WIDTHS = tuple((name, len(columns)) for name, columns in COLUMNS.items())
+_WIDTHS = tuple((name, widths[0], widths[-1]) for name, widths in ROW_WIDTHS.items())
 _SIZES = {name: np.dtype(name).itemsize for name in DTYPES}
 _UNPACK_TIMES = tuple(Struct(f"<{n}d").unpack for n in range(17))  # by number of rows; faster than an array
 
@@ -165,14 +172,15 @@ class TelemetryHistory:
     def add(self, sample: Sample) -> int:
         """Add one message; return how many of its kinds violate the contract."""
         rejected, max_t = 0, sample.t + _MAX_FUTURE_S
-        for name, width in _WIDTHS:
+        for name, width, widest in _WIDTHS:
             rows: Rows | None = getattr(sample, name)
             if rows is None:
                 continue
+            width = widest if rows.x.shape[1:] == (widest,) else width
             newest = _newest_time(rows.t, rows.x, width, max_t)
             if newest:
                 self._buffer_of(name, newest).add_bytes(
-                    rows.t.data, rows.x.data, rows.x.dtype, self.newest - self.keep_s
+                    rows.t.data, rows.x.data, (rows.x.dtype, width), self.newest - self.keep_s
                 )
             else:
                 rejected += self._add_checked(name, rows, max_t)
@@ -184,7 +192,7 @@ class TelemetryHistory:
             t, x = rows.t.numpy(), rows.x.numpy()
         except ValueError:
             return True
-        if x.ndim != 2 or t.shape != x.shape[:1] or x.shape[1] != len(COLUMNS[name]) or not len(t):
+        if x.ndim != 2 or t.shape != x.shape[:1] or x.shape[1] not in ROW_WIDTHS[name] or not len(t):
             return True
         valid = (t <= max_t) & (t > 0)  # false for nan; rows later than their message are inconsistent
         if valid.any():
@@ -222,6 +230,25 @@ class TelemetryHistory:
         """Replace all rows of one kind, (n,) and (n, k)."""
         self._buffers[name] = RowBuffer(np.array(t, float), np.array(x, float))
 
+    def blank_frozen(self, name: str, value: float) -> float:
+        """Set the first column to 0 where a sensor repeats one reading; return that reading, nan while it varies.
+
+        Args:
+            name: kind of row
+            value: reading that the sensor repeated at the previous call; nan: it did not
+        """
+        t, x = self.rows_since(name, self.newest - FROZEN_S)
+        readings = x[:, 0]
+        if not np.isfinite(value):
+            if len(t) < _MIN_FROZEN_ROWS or t[-1] - t[0] < 0.8 * FROZEN_S or not readings[0] or np.ptp(readings):
+                return float("nan")
+            value = float(readings[0])
+        _, every = self.rows_since(name)
+        others = np.flatnonzero((every[:, 0] != value) & (every[:, 0] != 0.0))
+        since = int(others[-1]) + 1 if len(others) else 0
+        every[since:, 0] = 0.0
+        return value if since < len(every) else float("nan")
+
     def shift_times(self, before_t: float, shift_s: float) -> None:
         """Shift rows before `before_t` [s since 1970] by `shift_s` [s], after a correction of their clock."""
         for buffer in self._buffers.values():
@@ -232,8 +259,7 @@ class TelemetryHistory:
 
     def is_consistent(self) -> bool:
         """Return whether every kind has its columns; compiled code does not check bounds."""
-        widths = dict(_WIDTHS)
-        return all(buffer.x.shape[1] == widths.get(name) for name, buffer in self._buffers.items())
+        return all(buffer.x.shape[1] in ROW_WIDTHS.get(name, ()) for name, buffer in self._buffers.items())
 
     def clear(self) -> None:
         """Remove all rows, for example after a clock jump."""

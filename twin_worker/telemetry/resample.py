@@ -11,12 +11,12 @@ import numpy as np
 
 from fleet.airframes.airframe import ServoMap
 from fleet.frames import Origin, to_ned
-from fleet.window import INPUTS, STATES, Window
+from fleet.window import INPUTS, LONGEST_GAP, STATES, Window, longest_gap
 from twin_worker.telemetry.history import TelemetryHistory
 
 DT = 0.04  # grid of every window [s]
-LONGEST_GAP = {"attitude": 0.5, "velocity": 1.0, "servo": 0.5, "position": 1.0}  # longer gaps are not filled [s]
 _FINAL_AFTER_S = 1.5  # rows older than this no longer arrive [s]
+_SPARSE_S = 0.2  # attitude with longer intervals is interpolated with its measured rates [s]
 _CONTEXT_S = 4.0  # rows before a segment that its interpolation uses [s]
 _MIN_ROWS = 4, 8  # minimum of every kind, to continue and to start
 _MIN_WINDOW_ROWS = 50  # minimum grid times of a window
@@ -46,7 +46,7 @@ def interpolate_samples(
 
     Args:
         t, y, grid: as for `lagrange`
-        max_gap: longer gaps are not filled [s]
+        max_gap: longer gaps are not filled, except across one lost row at low rates, see `longest_gap` [s]
         max_cubic_gaps: largest span of a cubic in median gaps; near a wide gap a cubic amplifies noise [-]
     Returns:
         values (n, k), measured or filled (n,) bool, filled across lost samples (n,) bool
@@ -55,7 +55,7 @@ def interpolate_samples(
         return np.zeros((len(grid), y.shape[1])), np.zeros(len(grid), bool), np.zeros(len(grid), bool)
     gaps = np.sort(np.diff(t))
     median_gap = 0.5 * float(gaps[(len(gaps) - 1) // 2] + gaps[len(gaps) // 2])
-    return _interpolate(t, y, grid, (median_gap, max_gap, max_cubic_gaps * median_gap))
+    return _interpolate(t, y, grid, (median_gap, longest_gap(max_gap, median_gap), max_cubic_gaps * median_gap))
 
 
 def _interpolate(
@@ -238,8 +238,11 @@ def _resample_rows(
     t, attitude = rows["attitude"]
     unwrapped = np.hstack([np.unwrap(attitude[:, :3], axis=0), attitude[:, 3:]])
     t_p, position = rows["position"]
+    angles = interpolate_samples(t, unwrapped, grid, LONGEST_GAP["attitude"])
+    if len(t) >= 4 and np.median(np.diff(t)) > _SPARSE_S and unwrapped[:, 3:].any():
+        angles = (_sparse_attitude(t, unwrapped, grid), *angles[1:])
     columns = [
-        interpolate_samples(t, unwrapped, grid, LONGEST_GAP["attitude"]),
+        angles,
         interpolate_samples(*rows["velocity"], grid, LONGEST_GAP["velocity"]),
         interpolate_samples(t_p, to_ned(origin, *position.T), grid, LONGEST_GAP["position"]),
         interpolate_samples(
@@ -248,6 +251,36 @@ def _resample_rows(
     ]
     values, ok, filled = zip(*columns, strict=True)
     return np.hstack(values), np.logical_and.reduce(ok), np.logical_or.reduce(filled)
+
+
+def _sparse_attitude(t: np.ndarray, attitude: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Interpolate angles with the cubic Hermite polynomial of measured angles and rates; rates are its derivative.
+
+    phi_dot = p + tan(theta) (q sin(phi) + r cos(phi)); theta_dot, psi_dot likewise, and their inverse.
+    Source: Beard & McLain 2012, eq. 3.3.
+
+    Args:
+        t: sample times, rising, (m,) [s]
+        attitude: unwrapped phi theta psi p q r, (m, 6) [rad, rad/s]
+        grid: requested times, rising, (n,) [s]
+    Returns:
+        phi theta psi p q r on the grid, (n, 6)
+    """
+    phi, theta, _, p, q, r = attitude.T
+    yawing = q * np.sin(phi) + r * np.cos(phi)
+    slope = np.column_stack([p + np.tan(theta) * yawing, q * np.cos(phi) - r * np.sin(phi), yawing / np.cos(theta)])
+    k = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 2)
+    h = (t[k + 1] - t[k])[:, None]
+    s = np.clip((grid - t[k])[:, None] / h, 0.0, 1.0)
+    first, last, change = h * slope[k], h * slope[k + 1], attitude[k + 1, :3] - attitude[k, :3]
+    c_2, c_3 = 3 * change - 2 * first - last, first + last - 2 * change
+    angles = attitude[k, :3] + s * (first + s * (c_2 + s * c_3))
+    phi_dot, theta_dot, psi_dot = ((first + s * (2 * c_2 + s * 3 * c_3)) / h).T
+    phi, theta, _ = angles.T
+    p = phi_dot - psi_dot * np.sin(theta)
+    q = theta_dot * np.cos(phi) + psi_dot * np.sin(phi) * np.cos(theta)
+    r = -theta_dot * np.sin(phi) + psi_dot * np.cos(phi) * np.cos(theta)
+    return np.column_stack([angles, p, q, r])
 
 
 def preprocess(

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fleet.airframes.airframe import SERVO_COUNT
 from fleet.frames import Origin, to_ned, wrap
 from twin_worker.numerics.interpolation import interpolate_rows
 from twin_worker.telemetry.history import TelemetryHistory
@@ -117,13 +118,12 @@ def _attitude(history: TelemetryHistory, grid: np.ndarray) -> np.ndarray:
 SETTLING_S = 3.0  # settling time of the air flow after a transition [s]
 _MOTOR_FUNCTIONS = (*range(33, 41), *range(82, 86))  # SERVOn_FUNCTION of motors 1 to 12
 _SPIN_THRESHOLD = 0.08  # fraction of the pulse range above which a lift motor spins [-]
-_N_SERVOS = 8
 
 
 def lift_channels(params: Mapping[str, float]) -> list[tuple[int, float]]:
     """Return the servo outputs of the lift motors: (column, pulse above which the motor spins [us])."""
     channels = []
-    for n in range(1, _N_SERVOS + 1):
+    for n in range(1, SERVO_COUNT + 1):
         if params.get(f"SERVO{n}_FUNCTION") in _MOTOR_FUNCTIONS:
             low, high = params.get("Q_M_PWM_MIN", 0.0), params.get("Q_M_PWM_MAX", 0.0)
             low, high = (low, high) if 500 < low < high else (1000.0, 2000.0)
@@ -150,6 +150,7 @@ def hovering_mask(
     channels = lift_channels(params)
     t_s, pulses = history.rows_since("servo", t[0] - 5.0)
     if channels and len(t_s):
-        spinning = np.any([pulses[:, column] > threshold for column, threshold in channels], axis=0)
+        sent = [pulses[:, column] > threshold for column, threshold in channels if column < pulses.shape[1]]
+        spinning = np.any([np.zeros(len(t_s), bool), *sent], axis=0)
         hovering |= spinning[np.clip(np.searchsorted(t_s, t, side="right") - 1, 0, None)]
     return hovering

@@ -13,7 +13,7 @@ import msgspec
 
 from fleet.bus.bus_protocol import key_of
 from fleet.bus.codec import encoding
-from fleet.contract import COLUMNS, PER_UAV, QUERIES, TOPICS, Sample, meaning
+from fleet.contract import COLUMNS, EXTRA_COLUMNS, PER_UAV, QUERIES, TOPICS, Sample, meaning
 
 EXAMPLES = """
   fleet schema                        every key in one table
@@ -72,7 +72,8 @@ def as_json(kind: type) -> dict[str, Any]:
         "components": components,
     }
     if kind is Sample:
-        described["columns"] = {name: [{"name": n, "unit": u} for n, u in rows] for name, rows in COLUMNS.items()}
+        for key, columns in (("columns", COLUMNS), ("extra_columns", EXTRA_COLUMNS)):
+            described[key] = {name: [{"name": n, "unit": u} for n, u in rows] for name, rows in columns.items()}
     return described
 
 
@@ -92,6 +93,9 @@ def as_text(kind: type) -> str:
         for name, rows in COLUMNS.items():
             columns = f"    {name:10} " + ", ".join(f"{n} [{u}]" for n, u in rows)
             lines += textwrap.wrap(columns, 118, subsequent_indent=" " * 15)
+        for name, rows in EXTRA_COLUMNS.items():
+            wide = f"    {name:10} in messages in which one of these is not 0, also: " + ", ".join(n for n, _ in rows)
+            lines += textwrap.wrap(wide, 118, subsequent_indent=" " * 15)
     return "\n".join(lines)
 
 

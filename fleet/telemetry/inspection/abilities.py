@@ -15,16 +15,15 @@ from fleet.mission import FIRST_ITEM, unroll_route
 from fleet.process.sanitise import format_below
 from fleet.telemetry.inspection.survey import (
     AIRBORNE_SPEED,
-    MAX_INTERVAL_S,
     ROTOR_AIRBORNE_SPEED,
     Survey,
     airborne,
     mode_spans,
 )
 from fleet.telemetry.inspection.thinned import TimeInterval, inside, overlap, seconds
-from fleet.window import INPUTS
+from fleet.window import INPUTS, LONGEST_GAP
 
-REQUIRED_FIELDS = tuple(MAX_INTERVAL_S)
+REQUIRED_FIELDS = tuple(LONGEST_GAP)
 MIN_IDENTIFY_S = 30.0  # minimum data for an identification [s]
 MAX_IDENTIFY_S = 140.0  # window of one identification [s]
 MIN_STRETCH_S = 4.0  # shortest continuous stretch for model verification [s]
@@ -115,11 +114,12 @@ def _obstacle(survey: Survey, in_air: list[TimeInterval], complete: list[TimeInt
         fast = ROTOR_AIRBORNE_SPEED if survey.vehicle_class.can_hover else AIRBORNE_SPEED
         return f"never in flight: no 5 s faster than {fast:.0f} m/s"
     for name in REQUIRED_FIELDS:
-        covered = seconds(overlap(survey.rows[name].stretches(), in_air))
+        rows = survey.rows[name]
+        covered = seconds(overlap(rows.stretches(), in_air))
         if covered < 0.5 * seconds(in_air):
             return (
-                f"{name} at {survey.rows[name].rate_hz:.1f} Hz is continuous for {covered:.0f} of {seconds(in_air):.0f}"
-                f" s in flight; required: no interval over {MAX_INTERVAL_S[name]:g} s, recommended: {_GOOD_HZ:.0f} Hz"
+                f"{name} at {rows.rate_hz:.1f} Hz is continuous for {covered:.0f} of {seconds(in_air):.0f} s in flight"
+                f"; required: no interval over {rows.longest_gap_s:.1f} s, recommended: {_GOOD_HZ:.0f} Hz"
             )
     parts = overlap(complete, in_air)
     available_s = max_coverage(parts, MAX_IDENTIFY_S)

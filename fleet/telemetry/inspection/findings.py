@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from fleet.airframes.airframe import servo_map
+from fleet.airframes.airframe import SERVO_COUNT, servo_map
 from fleet.contract import COLUMNS
 from fleet.frames import to_ned
 from fleet.telemetry.inspection.abilities import AbilityResult, abilities
@@ -15,6 +15,8 @@ from fleet.telemetry.inspection.survey import Survey, SurveyEvent, airborne, mod
 from fleet.telemetry.inspection.thinned import inside, seconds
 
 _SURFACES = {4: "aileron", 19: "elevator", 21: "rudder", 70: "throttle", 77: "left elevon", 78: "right elevon"}
+_SURFACES |= {79: "left V-tail", 80: "right V-tail", 24: "left flaperon", 25: "right flaperon"}
+_SURFACES |= {73: "left throttle", 74: "right throttle"}
 _DEFAULT_SURFACES = {1: "aileron", 2: "elevator", 3: "throttle", 4: "rudder"}
 _MIN_STD_US = 5.0  # standard deviation below which a channel is constant [us]
 _SATURATION_US = 1.0  # distance from SERVOn_MIN or _MAX below which a channel is saturated [us]
@@ -239,14 +241,14 @@ def _mission(survey: Survey) -> MissionStatistics:
 
 
 def _surface(survey: Survey, channel: int) -> str:
-    functions = {n: int(survey.values.get(f"SERVO{n}_FUNCTION", -1)) for n in range(1, 9)}
+    functions = {n: int(survey.values.get(f"SERVO{n}_FUNCTION", -1)) for n in range(1, SERVO_COUNT + 1)}
     if not any(function in _SURFACES for function in functions.values()):
         return _DEFAULT_SURFACES.get(channel, "")
     return _SURFACES.get(functions[channel], "")
 
 
 def _servo_map_text(survey: Survey) -> str:
-    entries = [f"{n} {surface}" for n in range(1, 9) if (surface := _surface(survey, n))]
+    entries = [f"{n} {surface}" for n in range(1, SERVO_COUNT + 1) if (surface := _surface(survey, n))]
     return servo_map(survey.values).sentence or ", ".join(entries)
 
 

@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.contract import COLUMNS, Item, Link, Message, Mission, Params, Rows, Sample, Status
+from fleet.contract import COLUMNS, ROW_WIDTHS, Item, Link, Message, Mission, Params, Rows, Sample, Status
 from fleet.frames import Origin
 from fleet.telemetry.inspection.thinned import MAX_ROWS, DecimatedRows, TimeInterval, inside
 from fleet.vehicles import UNKNOWN, VehicleClass, vehicle_class
+from fleet.window import LONGEST_GAP
 
-MAX_INTERVAL_S = {"attitude": 0.5, "velocity": 1.0, "servo": 0.5, "position": 1.0}  # that the twin interpolates [s]
 LINK_GAP_S = 3.0  # interval without any row that counts as a link gap [s]
 MAX_EVENTS = 2_000
 ROW_BUDGET = 5_000_000  # rows stored for all aircraft and fields
@@ -32,7 +32,7 @@ class SurveyEvent(NamedTuple):
 
 def _decimated_rows(name: str) -> DecimatedRows:
     dtype = "<f8" if name in ("position", "target", "gnss") else "<f4"
-    return DecimatedRows(MAX_INTERVAL_S.get(name, 1.0), MAX_ROWS, dtype)
+    return DecimatedRows(LONGEST_GAP.get(name, 1.0), MAX_ROWS, dtype)
 
 
 @dataclass
@@ -165,7 +165,7 @@ def _update_samples(survey: Survey, sample: Sample) -> None:
             continue
         try:
             t, x = rows.t.numpy(), rows.x.numpy()
-            valid = t.ndim == 1 and x.shape == (len(t), len(COLUMNS[name]))
+            valid = t.ndim == 1 and x.ndim == 2 and len(x) == len(t) and x.shape[1] in ROW_WIDTHS[name]
         except ValueError:
             valid = False
         if not valid:

@@ -5,6 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fleet.window import MAX_GAP_S, longest_gap
+
 MAX_ROWS = 200_000  # stored rows of one field [-]
 _BLOCK_ROWS = 4_096  # rows processed at once
 _MAX_WIDE_INTERVALS = 1_000  # wide intervals stored with their start
@@ -28,7 +30,7 @@ class DecimatedRows:
     """Store rows in order; beyond `max_rows`, halve the stored rows and double the stride.
 
     Args:
-        max_interval_s: an interval longer than this ends a stretch [s]
+        max_interval_s: an interval longer than this ends a stretch, at usual rates [s]
         max_rows: maximum number of stored rows
         dtype: type of the stored values; positions need double precision
     """
@@ -90,16 +92,30 @@ class DecimatedRows:
         return sorted(TimeInterval(start, start + length) for length, start in self._wide_intervals if length > limit)
 
     def stretches(self) -> list[TimeInterval]:
-        """Return the stretches of at least 1 s without an interval longer than `max_interval_s`."""
+        """Return the stretches of at least 1 s without an interval that the twin does not fill."""
         self._process_pending()
-        current = TimeInterval(float(self._stretch_start), float(self._newest_t))
-        return [*self._stretches, current] if current.seconds >= _MIN_STRETCH_S else list(self._stretches)
+        limit = self.longest_gap_s
+        wide = sorted(TimeInterval(start, start + length) for length, start in self._wide_intervals if length > limit)
+        stretches: list[TimeInterval] = []
+        for span in [*self._stretches, TimeInterval(float(self._stretch_start), float(self._newest_t))]:
+            inner = [gap for gap in wide if span.start <= gap.start and gap.stop <= span.stop]
+            edges = [span.start, *(t for gap in inner for t in gap), span.stop]
+            stretches += map(TimeInterval, edges[::2], edges[1::2])
+        return [stretch for stretch in stretches if stretch.seconds >= _MIN_STRETCH_S]
+
+    @property
+    def longest_gap_s(self) -> float:
+        """Return the longest interval that the twin fills at the rate of these rows [s]."""
+        return longest_gap(self.max_interval_s, self._usual_interval_s())
 
     def _gap_s(self) -> float:
         """Return the interval above which there is a gap [s]."""
+        return float(max(self.max_interval_s, 3 * self._usual_interval_s()))
+
+    def _usual_interval_s(self) -> float:
+        """Return the median interval, the upper edge of its bin [s]; 0 without intervals."""
         n = self._interval_counts.sum()
-        usual = _edges()[np.searchsorted(np.cumsum(self._interval_counts), 0.5 * n)] if n else 0.0
-        return float(max(self.max_interval_s, 3 * usual))
+        return float(_edges()[np.searchsorted(np.cumsum(self._interval_counts), 0.5 * n)]) if n else 0.0
 
     def _process_pending(self) -> None:
         if not self._pending:
@@ -128,7 +144,7 @@ class DecimatedRows:
         if len(wide):
             intervals = zip(dt[wide].tolist(), previous[wide].tolist(), strict=True)
             self._wide_intervals = nlargest(_MAX_WIDE_INTERVALS, [*self._wide_intervals, *intervals])
-        breaks = np.flatnonzero((dt > self.max_interval_s) | (dt < 0))
+        breaks = np.flatnonzero((dt > max(self.max_interval_s, MAX_GAP_S)) | (dt < 0))
         starts = np.concatenate([[self._stretch_start], t[breaks]])
         long_enough = previous[breaks] - starts[:-1] >= _MIN_STRETCH_S
         self._stretches += map(TimeInterval, starts[:-1][long_enough].tolist(), previous[breaks][long_enough].tolist())
@@ -145,7 +161,9 @@ class DecimatedRows:
 
 
 def _joined(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    return np.concatenate([t for t, _ in parts]), np.concatenate([x for _, x in parts])
+    width = max(x.shape[1] for _, x in parts)  # a column that some parts do not have is 0 in them
+    values = [x if x.shape[1] == width else np.pad(x, ((0, 0), (0, width - x.shape[1]))) for _, x in parts]
+    return np.concatenate([t for t, _ in parts]), np.concatenate(values)
 
 
 def _edges() -> np.ndarray:

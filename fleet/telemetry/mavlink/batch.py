@@ -4,19 +4,26 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fleet.contract import COLUMNS
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
 from fleet.telemetry.mavlink.arrays.fleet_arrays import AircraftArrays
-from fleet.telemetry.mavlink.arrays.row_arbiter import ACCEPTED, FIELDS, NO_FIELD, REJECTED, arbitrate_rows
-from fleet.telemetry.mavlink.arrays.rows import MAX_COLUMNS
+from fleet.telemetry.mavlink.arrays.row_arbiter import (
+    ACCEPTED,
+    FIELDS,
+    NO_FIELD,
+    REJECTED,
+    SOURCE_TIMEOUT_S,
+    arbitrate_rows,
+)
+from fleet.telemetry.mavlink.arrays.rows import MAX_COLUMNS, WITH_EXTRA, same_width
 from fleet.telemetry.mavlink.parsing.decode import Fields, Frames, GroupedFrames
 from fleet.telemetry.tables import clock
-from fleet.telemetry.tables.mavlink import TABLE, own_seconds
+from fleet.telemetry.tables.mavlink import SECOND_PORT, TABLE, own_seconds
 from fleet.telemetry.tables.row import FieldSource, is_plausible
 
 _TICK = np.array([row.tick for row in TABLE])
 _FIELD = np.array([FIELDS.index(row.field) for row in TABLE])
 _RANK = np.array([row.rank for row in TABLE])
+_SERVO = FIELDS.index("servo")
 _REQUIRES = np.array([FIELDS.index(row.requires) if row.requires else NO_FIELD for row in TABLE])
 
 
@@ -34,7 +41,7 @@ def process_table_rows(
     read = _read(frames, owner, aircraft)
     if read is None:
         return
-    row, frame_numbers, raw_s, values = read
+    row, frame_numbers, raw_s, values = _join_ports(read, frames.arrival, owner, arrays.second_ports)
     field, owner, arrival = _FIELD[row], owner[frame_numbers], frames.arrival[frame_numbers]
     n, count = len(row), len(aircraft)
     t, decision, advanced, jumped = np.empty(n), np.empty(n, np.int8), np.empty(n), np.full(count, np.nan)
@@ -58,7 +65,8 @@ def _read(frames: Frames, owner: np.ndarray, aircraft: Sequence[AircraftLink]) -
     """Apply all table rows to the frames of their messages; None without valid frames.
 
     Returns:
-        number in `TABLE`, (n,); frame number, (n,), non-decreasing; time stamp of the message, (n,) [s]; values, (n, 8)
+        number in `TABLE`, (n,); frame number, (n,), non-decreasing; time stamp of the message, (n,) [s]; values,
+        (n, 8), or (n, 16) if an aircraft of the batch uses extra columns
     """
     grouped, autopilots = GroupedFrames(frames), np.array([link.autopilot for link in aircraft])
     names, parts = set(grouped.names()), []
@@ -76,7 +84,8 @@ def _read(frames: Frames, owner: np.ndarray, aircraft: Sequence[AircraftLink]) -
         parts.append((np.full(valid.sum(), number), frame_numbers[valid], raw_s[valid], values[valid]))
     if not parts:
         return None
-    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    *others, all_values = zip(*parts, strict=True)
+    columns = [np.concatenate(column) for column in (*others, same_width(*all_values))]
     order = np.argsort(columns[1], kind="stable")
     return tuple(column[order] for column in columns)
 
@@ -93,12 +102,44 @@ def _applicable(row: FieldSource, fields: Fields, owner: np.ndarray, autopilots:
 
 
 def _values(row: FieldSource, fields: Fields) -> tuple[np.ndarray, np.ndarray]:
-    """Apply a table row: values (n, 8), and a mask of the plausible ones (n,)."""
-    values = np.zeros((len(fields.rows), MAX_COLUMNS))
+    """Apply a table row: values (n, 8), (n, 16) with extra columns in use, and a mask of the plausible ones (n,)."""
     with np.errstate(all="ignore"):  # NaN propagates and is rejected
-        for k, column in enumerate(row.columns(fields)):
+        columns = row.columns(fields)
+        values = np.zeros((len(fields.rows), MAX_COLUMNS if len(columns) <= MAX_COLUMNS else WITH_EXTRA))
+        for k, column in enumerate(columns):
             values[:, k] = column
-        return values, is_plausible(row.field, values[:, : len(COLUMNS[row.field])])
+        if len(columns) > MAX_COLUMNS and not values[:, MAX_COLUMNS:].any():
+            values = values[:, :MAX_COLUMNS]
+        return values, is_plausible(row.field, values[:, : min(len(columns), values.shape[1])])
+
+
+def _join_ports(
+    read: tuple[np.ndarray, ...],
+    arrival: np.ndarray,
+    owner: np.ndarray,
+    second_ports: dict[int, tuple[float, np.ndarray]],
+) -> tuple[np.ndarray, ...]:
+    """Complete the outputs of the first port by the newest of the second port; return the rows without its own.
+
+    Args:
+        read: result of `_read`
+        arrival, owner: of all frames, (m,)
+        second_ports: newest outputs of the second port by aircraft, changed in place
+    """
+    row, frame_numbers, _, values = read
+    is_second = row == SECOND_PORT
+    if not second_ports and not is_second.any():
+        return read
+    (values,) = same_width(values, np.empty((0, WITH_EXTRA)))[:1]
+    for i in np.flatnonzero(_FIELD[row] == _SERVO).tolist():
+        frame = frame_numbers[i]
+        aircraft, t = int(owner[frame]), float(arrival[frame])
+        if is_second[i]:
+            second_ports[aircraft] = (t, values[i, MAX_COLUMNS:].copy())
+        elif aircraft in second_ports and not values[i, MAX_COLUMNS:].any():
+            since, outputs = second_ports[aircraft]
+            values[i, MAX_COLUMNS:] = outputs if t - since <= SOURCE_TIMEOUT_S else 0.0
+    return tuple(column[~is_second] for column in (*read[:3], values))
 
 
 def _reject(

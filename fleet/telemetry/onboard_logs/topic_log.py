@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet.contract import COLUMNS
+from fleet.contract import ROW_WIDTHS
 from fleet.telemetry.mavlink.onboard_log import Chunk, FieldRows, OnboardEvent
 from fleet.telemetry.onboard_logs.topic import Topic
 from fleet.telemetry.tables.row import FieldSource, is_plausible
@@ -125,7 +125,7 @@ def _extract_block(row: FieldSource, topic: Topic) -> tuple[np.ndarray, np.ndarr
             columns: tuple[Any, ...] = row.columns(topic)
         except (AttributeError, IndexError):
             return None
-        if len(columns) != len(COLUMNS[row.field]):
+        if len(columns) not in ROW_WIDTHS[row.field]:
             return None
         values = np.stack(columns, axis=-1)
         valid = applicable & is_plausible(row.field, values)

@@ -12,6 +12,7 @@ from fleet.bus.codec import Stamp, decode, encoding, is_plausible_epoch
 from fleet.contract import (
     COLUMNS,
     MAX_ITEMS,
+    ROW_WIDTHS,
     TOPICS,
     Alert,
     FleetState,
@@ -198,7 +199,7 @@ def _validate(message: Any) -> None:
     if isinstance(message, Sample):
         for field in COLUMNS:
             rows: Rows | None = getattr(message, field)
-            if rows is not None and not _rows_valid(rows, len(COLUMNS[field])):
+            if rows is not None and not _rows_valid(rows, ROW_WIDTHS[field]):
                 raise ValueError(f"Sample with invalid rows of {field}")
     if isinstance(message, Mission):
         numbers = [n for item in message.items for n in (item.param1, item.param2, item.param3, item.alt_m)]
@@ -208,8 +209,8 @@ def _validate(message: Any) -> None:
         raise ValueError("Params with a non-finite value")
 
 
-def _rows_valid(rows: Rows, width: int) -> bool:
+def _rows_valid(rows: Rows, widths: tuple[int, ...]) -> bool:
     t, x = rows.t.numpy(), rows.x.numpy()
-    if t.ndim != 1 or x.shape != (len(t), width) or not len(t):
+    if t.ndim != 1 or x.ndim != 2 or len(x) != len(t) or x.shape[1] not in widths or not len(t):
         return False
     return bool(np.isfinite(x).all() and (t > 0).all() and (t < _MAX_TIME_S).all())

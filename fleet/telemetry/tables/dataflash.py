@@ -23,8 +23,11 @@ PARTS: dict[str, tuple[tuple[str, int], ...]] = {
     "attitude": (("attitude", 3), ("attitude: rates", 3)),
     "air": (("air", 1), ("air: throttle", 1), ("air: climb", 1)),
     "command": (("command", 2), ("command: errors", 3)),
+    "servo": (("servo", 14), ("servo: 15, 16", 2)),
 }
 """`Sample` field -> its parts, (name as in `Row.field`, how many columns), in column order."""
+OPTIONAL_PARTS = {"servo: 15, 16"}
+"""Parts without which the field consists of its first part."""
 
 ANGLES, RATES = "attitude", "attitude: rates"
 
@@ -84,7 +87,8 @@ def _has_wind(m: Any) -> Any:
 
 def _outputs(m: Any, names: str) -> tuple[Any, ...]:
     outputs = tuple(getattr(m, name) for name in names.split())
-    return (*outputs, *(outputs[0] * 0.0,) * (8 - len(outputs)))  # an output that is not logged is 0, as in MAVLink
+    width = 8 if len(outputs) <= 8 else 14
+    return (*outputs, *(outputs[0] * 0.0,) * (width - len(outputs)))  # an output that is not logged is 0, as in MAVLink
 
 
 def _is_plane(m: Any) -> Any:
@@ -149,7 +153,10 @@ TABLE: tuple[FieldSource, ...] = (
     FieldSource("BARO", "air: climb", lambda m: (m.CRt,), rank=3, when=lambda m: m.I == 0),
     FieldSource("BARO", "air: climb", lambda m: (m.CRt,), rank=2),
     FieldSource("GPS", "air: climb", lambda m: (-m.VZ,), rank=1, when=_fix),
+    FieldSource("RCOU", "servo", lambda m: _outputs(m, " ".join(f"C{n}" for n in range(1, 15))), rank=11),
+    FieldSource("RCOU", "servo", lambda m: _outputs(m, " ".join(f"C{n}" for n in range(1, 13))), rank=10),
     FieldSource("RCOU", "servo", lambda m: _outputs(m, "C1 C2 C3 C4 C5 C6 C7 C8"), rank=9),
+    FieldSource("RCO2", "servo: 15, 16", lambda m: (m.C15, m.C16)),
     FieldSource("RCOU", "servo", lambda m: _outputs(m, "Ch1 Ch2 Ch3 Ch4 Ch5 Ch6 Ch7 Ch8"), rank=8),
     FieldSource("RCOU", "servo", lambda m: _outputs(m, "Chan1 Chan2 Chan3 Chan4 Chan5 Chan6 Chan7 Chan8"), rank=8),
     FieldSource("RCOU", "servo", lambda m: _outputs(m, "Ch1 Ch2 Ch3 Ch4 Ch5 Ch6"), rank=7),
@@ -203,5 +210,5 @@ def field_of(part: str) -> str:
 
 def is_plausible(part: str, values: np.ndarray) -> np.ndarray:
     """Return a mask of the rows of a part, (n, k), with all columns finite and within `MAX_MAGNITUDE`, (n,)."""
-    highest = np.array(MAX_MAGNITUDE[field_of(part)])[COLUMNS_OF.get(part, slice(None))]
+    highest = np.array(MAX_MAGNITUDE[field_of(part)])[COLUMNS_OF.get(part, slice(None))][: values.shape[-1]]
     return (np.abs(values) <= highest).all(axis=-1)

@@ -25,9 +25,17 @@ def _command(m: Any, alt_error: Any, va_error: Any) -> tuple[Any, ...]:
     return (m.nav_roll * DEG, m.nav_pitch * DEG, m.xtrack_error, alt_error, va_error)
 
 
-def _servo(m: Any) -> tuple[Any, ...]:
-    raw = (m.servo1_raw, m.servo2_raw, m.servo3_raw, m.servo4_raw, m.servo5_raw, m.servo6_raw, m.servo7_raw)
-    return (*raw, m.servo8_raw)
+_NO_OUTPUT = 65535  # as some releases of PX4 send it
+_FIRST_OUTPUTS = tuple(f"servo{n}_raw" for n in range(1, 9))
+_LAST_OUTPUTS = tuple(f"servo{n}_raw" for n in range(9, 17))  # extension fields, 0 in MAVLink 1
+
+
+def _outputs(m: Any, names: tuple[str, ...]) -> tuple[Any, ...]:
+    return tuple(np.where(getattr(m, name) == _NO_OUTPUT, 0, getattr(m, name)) for name in names)
+
+
+def _second_port(m: Any) -> tuple[Any, ...]:
+    return (*(m.servo1_raw * 0,) * 8, *_outputs(m, _FIRST_OUTPUTS))
 
 
 _NO_ITEM = 65535
@@ -88,7 +96,21 @@ TABLE: tuple[FieldSource, ...] = (
         requires="position",  # without a fix PX4 sends a drifting velocity, not aligned with north
     ),
     FieldSource("VFR_HUD", "air", lambda m: (m.airspeed, m.throttle * 1e-2, m.climb), NONE),
-    FieldSource("SERVO_OUTPUT_RAW", "servo", _servo, USEC32, when=lambda m: m.port == 0),
+    FieldSource(
+        "SERVO_OUTPUT_RAW",
+        "servo",
+        lambda m: _outputs(m, _FIRST_OUTPUTS + _LAST_OUTPUTS),
+        USEC32,
+        when=lambda m: m.port == 0,
+    ),
+    FieldSource(
+        "SERVO_OUTPUT_RAW",
+        "servo",
+        _second_port,
+        USEC32,
+        autopilots=("px4", "generic"),  # AUX outputs; ArduPilot sends outputs 17 to 32 on this port
+        when=lambda m: m.port == 1,
+    ),
     FieldSource(
         "NAV_CONTROLLER_OUTPUT",
         "command",
@@ -143,6 +165,9 @@ TABLE: tuple[FieldSource, ...] = (
     # time_usec is boot time or receiver time, depending on the autopilot: not usable for the shared clock
     FieldSource("GPS_RAW_INT", "gnss", lambda m: (m.alt,), NONE, when=lambda m: m.fix_type >= _FIX_3D),
 )
+
+SECOND_PORT = next(number for number, row in enumerate(TABLE) if row.columns is _second_port)
+"""Row of the second servo port: its columns complete rows of the first port and are no rows themselves."""
 
 _OWN_TIME = {BOOT: lambda m: m.time_boot_ms * 1e-3, USEC: lambda m: m.time_usec * 1e-6, NONE: lambda m: 0.0}
 _OWN_TIME[USEC32] = _OWN_TIME[USEC]

@@ -40,8 +40,9 @@ def _has_position(m: Any) -> Any:
 
 
 def _channels(m: Any) -> tuple[Any, ...]:
-    channels = m.channels[:8]
-    return (*(np.nan_to_num(pulse) for pulse in channels), *(channels[0] * 0.0,) * (8 - len(channels)))
+    channels = m.channels[:16]
+    width = 8 if len(channels) <= 8 else 16
+    return (*(np.nan_to_num(pulse) for pulse in channels), *(channels[0] * 0.0,) * (width - len(channels)))
 
 
 TABLE: tuple[FieldSource, ...] = (

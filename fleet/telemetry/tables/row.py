@@ -32,7 +32,7 @@ MAX_MAGNITUDE: dict[str, tuple[float, ...]] = {
     "position": _MAX_POSITION,
     "velocity": (500.0, 500.0, 500.0),
     "air": (500.0, 1.5, 500.0),
-    "servo": (65535.0,) * 8,
+    "servo": (65535.0,) * 16,
     "command": (7.0, 7.0, 1e6, 1e5, 1e3),
     "leg": (65535.0,),
     "wind": (150.0, 150.0),
@@ -52,7 +52,7 @@ def is_plausible(field: str, values: np.ndarray) -> np.ndarray:
 
     Only the optional columns of `UNTOLD` may be non-finite.
     """
-    plausible = np.abs(values) <= _MAX_ARRAY[field]
+    plausible = np.abs(values) <= _MAX_ARRAY[field][: values.shape[-1]]
     optional_from = FIRST_OPTIONAL_COLUMN.get(field, values.shape[-1])
     plausible[..., optional_from:] |= np.isnan(values[..., optional_from:])
     return plausible.all(axis=-1)

@@ -88,12 +88,27 @@ def _air_rows() -> Iterator[FieldSource]:
 
 
 def _output(m: Any) -> tuple[Any, ...]:
-    return tuple(np.where(np.isfinite(output), output, 0.0) for output in m.output[:8])
+    first = tuple(np.where(np.isfinite(output), output, 0.0) for output in m.output[:8])
+    return first if len(m.output) <= 8 else (*first, *_only_pulses(m.output[8:16], 8))
+
+
+def _both_ports(m: Any) -> tuple[Any, ...]:
+    """Return the outputs of MAIN; those of AUX follow as 9 to 16 where MAIN has none."""
+    main, aux = _output(m), _only_pulses(m.interpolated("actuator_outputs.1").output[:8], 8)
+    rest = main[8:] or (np.zeros_like(main[0]),) * 8
+    has_own = np.any([output != 0 for output in rest], axis=0)
+    return (*main[:8], *(np.where(has_own, own, other) for own, other in zip(rest, aux, strict=True)))
+
+
+def _only_pulses(outputs: tuple[Any, ...], width: int) -> tuple[Any, ...]:
+    """Return outputs with 0 for all that is no pulse width."""
+    valid = tuple(np.where((o > _MIN_PULSE_US) & (o < _MAX_PULSE_US), o, 0.0) for o in outputs)
+    return (*valid, *(np.zeros_like(outputs[0], float),) * (width - len(valid)))
 
 
 def _are_pulses(m: Any) -> Any:
     """Return a mask of outputs that are pulse widths, not ESC counts or rad/s (since 1.13) nor all zero."""
-    outputs = np.array(_output(m))
+    outputs = np.array(_output(m)[:8])
     is_pulse = ((outputs == 0) | ((outputs > _MIN_PULSE_US) & (outputs < _MAX_PULSE_US))).all(axis=0)
     driven = (outputs != 0).any(axis=0)
     return is_pulse & driven & (np.sum(is_pulse & driven) >= 0.9 * np.sum(driven))
@@ -101,12 +116,13 @@ def _are_pulses(m: Any) -> Any:
 
 def _pulse_widths(m: Any, middle: float, reach: float) -> tuple[Any, ...]:
     """Return pulse widths [us] for a control of -1..1; 0 for non-finite controls."""
-    pulses = [np.where(np.isfinite(c), middle + reach * np.clip(c, -1, 1), 0.0) for c in m.control[:8]]
-    return (*pulses, *([np.zeros_like(pulses[0])] * (8 - len(pulses))))
+    pulses = [np.where(np.isfinite(c), middle + reach * np.clip(c, -1, 1), 0.0) for c in m.control[:16]]
+    width = 8 if len(pulses) <= 8 else 16
+    return (*pulses, *([np.zeros_like(pulses[0])] * (width - len(pulses))))
 
 
 def _is_driven(m: Any) -> Any:
-    return np.isfinite(np.array(m.control[:8])).any(axis=0)
+    return np.isfinite(np.array(m.control[:16])).any(axis=0)
 
 
 # --- command: set points of a fixed wing; errors are commanded minus actual ---------------------------------------
@@ -230,6 +246,7 @@ TABLE: tuple[FieldSource, ...] = (
         when=lambda m: (m.vel_ned_valid != 0) & (m.fix_type >= _FIX_3D),
     ),
     *_air_rows(),
+    FieldSource("actuator_outputs", "servo", _both_ports, rank=4, when=_are_pulses),
     FieldSource("actuator_outputs", "servo", _output, rank=3, when=_are_pulses),
     FieldSource("actuator_servos", "servo", lambda m: _pulse_widths(m, 1500.0, 500.0), rank=2, when=_is_driven),
     FieldSource("actuator_motors", "servo", lambda m: _pulse_widths(m, 1000.0, 1000.0), rank=1, when=_is_driven),

@@ -143,3 +143,38 @@ def test_absurd_parameters_give_finite_inputs(name: str, value: float):
 def test_absurd_pulses_stay_within_the_throw():
     got = servo_map(PLANE).inputs(np.array([[0.0] * 8, [65535.0] * 8]))
     assert np.abs(got).max() <= 1.2 and got[:, 3].min() >= 0.0
+
+
+# --- outputs 9 to 16 -------------------------------------------------------------------------------------------------
+
+
+def wide(params, width: int = 16, **servos: float) -> list[float]:
+    """Inputs of one row of 16 outputs; those not named have no pulse."""
+    row = np.zeros((1, width))
+    for name, pulse in servos.items():
+        row[0, int(name[1:]) - 1] = pulse
+    return servo_map(params).inputs(row)[0].round(9).tolist()
+
+
+def test_outputs_up_to_16_are_mapped():
+    last = {"SERVO9_FUNCTION": 4, "SERVO10_FUNCTION": 79, "SERVO16_FUNCTION": 80, "SERVO13_FUNCTION": 70}
+    last |= {"SERVO9_MIN": 1000.0, "SERVO9_MAX": 2000.0, "SERVO9_TRIM": 1400.0, "SERVO9_REVERSED": 1.0}
+    assert wide(last, s9=1700, s10=1900, s16=1900, s13=1500) == [-0.5, 1.0, 0.0, 0.5]
+    assert wide(last, s9=1400, s10=1900, s16=1100, s13=1100) == [0.0, 0.0, 1.0, 0.0]
+    thrust = {"SERVO9_FUNCTION": 73, "SERVO12_FUNCTION": 74}
+    assert wide(thrust, s9=1100, s12=1900)[3] == 0.5
+
+
+def test_an_output_without_a_pulse_does_not_halve_the_other():
+    params = PLANE | {"SERVO12_FUNCTION": 4, "SERVO11_FUNCTION": 70}
+    assert wide(params, s1=1700, s12=1900)[0] == 0.75
+    assert wide(params, s1=1700)[0] == wide(params, width=8, s1=1700)[0] == 0.5
+    assert wide(params, width=8, s3=1500)[3] == 0.5
+
+
+def test_aux_outputs_of_px4_are_9_to_16():
+    px4 = {"PWM_AUX_FUNC1": 201, "PWM_AUX_FUNC2": 202, "PWM_AUX_REV": 0b10, "CA_SV_CS0_TYPE": 2, "CA_SV_CS1_TYPE": 3}
+    px4 |= {"PWM_AUX_MIN1": 1000.0, "PWM_AUX_MAX1": 1800.0, "PWM_MAIN_FUNC1": 101}
+    assert wide(px4, s1=1250, s9=1800, s10=1750) == [1.0, -0.5, 0.0, 0.25]
+    many = px4 | {"PWM_MAIN_FUNC9": 202}  # a MAIN of more than eight outputs
+    assert wide(many, s9=2000)[:2] == [0.0, 1.0]

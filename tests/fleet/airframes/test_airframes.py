@@ -2,11 +2,16 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from fleet import airframes
 from fleet.airframes import GENERIC, derivatives, load
+from fleet.airframes.airframe import servo_map
+from fleet.contract import Params
 from fleet.physics.wrench import NAMES, OFFSETS, WIND
+from twin_worker.diagnosis.data.card import read_card
+from twin_worker.twin.state.state import Twin, ingest
 
 FILES = sorted(path.stem for path in Path(airframes.__file__).parent.glob("*.toml"))
 GOOD = (Path(airframes.__file__).parent / f"{GENERIC}.toml").read_text()
@@ -121,3 +126,67 @@ def test_bytes_that_are_no_text_are_no_airframe(tmp_path):
         load(str(path))
     with pytest.raises(OSError):
         load(str(tmp_path))
+
+
+SERVOS = """
+[[servo]]
+surface = "aileron"
+output = 9
+sign = -1
+min = 1000
+trim = 1450
+max = 1900
+[[servo]]
+surface = "elevator"
+output = 2
+[[servo]]
+surface = "throttle_left"
+output = 3
+[[servo]]
+surface = "throttle_right"
+output = 10
+"""
+
+
+def with_servos(tmp_path: Path, text: str = SERVOS) -> str:
+    path = tmp_path / "mine.toml"
+    path.write_text(GOOD + text)
+    return str(path)
+
+
+def test_a_file_may_give_the_servo_map(tmp_path):
+    servos = servo_map(load(with_servos(tmp_path)).servo_params)
+    row = np.zeros((1, 16))
+    row[0, [8, 1, 2, 9]] = 1900, 1300, 1100, 1900
+    assert servos.sentence == ""
+    assert servos.inputs(row)[0].round(9).tolist() == [-1.0, -0.5, 0.0, 0.5]
+    assert load(GENERIC).servo_params == {}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "match"),
+    [
+        ('"aileron"', '"flap"', "found servo surface = 'flap', expected one of aileron, elevator"),
+        ("output = 9", "output = 17", "found output = 17 of aileron, expected 1 to 16"),
+        ("output = 9", "output = 2", "found output 2 twice"),
+        ("sign = -1", "sign = 0", "found sign = 0 of aileron, expected 1 or -1"),
+        ("trim = 1450", "trim = 1950", "found min = 1000, trim = 1950, max = 1900 of aileron, expected rising"),
+        ("trim = 1450", "trim = nan", "expected rising"),
+        ("max = 1900", 'max = "high"', "found max = 'high' of aileron, expected a pulse width"),
+    ],
+)
+def test_a_wrong_servo_is_named(tmp_path, old, new, match):
+    with pytest.raises(ValueError, match=match):
+        load(with_servos(tmp_path, SERVOS.replace(old, new, 1)))
+
+
+def test_the_map_of_the_file_replaces_parameters_and_learning(tmp_path):
+    airframe = load(with_servos(tmp_path))
+    twin, own = Twin.of(1, airframe=airframe), servo_map(airframe.servo_params)
+    assert twin.telemetry.servo_map.equals(own)
+    ingest(twin, Params(uav=1, t=1e9, values={"SERVO1_FUNCTION": 4.0, "SERVO2_FUNCTION": 19.0}))
+    twin.telemetry.learn_servo_map()
+    assert twin.telemetry.servo_map.equals(own)
+    card = read_card(Path(with_servos(tmp_path)))
+    pulses = np.full((1, 16), 1700.0)
+    np.testing.assert_array_equal(card.commands(pulses, {"SERVO1_FUNCTION": 4.0}), own.inputs(pulses))

@@ -20,7 +20,7 @@ def flight(seed: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return errors, rates, 0.6 + 0.1 * np.convolve(rng.normal(0, 1, N), smooth, "same")
 
 
-def outputs(**surfaces: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def outputs(width: int = 8, **surfaces: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Pulses of outputs such as `s5="+a"`, with a little noise, and the signals behind them."""
     errors, rates, throttle = flight()
     aileron, elevator = errors[:, 0] - 0.2 * rates[:, 0], errors[:, 1] - 0.2 * rates[:, 1]
@@ -31,7 +31,7 @@ def outputs(**surfaces: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
         "e+r": elevator + aileron,
         "e-r": elevator - aileron,
     }
-    pulses = np.full((N, 8), 1500.0)
+    pulses = np.full((N, width), 1500.0)
     for name, surface in surfaces.items():
         sign = -1.0 if surface[0] == "-" else 1.0
         pulses[:, int(name[1:]) - 1] += sign * 300.0 * value[surface[1:]]
@@ -40,7 +40,7 @@ def outputs(**surfaces: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
 
 
 def inputs(learnt, **pulses: float) -> list[float]:
-    row = np.full((1, 8), 1500.0)
+    row = np.full((1, 16), 1500.0)
     for name, pulse in pulses.items():
         row[0, int(name[1:]) - 1] = pulse
     return learnt.inputs(row)[0].tolist()
@@ -94,3 +94,22 @@ def test_a_real_flight_shows_its_ailerons(recordings: Path) -> None:
     assert learnt is not None
     assert learnt.sentence.endswith("2 elevator, 3 throttle, 4 rudder, 5 aileron, 6 aileron")
     assert learnt.gain_up[4, 0] > 0 and learnt.gain_up[5, 0] > 0 and learnt.gain_up[1, 1] < 0
+
+
+def test_surfaces_on_outputs_9_to_16_are_learnt() -> None:
+    learnt = learn_servo_map(*outputs(16, s9="+a", s10="-e", s16="+t"))
+    assert learnt is not None
+    assert learnt.sentence == "servo map learnt from flight: 9 aileron, 10 elevator, 16 throttle"
+    assert inputs(learnt, s9=1900, s10=1100)[:2] == pytest.approx((1.0, 1.0), abs=0.15)
+
+
+def test_two_motors_are_learnt_as_one_throttle() -> None:
+    learnt = learn_servo_map(*outputs(s1="+a", s2="+e", s3="+t", s5="+t"))
+    assert learnt is not None and learnt.sentence.endswith("3 throttle, 5 throttle")
+    low, high = (inputs(learnt, s3=1300, s5=pulse)[3] for pulse in (1300, 1700))
+    assert high - low == pytest.approx(0.25, abs=0.01)  # half of 400 us of 800
+
+
+def test_flaperons_are_learnt_as_ailerons() -> None:
+    learnt = learn_servo_map(*outputs(s1="+a", s5="+a", s2="+e"))
+    assert learnt is not None and "1 aileron, 2 elevator, 5 aileron" in learnt.sentence

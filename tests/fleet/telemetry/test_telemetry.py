@@ -1,25 +1,27 @@
 import math
 
+import msgspec
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from fleet.contract import COLUMNS, Sample, Status
+from fleet.bus.codec import encode
+from fleet.contract import COLUMNS, ROW_WIDTHS, Sample, Status
 from fleet.telemetry.mavlink.arrays.row_arbiter import RANK_COUNT, SOURCE_TIMEOUT_S
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
 from fleet.telemetry.mavlink.parsing.decode import IDS, Decoder
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
 from fleet.telemetry.tables.mavlink import TABLE, own_seconds
 from fleet.telemetry.tables.row import MAX_MAGNITUDE, is_plausible
-from tests.support.talker import T0, Ears, Talker, assert_finite, of
+from tests.support.talker import ARDU, T0, Ears, Talker, assert_finite, of
 
 
 def columns(message: str, field: str, sent, autopilot: str = "ardupilot") -> dict[str, float]:
     """Send one message through the wire and the table."""
     frames = Decoder().decode(ReceivedBytes.from_pieces([(T0, None, Talker().pack(sent))]))
     named = [r for r in TABLE if r.message == message and r.field == field]
-    (row,) = [r for r in named if not r.autopilots or autopilot in r.autopilots]
-    columns = row.columns(frames.fields(np.array([0]), message))
+    (row, *_) = [r for r in named if not r.autopilots or autopilot in r.autopilots]
+    columns = row.columns(frames.fields(np.array([0]), message))[: len(COLUMNS[field])]
     return dict(zip([name for name, _ in COLUMNS[field]], [float(np.ravel(c)[0]) for c in columns], strict=True))
 
 
@@ -29,7 +31,7 @@ def test_every_row_names_a_message_and_fills_its_columns():
         kind = mav.mavlink_map[IDS[row.message]]
         frame = _frame(7, kind, bytes([1]) * kind.unpacker.size)
         fields = Decoder().decode(ReceivedBytes.from_pieces([(T0, None, frame)])).fields(np.array([0]), row.message)
-        assert len(row.columns(fields)) == len(COLUMNS[row.field]) == len(MAX_MAGNITUDE[row.field])
+        assert len(row.columns(fields)) == ROW_WIDTHS[row.field][-1] == len(MAX_MAGNITUDE[row.field])
         assert 0 <= row.rank < RANK_COUNT and row.requires in ("", *COLUMNS)
         assert np.isfinite(own_seconds(row, fields)).all()
 
@@ -141,14 +143,47 @@ def test_the_attitude_target_of_px4_is_a_command_that_leaves_errors_untold():
     assert not is_plausible("command", np.array([np.nan, 0.1, 0.0, 0.0, 0.0]))
 
 
-def test_only_servo_port_0_counts():
+FIRST, LAST = [1100 + i for i in range(8)], [1300 + i for i in range(8)]
+PX4 = mav.MAV_AUTOPILOT_PX4
+
+
+def servo_sample(autopilot: int, *messages: tuple[int, list[int]]) -> Sample:
+    """The sample of an aircraft that sends these outputs, (port, pulses), a second apart."""
     intake, talker = MavlinkReceiver(), Talker()
-    intake.receive(T0, talker.heartbeat() + talker.attitude(5.0))
-    for port in (0, 1):
-        pulses = [1100 + 100 * port + i for i in range(8)]
-        intake.receive(T0, talker.pack(mav.MAVLink_servo_output_raw_message(5_010_000 + port, port, *pulses)))
-    (sample,) = of(Sample, intake.flush(T0 + 0.1))
-    assert sample.servo.x.numpy().tolist() == [[1100 + i for i in range(8)]]
+    intake.receive(T0, talker.heartbeat(autopilot=autopilot) + talker.attitude(5.0))
+    for k, (port, pulses) in enumerate(messages, 1):
+        message = mav.MAVLink_servo_output_raw_message(5_000_000 + 1_000_000 * k, port, *pulses)
+        intake.receive(T0 + k, talker.attitude(5.0 + k) + talker.pack(message))
+    return of(Sample, intake.flush(T0 + len(messages) + 0.1))[0]
+
+
+def test_outputs_9_to_16_make_wider_rows_only_where_there_are_any():
+    wide = servo_sample(ARDU, (0, FIRST + LAST)).servo.x
+    assert wide.shape == (1, 16) and wide.numpy().tolist() == [FIRST + LAST]
+    for pulses in (FIRST, FIRST + [0] * 8, FIRST + [65535] * 8):
+        narrow = servo_sample(ARDU, (0, pulses)).servo.x
+        assert narrow.shape == (1, 8) and narrow.numpy().tolist() == [FIRST]
+
+
+def test_the_wire_is_plain_msgpack_either_way():
+    for sample, width in ((servo_sample(ARDU, (0, FIRST)), 8), (servo_sample(ARDU, (0, FIRST + LAST)), 16)):
+        x = msgspec.msgpack.decode(encode(sample))["servo"]["x"]
+        assert x["shape"] == [1, width] and len(x["data"]) == 4 * width
+        assert np.frombuffer(x["data"], "<f4")[:8].tolist() == FIRST
+
+
+def test_the_second_port_of_px4_has_outputs_9_to_16():
+    first, second = servo_sample(PX4, (1, LAST), (0, FIRST)), servo_sample(PX4, (0, FIRST), (1, LAST), (0, FIRST))
+    assert first.servo.x.numpy().tolist() == [FIRST + LAST]
+    assert second.servo.x.numpy().tolist() == [FIRST + [0] * 8, FIRST + LAST]
+    own = servo_sample(PX4, (1, LAST), (0, FIRST + FIRST))
+    assert own.servo.x.numpy().tolist() == [FIRST + FIRST]  # the first port has its own
+    stopped = servo_sample(PX4, (1, LAST), *[(0, FIRST)] * 5)
+    assert stopped.servo.x.numpy()[-1].tolist() == FIRST + [0] * 8  # the second port is silent for more than 3 s
+
+
+def test_the_second_port_of_ardupilot_has_outputs_17_to_32_which_no_map_uses():
+    assert servo_sample(ARDU, (1, LAST), (0, FIRST)).servo.x.numpy().tolist() == [FIRST]
 
 
 def test_the_better_imu_wins_and_the_other_returns_after_a_silence():

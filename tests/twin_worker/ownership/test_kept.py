@@ -135,3 +135,18 @@ def test_rows_are_the_caller_s_own_and_a_look_is_not() -> None:
     history.rows("leg")[1][:] = 5.0
     assert history.rows_since("leg")[1].tolist() == [[1.0]]
     assert np.shares_memory(history.rows_since("leg")[1], history.rows_since("leg")[1])
+
+
+def test_rows_of_8_and_of_16_outputs_are_one_series() -> None:
+    history = TelemetryHistory()
+    for k, width in enumerate((8, 16, 8, 16)):
+        t = T0 + k + np.array([0.0, 0.5])
+        x = np.full((2, width), 1000.0 + k)
+        history.add(Sample(uav=1, t=t[-1], servo=Rows(t=Array.of(t, "<f8"), x=Array.of(x))))
+        assert history.rows("servo")[1].shape == (2 * k + 2, 8 if k == 0 else 16)
+    t, x = history.rows("servo")
+    assert x[:, 0].tolist() == [1000, 1000, 1001, 1001, 1002, 1002, 1003, 1003]
+    assert x[:, 15].tolist() == [0, 0, 1001, 1001, 0, 0, 1003, 1003]
+    assert history.is_consistent()
+    wrong = Rows(t=Array.of(T0 + np.array([9.0]), "<f8"), x=Array.of(np.zeros((1, 12))))
+    assert history.add(Sample(uav=1, t=T0 + 9.0, servo=wrong)) == 1

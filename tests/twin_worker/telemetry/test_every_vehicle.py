@@ -53,11 +53,11 @@ def test_a_track_without_velocity_is_the_slope_of_its_positions():
 
 def test_slow_rows_are_named_with_what_is_needed():
     twin = Twin.of(4)
-    hz = {"attitude": 25 / 13, "servo": 20 / 11, "velocity": 2.0, "position": 2.0, "air": 2.0}
+    hz = {"attitude": 25 / 80, "servo": 20 / 70, "velocity": 2.0, "position": 2.0, "air": 2.0}
     made = predictions(drive(twin, f.messages(thinned(f.turn(40.0), hz), uav=4)))
-    assert made and "attitude at 1.9 Hz, identification needs 5 Hz" in made[-1].sentence
+    assert made and "attitude at 0.3 Hz, identification needs 0.4 Hz" in made[-1].sentence
     assert (
-        "servo at 1.8 Hz" in twin.identification.verdict.sentence
+        "servo at 0.3 Hz" in twin.identification.verdict.sentence
         and twin.identification.verdict.outcome is Outcome.INSUFFICIENT_DATA
     )
 

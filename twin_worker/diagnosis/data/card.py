@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fleet.airframes import load
-from fleet.airframes.airframe import servo_map
+from fleet.airframes.airframe import servo_map, servo_parameters
 from fleet.effects import SURFACES, Body, Effect, Onset
 
 _REQUIRED = ("m", "S", "b", "c", "Ixx", "Iyy", "Izz", "Ixz")
@@ -26,7 +26,8 @@ class AircraftCard:
         body: mass and geometry
         inertia: J_x J_y J_z J_xz [kg m2]
         throw: surface angle at full command, down and up, aileron elevator rudder, (3, 2) [rad]; ones where unknown
-        pulses: use the servo mapping of the card instead of the autopilot parameters
+        pulses: use the fixed servo mapping of a JSON card instead of the autopilot parameters
+        servo_params: servo map of the card as SERVOn_* parameters, instead of those of the autopilot; empty: none given
         known: False for the unit body of an aircraft without a card
     """
 
@@ -35,12 +36,17 @@ class AircraftCard:
     inertia: tuple[float, float, float, float]
     throw: tuple[tuple[float, float], ...] = ((1.0, 1.0),) * 3
     pulses: bool = False
+    servo_params: dict[str, float] = field(default_factory=dict)
     known: bool = True
 
+    def servo_parameters(self, params: Mapping[str, float]) -> Mapping[str, float]:
+        """Return the parameters that describe the servo map: those of the card where it has a map."""
+        return self.servo_params or params
+
     def commands(self, pulses: np.ndarray, params: Mapping[str, float]) -> np.ndarray:
-        """Convert servo pulses (n, 8) [us] to delta_a delta_e delta_r delta_t as shares of full command, (n, 4)."""
+        """Convert servo pulses, (n, 8) or (n, 16) [us], to delta_a delta_e delta_r delta_t of full command, (n, 4)."""
         if not self.pulses:
-            return servo_map(params).inputs(pulses)
+            return servo_map(self.servo_parameters(params)).inputs(pulses)
         u = (pulses[:, [0, 1, 3]] - 1500.0) / 500.0
         return np.column_stack([u, (pulses[:, 2] - 1000.0) / 1000.0])
 
@@ -69,7 +75,8 @@ def read_card(path: Path) -> AircraftCard:
         airframe = load(str(path) if path.suffix or path.exists() else path.name)
         v = airframe.value
         body = Body(v["mass"], v["S"], v["b"], v["c"], v["c"])
-        return AircraftCard(airframe.name, body, (v["J_x"], v["J_y"], v["J_z"], v["J_xz"]))
+        inertia = (v["J_x"], v["J_y"], v["J_z"], v["J_xz"])
+        return AircraftCard(airframe.name, body, inertia, servo_params=airframe.servo_params)
     try:
         document = json.loads(path.read_text())
     except (ValueError, UnicodeDecodeError) as error:
@@ -81,7 +88,10 @@ def read_card(path: Path) -> AircraftCard:
     body = Body(value["m"], value["S"], value["b"], value["c"], diameter)
     throw = _throws(path.name, document.get("surface_full_deg"))
     inertia = (value["Ixx"], value["Iyy"], value["Izz"], value["Ixz"])
-    return AircraftCard(str(document.get("airframe", path.stem)), body, inertia, throw, pulses="servo" in document)
+    servos, name = document.get("servo"), str(document.get("airframe", path.stem))
+    if isinstance(servos, list):
+        return AircraftCard(name, body, inertia, throw, servo_params=servo_parameters(path.name, servos))
+    return AircraftCard(name, body, inertia, throw, pulses=servos is not None)
 
 
 def _number(file: str, document: Mapping[str, object], name: str) -> float:

@@ -178,7 +178,7 @@ def resample_flight(name: str, history: TelemetryHistory, params: dict[str, floa
     commands[:, 3] = np.clip(commands[:, 3], 0.0, 1.0)
     ground = _ground_height(history, readings["h"], t, t_start)
     ok = _valid_rows(series, readings, t, t_start, ground)
-    outputs = read_outputs(history, params, t_start)
+    outputs = read_outputs(history, dict(card.servo_parameters(params)), t_start)
     flight = FlightData(name, t, t_start, readings, commands, horizontal, ground, ok, vane, tuple(limitations), outputs)
     _check_length(name, flight.seconds, "s in the air", "s at least; check that the aircraft flew")
     return flight

@@ -22,7 +22,7 @@ class ServoOutputs:
 
     Attributes:
         t: time since the first attitude, (n,) [s]
-        pulses: (n, 8) [us]
+        pulses: (n, 8) or (n, 16) [us]
         errors: commanded minus actual roll and pitch [rad], energy as height [m], (n, 3)
         signals: by axis (roll, pitch, energy), what a stabilising law answers, (n, k) each
         throttle: as reported, (n,) [-]
@@ -76,7 +76,7 @@ def read_outputs(history: TelemetryHistory, params: dict[str, float], t_start: f
     )
     return ServoOutputs(
         t=t - t_start,
-        pulses=pulses[:, :8],
+        pulses=pulses,
         errors=np.column_stack([phi_c - phi, theta_c - theta, energy]),
         signals=(
             np.column_stack([phi_c - phi, p, r, phi, phi_c]),

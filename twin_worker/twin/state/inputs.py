@@ -23,9 +23,10 @@ _ITEM_CHANGES = 64  # stored changes of the current item
 _MAX_ALTITUDE_OFFSET_M = 200.0  # largest plausible difference of a position's and the receiver's altitude [m]
 _FIX_WAIT_S = 10.0  # telemetry after which a position is used in spite of such a difference [s]
 _TICK_S = 1.0  # between updates of the wind filter [s]
-_LEARN_FROM = ("servo", "attitude", "command", "air")
+_LEARN_FROM = ("servo", "attitude", "command", "air", "velocity")
 _LEARN_S, _LEARN_PERIOD_S = 160.0, 20.0  # flight time that the servo map is learnt from, and between two attempts [s]
-_FLYING_AIRSPEED = 8.0  # [m/s]
+_FLYING_AIRSPEED = 8.0  # or ground speed [m/s]
+_WIND_MAX_AGE_S = 10.0  # maximum age of the autopilot's wind estimate, and of the airspeed that replaces it [s]
 _LATE_S = 10.0  # velocities older than this come too late for the wind [s]
 
 
@@ -45,6 +46,8 @@ class Telemetry(msgspec.Struct):
         rejected_rows: rows left out, because they were implausible
         servos_learned_t: when the servo map was learnt from flight; -inf: it was not [s since 1970]
         servos_tried_t: when that was last tried [s since 1970]
+        frozen_airspeed: reading that the airspeed sensor repeats, treated as no airspeed; nan: it varies [m/s]
+        airspeed_checked_t: when the airspeed was last checked for that [s since 1970]
     """
 
     history: TelemetryHistory = msgspec.field(default_factory=TelemetryHistory)
@@ -59,12 +62,18 @@ class Telemetry(msgspec.Struct):
     rejected_rows: int = 0
     servos_learned_t: float = -np.inf
     servos_tried_t: float = -np.inf
+    frozen_airspeed: float = np.nan
+    airspeed_checked_t: float = -np.inf
 
     def add(self, sample: Sample) -> None:
         """Append the rows of a sample; the first position of a valid fix is the origin."""
         self.rejected_rows += self.history.add(sample)
         if self.origin is None and sample.position is not None:
             self.origin = _first_position(self.history)
+        due = self.history.newest - self.airspeed_checked_t >= _TICK_S
+        if sample.air is not None and (due or np.isfinite(self.frozen_airspeed)):
+            self.airspeed_checked_t = self.history.newest
+            self.frozen_airspeed = self.history.blank_frozen("air", self.frozen_airspeed)
 
     def advance(self, t: float, *, back: bool = False) -> None:
         """Advance data time to `t` [s since 1970]; only with `back` it may decrease."""
@@ -99,8 +108,8 @@ class Telemetry(msgspec.Struct):
         t, pulses = series["servo"]
         if min(len(rows) for rows, _ in series.values()) < MIN_ROWS:
             return
-        attitude, command, air = (_at(t, *series[name]) for name in ("attitude", "command", "air"))
-        flying = air[:, 0] > _FLYING_AIRSPEED
+        attitude, command, air, velocity = (_at(t, *series[name]) for name in _LEARN_FROM[1:])
+        flying = np.fmax(air[:, 0], np.hypot(velocity[:, 0], velocity[:, 1])) > _FLYING_AIRSPEED
         learned = learn_servo_map(
             pulses[flying], (command[:, :2] - attitude[:, :2])[flying], attitude[flying, 3:5], air[flying, 1]
         )
@@ -112,6 +121,7 @@ class Telemetry(msgspec.Struct):
         self.history.clear()
         self.resampler.clear()
         self.data_t = self.last_step_t = self.link_restored_t = self.servos_tried_t = -np.inf
+        self.airspeed_checked_t, self.frozen_airspeed = -np.inf, np.nan
         self.delay = ArrivalDelay(self.delay.gateway_t)
 
     def shift_clock(self, step: float) -> None:
@@ -234,12 +244,14 @@ class Environment(msgspec.Struct):
     Attributes:
         wind: the wind filter
         wind_t: time of the newest row it has used [s since 1970]
+        reported_wind_t: when it last took the wind that the autopilot reports, without airspeed [s since 1970]
         flight_phase: flying, landed, landing
         autopilot: law and parameters identified from flight
     """
 
     wind: WindFilter = msgspec.field(default_factory=WindFilter)
     wind_t: float = -np.inf
+    reported_wind_t: float = -np.inf
     flight_phase: FlightPhase = msgspec.field(default_factory=FlightPhase)
     autopilot: AutopilotEstimate = msgspec.field(default_factory=AutopilotEstimate)
 
@@ -248,6 +260,15 @@ class Environment(msgspec.Struct):
         if history.newest - self.wind_t >= _TICK_S:
             since = max(self.wind_t, history.newest - _LATE_S)
             self.wind_t = update_from_history(self.wind, history, self.wind_t, since)
+            self._use_reported_wind(history)
+
+    def _use_reported_wind(self, history: TelemetryHistory) -> None:
+        """Take the wind of the autopilot's own estimator while no airspeed feeds the filter."""
+        is_fed = self.wind.t != self.reported_wind_t and history.newest - self.wind.t < _WIND_MAX_AGE_S
+        t, reported = history.rows_since("wind", history.newest - _WIND_MAX_AGE_S)
+        if not is_fed and len(t):
+            self.wind.reset_wind(float(t[-1]), np.append(reported[-1], 0.0))
+            self.reported_wind_t = self.wind.t
 
     def set_wind(self, wind: WindFilter, t: float) -> None:
         """Replace the wind filter by one that has used the rows up to `t` [s since 1970]."""
@@ -255,9 +276,10 @@ class Environment(msgspec.Struct):
 
     def reset_clock(self) -> None:
         """Forget times: the new time may be earlier than the old one."""
-        self.wind.t = self.wind_t = -np.inf
+        self.wind.t = self.wind_t = self.reported_wind_t = -np.inf
         self.flight_phase = FlightPhase()
 
     def shift_clock(self, step: float) -> None:
         """Date the wind `step` later [s]."""
         self.wind.t, self.wind_t = self.wind.t + step, self.wind_t + step
+        self.reported_wind_t += step

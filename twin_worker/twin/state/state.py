@@ -81,7 +81,7 @@ class TwinConfig(msgspec.Struct, frozen=True):
         uav: UAV id
         omega: verification threshold [%]
         method: prediction method, `AUTO` for the one with the lowest error
-        airframe: prior of the model
+        airframe: prior of the model; servo map where it has one
         schedule: periods of the recurring work
     """
 
@@ -109,6 +109,11 @@ class Twin(msgspec.Struct):
     confidence: ConfidenceState = msgspec.field(default_factory=ConfidenceState)
     alerts: AlertingState = msgspec.field(default_factory=AlertingState)
     budget: ComputeBudget | None = None
+
+    def __post_init__(self) -> None:
+        """Use the servo map of the airframe file, if it has one, before any parameter arrives."""
+        if self.config.airframe.servo_params:
+            self.telemetry.set_servo_map(self.config.airframe.servo_params)
 
     @classmethod
     def of(cls, uav: int, **config: Any) -> "Twin":
@@ -249,7 +254,7 @@ def ingest(twin: Twin, message: Message) -> None:
             event = Event.PARAMETERS if names else None
             invalidate_prediction(twin, event, message.t, text, is_first=twin.onboard.params is None)
         twin.onboard.set_params(message)
-        twin.telemetry.set_servo_map(message.values)
+        twin.telemetry.set_servo_map(twin.config.airframe.servo_params or message.values)
 
 
 def _is_same_mission(onboard: OnboardState, mission: Mission, first: int) -> bool:

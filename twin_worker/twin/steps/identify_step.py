@@ -8,7 +8,7 @@ from fleet.frames import G
 from fleet.physics.simulate import TAU
 from fleet.physics.wrench import NAMES
 from fleet.process.sanitise import format_below
-from fleet.window import Window
+from fleet.window import LONGEST_GAP, MAX_GAP_S, Window
 from twin_worker.identification.fixed_wing import derivatives_model
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel, linearise
 from twin_worker.identification.fixed_wing.plant import PAPER, Plant
@@ -141,7 +141,7 @@ def hindcast_error(initial: InitialCondition | Rollout | None, window: Window, s
     return float(np.linalg.norm(rollout.path - window.p[rows], axis=1).mean())
 
 
-_REQUIRED_HZ = {"attitude": 5.0, "velocity": 2.0, "position": 2.0, "servo": 5.0}  # minimum rates
+_REQUIRED_HZ = dict.fromkeys(LONGEST_GAP, 1.0 / MAX_GAP_S)  # minimum rates: slower rows are gaps
 _RATE_WINDOW_S = 20.0  # window of the rate [s]
 
 
@@ -160,7 +160,7 @@ def missing_telemetry(history: TelemetryHistory) -> str:
     slow = {kind: rate_hz(history, kind) for kind in _REQUIRED_HZ if kind not in absent}
     problems = [f"no {', '.join(absent)} rows yet"] if absent else []
     problems += [
-        f"{kind} at {rate:.1f} Hz, identification needs {_REQUIRED_HZ[kind]:.0f} Hz"
+        f"{kind} at {rate:.1f} Hz, identification needs {_REQUIRED_HZ[kind]:g} Hz"
         for kind, rate in slow.items()
         if rate < 0.9 * _REQUIRED_HZ[kind]
     ]

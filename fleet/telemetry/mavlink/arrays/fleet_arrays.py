@@ -9,7 +9,7 @@ from fleet.contract import Sample
 from fleet.telemetry.mavlink.arrays.counts import MessageCounters
 from fleet.telemetry.mavlink.arrays.pack import FIELDS
 from fleet.telemetry.mavlink.arrays.row_arbiter import new_arbiter_state
-from fleet.telemetry.mavlink.arrays.rows import MAX_COLUMNS, PendingRows
+from fleet.telemetry.mavlink.arrays.rows import MAX_COLUMNS, WITH_EXTRA, PendingRows
 from fleet.telemetry.tables import clock
 
 
@@ -25,6 +25,7 @@ class AircraftArrays:
         self.clocks = np.empty((0, *clock.new_clocks().shape))
         self.next_due_t = np.empty(0)  # latest time of the next messages other than rows, (m,) [s since 1970]
         self.arbiter_state = np.empty((0, *new_arbiter_state().shape))
+        self.second_ports: dict[int, tuple[float, np.ndarray]] = {}  # by aircraft: arrival [s since 1970], (8,) [us]
 
     def add_aircraft(self, uav: int) -> int:
         """Add one aircraft; return its number."""
@@ -40,6 +41,7 @@ class AircraftArrays:
         self.counts.reset(number)
         self.clocks[number], self.arbiter_state[number] = clock.new_clocks(), new_arbiter_state()
         self.pending.dropped[number] = 0
+        self.second_ports.pop(number, None)
         self.next_due_t[number] = np.inf
 
     def add_rows(self, number: int, field: str, t: np.ndarray, x: np.ndarray) -> None:
@@ -51,7 +53,8 @@ class AircraftArrays:
             t: fleet time, increasing and later than all earlier rows, (n,) [s since 1970]
             x: values, (n, k)
         """
-        padded = np.pad(x, ((0, 0), (0, MAX_COLUMNS - x.shape[1])))
+        width = MAX_COLUMNS if x.shape[1] <= MAX_COLUMNS else WITH_EXTRA
+        padded = np.pad(x, ((0, 0), (0, width - x.shape[1])))
         self.pending.add_rows(np.full(len(t), number * len(FIELDS) + FIELDS.index(field)), t, t, padded)
 
     def take_samples(self, now: float) -> dict[int, EncodedMessage]:

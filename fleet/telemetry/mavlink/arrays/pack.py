@@ -7,13 +7,14 @@ import numba as nb
 import numpy as np
 
 from fleet.bus.codec import encode
-from fleet.contract import COLUMNS, Sample
+from fleet.contract import COLUMNS, ROW_WIDTHS, Sample
 
 Packed = tuple[int, bytes, float]
 """Number of the aircraft, bytes of its `Sample`, the sample's time [s since 1970]."""
 FIELDS = tuple(COLUMNS)
 MAX_ROWS = 2_000  # maximum rows of one field in one message
 WIDTHS = np.array([len(COLUMNS[field]) for field in FIELDS])
+WIDEST = np.array([ROW_WIDTHS[field][-1] for field in FIELDS])  # with the extra columns
 _INTEGER_FIELDS = {"position", "leg", "target", "gnss"}  # integer fields, <i4; all others are <f4
 IS_INTEGER = np.array([field in _INTEGER_FIELDS for field in FIELDS])
 _MAX_FIELD_HEADER = 160  # upper limit of the bytes of a field without its numbers
@@ -69,7 +70,7 @@ def _write_bin_header(out, at, size):
 
 @nb.njit(cache=True, nogil=True)
 def _write_field(out, at, times, values, columns, is_integer, fragments, offsets):
-    """Write the rows of one field: times (n,), values (n, 8)."""
+    """Write the rows of one field: times (n,), values (n, 8) or (n, 16)."""
     n = len(times)
     as_double, as_float, as_int = np.empty(1), np.empty(1, np.float32), np.empty(1, np.int32)
     double_bytes, float_bytes, int_bytes = as_double.view(np.uint8), as_float.view(np.uint8), as_int.view(np.uint8)
@@ -94,8 +95,18 @@ def _write_field(out, at, times, values, columns, is_integer, fragments, offsets
 
 
 @nb.njit(cache=True, nogil=True)
+def _used_width(values, width, widest):
+    """Return the columns of the field in these rows: the widest form if an extra column is not 0."""
+    for i in range(len(values)):
+        for k in range(width, min(widest, values.shape[1])):
+            if values[i, k] != 0.0:
+                return widest
+    return width
+
+
+@nb.njit(cache=True, nogil=True)
 def _write_samples(
-    out, uavs, start, stop, t, values, widths, is_integer, prefix, names, name_offsets, fragments, offsets
+    out, uavs, start, stop, t, values, widths, widest, is_integer, prefix, names, name_offsets, fragments, offsets
 ):
     """Write a sample for every aircraft with rows; return owners, end of each in `out`, and sample times."""
     owners, ends, at = np.empty(len(start), np.int64), np.empty(len(start), np.int64), 0
@@ -118,8 +129,9 @@ def _write_samples(
             at = _copy_bytes(out, at, names, name_offsets[field], name_offsets[field + 1])
             first, end = start[owner, field], stop[owner, field]
             if first < end:
-                kind = (widths[field], is_integer[field])
-                at = _write_field(out, at, t[first:end], values[first:end], *kind, fragments, offsets)
+                rows = values[first:end]
+                kind = (_used_width(rows, widths[field], widest[field]), is_integer[field])
+                at = _write_field(out, at, t[first:end], rows, *kind, fragments, offsets)
             else:
                 out[at] = 0xC0
                 at += 1
@@ -152,11 +164,11 @@ def pack_samples(
         uavs: UAV ids, (m,)
         start, stop: row range of each aircraft and field, at most `MAX_ROWS`, (m, fields)
         t: fleet times, increasing within a field, (n,) [s since 1970]
-        values: columns, (n, 8)
+        values: columns, (n, 8), or (n, 16) where extra columns are in use
     """
-    out = np.empty(_max_size(start, stop, WIDTHS), np.uint8)
+    out = np.empty(_max_size(start, stop, WIDEST), np.uint8)
     owners, ends, sample_t = _write_samples(
-        out, uavs, start, stop, t, values, WIDTHS, IS_INTEGER, _PREFIX, *_FIELD_NAMES, *_FRAGMENTS
+        out, uavs, start, stop, t, values, WIDTHS, WIDEST, IS_INTEGER, _PREFIX, *_FIELD_NAMES, *_FRAGMENTS
     )
     payload, stops = out[: ends[-1]].tobytes() if len(ends) else b"", ends.tolist()
     entries = zip(owners.tolist(), [0, *stops][:-1], stops, sample_t.tolist(), strict=True)

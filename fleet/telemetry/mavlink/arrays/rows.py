@@ -5,7 +5,8 @@ import numpy as np
 
 from fleet.telemetry.mavlink.arrays.pack import FIELDS, MAX_ROWS, Packed, pack_samples
 
-MAX_COLUMNS = 8  # columns of the widest field
+MAX_COLUMNS = 8  # columns of the widest field without extra columns
+WITH_EXTRA = 16  # columns of all rows while extra columns are in use
 
 
 class PendingRows:
@@ -32,9 +33,10 @@ class PendingRows:
             key: number of the aircraft * number of fields + number of the field, (n,)
             arrival: arrival times, non-decreasing within a key, (n,) [s since 1970]
             t: fleet time, increasing within a key and later than all earlier rows, (n,) [s since 1970]
-            x: values, (n, k); columns beyond those of the field are ignored
+            x: values, (n, `MAX_COLUMNS`) or (n, `WITH_EXTRA`); columns beyond those of the field are ignored
         """
         if len(self._row_keys):
+            x, self._x = same_width(x, self._x)
             remaining = _remaining_rows(self._start, self._end, len(self._row_keys))
             key = np.concatenate([self._row_keys[remaining], key])
             arrival = np.concatenate([self._arrival[remaining], arrival])
@@ -58,6 +60,12 @@ class PendingRows:
             self._t, self._x = self._t[:0], self._x[:0]
             self._start, self._end = np.zeros_like(stop), np.zeros_like(stop)
         return packed
+
+
+def same_width(*parts: np.ndarray) -> list[np.ndarray]:
+    """Return arrays (n, k) with the columns of the widest; added columns are 0."""
+    width = max(x.shape[1] for x in parts)
+    return [x if x.shape[1] == width else np.pad(x, ((0, 0), (0, width - x.shape[1]))) for x in parts]
 
 
 @nb.njit(cache=True, nogil=True)

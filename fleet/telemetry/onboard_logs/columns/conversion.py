@@ -44,7 +44,7 @@ WIDTHS = {
     "velocity": (3,),
     "air": (1, 2, 3),
     "leg": (1,),
-    "servo": tuple(range(1, 9)),
+    "servo": tuple(range(1, 17)),
     "command": (2, 3, 4, 5),
     "wind": (2,),
     "target": (3,),
@@ -89,7 +89,8 @@ def pulses(control: np.ndarray) -> np.ndarray:
 
 
 def _padded(field: str, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
-    fill, width = {"servo": (0.0, 8), "air": (0.0, 3), "command": (np.nan, 5)}.get(field, (0.0, len(columns)))
+    forms = {"servo": (0.0, 8 if len(columns) <= 8 else 16), "air": (0.0, 3), "command": (np.nan, 5)}
+    fill, width = forms.get(field, (0.0, len(columns)))
     return [*columns, *[np.full(len(columns[0]), fill)] * (width - len(columns))]
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet.contract import COLUMNS
+from fleet.contract import ROW_WIDTHS
 from fleet.telemetry.mavlink.onboard_log import OnboardEvent
 from fleet.telemetry.onboard_logs.columns.column_map import NORMALISED, ColumnMap, FieldSpec, read_map
 from fleet.telemetry.onboard_logs.columns.conversion import pulses, to_sample
@@ -126,7 +126,7 @@ class TableLog(TopicLog):
             valid = np.isfinite(values[:, :3]).all(axis=1)
             t, values = _with_rates(t[valid], values[valid])
             self.skipped.append("attitude: no rates in the column map; p, q, r are differences of the angles")
-        plausible = is_plausible(name, values) if values.shape[1] == len(COLUMNS[name]) else np.zeros(len(t), bool)
+        plausible = is_plausible(name, values) if values.shape[1] in ROW_WIDTHS[name] else np.zeros(len(t), bool)
         if name in ("position", "target"):
             plausible &= (np.abs(values[:, :2]) > 1e5).any(axis=1)  # without a fix receivers report 0, 0
         if (rejected := int((~plausible).sum())) and rejected > 0.5 * len(t):

@@ -7,7 +7,7 @@ import numpy as np
 from fleet.frames import wrap
 from fleet.telemetry.mavlink.onboard_log import FieldRows
 from fleet.telemetry.onboard_logs.dataflash.records import Records
-from fleet.telemetry.tables.dataflash import ANGLES, PARTS, RATES, ROWS, TABLE, field_of, is_plausible
+from fleet.telemetry.tables.dataflash import ANGLES, OPTIONAL_PARTS, PARTS, RATES, ROWS, TABLE, field_of, is_plausible
 from fleet.telemetry.tables.row import FieldSource
 
 MAX_PART_GAP_S = 0.5  # maximum time between the parts of one row [s]
@@ -65,6 +65,8 @@ class RowBuilder:
     def __init__(self, sources: dict[str, FieldSource]) -> None:
         self._sources = sources
         self._joiners = {field: joiner for field in PARTS if (joiner := _part_joiner(field, sources)) is not None}
+        others = {parts[0][0]: {part for part, _ in parts[1:]} for parts in PARTS.values()}
+        self._alone = {part for part, optional in others.items() if optional <= OPTIONAL_PARTS - set(sources)}
         self._newest: dict[str, float] = {}  # newest time of each part [s]
 
     def add_block(self, block: list[Records], newest: float, last: bool = False) -> FieldRows:
@@ -81,7 +83,7 @@ class RowBuilder:
             joiner = self._joiners.get(field_of(part))
             if joiner is not None:
                 joiner.add(part, t, values)
-            elif field_of(part) not in PARTS and len(t):
+            elif (field_of(part) not in PARTS or part in self._alone) and len(t):
                 table[part] = (t, values)
         for field, joiner in self._joiners.items():
             t, values = joiner.join_until(float("inf") if last else newest - PART_WAIT_S)

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet.contract import COLUMNS
+from fleet.contract import COLUMNS, ROW_WIDTHS
 from fleet.telemetry.tables.dataflash import COLUMNS_OF, PARTS, TABLE, field_of
 from tests.support.dataflash_writer import Writer, read
 
@@ -42,6 +42,8 @@ CASES: tuple[tuple[str, tuple[Any, ...], str, str, tuple[float, ...]], ...] = (
      (1000, 1100, 1200, 1300, 0, 0, 0, 0)),
     ("RCOU QHHHHHHHHH TimeUS,C1,C2,C3,C4,C5,C6,C7,C8,C9", tuple(range(1001, 1010)), "servo", "RCOU",
      tuple(range(1001, 1009))),
+    (f"RCOU Q{'H' * 14} TimeUS,{','.join(f'C{n}' for n in range(1, 15))}", tuple(range(1001, 1015)), "servo", "RCOU",
+     (*range(1001, 1015), 0, 0)[:14]),
     ("MOT Ihhhhhh TimeMS,Mot1,Mot2,Mot3,Mot4,Mot5,Mot6", (1, 2, 3, 4, 5, 6), "servo", "MOT", (1, 2, 3, 4, 5, 6, 0, 0)),
     ("MISE QHHHffffLLfB TimeUS,CTot,CNum,CId,Prm1,Prm2,Prm3,Prm4,Lat,Lng,Alt,Frame",
      (9, 4, 16, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 5.0, 3), "leg", "MISE", (4,)),
@@ -142,4 +144,17 @@ def test_every_row_of_the_table_has_a_place_to_go() -> None:
         assert field_of(row.field) in COLUMNS
         assert row.field in COLUMNS_OF or field_of(row.field) not in PARTS
     for field, parts in PARTS.items():
-        assert sum(n for _, n in parts) == len(COLUMNS[field])
+        assert sum(n for _, n in parts) == ROW_WIDTHS[field][-1]
+
+
+@pytest.mark.parametrize("has_rest", [False, True])
+def test_outputs_15_and_16_come_from_their_own_message(has_rest: bool) -> None:
+    writer = Writer(False).fmt("RCOU", "Q" + "H" * 14, "TimeUS," + ",".join(f"C{n}" for n in range(1, 15)))
+    writer.fmt("RCO2", "QHHHH", "TimeUS,C15,C16,C17,C18")
+    for i in range(20):
+        writer.say("RCOU", 1_000_000 + 50_000 * i, *range(1001, 1015))
+        if has_rest:
+            writer.say("RCO2", 1_000_000 + 50_000 * i, 1015, 1016, 1017, 1018)
+    t, servo = read(writer.log())[0]["servo"]
+    assert len(t) == 20
+    np.testing.assert_array_equal(servo[3], [*range(1001, 1015), *([1015, 1016] if has_rest else [])])

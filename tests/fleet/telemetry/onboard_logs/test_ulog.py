@@ -15,7 +15,7 @@ from fleet.telemetry.onboard_logs.topic_log import extract_rows
 from fleet.telemetry.onboard_logs.ulog import sieve
 from fleet.telemetry.onboard_logs.ulog.reader import UlogLog
 from fleet.telemetry.tables.ulog import ROWS, TABLE, TOPICS, mode_name
-from tests.support.ulog_writer import START_US, TRUTH, UTC_US, flight, read, release, rows, said, ulog
+from tests.support.ulog_writer import START_US, TRUTH, UTC_US, flight, read, release, rows, said, topic, ulog
 
 VERSIONS = ((1, 6), (1, 8), (1, 11), (1, 13), (1, 14), (1, 16))
 SAMPLE = "real/px4_vtol_cubeorange_6s_reader_test.ulg"
@@ -98,7 +98,7 @@ def test_the_sample_reads_equal_to_plain_pyulog(sample_bytes):
 
 def agrees(row, values: np.ndarray) -> None:
     truth = TRUTH[row.field] if row.message != "actuator_motors" else (1600, 1400, 1500, 2000, 0, 0, 0, 0)
-    truth = np.tile(truth, (len(values), 1))
+    truth = np.tile([*truth, *[0.0] * (values.shape[1] - len(truth))], (len(values), 1))  # outputs 9 to 16
     if row.field == "command" and np.isnan(values[:, 2]).all():  # a row without the path topic
         truth[:, 2] = np.nan
     np.testing.assert_allclose(values, truth, rtol=1e-6, atol=2e-5, err_msg=str(row))
@@ -120,7 +120,7 @@ def test_a_release_is_read_with_its_own_names_and_units(version):
     got = rows(log)
     assert set(got) == set(COLUMNS) - {"height"}
     for field, (t, values) in got.items():
-        truth = np.tile(TRUTH[field], (len(t), 1))
+        truth = np.tile([*TRUTH[field], *[0.0] * (values.shape[1] - len(TRUTH[field]))], (len(t), 1))
         np.testing.assert_allclose(values, truth, rtol=1e-6, atol=2e-5, err_msg=field)
         assert (np.diff(t) > 0).all()
         assert t[0] >= START_US * 1e-6
@@ -134,6 +134,8 @@ def test_a_release_is_read_with_its_own_names_and_units(version):
 def test_every_row_of_the_table_is_exercised_and_tells_the_truth():
     applied = set()
     between = flight((1, 14)) | {"airspeed_validated": flight((1, 11))["airspeed_validated"]}
+    between["actuator_outputs"] = flight((1, 11))["actuator_outputs"]
+    between["actuator_outputs.1"] = topic(10.0, len(between["actuator_outputs"]) / 10.0, output=[0.0] * 16)
     for said_as in (*(flight(version) for version in VERSIONS), between):
         topics = read(ulog(said_as)).topics
         for field in ROWS:
@@ -151,8 +153,19 @@ def test_motors_alone_are_one_to_two_milliseconds_and_it_is_said():
     topics = flight((1, 14))
     del topics["actuator_servos"]
     log = read(ulog(topics))
-    np.testing.assert_allclose(rows(log)["servo"][1][0], (1600, 1400, 1500, 2000, 0, 0, 0, 0), atol=1e-3)
+    np.testing.assert_allclose(rows(log)["servo"][1][0], (1600, 1400, 1500, 2000, *[0] * 12), atol=1e-3)
     assert any("actuator_motors" in sentence for sentence in log.skipped)
+
+
+@pytest.mark.parametrize(
+    ("main", "expected"), [([0.0] * 8, (1300, 1700, 0, 0, 0, 0, 0, 0)), ([1550.0] * 8, (1550,) * 8)]
+)
+def test_outputs_of_aux_follow_those_of_main_that_has_none_of_its_own(main, expected):
+    topics = flight((1, 11))
+    topics["actuator_outputs"]["output"][:] = [1600.0, 1400.0, 1500.0, 2000.0, *[0.0] * 4, *main]
+    topics["actuator_outputs.1"] = topic(10.0, 10.0, output=[1300.0, 1700.0, 8191.0, *[0.0] * 13])
+    _, servo = rows(read(ulog(topics)))["servo"]
+    np.testing.assert_allclose(servo[5], (1600, 1400, 1500, 2000, 0, 0, 0, 0, *expected), atol=1e-3)
 
 
 @pytest.mark.parametrize("outputs", [[0.0] * 16, [4000.0, 8191.0] + [0.0] * 14, [float("nan")] * 16])
