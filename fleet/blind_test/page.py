@@ -44,7 +44,7 @@ def _scores(scores: Mapping[str, Any]) -> str:
 
 
 def _flights(results: Sequence[GradedFlight]) -> str:
-    headings = ("", "flight", "concealed", "named", "reported (true)", "onset", "held-out residual", "summary")
+    headings = ("", "flight", "concealed", "named", "reported (true)", "onset", "held-out force error [m/s2]", "summary")
     head = "".join(f"<th>{heading}</th>" for heading in headings)
     return f'<table class="all"><tr>{head}</tr>{"".join(map(_flight, misses_first(results)))}</table>'
 
