@@ -91,7 +91,8 @@ def held_out_gain(
     drawn = np.random.default_rng(_SEED).integers(len(held_out), size=(_RESAMPLES, len(held_out)))
     before, after, _ = squares[drawn].sum(axis=1).T
     low, high = np.percentile(1.0 - np.sqrt(after / np.maximum(before, 1e-12)), _LEVELS)
-    return ForceCheck(*map(float, rms), float(low), float(high))
+    without, with_effects, mean = map(float, rms)
+    return ForceCheck(without, with_effects, mean, float(low), float(high))
 
 
 def measured_force(recording: Path, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -129,5 +130,5 @@ def measured_force(recording: Path, t: np.ndarray) -> tuple[np.ndarray, np.ndarr
     valid = np.hypot(*velocity[:, :2].T) > _MIN_SPEED
     for k in np.flatnonzero(gaps > max(_MAX_GAP_S, 3.0 * float(np.median(gaps)))):
         valid &= ~((grid > source_t[k] - t_start - 0.5) & (grid < source_t[k + 1] - t_start + 0.5))
-    rows = np.clip(np.searchsorted(grid, t), 0, len(grid) - 1)
-    return np.stack([np.interp(t, grid, column) for column in force.T], axis=1), valid[rows]
+    nearest = np.clip(np.searchsorted(grid, t), 0, len(grid) - 1)
+    return np.stack([np.interp(t, grid, column) for column in force.T], axis=1), valid[nearest]

@@ -146,7 +146,7 @@ def grade(
         report: as `fleet diagnose --json` writes it
         force: force prediction of the named effects, evaluated against the recording
     """
-    rejected = {"verdict": "none", "sentence": "no report: the flight was rejected", "named": []}
+    rejected: Mapping[str, Any] = {"verdict": "none", "sentence": "no report: the flight was rejected", "named": []}
     diagnosis = rejected if report is None or report["verdict"] == "refused" else report
     named = tuple(name.split(":")[0] for name in diagnosis["named"])
     onset_errors, sizes, located, surfaces = [], [], [], []
@@ -190,12 +190,13 @@ def _is_in_forces(named: tuple[str, ...], diagnosis: Mapping[str, Any]) -> bool:
     """Return whether a prediction of forces shows one of the named effects; faults of outputs are in none."""
     channels = [place["channel"] for place in diagnosis.get("located", ())]
     return any(
-        name not in NOT_IN_FORCES and channel != OUTPUT_CHANNEL
-        for name, channel in zip(named, channels, strict=False)
+        name not in NOT_IN_FORCES and channel != OUTPUT_CHANNEL for name, channel in zip(named, channels, strict=False)
     )
 
 
-def _statements(label: Mapping[str, Any], named: tuple[str, ...], diagnosis: Mapping[str, Any]) -> tuple[Statement, ...]:
+def _statements(
+    label: Mapping[str, Any], named: tuple[str, ...], diagnosis: Mapping[str, Any]
+) -> tuple[Statement, ...]:
     """Return the stated probabilities of named and suspected candidates; none where the report states none."""
     pairs = list(zip(named, diagnosis.get("posterior") or (), strict=False))
     pairs += [(suspect["name"].split(":")[0], suspect.get("posterior")) for suspect in diagnosis.get("suspects", ())]
@@ -217,7 +218,10 @@ REQUIREMENTS = {  # score: bound and meaning
     "onset_within_5s": (0.9, "onsets reported within 5 s"),
     "sigma2_coverage": (0.85, "true values within two standard deviations"),
     "class_size_median": (-2.0, "size of the equivalence class, median"),
-    "named_improving": (1.0, "named flights whose error of predicted forces decreases on held-out blocks, below that of a constant"),
+    "named_improving": (
+        1.0,
+        "named flights whose error of predicted forces decreases on held-out blocks, below that of a constant",
+    ),
 }
 """Bounds: a positive value is a minimum, a negative value the negative of a maximum."""
 

@@ -1,6 +1,6 @@
 """Limits of detection: the smallest magnitude of each effect that a diagnosis names with 90 % probability.
 
-The table `detection_limits.json` is measured, not derived: `python -m fleet.blind_test.limits` builds it from the results
+The table `detection_limits.json` is measured, not derived: `python -m fleet.blind_test.limits` builds it from results
 of `fleet prove`. It has one source for each aircraft and reference of the diagnosis, with its provenance.
 """
 

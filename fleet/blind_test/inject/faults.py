@@ -190,7 +190,9 @@ def _stuck(pulses: np.ndarray, after: np.ndarray, used_map: ServoMap, fault: Inj
     column = SURFACES.index(fault.part)
     for k in np.flatnonzero(np.abs(used_map.gain_up[:, column]) > 0):
         gain = used_map.gain_up[k, column] * (np.abs(used_map.gain_up[:, column]) > 0).sum()
-        frozen = pulses[first, k] if not fault.values["position"] else used_map.trim[k] + fault.values["position"] / gain
+        frozen = (
+            pulses[first, k] if not fault.values["position"] else used_map.trim[k] + fault.values["position"] / gain
+        )
         out[after, k] = np.rint(np.clip(frozen, *_PULSE_LIMITS_US))
     return out
 
@@ -201,7 +203,9 @@ def _changed(flight: RecordedFlight, fault: InjectedFault, columns: Mapping[str,
     for kind, numbers in columns.items():
         if kind in flight.x:
             x = flight.x[kind].astype(float)
-            x[np.ix_(flight.t[kind] >= flight.t_start + fault.t0, numbers)] += by
+            after = flight.t[kind] >= flight.t_start + fault.t0
+            for number in numbers:
+                x[after, number] += by
             out[kind] = x
     return out
 

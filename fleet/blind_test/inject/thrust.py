@@ -71,7 +71,10 @@ def fit_thrust_curves(flights: Sequence[RecordedFlight], used_map: ServoMap) -> 
     balances = [_balance(flight, used_map) for flight in flights]
     highest = max(float(np.percentile(Va, 99)) for Va, *_ in balances)
     candidates = [[_fit(balance, k_motor) for balance in balances] for k_motor in _MOTOR_RATIOS * highest]
-    return min(candidates, key=lambda curves: sum((1.0 - curve.r2) * len(b[0]) for curve, b in zip(curves, balances, strict=True)))
+    return min(
+        candidates,
+        key=lambda curves: sum((1.0 - curve.r2) * len(b[0]) for curve, b in zip(curves, balances, strict=True)),
+    )
 
 
 def _fit(balance: tuple[np.ndarray, ...], k_motor: float) -> ThrustCurve:

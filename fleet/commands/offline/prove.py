@@ -126,7 +126,7 @@ def _check_recordings(args: argparse.Namespace) -> None:
         others = min(len({p.absolute() for p in args.against} - {path.absolute()}) for path in args.inject)
         if others < 2:
             raise ValueError(
-                f"--against: found {others} flights besides one of --inject, expected 2 at least to calibrate; name more"
+                f"--against: found {others} flights besides one of --inject, expected 2 to calibrate; name more"
             )
     missing = [path for path in (*args.inject, *(args.against or ()), args.model) if path and not path.exists()]
     if missing:
