@@ -51,13 +51,18 @@ class ForceCheck:
 
     @property
     def improves(self) -> bool:
-        """Return whether the effects reduce the error, to less than that of a constant."""
-        return self.gain > 0.0 and self.after < self.constant
+        """Return whether the effects reduce the error."""
+        return self.gain > 0.0
 
     @property
     def proven(self) -> bool:
-        """Return whether the interval of the gain excludes zero too."""
-        return self.improves and self.low > 0.0
+        """Return whether the interval of the gain excludes zero."""
+        return self.low > 0.0
+
+    @property
+    def predicts(self) -> bool:
+        """Return whether the prediction with the effects is better than a constant."""
+        return self.after < self.constant
 
 
 def check_forces(recording: Path, predictions: Path) -> ForceCheck | None:

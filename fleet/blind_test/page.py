@@ -48,7 +48,8 @@ def _scores(scores: Mapping[str, Any]) -> str:
     cards = []
     for met, meaning, required, achieved in score_rows(scores):
         chip = '<span class="chip none">met</span>' if met else '<span class="chip named">missed</span>'
-        cards.append(f'<div class="card"><b>{achieved} {chip}</b>{meaning}, {required}</div>')
+        chip = "" if met is None else chip
+        cards.append(f'<div class="card"><b>{achieved} {chip}</b>{", ".join(filter(None, (meaning, required)))}</div>')
     return f'<div class="cards">{"".join(cards)}</div>'
 
 

@@ -102,5 +102,6 @@ def _scores(scores: Mapping[str, Any]) -> Table:
     for heading in ("", "score", "required", "achieved (95 % interval)"):
         score_table.add_column(heading)
     for met, *cells in score_rows(scores):
-        score_table.add_row(Text("met", "green") if met else Text("missed", "red"), *cells)
+        verdict = Text("") if met is None else Text("met", "green") if met else Text("missed", "red")
+        score_table.add_row(verdict, *cells)
     return score_table

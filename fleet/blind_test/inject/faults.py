@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fleet.airframes.airframe import ServoMap
-from fleet.blind_test.inject.recorded import MIN_ROWS, RecordedFlight, Series
+from fleet.blind_test.inject.recorded import MIN_ROWS, FlightRecording, Series
 from fleet.blind_test.inject.thrust import MIN_R2, ThrustCurve, airspeed, density
 
 SURFACES = ("aileron", "elevator", "rudder")
@@ -34,7 +34,7 @@ class InjectedFault(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Aircraft:
+class InjectedAircraft:
     """What the concealed faults need of an aircraft: its servo map, its thrust curve, and S / m of its card.
 
     Attributes:
@@ -46,7 +46,7 @@ class Aircraft:
     area_per_mass: float = 1.0
 
 
-def is_vane(flight: RecordedFlight) -> bool:
+def is_vane(flight: FlightRecording) -> bool:
     """Return whether the accelerometer is fast enough to measure flow angles."""
     t = np.sort(flight.t.get("imu", np.zeros(0)))
     return len(t) > MIN_ROWS and float(np.median(np.diff(t))) <= 1.0 / VANE_HZ
@@ -89,7 +89,7 @@ FAULTS: Mapping[str, Injectable] = {
 _NEEDS_THRUST = ("thrust_loss", "drag_increase")
 
 
-def possible_faults(flight: RecordedFlight, aircraft: Aircraft) -> list[tuple[str, str]]:
+def possible_faults(flight: FlightRecording, aircraft: InjectedAircraft) -> list[tuple[str, str]]:
     """Return name and part of the faults that this flight can carry."""
     used = np.abs(aircraft.used_map.gain_up) > 0
     out = []
@@ -108,7 +108,7 @@ def possible_faults(flight: RecordedFlight, aircraft: Aircraft) -> list[tuple[st
     return out
 
 
-def inject(flight: RecordedFlight, aircraft: Aircraft, fault: InjectedFault) -> Series | None:
+def inject(flight: FlightRecording, aircraft: InjectedAircraft, fault: InjectedFault) -> Series | None:
     """Return the altered rows by kind; None where the faulty aircraft could not have flown this motion."""
     if fault.name in _SENSORS:
         return _SENSORS[fault.name](flight, fault)
@@ -133,7 +133,9 @@ def inject(flight: RecordedFlight, aircraft: Aircraft, fault: InjectedFault) -> 
     return out
 
 
-def _required_inputs(flight: RecordedFlight, aircraft: Aircraft, fault: InjectedFault, u: np.ndarray) -> np.ndarray:
+def _required_inputs(
+    flight: FlightRecording, aircraft: InjectedAircraft, fault: InjectedFault, u: np.ndarray
+) -> np.ndarray:
     """Return the input of the faulty aircraft that gives the recorded forces and moments, (n,) [-]."""
     t, values = flight.t["servo"], fault.values
     if fault.name in _NEEDS_THRUST:
@@ -197,7 +199,9 @@ def _stuck(pulses: np.ndarray, after: np.ndarray, used_map: ServoMap, fault: Inj
     return out
 
 
-def _changed(flight: RecordedFlight, fault: InjectedFault, columns: Mapping[str, tuple[int, ...]], by: float) -> Series:
+def _changed(
+    flight: FlightRecording, fault: InjectedFault, columns: Mapping[str, tuple[int, ...]], by: float
+) -> Series:
     """Add a constant to columns of some kinds after the onset."""
     out: Series = {}
     for kind, numbers in columns.items():
@@ -210,13 +214,13 @@ def _changed(flight: RecordedFlight, fault: InjectedFault, columns: Mapping[str,
     return out
 
 
-def _airspeed_scale(flight: RecordedFlight, fault: InjectedFault) -> Series:
+def _airspeed_scale(flight: FlightRecording, fault: InjectedFault) -> Series:
     x = flight.x["air"].astype(float)
     x[flight.t["air"] >= flight.t_start + fault.t0, 0] *= fault.values["scale"]
     return {"air": x}
 
 
-def _baro_bias(flight: RecordedFlight, fault: InjectedFault) -> Series:
+def _baro_bias(flight: FlightRecording, fault: InjectedFault) -> Series:
     x = flight.x["pressure"].astype(float)
     after = flight.t["pressure"] >= flight.t_start + fault.t0
     h = (1.0 - (x[after, 0] / _SEA_LEVEL_PA) ** (1.0 / _POWER)) / _LAPSE
@@ -224,7 +228,7 @@ def _baro_bias(flight: RecordedFlight, fault: InjectedFault) -> Series:
     return {"pressure": x}
 
 
-def _gps_latency(flight: RecordedFlight, fault: InjectedFault) -> Series:
+def _gps_latency(flight: FlightRecording, fault: InjectedFault) -> Series:
     out: Series = {}
     for kind in ("velocity", "position", "height", "gnss"):
         if kind in flight.x:
@@ -234,20 +238,20 @@ def _gps_latency(flight: RecordedFlight, fault: InjectedFault) -> Series:
     return out
 
 
-def _gyro_bias(flight: RecordedFlight, fault: InjectedFault) -> Series:
+def _gyro_bias(flight: FlightRecording, fault: InjectedFault) -> Series:
     column = 3 + "pqr".index(fault.part)
     by = float(np.radians(fault.values["bias_dps"]))
     return _changed(flight, fault, {"attitude": (column,), "imu": (column,)}, by)
 
 
-def _heading_bias(flight: RecordedFlight, fault: InjectedFault) -> Series:
+def _heading_bias(flight: FlightRecording, fault: InjectedFault) -> Series:
     out = _changed(flight, fault, {"attitude": (2,)}, float(np.radians(fault.values["bias_deg"])))
     psi = out["attitude"][:, 2]
     out["attitude"][:, 2] = np.arctan2(np.sin(psi), np.cos(psi))
     return out
 
 
-_SENSORS: Mapping[str, Callable[[RecordedFlight, InjectedFault], Series]] = {
+_SENSORS: Mapping[str, Callable[[FlightRecording, InjectedFault], Series]] = {
     "airspeed_scale": _airspeed_scale,
     "airspeed_bias": lambda flight, fault: _changed(flight, fault, {"air": (0,)}, fault.values["bias_mps"]),
     "baro_bias": _baro_bias,

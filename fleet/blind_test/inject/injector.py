@@ -13,13 +13,13 @@ import numpy as np
 from fleet.airframes import load
 from fleet.blind_test.inject.faults import (
     FAULTS,
-    Aircraft,
+    InjectedAircraft,
     InjectedFault,
     inject,
     is_vane,
     possible_faults,
 )
-from fleet.blind_test.inject.recorded import RecordedFlight, common_servo_map, read_recorded, write_recorded
+from fleet.blind_test.inject.recorded import FlightRecording, common_servo_map, read_recorded, write_recorded
 from fleet.blind_test.inject.thrust import airspeed, fit_thrust_curves
 from fleet.blind_test.seal import encrypt
 from fleet.cli import run_command
@@ -31,6 +31,7 @@ PAST_S = 47.0  # least flight before an onset: what the own past and the law of 
 AFTER_S = 18.0  # least flight after the earliest onset [s]
 _PAST_SHARE = 0.5
 _MARGIN_S = 3.0
+_ONSET_SHARE = 0.4  # of the later part, in which the onset lies, so that the fault acts in the rest
 _SHRINK, _MAX_SHRINKS = 0.8, 12  # of a magnitude beyond the range of its output
 _REPORT_EVERY = 10
 
@@ -38,7 +39,7 @@ _REPORT_EVERY = 10
 class Source:
     """One healthy flight that faults are concealed in, and the end of the part that stays healthy [s]."""
 
-    def __init__(self, path: Path, flight: RecordedFlight, aircraft: Aircraft) -> None:
+    def __init__(self, path: Path, flight: FlightRecording, aircraft: InjectedAircraft) -> None:
         self.path, self.flight, self.aircraft = path, flight, aircraft
         begin, self.end = flight.airborne
         self.until = begin + max(PAST_S, _PAST_SHARE * (self.end - begin))
@@ -61,7 +62,7 @@ def read_sources(paths: Sequence[Path], options: RecordingOptions, area_per_mass
             least = f"{PAST_S + AFTER_S:.0f} s: {PAST_S:.0f} s healthy before an onset, {AFTER_S:.0f} s after it"
             refused.append(f"{flight.name}: found {int(seconds)} s in the air, expected {least}; name a longer flight")
             continue
-        sources.append(Source(path, flight, Aircraft(used_map, curve, area_per_mass)))
+        sources.append(Source(path, flight, InjectedAircraft(used_map, curve, area_per_mass)))
     if not sources:
         raise ValueError("; ".join(refused))
     for sentence in refused:
@@ -94,7 +95,7 @@ def draw(sources: Sequence[Source], flights: int, rng: np.random.Generator) -> l
 def draw_fault(source: Source, name: str, part: str, place: float, rng: np.random.Generator) -> InjectedFault:
     """Draw one fault; `place` is the place of its magnitude between the limits, on a logarithmic scale."""
     fault = FAULTS[name]
-    t0 = float(rng.uniform(source.until + _MARGIN_S, max(source.end - 20.0, source.until + _MARGIN_S + 1.0)))
+    t0 = source.until + _MARGIN_S + float(rng.uniform(0.0, _ONSET_SHARE * (source.end - source.until)))
     sign = float(rng.choice([-1.0, 1.0])) if fault.signed else 1.0
     if name == "actuator_stuck":  # half of them at their last pulse
         value = sign * fault.high * place if rng.random() < 0.5 else 0.0
@@ -102,7 +103,7 @@ def draw_fault(source: Source, name: str, part: str, place: float, rng: np.rando
     return InjectedFault(name, part, {fault.key: sign * fault.low * (fault.high / fault.low) ** place}, t0)
 
 
-def in_report_units(fault: InjectedFault, aircraft: Aircraft) -> InjectedFault:
+def in_report_units(fault: InjectedFault, aircraft: InjectedAircraft) -> InjectedFault:
     """Convert the magnitude of a draw to the units of a report: a scale from its distance to 1, drag from its share."""
     ((key, size),) = fault.values.items()
     if fault.name == "airspeed_scale":
@@ -137,8 +138,8 @@ def describe(source: Source, fault: InjectedFault | None, seed: int) -> dict[str
             effect["surface" if fault.name.startswith(("actuator", "control")) else "of"] = fault.part
         effects.append(effect)
     role = "single" if fault else "control"
-    flown_s = round(source.end - source.flight.airborne[0], 1)
-    return {"role": role, "airframe": source.flight.name, "seed": seed, "effects": effects, "flown_s": flown_s}
+    seconds = round(source.end - source.flight.airborne[0], 1)
+    return {"role": role, "airframe": source.flight.name, "seed": seed, "effects": effects, "flown_s": seconds}
 
 
 def area_per_mass(card: Path | None, model: Path | None) -> float:

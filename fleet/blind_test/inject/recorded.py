@@ -25,7 +25,7 @@ Series = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
-class RecordedFlight:
+class FlightRecording:
     """One recorded aircraft.
 
     Attributes:
@@ -56,7 +56,7 @@ class RecordedFlight:
         return np.stack([np.interp(times, self.t[kind][order], column) for column in columns], axis=1)
 
 
-def common_servo_map(flights: Sequence[RecordedFlight]) -> ServoMap:
+def common_servo_map(flights: Sequence[FlightRecording]) -> ServoMap:
     """Return the servo map that the parameters of one aircraft describe, else the one that its flights show together.
 
     Without control errors it is the usual assignment of outputs.
@@ -73,7 +73,7 @@ def common_servo_map(flights: Sequence[RecordedFlight]) -> ServoMap:
     return learn_servo_map(*map(np.concatenate, zip(*parts, strict=True))) or described
 
 
-def read_recorded(path: Path, options: RecordingOptions) -> RecordedFlight:
+def read_recorded(path: Path, options: RecordingOptions) -> FlightRecording:
     """Read the recording of one fixed wing.
 
     Raises:
@@ -98,7 +98,7 @@ def read_recorded(path: Path, options: RecordingOptions) -> RecordedFlight:
     for kind in _REQUIRED:
         if len(t.get(kind, ())) < MIN_ROWS:
             raise ValueError(f"{name}: found no {kind} in it, expected telemetry of a flight; record that message too")
-    return RecordedFlight(name, messages, params, t, x, _airborne(name, t, x))
+    return FlightRecording(name, messages, params, t, x, _airborne(name, t, x))
 
 
 def _airborne(name: str, t: Series, x: Series) -> tuple[float, float]:
@@ -115,7 +115,7 @@ def _airborne(name: str, t: Series, x: Series) -> tuple[float, float]:
     return float(times.min()), float(times.max())
 
 
-def write_recorded(flight: RecordedFlight, altered: Mapping[str, np.ndarray], path: Path) -> None:
+def write_recorded(flight: FlightRecording, altered: Mapping[str, np.ndarray], path: Path) -> None:
     """Write the messages of a flight with altered rows (n, k) of some kinds, in recorded order."""
     position = dict.fromkeys(altered, 0)
     received_t = 0.0

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from fleet.airframes.airframe import ServoMap
-from fleet.blind_test.inject.recorded import RecordedFlight
+from fleet.blind_test.inject.recorded import FlightRecording
 from fleet.frames import G
 
 MIN_R2 = 0.5  # share of the variance of specific excess power that the curve must explain [-]
@@ -56,14 +56,14 @@ def density(h: np.ndarray) -> np.ndarray:
     return np.asarray(_RHO_0 * np.clip(1.0 - _LAPSE * h, 0.1, 2.0) ** _POWER)
 
 
-def airspeed(flight: RecordedFlight, times: np.ndarray) -> np.ndarray:
+def airspeed(flight: FlightRecording, times: np.ndarray) -> np.ndarray:
     """Return the airspeed, else the ground speed, at `times`, (n,) [m/s]."""
     if "air" in flight.t and np.ptp(flight.x["air"][:, 0]) > 0.5:
         return np.maximum(flight.at("air", times)[:, 0], 1.0)
     return np.maximum(np.linalg.norm(flight.at("velocity", times), axis=1), 1.0)
 
 
-def fit_thrust_curves(flights: Sequence[RecordedFlight], used_map: ServoMap) -> list[ThrustCurve]:
+def fit_thrust_curves(flights: Sequence[FlightRecording], used_map: ServoMap) -> list[ThrustCurve]:
     """Fit thrust and drag of every flight of one aircraft, with one `k_motor`; `r2` says whether a flight shows them.
 
     Weight and battery differ between flights, the propeller does not.
@@ -89,7 +89,7 @@ def _fit(balance: tuple[np.ndarray, ...], k_motor: float) -> ThrustCurve:
     return ThrustCurve(float(k_t), float(k_motor), float(c_0), r2 if k_t > 0.0 else 0.0)
 
 
-def _balance(flight: RecordedFlight, used_map: ServoMap) -> tuple[np.ndarray, ...]:
+def _balance(flight: FlightRecording, used_map: ServoMap) -> tuple[np.ndarray, ...]:
     """Return airspeed, throttle, density, load factor and specific excess thrust of a flight, (n,) each."""
     begin, end = (flight.t_start + x for x in flight.airborne)
     times = np.arange(begin, end, _STEP_S)

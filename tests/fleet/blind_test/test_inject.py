@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fleet.airframes.airframe import servo_map
-from fleet.blind_test.inject.faults import FAULTS, Aircraft, InjectedFault, inject, possible_faults
+from fleet.blind_test.inject.faults import FAULTS, InjectedAircraft, InjectedFault, inject, possible_faults
 from fleet.blind_test.inject.injector import (
     PAST_S,
     Source,
@@ -21,7 +21,7 @@ from fleet.blind_test.inject.injector import (
     read_sources,
     write_recordings,
 )
-from fleet.blind_test.inject.recorded import RecordedFlight, common_servo_map, read_recorded, write_recorded
+from fleet.blind_test.inject.recorded import FlightRecording, common_servo_map, read_recorded, write_recorded
 from fleet.blind_test.inject.thrust import ThrustCurve, airspeed, density, fit_thrust_curves
 from fleet.bus.codec import encode, encoding
 from fleet.cli import main as fleet
@@ -78,24 +78,24 @@ def record(path: Path, seconds: float = 120.0) -> Path:
 
 
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory: pytest.TempPathFactory) -> RecordedFlight:
+def flight(tmp_path_factory: pytest.TempPathFactory) -> FlightRecording:
     return read_recorded(record(tmp_path_factory.mktemp("recorded") / "monday.parauav"), NO_OPTIONS)
 
 
 @pytest.fixture(scope="module")
-def aircraft(flight: RecordedFlight) -> Aircraft:
-    return Aircraft(common_servo_map([flight]), CURVE)
+def aircraft(flight: FlightRecording) -> InjectedAircraft:
+    return InjectedAircraft(common_servo_map([flight]), CURVE)
 
 
-def surface(flight: RecordedFlight, aircraft: Aircraft, rows: np.ndarray, column: int) -> np.ndarray:
+def surface(flight: FlightRecording, aircraft: InjectedAircraft, rows: np.ndarray, column: int) -> np.ndarray:
     return aircraft.used_map.inputs(rows[:, :8].astype(float))[:, column]
 
 
-def after(flight: RecordedFlight, kind: str = "servo") -> np.ndarray:
+def after(flight: FlightRecording, kind: str = "servo") -> np.ndarray:
     return flight.t[kind] >= flight.t_start + ONSET_S
 
 
-def test_a_copy_without_a_fault_is_the_recording(flight: RecordedFlight, tmp_path: Path) -> None:
+def test_a_copy_without_a_fault_is_the_recording(flight: FlightRecording, tmp_path: Path) -> None:
     write_recorded(flight, {}, tmp_path / "copy.parauav")
     copy = read_recorded(tmp_path / "copy.parauav", NO_OPTIONS)
     assert set(copy.x) == set(flight.x)
@@ -103,7 +103,7 @@ def test_a_copy_without_a_fault_is_the_recording(flight: RecordedFlight, tmp_pat
         assert np.array_equal(copy.x[kind], x) and np.array_equal(copy.t[kind], flight.t[kind])
 
 
-def test_a_flight_shows_its_thrust_curve(flight: RecordedFlight) -> None:
+def test_a_flight_shows_its_thrust_curve(flight: FlightRecording) -> None:
     (curve,) = fit_thrust_curves([flight], SERVOS)
     assert curve.r2 > 0.95
     Va, rho = np.array([18.0, 20.0, 22.0]), np.full(3, 1.19)
@@ -113,7 +113,9 @@ def test_a_flight_shows_its_thrust_curve(flight: RecordedFlight) -> None:
     assert np.allclose(curve.throttle(healthy / 0.8, Va, rho), truth, atol=0.01)
 
 
-def test_thrust_of_the_faulty_aircraft_is_the_recorded_thrust(flight: RecordedFlight, aircraft: Aircraft) -> None:
+def test_thrust_of_the_faulty_aircraft_is_the_recorded_thrust(
+    flight: FlightRecording, aircraft: InjectedAircraft
+) -> None:
     altered = inject(flight, aircraft, InjectedFault("thrust_loss", "", {"loss": 0.2}, ONSET_S))
     assert altered is not None
     t = flight.t["servo"]
@@ -126,7 +128,7 @@ def test_thrust_of_the_faulty_aircraft_is_the_recorded_thrust(flight: RecordedFl
     assert (altered["air"][after(flight, "air"), 1] > flight.x["air"][after(flight, "air"), 1]).all()
 
 
-def test_more_drag_is_overcome_by_more_thrust(flight: RecordedFlight, aircraft: Aircraft) -> None:
+def test_more_drag_is_overcome_by_more_thrust(flight: FlightRecording, aircraft: InjectedAircraft) -> None:
     altered = inject(flight, aircraft, InjectedFault("drag_increase", "", {"dCD": 0.003}, ONSET_S))
     assert altered is not None
     t, on = flight.t["servo"], after(flight)
@@ -140,7 +142,7 @@ def test_more_drag_is_overcome_by_more_thrust(flight: RecordedFlight, aircraft: 
 @pytest.mark.parametrize("part", ["aileron", "elevator", "rudder"])
 @pytest.mark.parametrize("fault", ["actuator_offset", "control_effectiveness_loss", "actuator_delay"])
 def test_a_faulty_surface_stands_where_the_recorded_one_stood(
-    fault: str, part: str, flight: RecordedFlight, aircraft: Aircraft
+    fault: str, part: str, flight: FlightRecording, aircraft: InjectedAircraft
 ) -> None:
     key, size = {"actuator_offset": ("offset", 0.1), "control_effectiveness_loss": ("loss", 0.4)}.get(
         fault, ("delay_s", 0.3)
@@ -166,7 +168,9 @@ def test_a_faulty_surface_stands_where_the_recorded_one_stood(
 
 
 @pytest.mark.parametrize("position", [0.0, 0.4])
-def test_a_frozen_output_repeats_one_pulse(position: float, flight: RecordedFlight, aircraft: Aircraft) -> None:
+def test_a_frozen_output_repeats_one_pulse(
+    position: float, flight: FlightRecording, aircraft: InjectedAircraft
+) -> None:
     altered = inject(flight, aircraft, InjectedFault("actuator_stuck", "rudder", {"position": position}, ONSET_S))
     assert altered is not None
     frozen = altered["servo"][after(flight), 3]
@@ -182,7 +186,14 @@ def test_a_frozen_output_repeats_one_pulse(position: float, flight: RecordedFlig
     ],
 )
 def test_a_sensor_fault_changes_its_reading_from_the_onset_on(
-    name: str, part: str, size: float, kind: str, column: int, change: float, flight: RecordedFlight, aircraft: Aircraft
+    name: str,
+    part: str,
+    size: float,
+    kind: str,
+    column: int,
+    change: float,
+    flight: FlightRecording,
+    aircraft: InjectedAircraft,
 ) -> None:
     altered = inject(flight, aircraft, InjectedFault(name, part, {FAULTS[name].key: size}, ONSET_S))
     assert altered is not None
@@ -190,7 +201,7 @@ def test_a_sensor_fault_changes_its_reading_from_the_onset_on(
     assert np.allclose(difference, np.where(after(flight, kind), change, 0.0), atol=1e-6)
 
 
-def test_scale_pressure_and_latency(flight: RecordedFlight, aircraft: Aircraft) -> None:
+def test_scale_pressure_and_latency(flight: FlightRecording, aircraft: InjectedAircraft) -> None:
     scaled = inject(flight, aircraft, InjectedFault("airspeed_scale", "", {"scale": 0.9}, ONSET_S))
     pressed = inject(flight, aircraft, InjectedFault("baro_bias", "", {"bias_m": 10.0}, ONSET_S))
     late = inject(flight, aircraft, InjectedFault("gps_latency", "", {"latency_s": 0.3}, ONSET_S))
@@ -208,12 +219,12 @@ def test_scale_pressure_and_latency(flight: RecordedFlight, aircraft: Aircraft) 
     assert {"velocity", "position", "gnss"} <= set(late)
 
 
-def test_a_motion_beyond_the_faulty_aircraft_is_refused(flight: RecordedFlight, aircraft: Aircraft) -> None:
+def test_a_motion_beyond_the_faulty_aircraft_is_refused(flight: FlightRecording, aircraft: InjectedAircraft) -> None:
     assert inject(flight, aircraft, InjectedFault("thrust_loss", "", {"loss": 0.6}, ONSET_S)) is None
 
 
-def test_what_a_flight_cannot_show_is_not_concealed(flight: RecordedFlight) -> None:
-    blind = Aircraft(SERVOS, ThrustCurve(CURVE.k_t, CURVE.k_motor, CURVE.c_0, r2=0.3))
+def test_what_a_flight_cannot_show_is_not_concealed(flight: FlightRecording) -> None:
+    blind = InjectedAircraft(SERVOS, ThrustCurve(CURVE.k_t, CURVE.k_motor, CURVE.c_0, r2=0.3))
     names = {name for name, _ in possible_faults(flight, blind)}
     assert not names & {"thrust_loss", "drag_increase", "accel_bias"}  # no accelerometer in it
     assert {"baro_bias", "actuator_stuck", "airspeed_scale"} <= names
@@ -222,11 +233,13 @@ def test_what_a_flight_cannot_show_is_not_concealed(flight: RecordedFlight) -> N
 # --- draws ------------------------------------------------------------------------------------------------------------
 
 
-def sources(flight: RecordedFlight, aircraft: Aircraft, n: int = 3) -> list[Source]:
+def sources(flight: FlightRecording, aircraft: InjectedAircraft, n: int = 3) -> list[Source]:
     return [Source(Path(f"/flights/{k}.tlog"), flight, aircraft) for k in range(n)]
 
 
-def test_draws_are_balanced_seeded_and_every_flight_is_one_control(flight: RecordedFlight, aircraft: Aircraft) -> None:
+def test_draws_are_balanced_seeded_and_every_flight_is_one_control(
+    flight: FlightRecording, aircraft: InjectedAircraft
+) -> None:
     of = sources(flight, aircraft)
     drawn = draw(of, 90, np.random.default_rng(3))
     assert drawn == draw(of, 90, np.random.default_rng(3)) != draw(of, 90, np.random.default_rng(4))
@@ -240,7 +253,7 @@ def test_draws_are_balanced_seeded_and_every_flight_is_one_control(flight: Recor
     assert all(k / len(places) <= place <= (k + 1) / len(places) for k, place in enumerate(places))
 
 
-def test_an_onset_leaves_a_healthy_past(flight: RecordedFlight, aircraft: Aircraft) -> None:
+def test_an_onset_leaves_a_healthy_past(flight: FlightRecording, aircraft: InjectedAircraft) -> None:
     (source,) = sources(flight, aircraft, 1)
     rng = np.random.default_rng(0)
     for name, part in source.possible:
@@ -248,14 +261,16 @@ def test_an_onset_leaves_a_healthy_past(flight: RecordedFlight, aircraft: Aircra
         assert source.flight.airborne[0] + PAST_S < source.until < fault.t0 < source.end
 
 
-def test_a_size_beyond_the_outputs_is_reduced(flight: RecordedFlight, aircraft: Aircraft, tmp_path: Path) -> None:
+def test_a_size_beyond_the_outputs_is_reduced(
+    flight: FlightRecording, aircraft: InjectedAircraft, tmp_path: Path
+) -> None:
     (source,) = sources(flight, aircraft, 1)
     wanted = InjectedFault("thrust_loss", "", {"loss": 0.6}, ONSET_S)
     written = conceal(source, wanted, tmp_path / "rec.parauav")
     assert written is not None and 0.1 < written.values["loss"] < 0.6 and (tmp_path / "rec.parauav").exists()
 
 
-def test_files_do_not_betray_their_labels(flight: RecordedFlight, aircraft: Aircraft, tmp_path: Path) -> None:
+def test_files_do_not_betray_their_labels(flight: FlightRecording, aircraft: InjectedAircraft, tmp_path: Path) -> None:
     labels = write_recordings(sources(flight, aircraft, 1), argparse.Namespace(seed=5, flights=20, out=tmp_path))
     files = sorted(tmp_path.glob("*/rec_*"))
     assert {path.stem for path in files} == set(labels) and {label["role"] for label in labels.values()} == {

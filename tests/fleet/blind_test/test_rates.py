@@ -114,10 +114,12 @@ def test_a_gain_on_the_blocks_of_the_fit_alone_is_none() -> None:
     assert check is not None and check.gain < 0 and not check.improves
 
 
-def test_a_prediction_worse_than_a_constant_does_not_improve() -> None:
+def test_a_prediction_worse_than_a_constant_is_shown_as_such() -> None:
     t, force, noise = forces()
     check = held_out_gain(t, force, (force + 1e9 * noise, force + 1e6 * noise), np.ones(len(t), bool))
-    assert check is not None and check.gain > 0.99 and not check.improves
+    assert check is not None and check.gain > 0.99 and not check.predicts
+    scores = score([grade("a", label("icing"), report("icing"), check)])
+    assert scores["named_improving"] == 1.0 and scores["named_predicting"] == 0.0
 
 
 def test_too_little_held_out_flight_is_not_judged() -> None:
