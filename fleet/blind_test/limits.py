@@ -26,11 +26,19 @@ import numpy as np
 from scipy.optimize import minimize
 
 from fleet.cli import run_command
-from fleet.report.detection_limits import PROBABILITY, TABLE, DetectionLimit, LimitSource, LimitTable, load_table
+from fleet.report.detection_limits import (
+    MIN_FLIGHTS,
+    PROBABILITY,
+    TABLE,
+    DetectionLimit,
+    LimitSource,
+    LimitTable,
+    load_table,
+)
 
 _LOG_SLOPE, _LOG_SLOPE_STD = float(np.log(4.5)), 0.7  # prior of log b
 _INTERCEPT_STD = 20.0
-_MIN_FLIGHTS = 4  # fewer give no limit
+_MIN_FLIGHTS_OF_PART = 8  # fewer: all parts of the effect together
 _SIMULATED = {"c172p": ("JSBSim Cessna 172P", 48.0), "small": ("JSBSim small fixed wing", 23.0)}  # name, cruise [m/s]
 Trial = tuple[float, bool]  # magnitude, named
 
@@ -47,7 +55,7 @@ def magnitude(values: dict[str, float]) -> tuple[str, float] | None:
 
 def detection_limit(trials: Sequence[Trial]) -> float | None:
     """Return the magnitude named with 90 % probability; None where it is beyond the magnitudes tried."""
-    if len(trials) < _MIN_FLIGHTS:
+    if len(trials) < MIN_FLIGHTS:
         return None
     x, y = np.log([size for size, _ in trials]), np.array([named for _, named in trials])
     centre = float(x.mean())
@@ -63,12 +71,15 @@ def detection_limit(trials: Sequence[Trial]) -> float | None:
 
 
 def limits_of(marks: Iterable[dict[str, Any]]) -> tuple[DetectionLimit, ...]:
-    """Return the limits of every effect and part in the marks of `fleet prove --json`."""
+    """Return the limits of every effect in the marks of `fleet prove --json`, by part where each part has enough."""
     trials: dict[tuple[str, str, str], list[Trial]] = defaultdict(list)
     for mark in marks:
         size = magnitude(mark["values"]) if mark["role"] == "single" else None
         if size is not None:
             trials[mark["concealed"][0], mark["part"], size[0]].append((size[1], mark["hit"]))
+    for effect, _, parameter in [key for key, tried in trials.items() if len(tried) < _MIN_FLIGHTS_OF_PART]:
+        for key in [key for key in trials if key[0] == effect and key[2] == parameter and key[1]]:
+            trials[effect, "", parameter] += trials.pop(key)
     return tuple(
         DetectionLimit(
             effect=effect,

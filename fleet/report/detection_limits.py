@@ -13,6 +13,8 @@ import msgspec
 FORMAT = "parauav.detection_limits.1"
 TABLE = Path(__file__).with_suffix(".json")
 PROBABILITY = 0.9
+MIN_FLIGHTS = 4  # flights with an effect that say something about it
+_OF_ONE_AIRCRAFT = ("dCD", "dmass_kg", "dx_m")  # depend on the size of the aircraft or on its card
 _MAX_SPEED_RATIO = 1.7  # flights of another speed are of another kind of aircraft
 _SHARES = ("loss", "scale", "fraction", "density_ratio", "lift_loss")
 _UNITS = {"mps": "m/s", "mps2": "m/s2", "dps": "deg/s", "deg": "deg", "m": "m", "s": "s", "kg": "kg"}
@@ -127,8 +129,9 @@ def report_sentences(source: LimitSource | None, named: Sequence[str]) -> tuple[
     """Return what would have been named in a flight besides `named`, and what would not, with the origin."""
     if source is None:
         return ()
-    others = [one for one in source.limits if one.effect not in named]
-    above, never = describe_limits(others), sorted({_label(one) for one in others if one.limit is None})
+    others = [one for one in source.limits if one.effect not in named and one.parameter not in _OF_ONE_AIRCRAFT]
+    never = sorted({_label(one) for one in others if one.limit is None and one.flights >= MIN_FLIGHTS})
+    above = describe_limits(others)
     sentences = []
     if above:
         sentences.append(f"would have been named here with {PROBABILITY:.0%} probability above: {above}")

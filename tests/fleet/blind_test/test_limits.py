@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -58,6 +59,9 @@ def test_limits_are_of_effect_and_part_and_of_single_effects_alone() -> None:
     marks += [mark("icing", {"lift_loss": 0.1}, True, "compound"), mark("actuator_stuck", {}, True, part="rudder")]
     offset, scale = limits_of(marks)
     assert (offset.effect, offset.part, offset.flights) == ("actuator_offset", "rudder", 10)
+    few = [mark("actuator_offset", {"offset": 0.1}, True, part="aileron") for _ in range(3)]
+    pooled, _ = limits_of([*marks, *few])
+    assert (pooled.part, pooled.flights) == ("", 13)
     assert offset.limit is not None and 0.06 < offset.limit < 0.15
     assert scale.limit == pytest.approx(0.02, rel=0.01) and scale.largest == pytest.approx(0.3)
 
@@ -130,6 +134,8 @@ def test_a_report_says_what_would_have_been_named_and_where_that_comes_from() ->
     assert above == "would have been named here with 90% probability above: thrust_loss 9 %"
     assert never == "not named reliably at any magnitude tried: gyro_bias (p)" and "Skywalker" in origin
     assert not any("thrust_loss" in sentence for sentence in report_sentences(PLAIN, ["thrust_loss"]))
+    rare = msgspec.structs.replace(PLAIN, limits=(msgspec.structs.replace(NEVER, flights=3),))
+    assert report_sentences(rare, []) == ()  # three flights say nothing
     assert report_sentences(None, []) == ()
 
 
