@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from fleet.effects import FOLDERS_ENV, Body, Effect, catalogue
-from fleet.report.detection_limits import DetectionLimit, LimitSource, describe_size, load_table
+from fleet.report.detection_limits import MIN_FLIGHTS, DetectionLimit, LimitSource, describe_size, load_table
 
 EXAMPLES = """
   fleet effects                       table of all effects
@@ -99,8 +99,11 @@ def as_text(effect: Effect) -> str:
         lines += ["", "  magnitude named with 90 % probability, in flights with this effect concealed:"]
     for source, one in known:
         what = f"{one.parameter} {one.part}".rstrip()
-        size = f"{what} {describe_size(one.parameter, one.limit)}" if one.limit is not None else f"{what} none up to "
-        size += describe_size(one.parameter, one.largest) if one.limit is None else ""
+        size = f"{what} none up to {describe_size(one.parameter, one.largest)}"
+        if one.limit is not None:
+            size = f"{what} {describe_size(one.parameter, one.limit)}"
+        elif one.flights < MIN_FLIGHTS:
+            size = f"{what} not known, too few flights"
         text = f"{size}, {one.named} of {one.flights} named; {source.aircraft}, against {source.reference}"
         lines += _wrapped("    ", f"{text}, {source.made}")
     return "\n".join(lines)
