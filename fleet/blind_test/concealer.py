@@ -20,7 +20,7 @@ def _progress(name: str, done: int, total: int) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    labels = simulate_exam(args.seed, args.flights, args.out, _progress, args.jobs)
+    labels = simulate_exam(args.seed, args.flights, args.out, _progress, args.jobs, smallest=args.smallest)
     encrypt(json.dumps(labels, sort_keys=True).encode(), args.sealed, args.key)
     return 0
 
@@ -31,6 +31,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--flights", type=int, required=True)
     parser.add_argument("--jobs", type=int, required=True)
+    parser.add_argument("--smallest", type=float, default=1.0)
     for name in ("out", "sealed", "key"):
         parser.add_argument(f"--{name}", type=Path, required=True)
     return run_command("prove", _run, parser.parse_args(argv))

@@ -1,13 +1,18 @@
 """Grade reports against their labels: names, location, onset, parameters and standard deviations; score of all."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from statistics import median
 from typing import Any
 
 import numpy as np
 
-_ACTUATOR = ("actuator", "pitch", "roll", "yaw")
+from fleet.blind_test.examiner import NOT_IN_FORCES, ForceCheck
+from fleet.blind_test.rates import Statement, median_interval, poisson, score_probabilities, wilson
+
+OUTPUT_CHANNEL = "autopilot output"  # of a report whose fault is in the output of the controller
+MAX_CALIBRATION_ERROR = 0.05  # of stated probabilities [-]
+_ACTUATOR = ("actuator", "pitch", "roll", "yaw", OUTPUT_CHANNEL)
 _LOADS = ("lift", "drag", "force_x", "force_z")
 CHANNELS: Mapping[str, tuple[str, ...]] = {  # effect: correct channels
     **dict.fromkeys(("wind_steady", "wind_shear", "turbulence", "gust_discrete", "updraft"), ("air",)),
@@ -18,7 +23,7 @@ CHANNELS: Mapping[str, tuple[str, ...]] = {  # effect: correct channels
     "prop_torque": ("roll",),
     "p_factor": ("yaw", "pitch"),
     "slipstream_tail": ("pitch", "yaw"),
-    "thrust_loss": ("thrust", "force_x"),
+    "thrust_loss": ("thrust", "force_x", OUTPUT_CHANNEL),
     "thrust_asymmetry": ("yaw", "thrust"),
     "drag_increase": ("drag", "force_x"),
     **dict.fromkeys(("icing", "flap_deployed", "stall", "ground_effect"), _LOADS),
@@ -81,8 +86,11 @@ class GradedFlight:
         late: reported minus true onset and its tolerance, for each effect [s]
         sizes: parameters of correctly named effects
         located, surfaces: whether channel and surface are correct, for correctly named effects
-        before, after: residual on held-out blocks, None where nothing was named
+        force: force prediction of the named effects, evaluated again; None where forces do not show them
+        before, after: residual on held-out blocks as the report states it, None where nothing was named
+        statements: stated probabilities of the candidates, and which are true
         acts: strength of the effect in standard deviations of the sensors
+        values: concealed parameters of the first effect; part: its surface or axis, or empty
     """
 
     flight: str
@@ -97,9 +105,13 @@ class GradedFlight:
     sizes: tuple[tuple[str, ScoredParameter], ...] = ()
     located: tuple[bool, ...] = ()
     surfaces: tuple[bool, ...] = ()
+    force: ForceCheck | None = None
     before: float | None = None
     after: float | None = None
-    acts: Mapping[str, Any] = field(default_factory=dict)
+    statements: tuple[Statement, ...] = ()
+    acts: Sequence[Mapping[str, Any]] = ()
+    values: Mapping[str, float] = field(default_factory=dict)
+    part: str = ""
 
     @property
     def reported_names(self) -> tuple[str, ...]:
@@ -123,9 +135,19 @@ class GradedFlight:
         return self.hit or (bool(self.named) and self.concealed[0] in self.rivals[0])
 
 
-def grade(flight: str, label: Mapping[str, Any], report: Mapping[str, Any] | None) -> GradedFlight:
-    """Grade one report; a flight without a report was rejected."""
-    diagnosis = report or {"verdict": "none", "sentence": "no report: the flight was rejected", "named": []}
+def grade(
+    flight: str, label: Mapping[str, Any], report: Mapping[str, Any] | None, force: ForceCheck | None = None
+) -> GradedFlight:
+    """Grade one report; a flight without a report was rejected.
+
+    Args:
+        flight: name
+        label: what is concealed in it
+        report: as `fleet diagnose --json` writes it
+        force: force prediction of the named effects, evaluated against the recording
+    """
+    rejected: Mapping[str, Any] = {"verdict": "none", "sentence": "no report: the flight was rejected", "named": []}
+    diagnosis = rejected if report is None or report["verdict"] == "refused" else report
     named = tuple(name.split(":")[0] for name in diagnosis["named"])
     onset_errors, sizes, located, surfaces = [], [], [], []
     for effect in label["effects"]:
@@ -154,10 +176,32 @@ def grade(flight: str, label: Mapping[str, Any], report: Mapping[str, Any] | Non
         sizes=tuple(sizes),
         located=tuple(located),
         surfaces=tuple(surfaces),
+        force=force if _is_in_forces(named, diagnosis) else None,
         before=diagnosis.get("fit_before") if named else None,
         after=diagnosis.get("fit_after") if named else None,
-        acts=label.get("acts", {}),
+        statements=_statements(label, named, diagnosis),
+        acts=label.get("acts", ()),
+        values=label["effects"][0]["params"] if label["effects"] else {},
+        part=next((effect.get("surface") or effect.get("of") or "" for effect in label["effects"]), ""),
     )
+
+
+def _is_in_forces(named: tuple[str, ...], diagnosis: Mapping[str, Any]) -> bool:
+    """Return whether a prediction of forces shows one of the named effects; faults of outputs are in none."""
+    channels = [place["channel"] for place in diagnosis.get("located", ())]
+    return any(
+        name not in NOT_IN_FORCES and channel != OUTPUT_CHANNEL for name, channel in zip(named, channels, strict=False)
+    )
+
+
+def _statements(
+    label: Mapping[str, Any], named: tuple[str, ...], diagnosis: Mapping[str, Any]
+) -> tuple[Statement, ...]:
+    """Return the stated probabilities of named and suspected candidates; none where the report states none."""
+    pairs = list(zip(named, diagnosis.get("posterior") or (), strict=False))
+    pairs += [(suspect["name"].split(":")[0], suspect.get("posterior")) for suspect in diagnosis.get("suspects", ())]
+    concealed = {effect["name"] for effect in label["effects"]}
+    return tuple(Statement(float(p), name in concealed) for name, p in pairs if p is not None and 0.0 <= p <= 1.0)
 
 
 _NEAR_EQUIVALENT = {("thrust_asymmetry", "thrust_loss"), ("stall", "drag_increase"), ("ground_effect", "drag_increase")}
@@ -174,17 +218,39 @@ REQUIREMENTS = {  # score: bound and meaning
     "onset_within_5s": (0.9, "onsets reported within 5 s"),
     "sigma2_coverage": (0.85, "true values within two standard deviations"),
     "class_size_median": (-2.0, "size of the equivalence class, median"),
-    "named_improving": (1.0, "named flights whose held-out residual decreases"),
+    "named_improving": (1.0, "named flights whose error of predicted forces decreases on held-out blocks"),
+    "named_gain_proven": (1.0, "of them with an interval of the decrease that excludes zero"),
 }
 """Bounds: a positive value is a minimum, a negative value the negative of a maximum."""
 
+REPORTED = {  # score without a bound: meaning
+    "named_predicting": "of them with forces predicted better than by a constant",
+    "surface_ok": "correct names with the correct surface",
+    "onset_median_err_s": "error of the onset, median [s]",
+}
 
-def score_rows(scores: Mapping[str, Any]) -> Iterator[tuple[bool, str, str, str]]:
-    """Format every score: whether it meets its requirement, meaning, requirement, value."""
+
+def score_rows(scores: Mapping[str, Any]) -> Iterator[tuple[bool | None, str, str, str]]:
+    """Format every score: whether it meets its requirement, if any, meaning, requirement, value with interval."""
     for name, (required, meaning) in REQUIREMENTS.items():
-        value = scores[name]
         bound = f"at most {-required:.3g}" if required < 0 else f"at least {required:.3g}"
-        yield meets_requirement(name, value), meaning, bound, "no data" if value is None else f"{value:.3g}"
+        yield meets_requirement(name, scores[name]), meaning, bound, score_text(scores, name)
+    for name, meaning in REPORTED.items():
+        yield None, meaning, "", score_text(scores, name)
+    if scores["probabilities"] is not None:
+        error = scores["probabilities"]["calibration_error"]
+        text = f"{error:.3f}, Brier score {scores['probabilities']['brier']:.3f}, {scores['probabilities']['n']} stated"
+        yield error <= MAX_CALIBRATION_ERROR, "calibration error", f"at most {MAX_CALIBRATION_ERROR:g}", text
+
+
+def score_text(scores: Mapping[str, Any], name: str) -> str:
+    """Format one score with its 95 % interval and its counts."""
+    if scores[name] is None:
+        return "no data"
+    interval, counts = scores["intervals"].get(name), scores["counts"].get(name)
+    text = f"{scores[name]:.3g}"
+    text += f" ({interval[0]:.2g} to {interval[1]:.2g})" if interval else ""
+    return text + (f", {counts[0]} of {counts[1]}" if counts else "")
 
 
 def meets_requirement(name: str, value: float | None) -> bool:
@@ -194,46 +260,56 @@ def meets_requirement(name: str, value: float | None) -> bool:
 
 
 def score(results: Sequence[GradedFlight]) -> dict[str, Any]:
-    """Compute all scores; None where no flight contributes."""
+    """Compute all scores, their 95 % intervals and counts; None where no flight contributes."""
     roles = ("control", "single", "compound", "unknown")
     by_role = {role: [result for result in results if result.role == role] for role in roles}
     parameters = [parameter for one in results for _, parameter in one.sizes]
-    errors = [size.error for size in parameters]
     onset_errors = [pair for one in results for pair in one.late]
-    fits = [(one.before, one.after) for one in results if one.before and one.after is not None]
-    correct = [len(set(one.concealed) & set(one.named)) for one in by_role["compound"]]
+    fits = [one.force for one in results if one.force is not None]
     extra = [len(set(one.named) - set(one.concealed)) for one in by_role["compound"]]
-    named = [one for one in results if one.named]
+    rates = {
+        "top1_naming": [one.hit for one in by_role["single"]],
+        "in_class": [one.in_class for one in by_role["single"]],
+        "channel_ok": [ok for one in results for ok in one.located],
+        "surface_ok": [ok for one in results for ok in one.surfaces],
+        "onset_ok": [abs(dt) <= tolerance for dt, tolerance in onset_errors],
+        "onset_within_5s": [abs(dt) <= _ONSET_TOLERANCE_S for dt, _ in onset_errors],
+        "false_alarm": [not one.hit for one in by_role["control"]],
+        "compound_recall": [name in one.named for one in by_role["compound"] for name in one.concealed],
+        "unknown_abstained": [one.hit for one in by_role["unknown"]],
+        "sigma2_coverage": [bool(size.covered) for size in parameters if size.covered is not None],
+        "named_improving": [fit.improves for fit in fits],
+        "named_gain_proven": [fit.proven for fit in fits],
+        "named_predicting": [fit.predicts for fit in fits],
+    }
+    medians = {
+        "onset_median_err_s": [abs(dt) for dt, _ in onset_errors],
+        "magnitude_median_err": [size.error for size in parameters],
+        "heldout_improvement_median": [fit.gain for fit in fits],
+        "class_size_median": [1.0 + len(rivals) for one in results if one.named for rivals in one.rivals],
+    }
+    intervals = {name: wilson(sum(outcomes), len(outcomes)) for name, outcomes in rates.items()}
+    intervals |= {name: median_interval(values) for name, values in medians.items()}
+    intervals["compound_extra_per_flight"] = poisson(sum(extra), len(extra))
+    probabilities = score_probabilities([statement for one in results for statement in one.statements])
+    errors = medians["magnitude_median_err"]
     return {
-        "top1_naming": _fraction(one.hit for one in by_role["single"]),
-        "in_class": _fraction(one.in_class for one in by_role["single"]),
+        **{name: sum(outcomes) / len(outcomes) if outcomes else None for name, outcomes in rates.items()},
+        **{name: _median(values) for name, values in medians.items()},
         "spurious_extra_names": sum(
-            (one.concealed[0], extra) not in _NEAR_EQUIVALENT for one in by_role["single"] for extra in one.named[1:]
+            name not in one.concealed and (one.concealed[0], name) not in _NEAR_EQUIVALENT
+            for one in by_role["single"]
+            for name in one.named[1:]
         ),
-        "channel_ok": _fraction(ok for one in results for ok in one.located),
-        "surface_ok": _fraction(ok for one in results for ok in one.surfaces),
-        "onset_ok": _fraction(abs(dt) <= tolerance for dt, tolerance in onset_errors),
-        "onset_within_5s": _fraction(abs(dt) <= _ONSET_TOLERANCE_S for dt, _ in onset_errors),
-        "onset_median_err_s": _median(abs(dt) for dt, _ in onset_errors),
-        "false_alarm": _fraction(not one.hit for one in by_role["control"]),
-        "compound_recall": sum(correct) / sum(len(one.concealed) for one in by_role["compound"]) if correct else None,
         "compound_extra": sum(extra),
         "compound_extra_per_flight": sum(extra) / len(extra) if extra else None,
-        "unknown_abstained": _fraction(one.hit for one in by_role["unknown"]),
-        "magnitude_median_err": _median(errors),
         "magnitude_p90_err": float(np.percentile(errors, 90)) if errors else None,
-        "sigma2_coverage": _fraction(size.covered for size in parameters if size.covered is not None),
-        "heldout_improvement_median": _median(1.0 - after / before for before, after in fits),
-        "named_improving": _fraction(after < before for before, after in fits),
-        "class_size_median": _median(1 + len(rivals) for one in named for rivals in one.rivals),
+        "intervals": intervals,
+        "counts": {name: (sum(outcomes), len(outcomes)) for name, outcomes in rates.items() if outcomes},
+        "probabilities": asdict(probabilities) if probabilities else None,
         "n": {kind: len(flights) for kind, flights in by_role.items()}
         | {"sizes": len(parameters), "onsets": len(onset_errors)},
     }
-
-
-def _fraction(outcomes: Iterable[bool | None]) -> float | None:
-    items = list(outcomes)
-    return sum(map(bool, items)) / len(items) if items else None
 
 
 def _median(values: Iterable[float]) -> float | None:

@@ -7,7 +7,7 @@ from typing import Any
 from fleet.blind_test.course import BlindTestConfig, BlindTestResult
 from fleet.blind_test.mark import GradedFlight, score_rows
 from fleet.blind_test.shown import confusion, fit_text, misses_first, parameter_texts
-from fleet.report.ink import document, escape_text
+from fleet.report.ink import GRID, LINES, MUTED, document, escape_text
 
 _METHOD = (
     "JSBSim simulates every flight. The effects come from its own physics or from faults of servos and sensors that "
@@ -15,16 +15,25 @@ _METHOD = (
     "their hash is printed. Only then are the labels decrypted."
 )
 
+_METHOD_INJECTED = (
+    "Every flight is a healthy recording with a concealed fault: the recorded motion is kept, outputs and readings are "
+    "those of a faulty aircraft that flies it. Copies of one recording are not independent of each other. The labels "
+    "are encrypted and their hash is printed. The reports are written and their hash is printed. Only then are the "
+    "labels decrypted."
+)
+_PLOT_PX, _MARGIN_PX = 220, 34
+
 
 def write(config: BlindTestConfig, outcome: BlindTestResult, scores: Mapping[str, Any]) -> Path:
     """Write `index.html`; return its path."""
     title = f"Blind test of {len(outcome.results)} flights, seed {config.seed}"
     body = "\n".join(
         (
-            f"<h1>{title}</h1><p>{_METHOD}</p>",
+            f"<h1>{title}</h1><p>{_METHOD_INJECTED if config.injected else _METHOD}</p>",
             f'<p class="soft">labels sha256 <code>{outcome.labels_sha256}</code><br>'
             f"reports sha256 <code>{outcome.reports_sha256}</code></p>",
             _scores(scores),
+            _reliability(scores["probabilities"]),
             _flights(outcome.results),
             _confusion(outcome.results),
         )
@@ -39,12 +48,45 @@ def _scores(scores: Mapping[str, Any]) -> str:
     cards = []
     for met, meaning, required, achieved in score_rows(scores):
         chip = '<span class="chip none">met</span>' if met else '<span class="chip named">missed</span>'
-        cards.append(f'<div class="card"><b>{achieved} {chip}</b>{meaning}, {required}</div>')
+        chip = "" if met is None else chip
+        cards.append(f'<div class="card"><b>{achieved} {chip}</b>{", ".join(filter(None, (meaning, required)))}</div>')
     return f'<div class="cards">{"".join(cards)}</div>'
 
 
+def _reliability(probabilities: Mapping[str, Any] | None) -> str:
+    """Draw the reliability diagram: stated probability against the share of true candidates, with intervals."""
+    if probabilities is None:
+        return ""
+
+    def x(share: float) -> str:
+        return f"{_MARGIN_PX + _PLOT_PX * share:.1f}"
+
+    def y(share: float) -> str:
+        return f"{_PLOT_PX * (1.0 - share) + 8:.1f}"
+
+    marks = [f'<line x1="{x(0)}" y1="{y(0)}" x2="{x(1)}" y2="{y(1)}" stroke="{GRID}"/>']
+    for one in probabilities["bins"]:
+        at, (low, high) = x(one["stated"]), one["interval"]
+        marks.append(f'<line x1="{at}" y1="{y(low)}" x2="{at}" y2="{y(high)}" stroke="{LINES[0]}"/>')
+        title = f"<title>{one['n']} candidates</title>"
+        marks.append(f'<circle cx="{at}" cy="{y(one["share"])}" r="4" fill="{LINES[0]}">{title}</circle>')
+    texts = [(x(0.5), _PLOT_PX + 28, "stated probability"), (x(0.0), 6, "share of true candidates")]
+    marks += [f'<text x="{at}" y="{down}" font-size="11" fill="{MUTED}">{text}</text>' for at, down, text in texts]
+    size = _PLOT_PX + 2 * _MARGIN_PX
+    return f'<h3>Stated probabilities</h3><svg viewBox="0 0 {size} {size}" width="{size}">{"".join(marks)}</svg>'
+
+
 def _flights(results: Sequence[GradedFlight]) -> str:
-    headings = ("", "flight", "concealed", "named", "reported (true)", "onset", "held-out residual", "summary")
+    headings = (
+        "",
+        "flight",
+        "concealed",
+        "named",
+        "reported (true)",
+        "onset",
+        "held-out force error [m/s2]",
+        "summary",
+    )
     head = "".join(f"<th>{heading}</th>" for heading in headings)
     return f'<table class="all"><tr>{head}</tr>{"".join(map(_flight, misses_first(results)))}</table>'
 

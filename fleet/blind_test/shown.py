@@ -1,5 +1,6 @@
 """Result of a blind test as terminal tables and as JSON values."""
 
+import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -19,12 +20,23 @@ def as_json_values(config: BlindTestConfig, outcome: BlindTestResult, scores: Ma
         **scores,
         "seed": config.seed,
         "flights": config.flights,
+        "smallest": config.smallest,
+        "injected": _injected(config),
         "labels_sha256": outcome.labels_sha256,
         "reports_sha256": outcome.reports_sha256,
         "asked_met": {name: meets_requirement(name, scores[name]) for name in REQUIREMENTS},
         "confusion": [[*pair, count] for pair, count in sorted(confusion(outcome.results).items())],
         "marks": [asdict(result) | {"hit": result.hit} for result in outcome.results],
     }
+
+
+def _injected(config: BlindTestConfig) -> dict[str, Any] | None:
+    """Return the recordings that faults were concealed in, and the reference; None for simulated flights."""
+    if config.injected is None:
+        return None
+    paths = sorted(config.folder.glob("*/source.json"))
+    sources = {path.parent.name: json.loads(path.read_text()) for path in paths}
+    return {"reference": config.injected.reference, "sources": sources}
 
 
 def confusion(results: Sequence[GradedFlight]) -> Counter[tuple[str, str]]:
@@ -55,7 +67,7 @@ def table(results: Sequence[GradedFlight], scores: Mapping[str, Any]) -> Rendera
 
 def _flights(results: Sequence[GradedFlight]) -> Table:
     flight_table = Table(box=None, pad_edge=False)
-    for heading in ("", "flight", "concealed", "named", "reported (true)", "onset", "held out"):
+    for heading in ("", "flight", "concealed", "named", "reported (true)", "onset", "force error [m/s2]"):
         flight_table.add_column(heading, overflow="fold")
     for result in misses_first(results):
         flight_table.add_row(
@@ -81,14 +93,15 @@ def parameter_texts(result: GradedFlight) -> list[str]:
 
 
 def fit_text(result: GradedFlight) -> str:
-    """Format the residual on held-out blocks before and after."""
-    return f"{result.before:.2f} → {result.after:.2f}" if result.before and result.after is not None else ""
+    """Format the error of predicted forces on held-out blocks before and after [m/s2]."""
+    return f"{result.force.before:.2f} → {result.force.after:.2f}" if result.force else ""
 
 
 def _scores(scores: Mapping[str, Any]) -> Table:
     score_table = Table(box=None, pad_edge=False)
-    for heading in ("", "score", "required", "achieved"):
+    for heading in ("", "score", "required", "achieved (95 % interval)"):
         score_table.add_column(heading)
     for met, *cells in score_rows(scores):
-        score_table.add_row(Text("met", "green") if met else Text("missed", "red"), *cells)
+        verdict = Text("") if met is None else Text("met", "green") if met else Text("missed", "red")
+        score_table.add_row(verdict, *cells)
     return score_table

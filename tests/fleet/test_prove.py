@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from fleet.blind_test.examiner import ForceCheck
 from fleet.blind_test.mark import REQUIREMENTS, GradedFlight, ScoredParameter, grade, meets_requirement, score
 from fleet.blind_test.seal import consume_key, decrypt, digest, encrypt
 from fleet.blind_test.shown import confusion, misses_first
@@ -125,7 +126,10 @@ def examined() -> list[GradedFlight]:
         ("unknown", ["_slosh"], report(verdict="unknown")),
     ]
     flights = [(label(role, *map(effect, names)), said) for role, names, said in asked]
-    return [grade(f"rec_{k}", one, said) for k, (one, said) in enumerate(flights)]
+    checks = [None, *(ForceCheck(1.0, after, 2.0, 0.1, 0.3) for after in (0.8, 0.8, 1.2, 0.8)), None]
+    return [
+        grade(f"rec_{k}", one, said, check) for k, ((one, said), check) in enumerate(zip(flights, checks, strict=True))
+    ]
 
 
 def test_a_direction_is_covered_across_north() -> None:

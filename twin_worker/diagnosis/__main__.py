@@ -33,6 +33,8 @@ def _run(args: argparse.Namespace) -> int:
     for task, (file_reports, refusal) in zip(tasks, results, strict=True):
         for report in file_reports:
             print(f"{report.flight}: {report.sentence}", flush=True)
+            if report.outcome is ReportOutcome.NONE and report.detection_limits:
+                print(f"{report.flight}: {'; '.join(report.detection_limits)}", flush=True)
         reports += file_reports
         if refusal:
             refused.append((task.path.name.split(".")[0], refusal))

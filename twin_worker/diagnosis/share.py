@@ -3,15 +3,19 @@
 import multiprocessing
 import signal
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
+from fleet.report.detection_limits import find_source, load_table, report_sentences
 from fleet.telemetry.recording.options import RecordingOptions
 from twin_worker.diagnosis.baseline.own_past import OwnPast, conceal_channels, exclude_concealed, with_output_faults
 from twin_worker.diagnosis.data.flight import FlightData, read_flights
 from twin_worker.diagnosis.inference.diagnose import diagnose
-from twin_worker.diagnosis.inference.report import Report
+from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.model.baseline import Baseline
 
 ReportProgress = Callable[[str], None]
@@ -64,14 +68,25 @@ def _diagnose_task(
         for flight in _flights_of(task, reference):
             progress(f"{flight.name}: {flight.seconds:.0f} s of flight")
             if isinstance(reference, OwnPast):
-                reports.append(reference.diagnose(flight, progress, conceal))
+                report = reference.diagnose(flight, progress, conceal)
             else:
                 visible = conceal_channels(flight, conceal, flight)
                 report = diagnose(visible, exclude_concealed(reference, conceal), progress)
-                reports.append(with_output_faults(report, visible))
+                report = with_output_faults(report, visible)
+            reports.append(with_detection_limits(report, flight, reference))
     except (ValueError, OSError) as error:
         return reports, str(error)
     return reports, ""
+
+
+def with_detection_limits(report: Report, flight: FlightData, reference: Reference) -> Report:
+    """Return the report with the limits of detection measured on the nearest aircraft with such telemetry."""
+    own_past = isinstance(reference, OwnPast)
+    vane = flight.vane if isinstance(reference, OwnPast) else reference.vane
+    speed = float(np.median(np.hypot(flight.readings["v_n"], flight.readings["v_e"])[flight.ok]))
+    named = [finding.hypothesis.effect.name for finding in report.findings if report.outcome is ReportOutcome.NAMED]
+    source = find_source(load_table(), vane, own_past, speed)
+    return replace(report, detection_limits=report_sentences(source, named))
 
 
 def _flights_of(task: Path | RecordingTask | FlightData, reference: Reference) -> list[FlightData]:

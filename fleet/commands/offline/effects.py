@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from fleet.effects import FOLDERS_ENV, Body, Effect, catalogue
+from fleet.report.detection_limits import MIN_FLIGHTS, DetectionLimit, LimitSource, describe_size, load_table
 
 EXAMPLES = """
   fleet effects                       table of all effects
@@ -94,7 +95,23 @@ def as_text(effect: Effect) -> str:
     lines += [
         row for other, difference in effect.confusable_with.items() for row in _wrapped(f"    {other:27} ", difference)
     ]
+    if known := limits_of(effect):
+        lines += ["", "  magnitude named with 90 % probability, in flights with this effect concealed:"]
+    for source, one in known:
+        what = f"{one.parameter} {one.part}".rstrip()
+        size = f"{what} none up to {describe_size(one.parameter, one.largest)}"
+        if one.limit is not None:
+            size = f"{what} {describe_size(one.parameter, one.limit)}"
+        elif one.flights < MIN_FLIGHTS:
+            size = f"{what} not known, too few flights"
+        text = f"{size}, {one.named} of {one.flights} named; {source.aircraft}, against {source.reference}"
+        lines += _wrapped("    ", f"{text}, {source.made}")
     return "\n".join(lines)
+
+
+def limits_of(effect: Effect) -> list[tuple[LimitSource, DetectionLimit]]:
+    """Return the measured limits of detection of an effect, with their origin."""
+    return [(source, one) for source in load_table().sources for one in source.limits if one.effect == effect.name]
 
 
 def _wrapped(head: str, text: str) -> list[str]:
@@ -124,4 +141,7 @@ def as_json(effect: Effect) -> dict[str, Any]:
         "told": reported_names(effect),
         "parameters": [vars(p) for p in effect.parameters],
         "confused": dict(effect.confusable_with),
+        "detection_limits": [
+            {"origin": source.origin, **msgspec.to_builtins(one)} for source, one in limits_of(effect)
+        ],
     }

@@ -7,11 +7,14 @@ from tempfile import TemporaryDirectory
 
 from fleet.cli import check_parent, stop_on_signal
 from fleet.process.logs import report_progress
+from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
 
 EXAMPLES = """
   fleet prove --flights 12                                  a demonstration of some minutes
   fleet prove --seed 7 --flights 12 --report proof          store recordings, reports and a page for every flight
   fleet prove --seed 9001 --flights 140 --json proof.json   the complete test
+  fleet prove --inject monday/*.tlog --flights 40           faults in your own healthy flights, against their own past
+  fleet prove --inject a.tlog b.tlog c.tlog --against a.tlog b.tlog c.tlog    each against the other two
 """
 _MIN_FLIGHTS, _MAX_FLIGHTS = 6, 2000
 
@@ -23,6 +26,25 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write scores, marks and hashes")
     parser.add_argument("--report", type=Path, metavar="DIR", help="store recordings, reports and pages in DIR")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
+    parser.add_argument(
+        "--smallest",
+        type=float,
+        default=1.0,
+        metavar="SHARE",
+        help="simulated effects of SHARE to 1 times their usual magnitude, for limits of detection (1)",
+    )
+    group = parser.add_argument_group("recordings", "conceal faults in recordings instead of simulated flights")
+    group.add_argument("--inject", type=Path, nargs="+", metavar="FLIGHT", help="healthy flights of one fixed wing")
+    group.add_argument("--model", type=Path, metavar="MODEL", help="reference: output of `fleet calibrate`")
+    group.add_argument(
+        "--against",
+        type=Path,
+        nargs="+",
+        metavar="NOMINAL",
+        help="or other healthy flights, each flight without itself; otherwise the past of each flight",
+    )
+    group.add_argument("--airframe", type=Path, metavar="CARD", help="without --model: the aircraft, as for calibrate")
+    add_recording_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -42,10 +64,17 @@ def _run_test(args: argparse.Namespace, folder: Path) -> int:
     from rich.console import Console
 
     from fleet.blind_test import page, shown
-    from fleet.blind_test.course import BlindTestConfig, RunAborted, run_blind_test
+    from fleet.blind_test.course import BlindTestConfig, InjectedFlights, RunAborted, run_blind_test
     from fleet.blind_test.mark import score
 
-    setup = BlindTestConfig(args.seed, args.flights, folder, args.jobs, write_pages=args.report is not None)
+    injected = None
+    if args.inject:
+        options = RecordingOptions.of(args)
+        against = tuple(args.against or ())
+        injected = InjectedFlights(tuple(args.inject), args.model, against, args.airframe, options)
+    setup = BlindTestConfig(
+        args.seed, args.flights, folder, args.jobs, args.report is not None, injected, smallest=args.smallest
+    )
     try:
         result = run_blind_test(setup, stop_on_signal(), _report)
     except RunAborted as ended:
@@ -70,7 +99,35 @@ def _check(args: argparse.Namespace) -> None:
         raise ValueError(f"--seed: found {args.seed}, expected an integer from 0; change it")
     if not 1 <= args.jobs <= 64:
         raise ValueError(f"--jobs: found {args.jobs}, expected 1..64; change it")
+    if not 0.01 <= args.smallest <= 1.0:
+        raise ValueError(f"--smallest: found {args.smallest:g}, expected 0.01..1; change it")
     check_parent("--json", args.json)
     check_parent("--report", args.report)
     if args.report and args.report.exists() and any(args.report.iterdir()):
         raise ValueError(f"--report: found files in {str(args.report)!r}, expected an empty folder; name another")
+    _check_recordings(args)
+
+
+def _check_recordings(args: argparse.Namespace) -> None:
+    """Validate the options of recordings before anything is read."""
+    given = [name for name in ("model", "against", "airframe", "mission", "params", "columns") if getattr(args, name)]
+    if given and not args.inject:
+        raise ValueError(f"--{given[0]}: found it without --inject, expected recordings; name them with --inject")
+    if not args.inject:
+        return
+    if args.model and (args.against or args.airframe):
+        raise ValueError("expected one of --model and --against, and --airframe without --model; leave one out")
+    if args.smallest < 1.0:
+        raise ValueError("--smallest: found it with --inject, expected simulated flights; leave it out")
+    stems = [path.name.split(".")[0] for path in args.inject]
+    if len(set(stems)) < len(stems):
+        raise ValueError("--inject: found two flights of one name, expected different names; rename one")
+    if args.against:
+        others = min(len({p.absolute() for p in args.against} - {path.absolute()}) for path in args.inject)
+        if others < 2:
+            raise ValueError(
+                f"--against: found {others} flights besides one of --inject, expected 2 to calibrate; name more"
+            )
+    missing = [path for path in (*args.inject, *(args.against or ()), args.model) if path and not path.exists()]
+    if missing:
+        raise ValueError(f"found no file {str(missing[0])!r}, expected a recording or a model; correct the path")

@@ -127,10 +127,29 @@ _UNREPORTED = (  # values that a report contains in other terms
 )
 
 
+_UNSCALED = ("from_deg", "position", "sense")
+_RATIOS = ("scale", "density_ratio")
+
+
+def scaled_values(name: str, values: Mapping[str, float], share: float) -> Values:
+    """Return the values of an effect of `share` times the magnitude; unknown effects, directions and positions stay."""
+    if name not in HIDDEN:
+        return dict(values)
+    out = {}
+    for key, value in values.items():
+        if key in _UNSCALED:
+            out[key] = value
+        elif key in _RATIOS:
+            out[key] = 1.0 + share * (value - 1.0)
+        else:
+            out[key] = value / share if key == "rate_per_s" else value * share
+    return out
+
+
 def reported_values(name: str, airframe: str, values: Mapping[str, float]) -> Values:
     """Return the expected report values known from the draw; a servo lag includes that of the healthy servo."""
     if name == "thrust_loss" and airframe == "small":
-        return dict(values)
+        return {"loss": values["fraction"]}
     if name == "actuator_lag":
         return {"tau_s": values["tau_s"] + SERVO_LAG_S[airframe]}
     return dict(values) if name in HIDDEN and name not in _UNREPORTED else {}

@@ -53,7 +53,7 @@ def describe_effect(planned: PlannedFlight, fault: Fault, log: ExamFlightLog, fi
     if fault.name == "air_density":
         params["density_ratio"] = density_ratio(log)
     if fault.name == "thrust_loss" and airframe == "c172p":
-        params["fraction"] = thrust_lost(planned, fault)
+        params["loss"] = thrust_lost(planned, fault)
     label: Label = {"name": fault.name, "params": {key: round(x, 6) for key, x in params.items()}}
     if fault.part:
         label["surface" if fault.name.startswith(("actuator", "control")) else "of"] = fault.part
@@ -132,7 +132,13 @@ EffectNames = tuple[str, ...]
 
 
 def simulate_exam(
-    seed: int, flights: int, out: Path, progress: Callable[[str, int, int], None] = lambda *_: None, processes: int = 2
+    seed: int,
+    flights: int,
+    out: Path,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+    processes: int = 2,
+    *,
+    smallest: float = 1.0,
 ) -> Labels:
     """Simulate the flights of a blind test into a folder and return the labels.
 
@@ -142,13 +148,14 @@ def simulate_exam(
         out: folder; one subfolder per airframe with recordings and `<airframe>.card.json`
         progress: called for every flight with its name, the number done and the total
         processes: number of processes
+        smallest: magnitudes as a share of the usual ones, from this to 1
     Returns:
         {flight: {role, airframe, seed, effects, flown_s, acts, redrawn}}, times since its first ATTITUDE [s]
     Raises:
         ValueError: when there are too few flights for all roles.
         RuntimeError: when an effect stays too weak in all attempts.
     """
-    flight_jobs = draw_jobs(seed, flights)
+    flight_jobs = [job._replace(smallest=smallest) for job in draw_jobs(seed, flights)]
     for airframe in AIRFRAMES:
         (out / airframe).mkdir(parents=True, exist_ok=True)
         (out / airframe / f"{airframe}.card.json").write_text(json.dumps(card(airframe), indent=1) + "\n")

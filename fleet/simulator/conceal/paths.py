@@ -1,13 +1,13 @@
 """Plan of a blind test: missions with more manoeuvres than usual, start and wind, test pilot inputs for excitation."""
 
-from math import atan2, cos, hypot, inf, pi, radians, sin
+from math import atan2, cos, exp, hypot, inf, log, pi, radians, sin
 from typing import NamedTuple
 
 import numpy as np
 
 from fleet.contract import Item
 from fleet.frames import Origin, wrap
-from fleet.simulator.conceal.effects import HIDDEN, UNKNOWN, HiddenEffect
+from fleet.simulator.conceal.effects import HIDDEN, UNKNOWN, HiddenEffect, scaled_values
 from fleet.simulator.faults.physics import Fault
 from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.altered import instrumented_type
@@ -146,6 +146,7 @@ class FlightJob(NamedTuple):
     effects: tuple[str, ...]  # names in `effects`
     number: int  # index in the blind test
     excitation: float = 0.0
+    smallest: float = 1.0  # share of the usual magnitudes
 
 
 class PlannedFlight(NamedTuple):
@@ -191,6 +192,12 @@ def draw_flight(job: FlightJob, seed: int, attempt: int) -> PlannedFlight:
     flight_seed = int(np.random.SeedSequence((seed, job.number, attempt)).generate_state(1)[0])
     rng = np.random.default_rng((flight_seed, 21))
     hidden_faults = tuple(_draw_fault(rng, name, job.airframe) for name in job.effects)
+    if job.smallest < 1.0:
+        shares = np.random.default_rng((flight_seed, 23)).uniform(log(job.smallest), 0.0, len(hidden_faults))
+        hidden_faults = tuple(
+            fault._replace(values=scaled_values(fault.name, fault.values, exp(share)))
+            for fault, share in zip(hidden_faults, shares.tolist(), strict=True)
+        )
     steep = "wind_shear" in job.effects or bool(rng.random() < _STEEP_SHARE)
     seconds = NOMINAL_S if job.role == "nominal" else EXAMINED_S
     return PlannedFlight(job, seed, flight_seed, hidden_faults, steep, seconds)

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from fleet.contract import Mission, Params, Sample
+from fleet.effects import Body, catalogue
 from fleet.simulator.conceal import acts as acting
 from fleet.simulator.conceal import exam as examination
 from fleet.simulator.conceal import paths as planning
 from fleet.simulator.conceal import record as recording
-from fleet.simulator.conceal.effects import BOTH, HIDDEN, UNKNOWN
+from fleet.simulator.conceal.effects import BOTH, HIDDEN, UNKNOWN, reported_values, scaled_values
 from fleet.simulator.conceal.exam import are_separable, counts, draw_jobs, simulate_exam
 from fleet.simulator.conceal.paths import FlightJob, PlannedFlight, draw_flight
 from fleet.simulator.conceal.record import fly, rejection_reason
@@ -50,6 +51,31 @@ def test_every_effect_acts(name: str, soon: None) -> None:
             break
     else:
         pytest.fail(f"{name} acts {found}")
+
+
+def test_smaller_effects_are_of_the_same_kind() -> None:
+    job = FlightJob("x", "small", "single", ("airspeed_scale",), 3)
+    usual, small = draw_flight(job, 5, 0), draw_flight(job._replace(smallest=0.1), 5, 0)
+    (one,), (other,) = usual.hidden_faults, small.hidden_faults
+    share = (other.values["scale"] - 1.0) / (one.values["scale"] - 1.0)
+    assert 0.1 <= share < 1.0 and (one.part, one.t0) == (other.part, other.t0)
+    assert draw_flight(job._replace(smallest=0.1), 5, 0) == small
+    assert scaled_values("wind_steady", {"speed_mps": 4.0, "from_deg": 90.0}, 0.5) == {
+        "speed_mps": 2.0,
+        "from_deg": 90.0,
+    }
+    assert scaled_values("actuator_rate_limit", {"rate_per_s": 0.2}, 0.5) == {"rate_per_s": 0.4}  # less of a fault
+    assert scaled_values("_gyro_scale", {"scale": 0.2}, 0.5) == {"scale": 0.2}
+
+
+def test_a_label_uses_the_names_of_a_report() -> None:
+    effects = catalogue("")
+    for name, hidden in HIDDEN.items():
+        for airframe in hidden.airframes:
+            values = hidden.draw(np.random.default_rng(1), airframe == "small")
+            effect = effects[name]
+            told = effect.reported(effect, np.array(effect.examples[0]), Body())
+            assert set(reported_values(name, airframe, values)) <= set(told), name
 
 
 def test_an_effect_of_size_nothing_does_not_act(soon: None) -> None:

@@ -61,6 +61,13 @@ def test_nominal_flights_are_left_in_peace(reports: dict[str, Report]) -> None:
         assert report.outcome in (ReportOutcome.NONE, ReportOutcome.SUSPECTED), report.sentence
 
 
+def test_reports_say_what_would_have_been_named_and_where_that_comes_from(reports: dict[str, Report]) -> None:
+    for report in reports.values():
+        assert "limits of detection measured on" in report.detection_limits[-1]
+        assert "reference own past" in report.detection_limits[-1]
+        assert keep.as_json(report)["detection_limits"] == list(report.detection_limits)
+
+
 def test_axes_the_past_does_not_foretell_are_said(reports: dict[str, Report]) -> None:
     assert any("yaw not covered" in word for word in reports["s10_multi3_nominal-uav21"].limitations)
 

@@ -97,6 +97,7 @@ class Report:
         terms: for unknown: sparse free-form fit without physical meaning, `term -> coefficient`
         ranking: candidates, best first
         limitations: detection power lost because of missing data, in sentences
+        detection_limits: what would have been named in this flight, and the origin of these limits, in sentences
         series: for the figures
         seconds: computing time [s]
     """
@@ -120,6 +121,7 @@ class Report:
     limitations: tuple[str, ...]
     series: FigureSeries = field(compare=False)
     seconds: float = 0.0
+    detection_limits: tuple[str, ...] = ()
 
 
 def with_sentence(report: Report) -> Report:

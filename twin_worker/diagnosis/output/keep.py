@@ -141,6 +141,7 @@ def as_json(report: Report, predictions: Path | None = None) -> dict[str, Any]:
         "odd": report.anomaly_ratio,
         "free_form": report.terms,
         "lacks": list(report.limitations),
+        "detection_limits": list(report.detection_limits),
         "seconds": round(report.seconds, 2),
     }
 

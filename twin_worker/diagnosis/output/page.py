@@ -64,6 +64,7 @@ def _overview(title: str, reports: Sequence[Report], names: Sequence[str]) -> st
 
 
 def _section(report: Report, figures: Sequence[Path]) -> str:
+    detection = "".join(f"<li>{escape_text(sentence)}</li>" for sentence in report.detection_limits)
     limitations = "".join(f"<li>{escape_text(limitation)}</li>" for limitation in report.limitations)
     parts = (
         f"<h2>{_chip(report.outcome)} {escape_text(report.flight)}</h2>",
@@ -72,6 +73,7 @@ def _section(report: Report, figures: Sequence[Path]) -> str:
         *(_finding_section(finding) for finding in report.findings),
         _unknown_section(report),
         f"<h3>Limitations</h3><ul>{limitations}</ul>" if limitations else "",
+        f"<h3>Limits of detection</h3><ul>{detection}</ul>" if detection else "",
         *_figures(report, figures),
     )
     return "<section>" + "\n".join(filter(None, parts)) + "</section>"
