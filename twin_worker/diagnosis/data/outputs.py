@@ -81,11 +81,9 @@ def read_outputs(
     energy = np.nan_to_num(low) + speed / G * slow
     air = series["air"]
     is_high = _height(history, t) > _MIN_HEIGHT_M
-    by_hand = [(since, mode in _STICK_MODES) for since, mode in modes]
-    piloted = np.zeros(len(t), bool)
-    if by_hand:
-        since, hand = (np.array(column) for column in zip(*by_hand, strict=True))
-        piloted = hand[np.clip(np.searchsorted(since, t, side="right") - 1, 0, None)].astype(bool)
+    changes = np.array([since for since, _ in modes])
+    is_stick_mode = np.array([False, *(mode in _STICK_MODES for _, mode in modes)])
+    piloted = is_stick_mode[np.searchsorted(changes, t, side="right")]
     return ServoOutputs(
         t=t - t_start,
         pulses=pulses[:, :8],
