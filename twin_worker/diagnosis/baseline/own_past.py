@@ -35,12 +35,6 @@ def find_tracking_loss(flight: FlightData, until: float) -> tuple[str, float] | 
     return min(lost, key=lambda loss: loss[1], default=None)
 
 
-def find_loss_onset(name: str, flight: FlightData, until: float) -> float | None:
-    """Return when one signal left its range of before `until` for good [s]; None if not, or not recorded."""
-    signal = _signals(flight).get(name)
-    return None if signal is None else _loss_onset(name, signal, flight, until)
-
-
 def _signals(flight: FlightData) -> dict[str, np.ndarray]:
     """Return the tracked signals, (n,) each: energy error as height [m], turn rate less that of the bank [rad/s]."""
     r = flight.readings
@@ -141,7 +135,7 @@ def find_output_faults(flight: FlightData, until: float | None = None) -> list[F
     if until is None:
         flying = outputs.t[outputs.flying]
         until = float(flying[0]) + LAW_S if len(flying) else float("inf")
-    return find_frozen_outputs(outputs, until, find_loss_onset(ENERGY, flight, until))
+    return find_frozen_outputs(outputs, until)
 
 
 def only_new_findings(report: Report, tracking_loss: tuple[str, float] | None, until: float) -> Report:

@@ -1,6 +1,6 @@
 """Read a recording, smooth it and resample each flight to one grid, with a mask of valid rows."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -124,6 +124,7 @@ def read_flights(path: Path, card: AircraftCard, options: RecordingOptions = NO_
     """
     telemetry: dict[int, tuple[TelemetryHistory, dict[str, float]]] = {}
     rotors: dict[int, str] = {}
+    modes: dict[int, list[tuple[float, str]]] = {}
     skipped: list[str] = []
     for message in replay_messages(path, skipped=skipped, options=options):
         uav = message.uav
@@ -132,8 +133,12 @@ def read_flights(path: Path, card: AircraftCard, options: RecordingOptions = NO_
             history.add(message)
         elif isinstance(message, Params):
             params.update(message.values)
-        elif isinstance(message, Status) and vehicle_class(message.vehicle).is_rotorcraft:
-            rotors[uav] = message.vehicle
+        elif isinstance(message, Status):
+            if vehicle_class(message.vehicle).is_rotorcraft:
+                rotors[uav] = message.vehicle
+            changes = modes.setdefault(uav, [])
+            if message.mode and (not changes or changes[-1][1] != message.mode):
+                changes.append((message.t, message.mode))
     stem = path.name.split(".")[0]
     flights, refused = [], []
     for uav, (history, params) in sorted(telemetry.items()):
@@ -142,7 +147,7 @@ def read_flights(path: Path, card: AircraftCard, options: RecordingOptions = NO_
             refused.append(f"{name}: found a {rotors[uav]}, expected a fixed wing; diagnose fixed-wing flights only")
             continue
         try:
-            flights.append(resample_flight(name, history, params, card))
+            flights.append(resample_flight(name, history, params, card, modes.get(uav, ())))
         except ValueError as error:
             refused.append(str(error))
     if not flights:
@@ -150,8 +155,14 @@ def read_flights(path: Path, card: AircraftCard, options: RecordingOptions = NO_
     return flights
 
 
-def resample_flight(name: str, history: TelemetryHistory, params: dict[str, float], card: AircraftCard) -> FlightData:
-    """Resample the telemetry of one aircraft to the grid.
+def resample_flight(
+    name: str,
+    history: TelemetryHistory,
+    params: dict[str, float],
+    card: AircraftCard,
+    modes: Sequence[tuple[float, str]] = (),
+) -> FlightData:
+    """Resample the telemetry of one aircraft to the grid; `modes` as in `read_outputs`.
 
     Raises:
         ValueError: if required telemetry is missing; the message names it.
@@ -178,7 +189,7 @@ def resample_flight(name: str, history: TelemetryHistory, params: dict[str, floa
     commands[:, 3] = np.clip(commands[:, 3], 0.0, 1.0)
     ground = _ground_height(history, readings["h"], t, t_start)
     ok = _valid_rows(series, readings, t, t_start, ground)
-    outputs = read_outputs(history, dict(card.servo_parameters(params)), t_start)
+    outputs = read_outputs(history, dict(card.servo_parameters(params)), t_start, modes)
     flight = FlightData(name, t, t_start, readings, commands, horizontal, ground, ok, vane, tuple(limitations), outputs)
     _check_length(name, flight.seconds, "s in the air", "s at least; check that the aircraft flew")
     return flight

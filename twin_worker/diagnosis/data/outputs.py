@@ -1,5 +1,6 @@
 """Servo outputs as the autopilot sent them, at their own times, with the control errors that they answer."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,11 +10,13 @@ from fleet.airframes.servo_learning import learn_servo_map
 from fleet.frames import G
 from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.telemetry.history import TelemetryHistory
+from twin_worker.telemetry.track import hovering_mask
 
-_KINDS = ("servo", "attitude", "velocity", "command", "air", "height")
+_KINDS = ("servo", "attitude", "velocity", "command", "air")
 _MIN_ROWS = 50
 _SPACING_S = 0.25
 _MIN_SPEED, _MIN_HEIGHT_M = 8.0, 15.0  # slower or lower rows are on or near the ground
+_STICK_MODES = ("MANUAL", "STABILIZE", "STABILIZED", "TRAINING", "ACRO", "RATTITUDE", "FBWA", "AUTOTUNE")
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class ServoOutputs:
         errors: commanded minus actual roll and pitch [rad], energy as height [m], (n, 3)
         signals: by axis (roll, pitch, energy), what a stabilising law answers, (n, k) each
         throttle: as reported, (n,) [-]
-        flying: rows in the air, (n,) bool
+        flying: rows in the air, flown on the wings by the autopilot, (n,) bool
         params: autopilot parameters
     """
 
@@ -48,10 +51,18 @@ class ServoOutputs:
         return learned or described
 
 
-def read_outputs(history: TelemetryHistory, params: dict[str, float], t_start: float) -> ServoOutputs | None:
+def read_outputs(
+    history: TelemetryHistory, params: dict[str, float], t_start: float, modes: Sequence[tuple[float, str]] = ()
+) -> ServoOutputs | None:
     """Return the outputs of one aircraft; None without control errors or other required telemetry.
 
     Signals are taken at the time of each output, the newest value before it.
+
+    Args:
+        history: telemetry as received
+        params: autopilot parameters
+        t_start: time zero of the flight [s since 1970]
+        modes: mode changes, (time [s since 1970], name), in order; in modes flown by hand outputs answer the pilot
     """
     series = {kind: history.rows(kind) for kind in _KINDS}
     if any(len(series[kind][0]) < _MIN_ROWS for kind in ("servo", "attitude", "velocity", "command")):
@@ -68,12 +79,11 @@ def read_outputs(history: TelemetryHistory, params: dict[str, float], t_start: f
     slow = np.nan_to_num(slow)
     load = np.abs(np.tan(np.clip(phi, -1.0, 1.0)))
     energy = np.nan_to_num(low) + speed / G * slow
-    air, height = series["air"], series["height"]
-    is_high = (
-        zero_order_hold(*height, t, np.inf)[:, 0] > _MIN_HEIGHT_M
-        if len(height[0]) >= _MIN_ROWS
-        else np.ones(len(t), bool)
-    )
+    air = series["air"]
+    is_high = _height(history, t) > _MIN_HEIGHT_M
+    changes = np.array([since for since, _ in modes])
+    is_stick_mode = np.array([False, *(mode in _STICK_MODES for _, mode in modes)])
+    piloted = is_stick_mode[np.searchsorted(changes, t, side="right")]
     return ServoOutputs(
         t=t - t_start,
         pulses=pulses,
@@ -84,9 +94,19 @@ def read_outputs(history: TelemetryHistory, params: dict[str, float], t_start: f
             np.column_stack([energy, velocity[:, 2], theta_c, load, slow]),
         ),
         throttle=zero_order_hold(*air, t, np.inf)[:, 1] if len(air[0]) >= _MIN_ROWS else np.full(len(t), np.nan),
-        flying=(speed > _MIN_SPEED) & is_high,
+        flying=(speed > _MIN_SPEED) & is_high & ~piloted & ~hovering_mask(t, history, params, modes),
         params=params,
     )
+
+
+def _height(history: TelemetryHistory, t: np.ndarray) -> np.ndarray:
+    """Return the height above home, or above the lowest position where that is not reported, (n,) [m]."""
+    above, position = history.rows("height"), history.rows("position")
+    if len(above[0]) >= _MIN_ROWS:
+        return zero_order_hold(*above, t, np.inf)[:, 0]
+    if len(position[0]) < _MIN_ROWS:
+        return np.full(len(t), np.inf)
+    return (zero_order_hold(*position, t, np.inf)[:, 2] - position[1][:, 2].min()) * 1e-3
 
 
 def _thinned(t: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,13 @@ logarithm of the number of possible pulses, plus once the distance from the pred
 distribution whose scale is the law's error in trusted flight or in the seconds before the run, whichever is larger.
 The other predictors are limited to the range of trusted flight: no evidence is extrapolated. An output at a limit is
 saturated, which is no evidence, where its control error points there or where the law had failed before: the limit is
-within the law's error of the last seconds. A throttle output at its minimum while the energy is short is cut.
+within the law's error of the last seconds.
+
+The level of a throttle output is arbitrary, since it contains the integral of the energy error. Its law is the
+regression of its change over `_LAG_S` on the change of energy error, climb rate, pitch demand, load and speed error; it
+predicts a run from the output before the run. The error of that prediction grows as a random walk. A throttle output
+at a limit is saturated where the prediction is within three such errors of the limit, or beyond it; one that the
+prediction does not bring there is cut.
 Source: Agresti 2013, Categorical Data Analysis, chapter 5; Lambregts 1983 (total energy control).
 """
 
@@ -42,11 +48,11 @@ _RIDGE = 0.01
 _RECENT_S = 2.0  # before a run of repeats, for the law's present error [s]
 _SATURATED_SIGMAS = 3.0  # a limit within so many present errors of the predicted output may be demanded [-]
 _NU = 4.0  # degrees of freedom of the distance from the predicted output: heavy tails
+_LAG_S = 2.0  # over which the law of the throttle predicts changes [s]
+_MEDIAN_SIGMAS = 0.6745  # median of the absolute value of a standard normal variable [-]
 _PRIOR_MEAN, _PRIOR_STD = np.array([-1.0, 1.0, -0.5, -1.0]), np.array([2.0, 1.0, 1.0, 1.0])
 _AXIS = {"aileron": 0, "elevator": 1, "rudder": 0, "throttle": 2}
 _NAMES = (*SURFACES, "throttle")
-_IDLE_SHARE = 0.7  # least share of the time after an energy loss at which a cut throttle is at its minimum [-]
-_IDLE_PERCENTILE = 2.0
 
 
 @dataclass(frozen=True)
@@ -72,13 +78,12 @@ class FrozenOutput:
     error_before: float
 
 
-def find_frozen_outputs(outputs: ServoOutputs, trusted_until: float, energy_loss: float | None) -> list[FrozenOutput]:
+def find_frozen_outputs(outputs: ServoOutputs, trusted_until: float) -> list[FrozenOutput]:
     """Return the frozen outputs after the trusted part of a flight, earliest first.
 
     Args:
         outputs: of the flight
         trusted_until: end of the trusted part [s]
-        energy_loss: since when the flight does not hold its energy [s]; None: it does
     """
     trusted = outputs.flying & (outputs.t < trusted_until)
     if trusted.sum() < _MIN_ROWS:
@@ -90,9 +95,8 @@ def find_frozen_outputs(outputs: ServoOutputs, trusted_until: float, energy_loss
     used = _used_outputs(outputs, used_map, trusted)
     ailerons = [k for k, surface in used if surface == "aileron"]
     for k, surface in used:
-        output = _ModelledOutput(outputs, k, surface, trusted, ailerons)
-        frozen = output.cut(energy_loss) if surface == "throttle" and energy_loss is not None else None
-        frozen = frozen or output.longest_run(trusted_until)
+        kind = _ModelledThrottle if surface == "throttle" else _ModelledOutput
+        frozen = kind(outputs, k, surface, trusted, ailerons).longest_run(trusted_until)
         if frozen is not None and frozen.evidence > least:
             detected.append(replace(frozen, position=_position(used_map, k, frozen)))
     return sorted(detected, key=lambda one: one.since)
@@ -123,39 +127,38 @@ class _ModelledOutput:
     def __init__(
         self, outputs: ServoOutputs, k: int, surface: str, trusted: np.ndarray, ailerons: Sequence[int] = ()
     ) -> None:
-        self._outputs, self._k, self._surface, self._trusted = outputs, k, surface, trusted
+        self._outputs, self._k, self._surface = outputs, k, surface
         self._y = y = outputs.pulses[:, k]
         axis = _AXIS[surface]
         x = outputs.signals[axis]
         if surface == "rudder":  # mixed with the ailerons
             x = np.column_stack([x, *(outputs.pulses[:, n] for n in ailerons)])
-        mean = y[trusted].mean()
-        x = (x - x[trusted].mean(axis=0)) / (x[trusted].std(axis=0) + 1e-9)
-        gram = x[trusted].T @ x[trusted] + _RIDGE * trusted.sum() * np.eye(x.shape[1])
-        self._predicted = mean + x @ np.linalg.solve(gram, x[trusted].T @ (y[trusted] - mean))
-        self._scale = max(float(np.sqrt(np.mean((y - self._predicted)[trusted] ** 2))), 1.0)
-        self.r2 = 1.0 - self._scale**2 / float(y[trusted].var())
         steps = np.abs(np.diff(y[trusted]))
         self._step = float(steps[steps > 0].min())
         self._low, self._high = float(y[trusted].min()), float(y[trusted].max())
-        self._idle = float(np.percentile(y[trusted], _IDLE_PERCENTILE))
-        self._error = outputs.errors[:, axis] * np.sign(np.corrcoef(outputs.errors[trusted, axis], y[trusted])[0, 1])
+        self._at_limit = (y <= self._low) | (y >= self._high)
         self._repeats = np.concatenate([[False], np.diff(y) == 0])
+        self._error = outputs.errors[:, axis] * np.sign(np.corrcoef(outputs.errors[trusted, axis], y[trusted])[0, 1])
+        x = (x - x[trusted].mean(axis=0)) / (x[trusted].std(axis=0) + 1e-9)
+        self._predicted, self._scale, self.r2 = self._fit_law(x, trusted)
         self._surprise = self._fit_surprise(trusted)
+
+    def _fit_law(self, x: np.ndarray, trusted: np.ndarray) -> tuple[np.ndarray, float, float]:
+        """Return the predicted output, (n,) [us], the rms of its error [us] and the explained share of variance."""
+        mean = self._y[trusted].mean()
+        predicted = mean + x @ _ridge_regression(x[trusted], self._y[trusted] - mean)
+        scale = max(float(np.sqrt(np.mean((self._y - predicted)[trusted] ** 2))), 1.0)
+        return predicted, scale, 1.0 - scale**2 / float(self._y[trusted].var())
 
     def _fit_surprise(self, trusted: np.ndarray) -> np.ndarray:
         """Return -log P(repeat | healthy) of every row, zero where the output is saturated, (n,)."""
         y = self._y
-        self._expected = expected = np.clip(self._predicted, np.minimum(self._low, y), np.maximum(self._high, y))
+        self._expected = expected = self._within_limits()
         change = np.log1p(np.abs(np.diff(expected, prepend=expected[0])) / self._step)
-        distance = np.log1p(np.abs(y - expected) / self._scale)
-        at_limit = (y <= self._low) | (y >= self._high)
-        rows = trusted & ~at_limit
+        rows = trusted & ~self._at_limit
         rows[:2] = False
         repeated_before = np.concatenate([[False], self._repeats[:-1]])
-        if self._surface == "throttle":  # the level of its integrator is arbitrary
-            distance = np.zeros(len(y))
-        limited = [np.minimum(x, x[trusted].max()) for x in (change, distance)]
+        limited = [np.minimum(x, x[trusted].max()) for x in (change, self._log_distance())]
         X = np.column_stack([np.ones(len(y)), repeated_before, *limited])
         repeats = self._repeats[rows]
 
@@ -165,11 +168,18 @@ class _ModelledOutput:
             return float(value), X[rows].T @ (1.0 / (1.0 + np.exp(-z)) - repeats) + offset / _PRIOR_STD
 
         b = minimize(cost, _PRIOR_MEAN, jac=True).x
-        upward = y >= self._high
-        saturated = at_limit & (np.where(upward, 1.0, -1.0) * self._error > 0.0)
-        if self._surface == "throttle":  # energy rates, which also saturate it, are not reported
-            saturated |= at_limit
-        return np.where(saturated, 0.0, np.logaddexp(0.0, -(X @ b)))
+        return np.where(self._saturated(), 0.0, np.logaddexp(0.0, -(X @ b)))
+
+    def _within_limits(self) -> np.ndarray:
+        y = self._y
+        return np.clip(self._predicted, np.minimum(self._low, y), np.maximum(self._high, y))
+
+    def _log_distance(self) -> np.ndarray:
+        return np.log1p(np.abs(self._y - self._expected) / self._scale)
+
+    def _saturated(self) -> np.ndarray:
+        """Return the rows at a limit to which the control error points, (n,) bool."""
+        return self._at_limit & (np.where(self._y >= self._high, 1.0, -1.0) * self._error > 0.0)
 
     def longest_run(self, trusted_until: float) -> FrozenOutput | None:
         """Return the run of repeats with the most evidence; None where the law does not explain the output."""
@@ -181,43 +191,104 @@ class _ModelledOutput:
         runs = [(self._evidence(a, b), a - 1, b) for a, b in zip(edges[::2], edges[1::2], strict=True)]
         return self._frozen(*max(runs)) if runs else None
 
+    def _recent(self, first: int) -> slice:
+        """Return the rows of the seconds before a run whose first repeat is row `first`."""
+        t = self._outputs.t
+        return slice(int(np.searchsorted(t, t[first - 1] - _RECENT_S)), first - 1)
+
     def _evidence(self, first: int, end: int) -> float:
         """Return the log likelihood ratio of a run of repeats: each repeat, the pulse, and once its distance."""
-        t, error = self._outputs.t, np.abs(self._y - self._expected)
-        recent = error[np.searchsorted(t, t[first - 1] - _RECENT_S) : first - 1]
+        error = np.abs(self._y - self._expected)
+        recent = error[self._recent(first)]
         present = float(np.sqrt(np.mean(recent**2))) if len(recent) else 0.0
-        repeats = float(self._surprise[first:end].sum())
         distance = float(np.median(error[first:end])) / max(self._scale, present)
-        at_limit = not self._low < self._y[first] < self._high
-        if at_limit and present > self._scale and distance < _SATURATED_SIGMAS:
+        if self._at_limit[first] and present > self._scale and distance < _SATURATED_SIGMAS:
             return 0.0
-        if not repeats or self._surface == "throttle":  # saturated, or the level of its integrator is arbitrary
-            distance = 0.0
+        repeats = float(self._surprise[first:end].sum())
+        return self._log_ratio(repeats, distance if repeats else 0.0)
+
+    def _log_ratio(self, repeats: float, distance: float) -> float:
         level = 0.5 * (_NU + 1.0) * np.log1p(distance**2 / _NU)
         return repeats + float(level - np.log(_PULSE_RANGE_US / self._step))
 
-    def cut(self, energy_loss: float) -> FrozenOutput | None:
-        """Return the throttle as cut where it is at its minimum while the energy is short since `energy_loss` [s]."""
-        t, flying = self._outputs.t, self._outputs.flying
-        after = np.flatnonzero(flying & (t > energy_loss))
-        idle = self._y <= self._idle
-        if len(after) < 2 or idle[after].mean() < _IDLE_SHARE or not (self._error[after[-1]] > 0.0):
-            return None
-        first = int(after[np.argmax(idle[after])])
-        while first > 0 and idle[first - 1]:
-            first -= 1
-        short = self._trusted & (self._error > np.median(self._error[self._trusted]))
-        usual = (1.0 + (idle & short).sum()) / (2.0 + short.sum())  # of idle rows, Laplace rule
-        seconds = float(t[after[-1]] - t[first]) * float(idle[after].mean())
-        return self._frozen(-np.log(usual) * seconds, first, int(after[-1]) + 1)  # rows within 1 s are not independent
+    def _misfit(self, first: int, end: int) -> np.ndarray:
+        """Return output less prediction in a run, (end - first,) [us]."""
+        return (self._y - self._predicted)[first:end]
 
     def _frozen(self, evidence: float, first: int, end: int) -> FrozenOutput:
         t, y = self._outputs.t, self._y
-        misfit = float(np.sqrt(np.mean((y - self._predicted)[first + 1 : end] ** 2))) / self._scale
+        misfit = float(np.sqrt(np.mean(self._misfit(first + 1, end) ** 2))) / self._scale
         last = min(end - 1, len(t) - 1)
         return FrozenOutput(
             self._k + 1, self._surface, float(y[last]), 0.0, float(t[first]), float(t[last]), evidence, misfit
         )
+
+
+class _ModelledThrottle(_ModelledOutput):
+    """Throttle output: its law predicts changes, since its level contains the integral of the energy error."""
+
+    def _fit_law(self, x: np.ndarray, trusted: np.ndarray) -> tuple[np.ndarray, float, float]:
+        t, y = self._outputs.t, self._y
+        later = np.searchsorted(t, t + _LAG_S)
+        start = np.flatnonzero(later < len(t))
+        end = later[start]
+        free = trusted & ~self._at_limit
+        used = free[start] & free[end]
+        start, end = start[used], end[used]
+        dx, dy = x[end] - x[start], y[end] - y[start]
+        self._x, self._covariance = x, np.eye(x.shape[1])
+        if len(start) < _MIN_ROWS // 2:
+            return np.full(len(t), float(y[trusted].mean())), 1.0, 0.0
+        size = dx.std(axis=0) + 1e-9
+        b = _ridge_regression(dx / size, dy) / size
+        overlap = _LAG_S / float(np.median(np.diff(t)))  # changes that share their time are not independent
+        gram = dx.T @ dx / overlap + _RIDGE * len(dx) * np.diag(size**2) / overlap
+        self._covariance = np.linalg.inv(gram)
+        scale = max(float(np.sqrt(np.mean((dy - dx @ b) ** 2))), 1.0)
+        return x @ b, scale, 1.0 - scale**2 / max(float(np.mean(dy**2)), 1e-9)
+
+    def _within_limits(self) -> np.ndarray:
+        return self._predicted
+
+    def _log_distance(self) -> np.ndarray:
+        return np.zeros(len(self._y))
+
+    def _saturated(self) -> np.ndarray:
+        return np.zeros(len(self._y), bool)  # depends on the run
+
+    def _misfit(self, first: int, end: int) -> np.ndarray:
+        recent = self._recent(first)
+        if recent.stop <= recent.start:
+            return np.zeros(end - first)
+        offset = float(np.median((self._y - self._predicted)[recent]))
+        return (self._y - self._predicted)[first:end] - offset
+
+    def _evidence(self, first: int, end: int) -> float:
+        """Return the log likelihood ratio of a run, from its prediction by the output before it.
+
+        The variance of the prediction is that of the law's error, as large as in trusted flight or before the run,
+        growing as of a random walk, and that of the regression coefficients.
+        """
+        recent, t = self._recent(first), self._outputs.t
+        if recent.stop - recent.start < 2:
+            return 0.0
+        error = (self._y - self._predicted)[recent]
+        scale = max(self._scale, float(np.median(np.abs(error - np.median(error)))) / _MEDIAN_SIGMAS)
+        change = self._x[first:end] - self._x[recent].mean(axis=0)
+        growth = np.maximum(t[first:end] - t[first - 1], _LAG_S) / _LAG_S
+        sigmas = self._misfit(first, end) / (
+            scale * np.sqrt(growth + np.einsum("ij,jk,ik->i", change, self._covariance, change))
+        )
+        surprise = self._surprise[first:end]
+        if self._at_limit[first]:
+            inside = sigmas if self._y[first] >= self._high else -sigmas  # prediction inside the limit: positive
+            surprise = np.where(inside > _SATURATED_SIGMAS, surprise, 0.0)
+        repeats = float(surprise.sum())
+        return self._log_ratio(repeats, float(np.median(np.abs(sigmas))) if repeats else 0.0)
+
+
+def _ridge_regression(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.asarray(np.linalg.solve(x.T @ x + _RIDGE * len(x) * np.eye(x.shape[1]), x.T @ y))
 
 
 def with_frozen_outputs(report: Report, frozen: list[FrozenOutput]) -> Report:

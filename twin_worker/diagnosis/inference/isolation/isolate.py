@@ -159,6 +159,8 @@ def _scan_by_start(whitened: WhitenedResiduals, effect: Effect, target: str) -> 
     before = (whitened.e**2).sum(axis=1)
     t = whitened.modelled.t
     onset_rows = np.flatnonzero((t > t[0] + _EDGE_S[0]) & (t < t[-1] - _EDGE_S[1]))
+    if not len(onset_rows):  # a short flight has no onset inside
+        onset_rows = np.array([0])
     for start in effect.initial_guesses:
         hypothesis = FaultHypothesis(effect, target, start)
         gain = before - (whitened.clipped((hypothesis,)) ** 2).sum(axis=1)
