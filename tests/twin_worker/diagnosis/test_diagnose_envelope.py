@@ -10,7 +10,7 @@ import pytest
 from fleet.effects import catalogue
 from twin_worker.diagnosis.data.card import UNKNOWN, FaultHypothesis
 from twin_worker.diagnosis.model.baseline import Baseline
-from twin_worker.diagnosis.model.envelope import extrapolation_sigma, flown_envelope, is_other_day
+from twin_worker.diagnosis.model.envelope import extrapolation_sigma, is_other_day, nominal_envelope
 
 
 def flight(height: float, speed: float, day: float) -> Any:
@@ -23,7 +23,7 @@ def flight(height: float, speed: float, day: float) -> Any:
 @pytest.fixture
 def base() -> Baseline:
     nominal = [flight(600.0, 21.0, 100.0), flight(500.0, 23.0, 100.1)]
-    return replace(Baseline(UNKNOWN, {}, 22.0), envelope=flown_envelope(nominal))
+    return replace(Baseline(UNKNOWN, {}, 22.0), envelope=nominal_envelope(nominal))
 
 
 def test_inside_the_envelope_nothing_is_added(base: Baseline) -> None:

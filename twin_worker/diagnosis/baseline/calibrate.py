@@ -18,7 +18,7 @@ from twin_worker.diagnosis.inference.isolation.select_hypotheses import best_hyp
 from twin_worker.diagnosis.inference.isolation.unmodelled import find_anomalies
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline, Noise, wind_is_nominal
-from twin_worker.diagnosis.model.envelope import flown_envelope
+from twin_worker.diagnosis.model.envelope import nominal_envelope
 from twin_worker.diagnosis.model.residual import ModelledFlight
 from twin_worker.diagnosis.model.weather import fit_wind, weather_hypotheses
 
@@ -58,7 +58,7 @@ def calibrate(
     modelled_flights = list(map(ModelledFlight, parts, partial_fits))
     others = [{name: b.coef[name] - x for name, x in base.coef.items()} for b in partial_fits]
     drag = drag_uncertainty(terms_in_wind([ModelledFlight(flight, base) for flight in flights], winds))
-    base = replace(base, others=(*others, drag), envelope=flown_envelope(flights))
+    base = replace(base, others=(*others, drag), envelope=nominal_envelope(flights))
     _check_plausible(base)
     winds = [fit_wind(modelled, np.zeros(4)) for modelled in modelled_flights]
     _check_consistent(modelled_flights, winds)

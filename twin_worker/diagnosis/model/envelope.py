@@ -23,7 +23,7 @@ SAME_DAY_DAYS = 0.5  # flights further apart are of different days
 _RANGE_PERCENTILES = 1.0, 99.0  # of the valid rows
 
 
-def flown_envelope(flights: Sequence[FlightData]) -> Envelope:
+def nominal_envelope(flights: Sequence[FlightData]) -> Envelope:
     """Return the conditions of nominal flights."""
     ln_density = np.concatenate([_ln_density(flight) for flight in flights])
     ln_speed = np.concatenate([_ln_speed(flight) for flight in flights])
