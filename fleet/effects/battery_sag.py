@@ -17,7 +17,7 @@ EFFECT = Effect(
     equation="T = (1 - sag used / 100 s) T_full, used = integral of delta_t",
     source="Traub 2011, J. Aircraft 48(2) (discharge of batteries), to first order",
     parameters=(
-        Parameter("sag_per_100s", "-", "thrust fraction lost in 100 s of full throttle", step=0.03, low=-0.1, high=1.0),
+        Parameter("sag_per_100s", "-", "thrust fraction lost in 100 s of full throttle", step=0.03, low=0.0, high=1.0),
     ),
     act=act,
     onsets=(Onset.ALWAYS,),

@@ -17,7 +17,7 @@ EFFECT = Effect(
     equation="C_D = C_D0 + dCD",
     source="Beard & McLain 2012, eq. 4.11",
     parameters=(
-        Parameter("dCD", "-", "drag coefficient added", step=0.005, low=-0.05, high=0.5),
+        Parameter("dCD", "-", "drag coefficient added", step=0.005, low=0.0, high=0.5),
         Parameter("dCm", "-", "associated pitching moment coefficient", step=0.002, low=-0.3, high=0.3, nuisance=True),
     ),
     act=act,

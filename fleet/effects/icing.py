@@ -17,8 +17,8 @@ EFFECT = Effect(
     equation="C_L = (1 - lift_loss) C_L_clean, C_D = C_D_clean + dCD",
     source="Bragg, Broeren & Blumenthal 2005, Progress in Aerospace Sciences 41 (iced airfoils)",
     parameters=(
-        Parameter("lift_loss", "-", "fraction of lift lost", step=0.03, low=-0.02, high=0.7),
-        Parameter("dCD", "-", "drag coefficient added", step=0.005, low=-0.02, high=0.3),
+        Parameter("lift_loss", "-", "fraction of lift lost", step=0.03, low=0.0, high=0.7),
+        Parameter("dCD", "-", "drag coefficient added", step=0.005, low=0.0, high=0.3),
         Parameter("dCm", "-", "associated pitching moment coefficient", step=0.002, low=-0.3, high=0.3, nuisance=True),
     ),
     act=act,

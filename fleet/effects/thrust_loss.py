@@ -16,7 +16,7 @@ EFFECT = Effect(
     channel="thrust",
     equation="T = (1 - loss) T_healthy",
     source="Beard & McLain 2012, section 4.3 (propeller thrust)",
-    parameters=(Parameter("loss", "-", "fraction lost; 1: engine off", step=0.05, low=-0.5, high=1.0),),
+    parameters=(Parameter("loss", "-", "fraction lost; 1: engine off", step=0.05, low=0.0, high=1.0),),
     act=act,
     onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
     examples=((0.08,), (0.15,), (0.3,)),

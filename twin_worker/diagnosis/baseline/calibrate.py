@@ -18,6 +18,7 @@ from twin_worker.diagnosis.inference.isolation.select_hypotheses import best_hyp
 from twin_worker.diagnosis.inference.isolation.unmodelled import find_anomalies
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline, Noise, wind_is_nominal
+from twin_worker.diagnosis.model.envelope import nominal_envelope
 from twin_worker.diagnosis.model.residual import ModelledFlight
 from twin_worker.diagnosis.model.weather import fit_wind, weather_hypotheses
 
@@ -57,7 +58,7 @@ def calibrate(
     modelled_flights = list(map(ModelledFlight, parts, partial_fits))
     others = [{name: b.coef[name] - x for name, x in base.coef.items()} for b in partial_fits]
     drag = drag_uncertainty(terms_in_wind([ModelledFlight(flight, base) for flight in flights], winds))
-    base = replace(base, others=(*others, drag))
+    base = replace(base, others=(*others, drag), envelope=nominal_envelope(flights))
     _check_plausible(base)
     winds = [fit_wind(modelled, np.zeros(4)) for modelled in modelled_flights]
     _check_consistent(modelled_flights, winds)
@@ -113,12 +114,18 @@ def _check_plausible(base: Baseline) -> None:
 
 
 def _check_consistent(modelled_flights: list[ModelledFlight], winds: list[np.ndarray]) -> None:
-    """Reject nominal flights if one deviates from the others."""
+    """Reject nominal flights if one deviates from the others.
+
+    Gusts raise the scatter of all air channels together: the scatter of a channel is compared with that of the others.
+    """
     pairs = zip(modelled_flights, winds, strict=True)
     residual_rows = [modelled.residuals(weather_hypotheses(w))[modelled.ok] for modelled, w in pairs]
-    rms = np.array([np.sqrt((x**2).mean(axis=0)) for x in residual_rows])[:, :_N_MODEL_CHANNELS]
-    for k, modelled in enumerate(modelled_flights):
-        ratio = rms[k] / np.maximum(np.median(np.delete(rms, k, axis=0), axis=0), 1e-6)
+    residual_rows = [x[:, :_N_MODEL_CHANNELS] for x in residual_rows]
+    rms = np.array([np.sqrt((x**2).mean(axis=0)) for x in residual_rows])
+    for k, (modelled, x) in enumerate(zip(modelled_flights, residual_rows, strict=True)):
+        usual = np.maximum(np.median(np.delete(rms, k, axis=0), axis=0), 1e-6)
+        scatter = x.std(axis=0) / usual
+        ratio = np.maximum(scatter / max(float(np.median(scatter)), 1.0), np.abs(x.mean(axis=0)) / usual)
         worst = int(np.argmax(ratio))
         if ratio[worst] > _MAX_RMS_RATIO:
             raise ValueError(

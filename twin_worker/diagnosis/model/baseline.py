@@ -47,6 +47,21 @@ def unit_noise() -> Noise:
 
 
 @dataclass(frozen=True)
+class Envelope:
+    """Conditions of the nominal flights. Outside them the baseline extrapolates, and its uncertainty grows.
+
+    Attributes:
+        ln_density: lowest and highest logarithm of the standard density at the flown heights, in kg/m3
+        ln_speed: the same of the speed over ground, in m/s
+        days: start of each flight [days since 1970]
+    """
+
+    ln_density: tuple[float, float]
+    ln_speed: tuple[float, float]
+    days: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class Baseline:
     """Simulation calibrated on nominal flights; the field names are the keys of the model file.
 
@@ -64,6 +79,7 @@ class Baseline:
         others: coefficients with each nominal flight left out, less those of all flights: their uncertainty
         usual: mean square of each whitened residual on nominal flights, (c,)
         flights: names of the nominal flights
+        envelope: conditions of the nominal flights; None where the flight itself is its baseline
     """
 
     card: AircraftCard
@@ -79,6 +95,7 @@ class Baseline:
     others: tuple[dict[str, np.ndarray], ...] = ()
     usual: np.ndarray = field(default_factory=lambda: np.ones(len(CHANNELS)))
     flights: tuple[str, ...] = ()
+    envelope: Envelope | None = None
 
     def varied(self, k: int) -> "Baseline":
         """Return the baseline with the coefficients of the k-th entry of `others`."""

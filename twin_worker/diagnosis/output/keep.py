@@ -17,6 +17,7 @@ from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline
 from twin_worker.diagnosis.model.equations import TERMS
 
 FORMAT = "parauav.simulation.1"
+_OPTIONAL = ("envelope",)  # fields that earlier models lack
 
 
 def save(path: Path, base: Baseline, findings: Sequence[DiagnosisFinding] = ()) -> None:
@@ -55,7 +56,7 @@ def load(path: Path) -> tuple[Baseline, tuple[FaultHypothesis, ...]]:
             f"{path.name}: found format {format_name!r}, expected {FORMAT}; make it with `fleet calibrate`"
         )
     try:
-        if missing := [field.name for field in fields(Baseline) if field.name not in document]:
+        if missing := [field.name for field in fields(Baseline) if field.name not in (*document, *_OPTIONAL)]:
             raise KeyError(*missing)
         base = msgspec.convert(document, Baseline, dec_hook=lambda _, x: np.array(x, float))
         _check_shapes(base)

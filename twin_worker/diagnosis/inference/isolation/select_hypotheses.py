@@ -196,7 +196,7 @@ def _is_related(kind: str, hypothesis: FaultHypothesis) -> bool:
 def is_plausible(whitened: WhitenedResiduals, hypothesis: FaultHypothesis) -> bool:
     """Return whether a hypothesis exceeds sensor tolerances and minimum values, not by nuisances alone."""
     bounds = {
-        n.index: n.release_sigmas * max(whitened.base.spread.get(n.name, n.floor), n.floor)
+        n.index: n.release_sigmas * whitened.spread(n)
         for n in whitened.nuisances
         if n.is_sensor_bias and (n.effect.name, n.target) == (hypothesis.effect.name, hypothesis.target)
     }

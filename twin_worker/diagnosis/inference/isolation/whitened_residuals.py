@@ -8,6 +8,7 @@ import numpy as np
 
 from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.inference.isolation.nuisance import (
+    MAX_SPREAD_RATIO,
     RELEASE_SIGMAS,
     Nuisance,
     drift_modes,
@@ -15,6 +16,7 @@ from twin_worker.diagnosis.inference.isolation.nuisance import (
     list_nuisances,
 )
 from twin_worker.diagnosis.model.baseline import CHANNELS, Noise, wind_is_nominal
+from twin_worker.diagnosis.model.envelope import TRIM, extrapolation_sigma, is_other_day
 from twin_worker.diagnosis.model.residual import ModelledFlight
 
 CLIP = 6.0  # clipping limit of whitened residuals [-]
@@ -50,6 +52,8 @@ class WhitenedResiduals:
         self.noise = self._scaled_noise()
         self.wind_nominal = wind_is_nominal(self.base)
         self.nuisances: tuple[Nuisance, ...] = list_nuisances(self.base.vane)
+        self._extrapolation = extrapolation_sigma(self.base, modelled.flight)
+        self._other_day = is_other_day(self.base, modelled.flight)
         self.drift_modes = drift_modes(self.base.vane)
         self.clip = np.full(len(CHANNELS), CLIP)
         if self.base.vane:
@@ -116,7 +120,7 @@ class WhitenedResiduals:
         """Estimate the nuisances; fix those beyond their spread at zero, so that hypotheses explain them."""
         extra = np.ones(len(self.base.others))
         drift_spreads = np.array([self.base.spread.get(mode.name, mode.floor) for mode in self.drift_modes])
-        self.precision = np.array([*(1.0 / self._spread(n) ** 2 for n in self.nuisances), *drift_spreads**-2.0, *extra])
+        self.precision = np.array([*(1.0 / self.spread(n) ** 2 for n in self.nuisances), *drift_spreads**-2.0, *extra])
         self.prior_precision = self.precision.copy()
         free = np.array([n.is_unbounded or (self.wind_nominal and n.is_wind) for n in self.nuisances])
         free = np.concatenate([free, np.zeros(len(drift_spreads) + len(extra), bool)])
@@ -141,9 +145,14 @@ class WhitenedResiduals:
         out.xn = np.linalg.solve(out.Ann, self.bn)
         return out
 
-    def _spread(self, n: Nuisance) -> float:
+    def spread(self, n: Nuisance) -> float:
+        """Return the standard deviation of a nuisance on this flight, wider outside the calibrated envelope."""
         spread = self.base.spread.get(n.name, n.floor)
-        return max(spread, 2.5) if self.wind_nominal and n.effect.name == "wind_steady" else spread
+        if self.wind_nominal and n.effect.name == "wind_steady":
+            spread = max(spread, 2.5)
+        if self._other_day and n.name in TRIM:
+            spread = max(spread, MAX_SPREAD_RATIO * n.floor)
+        return float(np.hypot(spread, self._extrapolation.get(n.name, 0.0)))
 
     def cost(self, hypotheses: Sequence[FaultHypothesis]) -> float:
         """Return the sum of squares with these hypotheses, the nuisances profiled out."""

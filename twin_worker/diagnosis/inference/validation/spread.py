@@ -51,7 +51,7 @@ def _floor(whitened: WhitenedResiduals, hypothesis: FaultHypothesis) -> np.ndarr
             hypothesis.effect.name,
             hypothesis.target,
         ):
-            usual[n.index] = whitened.base.spread.get(n.name, n.floor)
+            usual[n.index] = whitened.spread(n)
     return times * _CLOCK_S**2 + (_MODEL_ERROR * np.array(hypothesis.par)) ** 2 + usual**2
 
 
