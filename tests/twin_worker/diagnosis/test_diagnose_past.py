@@ -9,7 +9,7 @@ from twin_worker.diagnosis import __main__ as diagnosis
 from twin_worker.diagnosis import learn
 from twin_worker.diagnosis.baseline.own_past import OwnPast
 from twin_worker.diagnosis.baseline.past import calibrate_past, part_after, part_before, split
-from twin_worker.diagnosis.data.card import read_card
+from twin_worker.diagnosis.data.card import UNKNOWN, read_card
 from twin_worker.diagnosis.data.flight import FlightData, read_flights
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.output import keep
@@ -106,3 +106,10 @@ def test_it_is_one_thing_that_flights_are_compared_with(tmp_path: Path, capsys: 
     assert "exactly one of --model, --against, --against-own-past" in capsys.readouterr().err
     assert diagnosis.main(["a.tlog", "--against-own-past", "-3"]) == 2
     assert "--against-own-past: found -3" in capsys.readouterr().err
+
+
+def test_a_loss_of_energy_that_a_short_past_in_moving_air_explains_is_not_named(recordings: Path) -> None:
+    """No airspeed, 41 s of past, a loss in the last 16 s: six independent blocks against four coefficients."""
+    (healthy,) = read_flights(recordings / "real" / "alfa_09-11-15-05-11_2_no_failure.tlog.xz", UNKNOWN)
+    report = OwnPast(46.0, UNKNOWN).diagnose(healthy)
+    assert report.outcome is not ReportOutcome.NAMED, report.sentence

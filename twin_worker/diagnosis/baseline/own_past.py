@@ -10,8 +10,11 @@ from fleet.process.sanitise import format_below
 from twin_worker.diagnosis.baseline.past import CONTEXT_S, calibrate_past, part_after, part_before
 from twin_worker.diagnosis.data.card import AircraftCard
 from twin_worker.diagnosis.data.flight import DT, FlightData
+from twin_worker.diagnosis.inference.air_movement import energy_evidence
 from twin_worker.diagnosis.inference.diagnose import diagnose
 from twin_worker.diagnosis.inference.output_faults import (
+    POSTERIOR,
+    PRIOR,
     FrozenOutput,
     find_frozen_outputs,
     with_frozen_outputs,
@@ -20,6 +23,7 @@ from twin_worker.diagnosis.inference.report import Report, ReportOutcome, with_s
 from twin_worker.diagnosis.model.baseline import Baseline, exclude_equations
 
 ENERGY, TURN, PITCH = "energy held", "turn by bank", "pitch attitude"
+_ENERGY_EFFECTS = ("thrust_loss", "drag_increase", "battery_sag", "icing", "flap_deployed")
 _MEAN_S = 2.0  # running mean
 _MIN_DURATION_S = 2.0  # a shorter deviation is a gust
 _MIN_OUT_SHARE = 0.7  # least share of the remaining flight outside the range
@@ -113,8 +117,20 @@ class OwnPast:
         )
         later = part_after(visible, self.until - CONTEXT_S)
         report = diagnose(replace(later, limitations=(*visible.limitations, limitation)), base, progress)
+        report = _without_weather(report, visible, base)
         report = only_new_findings(report, find_tracking_loss(flight, self.until), self.until)
         return with_output_faults(report, visible, self.until)
+
+
+def _without_weather(report: Report, flight: FlightData, base: Baseline) -> Report:
+    """Return a named loss of energy as suspected where earlier air movement may explain it (`air_movement`)."""
+    least = np.log(POSTERIOR / (1.0 - POSTERIOR)) - np.log(PRIOR)
+    onsets = [f.segments[0][0] for f in report.findings if f.hypothesis.effect.name in _ENERGY_EFFECTS]
+    if report.outcome is not ReportOutcome.NAMED or not onsets:
+        return report
+    if energy_evidence(flight, base, min(onsets)) >= least:
+        return report
+    return with_sentence(replace(report, outcome=ReportOutcome.SUSPECTED))
 
 
 def with_output_faults(report: Report, flight: FlightData, until: float | None = None) -> Report:
