@@ -7,10 +7,10 @@ import numpy as np
 
 from fleet.frames import G
 from fleet.process.sanitise import format_below
+from twin_worker.diagnosis.baseline.air_movement import energy_evidence
 from twin_worker.diagnosis.baseline.past import CONTEXT_S, calibrate_past, part_after, part_before
 from twin_worker.diagnosis.data.card import AircraftCard
 from twin_worker.diagnosis.data.flight import DT, FlightData
-from twin_worker.diagnosis.inference.air_movement import energy_evidence
 from twin_worker.diagnosis.inference.diagnose import diagnose
 from twin_worker.diagnosis.inference.output_faults import (
     POSTERIOR,
