@@ -31,6 +31,13 @@ def test_inside_the_envelope_nothing_is_added(base: Baseline) -> None:
     assert extrapolation_sigma(replace(base, envelope=None), flight(0.0, 40.0, 3.0)) == {}
 
 
+def test_a_short_extrapolation_adds_little(base: Baseline) -> None:
+    """Half as far as the envelope is wide: half the distance counts."""
+    width = base.envelope.ln_density[1] - base.envelope.ln_density[0]  # type: ignore[union-attr]
+    near = extrapolation_sigma(base, flight(450.0, 22.0, 100.2))
+    assert near["rho"] == pytest.approx(0.25 * width, rel=0.1)
+
+
 def test_outside_the_envelope_thrust_density_and_airspeed_become_uncertain(base: Baseline) -> None:
     low = extrapolation_sigma(base, flight(40.0, 22.0, 100.2))
     assert low["thrust"] == pytest.approx(0.044, abs=0.004) == low["rho"]  # 460 m below, 9.6 % per km
