@@ -81,7 +81,7 @@ def test_who_does_not_answer_is_asked_ever_less():
     assert 4 <= names.count("PARAM_REQUEST_LIST") <= 9
     assert 295 <= names.count("HEARTBEAT") <= 301
     rates = [question for _, question in aircraft.asked if question.get_type() == "COMMAND_LONG"]
-    assert len(rates) == 3 * 6  # three tries, then it is left in peace
+    assert len(rates) == 3 * 8  # three tries, then it is left in peace
     assert {(int(q.param1), q.param2) for q in rates} >= {(30, 40_000.0), (33, 100_000.0)}
 
 

@@ -101,7 +101,7 @@ def possible_faults(flight: FlightRecording, aircraft: InjectedAircraft) -> list
         for part in fault.parts:
             if part in SURFACES:
                 outputs = used[:, SURFACES.index(part)]
-                moves = np.ptp(flight.x["servo"][:, :8], axis=0) > 10.0
+                moves = np.ptp(_padded(flight.x["servo"].astype(float), aircraft.used_map), axis=0) > 10.0
                 if not (outputs & moves).any() or (name == "actuator_stuck" and used[outputs].sum() > outputs.sum()):
                     continue  # a stuck output of a mixed surface blocks two axes
             out.append((name, part))
@@ -117,7 +117,7 @@ def inject(flight: FlightRecording, aircraft: InjectedAircraft, fault: InjectedF
     pulses = flight.x["servo"].astype(float)
     if fault.name == "actuator_stuck":
         return {"servo": _stuck(pulses, after, aircraft.used_map, fault)}
-    inputs = aircraft.used_map.inputs(pulses[:, :8])
+    inputs = aircraft.used_map.inputs(pulses)
     column = _THROTTLE if fault.name in _NEEDS_THRUST else SURFACES.index(fault.part)
     required = _required_inputs(flight, aircraft, fault, inputs)
     change = np.where(after, required - inputs[:, column], 0.0)
@@ -131,6 +131,12 @@ def inject(flight: FlightRecording, aircraft: InjectedAircraft, fault: InjectedF
         out["air"][:, 1] += np.interp(flight.t["air"], t[order], change[order])
         out["air"][:, 1] = np.clip(out["air"][:, 1], 0.0, 1.0)
     return out
+
+
+def _padded(pulses: np.ndarray, used_map: ServoMap) -> np.ndarray:
+    """Return the pulses of all outputs of the map; those that are not in telemetry stand at their trim."""
+    width = pulses.shape[1]
+    return np.hstack([pulses, np.tile(used_map.trim[width:], (len(pulses), 1))])
 
 
 def _required_inputs(
@@ -161,7 +167,7 @@ def _with_input_change(
 
     d_pulse = pinv(G) d_u with the gain G of each output on the side of its trim.
     """
-    own, wanted = pulses[:, :8], np.zeros((len(pulses), 4))
+    own, wanted = _padded(pulses, used_map), np.zeros((len(pulses), 4))
     wanted[:, column] = change
     new = own.copy()
     for _ in range(2):  # the side of the trim follows from the result
@@ -173,13 +179,11 @@ def _with_input_change(
     if column == _THROTTLE:
         high = np.where(np.abs(used_map.gain_up[:, column]) > 0, _full_throttle(used_map, own), high)
     clipped = (moved & ((new < low) | (new > high))).any(axis=1)
-    out = pulses.copy()
-    out[:, :8] = np.where(moved, np.rint(np.clip(new, low, high)), own)
-    return out, clipped
+    return np.where(moved, np.rint(np.clip(new, low, high)), own)[:, : pulses.shape[1]], clipped
 
 
 def _full_throttle(used_map: ServoMap, own: np.ndarray) -> np.ndarray:
-    """Return the pulse of full throttle of every output, (8,) [us]."""
+    """Return the pulse of full throttle of every output, (16,) [us]."""
     gain = used_map.gain_up[:, _THROTTLE] * np.maximum((np.abs(used_map.gain_up[:, _THROTTLE]) > 0).sum(), 1)
     full = used_map.trim + 1.0 / np.where(np.abs(gain) > 0, gain, np.inf)
     return np.asarray(np.maximum(full, own.max(axis=0)))
@@ -190,7 +194,7 @@ def _stuck(pulses: np.ndarray, after: np.ndarray, used_map: ServoMap, fault: Inj
     out = pulses.copy()
     first = int(np.argmax(after))
     column = SURFACES.index(fault.part)
-    for k in np.flatnonzero(np.abs(used_map.gain_up[:, column]) > 0):
+    for k in np.flatnonzero(np.abs(used_map.gain_up[: pulses.shape[1], column]) > 0):
         gain = used_map.gain_up[k, column] * (np.abs(used_map.gain_up[:, column]) > 0).sum()
         frozen = (
             pulses[first, k] if not fault.values["position"] else used_map.trim[k] + fault.values["position"] / gain

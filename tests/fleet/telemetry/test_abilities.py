@@ -82,7 +82,7 @@ def test_a_quadrotor_on_its_route_is_predicted_as_the_twin_does():
     mission = Mission(uav=1, t=T0, items=tuple(flights.item(n, north=200.0 * n) for n in range(4)), complete=True)
     messages = [status, mission, *flights.messages(laid)]
     made = [m for m in run_offline(messages, {}) if isinstance(m, Prediction)]
-    assert made[-1].method == "copter"
+    assert "copter" in {m.method for m in made}
     can, why = judged(survey_recording(messages)[1])["predict on the route"]
     assert can and "40 s on the route" in why
 
