@@ -70,7 +70,7 @@ def _live(rows: dict[str, Arrival], args: argparse.Namespace) -> dict[str, Outco
     """Run all rows at once, in real time, beside busy processes."""
     flights = [flight(args.seconds, args.seed, uav) for uav in range(len(rows))]
     judges = [Judge() for _ in rows]
-    heard: deque[tuple[float, Message]] = deque()
+    received: deque[tuple[float, Message]] = deque()
     busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(args.busy)]
     try:
         with Site(len(rows), args.router, pace=_PACE) as site:
@@ -78,11 +78,11 @@ def _live(rows: dict[str, Arrival], args: argparse.Namespace) -> dict[str, Outco
             with connect(args.router) as bus:
                 site.add()
                 for kind in (Sample, Status, Alert, Prediction):
-                    bus.subscribe(kind, lambda message, _: heard.append((time.monotonic(), message)))
+                    bus.subscribe(kind, lambda message, _: received.append((time.monotonic(), message)))
                 link = f"--link=udpin:127.0.0.1:{_PORT}"
                 site.start("gateway", link, "--offset=-1", "--router", args.router, name="gateway")
                 until(_is_open, _PATIENCE_S, "the gateway's port")
-                _send(_schedule(flights, list(rows.values())), lambda: _hear(heard, judges))
+                _send(_schedule(flights, list(rows.values())), lambda: _judge(received, judges))
     finally:
         for child in busy:
             child.kill()
@@ -108,26 +108,26 @@ def _schedule(flights: list[list[Datagram]], arrivals: list[Arrival]) -> list[tu
     return sorted(found, key=lambda one: one[0])
 
 
-def _send(schedule: list[tuple[float, int, bytes]], hear: Callable[[], None]) -> None:
+def _send(schedule: list[tuple[float, int, bytes]], judge: Callable[[], None]) -> None:
     """Send each datagram when it is due, from a socket for each aircraft, and take down what is published meanwhile."""
     sockets: dict[int, socket.socket] = defaultdict(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-    begun, never, heard = time.monotonic(), threading.Event(), 0.0
+    begun, never, received = time.monotonic(), threading.Event(), 0.0
     for at, uav, frame in schedule:
-        while (now := time.monotonic()) < begun + at or now > heard + _TICK_S:
-            hear()
-            heard = now
+        while (now := time.monotonic()) < begun + at or now > received + _TICK_S:
+            judge()
+            received = now
             never.wait(min(max(begun + at - time.monotonic(), 0.0), _TICK_S))
         sockets[uav].sendto(frame, ("127.0.0.1", _PORT))
     never.wait(_LAST_S)
-    hear()
+    judge()
     for each in sockets.values():
         each.close()
 
 
-def _hear(heard: deque[tuple[float, Message]], judges: list[Judge]) -> None:
+def _judge(received: deque[tuple[float, Message]], judges: list[Judge]) -> None:
     """Hand what was published to the judge of its aircraft."""
-    while heard:
-        at, message = heard.popleft()
+    while received:
+        at, message = received.popleft()
         judges[message.uav].hear(at, message)
     for judge in judges:
         judge.tick(time.monotonic())

@@ -5,8 +5,8 @@
 
 Sets: `open` (concealed-open), `sitl` (sitl and sitl-more on s01 to s03), `calmwindy` (the same on calm and windy
 nominal flights together), or the folder of an examination of `fleet prove` with its labels opened. Half of sitl-more is
-kept apart (`KEPT`) and only read with `--kept`. Flights are read once, models are calibrated once per source of the
-baseline, and reports are stored per source of the whole diagnosis.
+held out (`HELD_OUT`) and only read with `--held-out`. Flights are read once, models are calibrated once per source of
+the baseline, and reports are stored per source of the whole diagnosis.
 """
 
 import argparse
@@ -31,7 +31,7 @@ from twin_worker.diagnosis.inference.diagnose import diagnose
 from twin_worker.diagnosis.model.baseline import Baseline
 from twin_worker.diagnosis.output.keep import as_json
 
-KEPT = ("h03", "h14", "h20", "n5", "f05", "f13")
+HELD_OUT = ("h03", "h14", "h20", "n5", "f05", "f13")
 """Flights of sitl-more that no rule was chosen on."""
 ZERO_S = 2.045  # boot time of the first attitude of flights without a start stamp [s]
 Value = TypeVar("Value")
@@ -82,7 +82,7 @@ OPEN_PARAMS = ("loss", "tau_s", "scale", "latency_s", "offset", "speed_mps", "fr
 ROLES = {0: "control", 1: "single", 2: "compound"}
 
 
-def cases(name: str, recordings: Path, kept: bool) -> tuple[list[Case], dict[str, tuple[list[Path], Path]]]:
+def cases(name: str, recordings: Path, held_out: bool) -> tuple[list[Case], dict[str, tuple[list[Path], Path]]]:
     """Return the flights of one set, and the nominal flights and the card of each of its baselines."""
     if name == "open":
         folder = recordings / "concealed-open"
@@ -95,13 +95,13 @@ def cases(name: str, recordings: Path, kept: bool) -> tuple[list[Case], dict[str
         return found, {"open": (sorted(folder.glob("cal_*.tlog")), folder / "card.json")}
     if name in ("sitl", "calmwindy"):
         sitl, more = recordings / "sitl", recordings / "sitl-more"
-        chosen = {stem: effects for stem, effects in MORE.items() if kept == (stem in KEPT)}
+        chosen = {stem: effects for stem, effects in MORE.items() if held_out == (stem in HELD_OUT)}
         paths = {stem: more / f"{stem}.tlog.xz" for stem in chosen}
         nominal = sorted(sitl.glob("s0[123]*.tlog.xz"))
         if name == "calmwindy":
             nominal = [more / "n1.tlog.xz", more / "n3.tlog.xz"]
             chosen = {stem: effects for stem, effects in chosen.items() if stem not in ("n1", "n3")}
-        if not kept:
+        if not held_out:
             chosen |= SITL
             paths |= {stem: sitl / f"{stem}.tlog.xz" for stem in SITL}
         found = [
@@ -220,7 +220,7 @@ def main() -> int:
     parser.add_argument("--sets", nargs="+", required=True)
     parser.add_argument("--recordings", type=Path, default=os.environ.get("PARAUAV_RECORDINGS", "recordings"))
     parser.add_argument("--cache", type=Path, required=True)
-    parser.add_argument("--kept", action="store_true", help="the flights kept apart, instead of the others")
+    parser.add_argument("--held-out", action="store_true", help="the held-out flights, instead of the others")
     parser.add_argument("--only", nargs="+", help="flights")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
@@ -228,7 +228,7 @@ def main() -> int:
     cache, rows = Cache(args.cache), []
     version = source_hash("baseline", "model", "data", "inference")
     for name in args.sets:
-        found, nominal = cases(name, args.recordings, args.kept)
+        found, nominal = cases(name, args.recordings, args.held_out)
         results, started = [], time.perf_counter()
         for case in found:
             if args.only and case.name not in args.only:

@@ -2,7 +2,7 @@
 
 Prints one row per recording (vehicle, modes, methods used, figures) and, over all real flights of a kind, the paired
 difference of the error to each simple method with its 95 % interval over flights. The result of each recording is
-kept in a folder, so that a run can be continued. Flights of the ALFA set last one to three minutes: they are scored
+cached in a folder, so that a run can be continued. Flights of the ALFA set last one to three minutes: they are scored
 from 20 s after their first sample on, as far as they go; all others as `fleet assess` does.
 """
 
@@ -193,7 +193,7 @@ def _interval(s: str, x: dict[str, Any]) -> str:
 
 
 def load_or(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """Return the kept result of a recording, else evaluate and keep it."""
+    """Return the cached result of a recording, else evaluate and cache it."""
     if not path.exists():
         path.write_text(json.dumps(make()))
     return json.loads(path.read_text())  # type: ignore[no-any-return]
@@ -205,10 +205,10 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path(os.environ.get("PARAUAV_RECORDINGS", "recordings")))
     parser.add_argument("--sets", nargs="+", default=list(SETS), choices=SETS)
     parser.add_argument("--only", default="", help="recordings whose name contains this")
-    parser.add_argument("--kept", type=Path, default=Path("prediction-bench"), help="folder of the results so far")
+    parser.add_argument("--cache", type=Path, default=Path("prediction-bench"), help="folder of the results so far")
     parser.add_argument("--json", type=Path, help="write all figures")
     args = parser.parse_args()
-    args.kept.mkdir(parents=True, exist_ok=True)
+    args.cache.mkdir(parents=True, exist_ok=True)
     warm_up()
     results = []
     for path in recordings(args.folder, args.sets):
@@ -216,7 +216,7 @@ def main() -> None:
             continue
         try:
             results.append(
-                load_or(args.kept / f"{path.parent.name}-{path.name}.json", lambda path=path: evaluate(path))
+                load_or(args.cache / f"{path.parent.name}-{path.name}.json", lambda path=path: evaluate(path))
             )  # type: ignore[misc]
             print(path.name, results[-1]["starts"], "starts", flush=True)
         except ValueError as error:
