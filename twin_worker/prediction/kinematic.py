@@ -14,7 +14,7 @@ from fleet.autopilots import arduplane
 from fleet.autopilots import greybox as law
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.modes import NO_ITEM, ModeEntry
-from fleet.autopilots.shadow import replay_controller
+from fleet.autopilots.shadow import NO_MEMORY, replay_controller
 from fleet.contract import Item
 from fleet.frames import G, Origin
 from fleet.mission import KIND, TAKEOFF, VA_C, Route
@@ -234,7 +234,7 @@ def _synchronise(
     euler = np.column_stack([banks, 0.0 * psi, psi])
     triple, quad = np.full((n, 3), np.nan), np.full((n, 4), np.nan)
     rows = (recent.t - recent.t[0], recent.p, recent.v, euler, triple, missing, banks, missing, quad, seq)
-    ctl, rms = replay_controller(*par_legs_start, *(np.ascontiguousarray(row) for row in rows))  # type: ignore[call-arg]
+    ctl, rms = replay_controller(*par_legs_start, *(np.ascontiguousarray(row) for row in rows), NO_MEMORY)  # type: ignore[call-arg]
     return ctl, float(rms), banks
 
 

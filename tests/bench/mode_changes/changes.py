@@ -100,7 +100,7 @@ def _change(
 def _inside(flight: Flight, p, look_aheads: tuple[float, ...]) -> float:
     from twin_worker.numerics.prediction_errors import along_cross_down, track_frame
 
-    ahead, path = p.ahead.numpy(), p.path.numpy().astype(float)
+    ahead, path = p.ahead.numpy().astype(float), p.path.numpy().astype(float)
     actual = flight.positions(p.ned_origin(), p.t + ahead)
     inside = (np.abs(along_cross_down(track_frame(path, ahead), actual - path)) <= p.prediction_region_half_axes.numpy()).all(axis=1)
     return float(np.mean([inside[np.searchsorted(ahead, s)] for s in look_aheads]))

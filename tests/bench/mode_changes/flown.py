@@ -84,9 +84,9 @@ def make(seed: int, autopilot: str, params: Mapping[str, float] = NO_PARAMS) -> 
 def fly(
     uav: SimulatedUav, seed: int, seconds: float, folder: Path, commands: Iterable[Command] = (), autopilot: str = ""
 ) -> Flight:
-    """Fly with commands at whole seconds; return what the gateway publishes."""
+    """Fly with commands; return what the gateway publishes."""
     rng, link = np.random.default_rng((seed, 12)), RadioLink(np.random.default_rng((seed, 6, uav.uav_id)), LOSS)
-    due, truth, path = {round(c.t): c.mode for c in commands}, [], folder / "flight.tlog"
+    due, truth, path = {round(c.t / TICK_S): c.mode for c in commands}, [], folder / "flight.tlog"
     with path.open("wb") as file:
         write(file, [(0.0, frame) for frame in uav.initial_frames()])
         for k in range(1, int(seconds / TICK_S) + 1):
@@ -94,7 +94,7 @@ def fly(
             link.send(t, uav.step(t))
             if k % round(TRUTH_S / TICK_S) == 0:
                 truth.append(uav.estimate.p.copy())
-            if k % round(1.0 / TICK_S) == 0 and (mode := due.get(round(t))):
+            if mode := due.get(k):
                 link.send(t, uav.receive(command_bytes(uav, mode, rng, autopilot)))
             if k % 100 == 0:
                 write(file, link.receive(t))
@@ -136,7 +136,7 @@ def predict(messages: Iterable[Message], twins: dict[int, Twin]) -> list[Predict
 
 def error_at(flight: Flight, p: Prediction, ahead_s: float) -> float:
     """Return the distance between predicted and true position at a look-ahead; nan where not flown [m]."""
-    ahead, path = p.ahead.numpy(), p.path.numpy().astype(float)
+    ahead, path = p.ahead.numpy().astype(float), p.path.numpy().astype(float)
     if ahead[-1] < ahead_s:
         return float("nan")
     predicted = np.array([np.interp(ahead_s, ahead, column) for column in path.T])

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from fleet.autopilots.laws import remember
 from fleet.window import Window
 from twin_worker.confidence.calibration_table import error_growth
 from twin_worker.confidence.tube_and_horizon import AHEAD
@@ -37,6 +38,7 @@ def predict_route(twin: Twin, window: Window, recent: Track, ahead: np.ndarray) 
     initial = synchronise_controller(situation)
     if isinstance(initial, Rollout):
         return no_prediction(initial.sentence, initial.seq)
+    _store_controller_state(twin, situation.onboard.law, initial)
     initial, failsafe_text = _with_failsafe(twin, situation, initial)
     t = float(window.t[-1])
     due = twin.prediction.selector.is_due(t)
@@ -49,6 +51,15 @@ def predict_route(twin: Twin, window: Window, recent: Track, ahead: np.ndarray) 
         name: PathForecast(path, name, control.law, initial.seq, sentence, control) for name, path in candidates.items()
     }
     return select_method(twin, t, forecasts, recent, ahead)
+
+
+def _store_controller_state(twin: Twin, law: str, initial: InitialCondition) -> None:
+    """Store the synchronised state of the controller, from which it continues when its route changes."""
+    if twin.telemetry.link_lost or twin.prediction.override is not None:
+        return
+    ctl, par, _ = initial.synchronised
+    state = remember(ctl, par, -float(initial.window.p[-1, 2]))
+    twin.prediction.store_controller_state(float(initial.window.t[-1]), law, state)
 
 
 def select_method(
