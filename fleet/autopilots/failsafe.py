@@ -1,16 +1,15 @@
 """What an autopilot does after the radio link is lost: the mode changes that its parameters describe, one rule per law.
 
-    link_loss_steps("arduplane", "AUTO", params)  ->  (FailsafeStep(5.0, "RTL", "FS_LONG_ACTN 1"),)
+    link_loss_steps("arduplane", "AUTO", params)  ->  (FailsafeStep(6.2, "RTL", "FS_LONG_ACTN 1"),)
 
 A lost link is assumed to be lost in both directions, together with the remote control. Then ArduPlane begins the short
 failsafe 0.2 s after RC_FS_TIMEOUT, but not before FS_SHORT_TIMEOUT, if THR_FAILSAFE is 1. The long action follows
-FS_LONG_TIMEOUT after that, also where the short one does not change the mode; after the last contact where FS_SHORT_ACTN
-disables it, and by FS_GCS_ENABL. ArduCopter takes FS_THR_ENABLE at RC_FS_TIMEOUT and FS_GCS_ENABLE at FS_GCS_TIMEOUT,
-except where FS_OPTIONS lets the mission, GUIDED or a landing continue; SmartRTL is a return by another path, and is
-flown as RTL here. PX4 takes NAV_DLL_ACT at COM_DL_LOSS_T, and holds for COM_FAIL_ACT_T before it. NAV_RCL_ACT is
-followed only where the remote control arrives by the same link (COM_RC_IN_MODE 1). A parameter that is not received
-causes no action.
-Source: ArduPlane and ArduCopter failsafe documentation and parameter references, and the timing of their checks; PX4 user guide, "Safety configuration (failsafes)".
+FS_LONG_TIMEOUT after that, also where the short one does not change the mode; after the last contact where
+FS_SHORT_ACTN disables it, and by FS_GCS_ENABL. PX4 takes NAV_DLL_ACT at COM_DL_LOSS_T, and holds for COM_FAIL_ACT_T
+before it. NAV_RCL_ACT is followed only where the remote control arrives by the same link (COM_RC_IN_MODE 1). A
+parameter that is not received causes no action.
+Source: ArduPlane failsafe documentation, parameter reference and the timing of its checks; PX4 user guide, "Safety
+configuration (failsafes)".
 """
 
 from collections.abc import Mapping
@@ -28,18 +27,6 @@ _GCS_HEARTBEAT, _GCS_AUTO_ONLY = (1, 2), 3  # FS_GCS_ENABL
 _PX4_MODES = {1: "LOITER", 2: "RTL", 3: "LAND"}
 _RC_BY_LINK = 1  # COM_RC_IN_MODE
 _RC_EXCEPT = {"MISSION": 1, "LOITER": 2, "OFFBOARD": 4}  # bits of COM_RCL_EXCEPT
-
-
-_COPTER_MODES = {
-    "FS_THR_ENABLE": {1: "RTL", 2: "RTL", 3: "LAND", 4: "RTL", 5: "RTL", 6: "RTL", 7: "BRAKE"},
-    "FS_GCS_ENABLE": {1: "RTL", 2: "RTL", 3: "RTL", 4: "RTL", 5: "LAND", 6: "RTL", 7: "BRAKE"},
-}
-_CONTINUE_MISSION = 2
-_COPTER_OPTIONS = 16  # default of FS_OPTIONS
-_COPTER_CONTINUES = (  # bits of FS_OPTIONS by which a mode continues: remote control lost, ground station lost
-    {"AUTO": 1, "GUIDED": 4, "LAND": 8},
-    {"AUTO": 2, "LAND": 8} | dict.fromkeys(("STABILIZE", "ALT_HOLD", "ACRO", "LOITER", "POSHOLD"), 16),
-)
 
 
 class FailsafeStep(NamedTuple):
@@ -103,22 +90,6 @@ def _arduplane_steps(mode: str, params: Mapping[str, float]) -> tuple[FailsafeSt
     return tuple(steps)
 
 
-def _copter_steps(mode: str, params: Mapping[str, float]) -> tuple[FailsafeStep, ...]:
-    steps: list[FailsafeStep] = []
-    options = int(params.get("FS_OPTIONS", _COPTER_OPTIONS))
-    rules = (
-        ("FS_THR_ENABLE", params.get("RC_FS_TIMEOUT", 0.5), _COPTER_CONTINUES[0]),
-        ("FS_GCS_ENABLE", params.get("FS_GCS_TIMEOUT", 5.0), _COPTER_CONTINUES[1]),
-    )
-    for name, lost_s, continues in sorted(rules, key=lambda rule: rule[1]):
-        action, before = int(params.get(name, 0)), steps[-1].mode if steps else mode
-        new_mode = _COPTER_MODES[name].get(action, "")
-        continues_mission = action == _CONTINUE_MISSION and before == "AUTO"
-        if new_mode and new_mode != before and not continues_mission and not options & continues.get(before, 0):
-            steps.append(FailsafeStep(lost_s, new_mode, f"{name} {action}"))
-    return tuple(steps)
-
-
 def _px4_steps(mode: str, params: Mapping[str, float]) -> tuple[FailsafeStep, ...]:
     steps: list[FailsafeStep] = []
     hold_s = params.get("COM_FAIL_ACT_T", 0.0)
@@ -141,11 +112,11 @@ def link_loss_steps(law: str, mode: str, params: Mapping[str, float]) -> tuple[F
     """Return the mode changes after a link loss in time order, at most two; empty: the mode continues.
 
     Args:
-        law: name in `fleet.autopilots.laws.LAWS`, or arducopter
+        law: name in `fleet.autopilots.laws.LAWS`
         mode: at the loss, as in `Status.mode`
         params: received parameters in the autopilot's names and units
     """
-    rules = {"arduplane": _arduplane_steps, "arducopter": _copter_steps, "px4": _px4_steps}
+    rules = {"arduplane": _arduplane_steps, "px4": _px4_steps}
     return rules[law](mode, params) if law in rules else ()
 
 

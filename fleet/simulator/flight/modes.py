@@ -36,7 +36,7 @@ class FlightMode:
         self._contact_t = 0.0  # last contact with the ground [s]
         self._short_t: float | None = None  # when the short failsafe began [s]
         self._long_done = False
-        self._held_t: float | None = None  # when the hold before a failsafe action of PX4 began [s]
+        self._hold_t: float | None = None  # when the hold before a failsafe action of PX4 began [s]
 
     @property
     def follows_mission(self) -> bool:
@@ -49,7 +49,7 @@ class FlightMode:
 
     def contact(self, t: float) -> None:
         """Record contact with the ground at `t` [s]: every failsafe ends, and the mode stays."""
-        self._contact_t, self._short_t, self._held_t, self._long_done = t, None, None, False
+        self._contact_t, self._short_t, self._hold_t, self._long_done = t, None, None, False
 
     def update(self, t: float) -> bool:
         """Run the failsafes at time `t` [s]; return whether one has changed the mode."""
@@ -92,11 +92,13 @@ class FlightMode:
         rules = [("NAV_DLL_ACT", get("COM_DL_LOSS_T", 10.0))]
         if get("COM_RC_IN_MODE") == _PX4_RC_BY_LINK and not int(get("COM_RCL_EXCEPT", 0.0)) & 1:
             rules.append(("NAV_RCL_ACT", get("COM_RC_LOSS_T", 0.5)))
-        due = [int(get(name, 0.0)) for name, lost_s in rules if silence > lost_s and int(get(name, 0.0)) in _PX4_ACTIONS]
+        due = [
+            int(get(name, 0.0)) for name, lost_s in rules if silence > lost_s and int(get(name, 0.0)) in _PX4_ACTIONS
+        ]
         if not due or self._long_done:
             return
-        self._held_t = t if self._held_t is None else self._held_t
-        if t - self._held_t >= get("COM_FAIL_ACT_T", 0.0):
+        self._hold_t = t if self._hold_t is None else self._hold_t
+        if t - self._hold_t >= get("COM_FAIL_ACT_T", 0.0):
             self.name, self._long_done = _PX4_ACTIONS[max(due)], True
         elif self.name != "LOITER":
             self.name = "LOITER"

@@ -15,7 +15,6 @@ from twin_worker.prediction.replay_window import ControllerMemory
 from twin_worker.twin.state.budget import Timer
 from twin_worker.twin.state.events import FlightEvent
 
-
 _STATES = 4  # stored states of the controller
 _MAX_STATE_AGE_S = 10.0  # oldest state that a controller continues from after its route changed [s]
 
@@ -125,7 +124,7 @@ class PredictionState(msgspec.Struct):
         self.controller_states.append((t, law, tuple(state.tolist())))
 
     def controller_memory(self, t: float) -> ControllerMemory:
-        """Return the newest state of the controller at or before `t` [s since 1970]; empty if there is no recent one."""
+        """Return the newest state of the controller up to `t` [s since 1970]; empty if there is no recent one."""
         recent = [one for one in self.controller_states if 0.0 <= t - one[0] <= _MAX_STATE_AGE_S]
         return (recent[-1][1], recent[-1][2]) if recent else ("", ())
 
