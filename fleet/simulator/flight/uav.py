@@ -95,7 +95,8 @@ class SimulatedUav:
         self.silent = False  # sends no telemetry, which saves most of the time of a flight
         self.link_lost = False  # no link to the ground in any direction, the remote control included
         self.mode = FlightMode(autopilot, self.params)
-        self._mission_seq, self._target = start.seq, None  # current mission item; commanded point, NED, (3,) [m]
+        self._mission_seq = start.seq  # current mission item
+        self._target: np.ndarray | None = None  # commanded point, NED, (3,) [m]
         self._wind = setup.weather.wind(rng, DT * _OUTER)
         scale_rng = altitude_rng = self._jitter = None
         dialect = DIALECTS[autopilot]
