@@ -23,15 +23,22 @@ class FailsafePlan:
         steps: in time order, at most two
         route_of: route of a mode that is entered at a position, NED (3,) [m], with a course [rad]; None: not known
         sentence: what is assumed beside the steps
+        lost_t: newest telemetry, from which the times of the steps count [s since 1970]; -inf: the start
     """
 
     steps: tuple[FailsafeStep, ...]
     route_of: Callable[[str, np.ndarray, float], Route | None]
     sentence: str = ""
+    lost_t: float = -np.inf
+
+    def steps_from(self, t: float) -> tuple[FailsafeStep, ...]:
+        """Return the steps with times from `t` on: a rollout begins before the newest row of telemetry."""
+        delay = max(self.lost_t - t, 0.0)
+        return tuple(step._replace(after_s=step.after_s + delay) for step in self.steps)
 
 
 def with_failsafe(
-    ctl: np.ndarray, legs: np.ndarray, plan: FailsafePlan, position_at: PositionAt
+    ctl: np.ndarray, legs: np.ndarray, plan: FailsafePlan, position_at: PositionAt, t: float
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """Append the routes of a plan to the present route.
 
@@ -39,18 +46,19 @@ def with_failsafe(
         ctl, legs: state of the controller at the loss, and its route
         plan: mode changes
         position_at: predicts where the aircraft is at a change
+        t: time of that state [s since 1970]
     Returns:
         state with the scheduled changes, all legs, and a description of what is followed
     """
     scheduled: list[FailsafeStep] = []
-    for step in plan.steps:
+    for step, described in zip(plan.steps_from(t), plan.steps, strict=True):
         path = position_at(ctl, legs, step.after_s + np.array([-_COURSE_S, 0.0]).clip(-step.after_s))
         route = None
         if path is not None and np.isfinite(path).all():
             moved = path[1] - path[0]
             route = plan.route_of(step.mode, path[1], float(np.arctan2(moved[1], moved[0])))
         if route is None or not len(route.legs):
-            text = describe_steps((*scheduled, step))
+            text = describe_steps((*plan.steps[: len(scheduled)], described))
             return ctl, legs, f"{text}, whose path is not predicted"
         # the separator keeps the new route from being a continuation of the last leg
         ctl, first = ctl.copy(), len(legs) + 1

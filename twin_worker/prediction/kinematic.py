@@ -180,7 +180,7 @@ def _fly_route(
 
     ctl, legs = guidance.ctl, guidance.route.legs
     if config.failsafe is not None:
-        ctl, legs, failsafe_text = with_failsafe(ctl, legs, config.failsafe, path_of)
+        ctl, legs, failsafe_text = with_failsafe(ctl, legs, config.failsafe, path_of, float(recent.t[-1]))
         sentence = " ".join(filter(None, (failsafe_text, sentence)))
     path = path_of(ctl, legs, ahead)
     start_seq = int(seq[-1]) if config.override is None else config.override.seq

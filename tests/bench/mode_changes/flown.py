@@ -97,6 +97,7 @@ def fly(uav: SimulatedUav, seed: int, seconds: float, folder: Path, commands: It
                 link.send(t, uav.receive(command_bytes(uav, mode, rng)))
             if k % 100 == 0:
                 write(file, link.receive(t))
+        write(file, link.receive(seconds))
     messages = tuple(replay_messages(path))
     path.unlink()
     return Flight(messages, epoch(FLOWN_S * np.arange(1, len(flown) + 1)), np.array(flown), uav.origin)

@@ -111,10 +111,8 @@ def report(paths: Iterable[Path]) -> Iterable[tuple[str, ModeChange | None]]:
     for path in paths:
         for c in measure(path.name, replay_messages(path)):
             delay, error = ("—" if x is None else f"{x:.1f}" for x in (c.delay_s, c.error_m))
-            yield (
-                (
-                    f"| {c.recording}:uav-{c.uav} | {c.t:.0f} | {c.before} to {c.after} | {delay} | {c.method} | {error} "
-                    f"| {c.usual_m:.1f} | {'yes' if c.is_met else 'no'} |"
-                ),
-                c,
+            line = (
+                f"| {c.recording}:uav-{c.uav} | {c.t:.0f} | {c.before} to {c.after} | {delay} | {c.method} | {error} "
+                f"| {c.usual_m:.1f} | {'yes' if c.is_met else 'no'} |"
             )
+            yield line, c

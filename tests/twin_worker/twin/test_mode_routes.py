@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from fleet.autopilots.control_law import eas2tas
+from fleet.autopilots.failsafe import FailsafeStep
 from fleet.contract import Event, Prediction, TwinState
 from fleet.frames import Origin, to_geodetic, to_ned
 from fleet.mission import RADIUS
 from tests.support.flights import ROUTE, drive, predictions, sample, status
+from twin_worker.prediction.failsafe_route import FailsafePlan
 from twin_worker.twin.state.routes import identified_radius, mode_change_time, present_route
 from twin_worker.twin.step import Twin, advance
 
@@ -281,3 +283,19 @@ def test_on_the_way_to_a_circle_its_sign_is_that_of_the_parameter(winged):
         winged, (sample(1, t[-1], target=(t, centre), position=(t, to_geodetic(origin, p)), command=(t, commands)),)
     )
     assert identified_radius(winged) > 0.0
+
+
+def test_a_failsafe_counts_from_the_newest_telemetry_and_not_from_the_start_of_the_rollout():
+    step = FailsafeStep(6.2, "RTL", "FS_LONG_ACTN 1")
+    plan = FailsafePlan((step,), lambda mode, p, course: None, lost_t=1000.0)
+    assert plan.steps_from(999.5)[0].after_s == pytest.approx(6.7)
+    assert plan.steps_from(1000.0) == (step,)
+
+
+@pytest.mark.parametrize("long", [0.0, 1.0])
+def test_predictions_of_the_route_before_a_failsafe_are_not_scored_on_it(winged, long):
+    with_params(winged, **RADIO, FS_SHORT_ACTN=0.0, FS_LONG_ACTN=long)
+    advance(winged, (), winged.telemetry.history.newest + 1.0)
+    assert winged.confidence.tracker.has_open
+    lost(winged)
+    assert winged.confidence.tracker.has_open == (long == 0.0)

@@ -135,7 +135,7 @@ def failsafe_plan(twin: "Twin") -> FailsafePlan | None:
             return _mission_from_here(twin)
         return mode_route(law, mode, _situation(twin, p, course, None), params, failsafe=True)
 
-    return FailsafePlan(steps, route_of, "(assumes that every radio link is lost)")
+    return FailsafePlan(steps, route_of, "(assumes that every radio link is lost)", twin.telemetry.history.newest)
 
 
 def _no_route(mode: str, p: np.ndarray, course: float) -> None:

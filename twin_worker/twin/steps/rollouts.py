@@ -99,7 +99,7 @@ def _with_failsafe(twin: Twin, situation: PredictionContext, initial: InitialCon
         paths, _ = method_paths(twin, (situation, start), times, False)
         return next(iter(paths.values()), None)
 
-    ctl, legs, text = with_failsafe(ctl, legs, plan, position_at)
+    ctl, legs, text = with_failsafe(ctl, legs, plan, position_at, float(initial.window.t[-1]))
     return replace(initial, synchronised=(ctl, par, legs)), text
 
 
