@@ -39,7 +39,7 @@ class FailsafePlan:
 
 def with_failsafe(
     ctl: np.ndarray, legs: np.ndarray, plan: FailsafePlan, position_at: PositionAt, t: float
-) -> tuple[np.ndarray, np.ndarray, str]:
+) -> tuple[np.ndarray, np.ndarray, str, float]:
     """Append the routes of a plan to the present route.
 
     Args:
@@ -48,7 +48,8 @@ def with_failsafe(
         position_at: predicts where the aircraft is at a change
         t: time of that state [s since 1970]
     Returns:
-        state with the scheduled changes, all legs, and a description of what is followed
+        state with the scheduled changes, all legs, a description of what is followed, and the look-ahead from `t` at
+        which a route begins that is not known; inf: all are [s]
     """
     scheduled: list[FailsafeStep] = []
     for step, described in zip(plan.steps_from(t), plan.steps, strict=True):
@@ -59,7 +60,7 @@ def with_failsafe(
             route = plan.route_of(step.mode, path[1], float(np.arctan2(moved[1], moved[0])))
         if route is None or not len(route.legs):
             text = describe_steps((*plan.steps[: len(scheduled)], described))
-            return ctl, legs, f"{text}, whose path is not predicted"
+            return ctl, legs, f"{text}, whose path is not predicted", step.after_s
         # the separator keeps the new route from being a continuation of the last leg
         ctl, first = ctl.copy(), len(legs) + 1
         legs = np.vstack([legs, legs[-1:], route.legs])
@@ -68,4 +69,4 @@ def with_failsafe(
         else:
             ctl[SWITCH_S], ctl[SWITCH_LEG] = max(step.after_s, _MIN_SWITCH_S), first
         scheduled.append(step)
-    return ctl, legs, " ".join(filter(None, (describe_steps(plan.steps), plan.sentence)))
+    return ctl, legs, " ".join(filter(None, (describe_steps(plan.steps), plan.sentence))), np.inf

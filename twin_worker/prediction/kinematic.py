@@ -86,6 +86,7 @@ class KinematicRollout:
     seq: int
     sentence: str
     controller: ControllerTwin | None = None
+    known_s: float = np.inf  # look-ahead at which a failsafe begins whose route is not known [s]
 
 
 def wind_and_airspeed(track: Track, wind: np.ndarray | None) -> tuple[np.ndarray, float]:
@@ -178,13 +179,13 @@ def _fly_route(
         law.follow(ctl.copy(), guidance.par, legs, guidance.lags, state, w, STEP, out)
         return interpolate_rows(times, STEP * np.arange(len(out)), out)
 
-    ctl, legs = guidance.ctl, guidance.route.legs
+    ctl, legs, known_s = guidance.ctl, guidance.route.legs, np.inf
     if config.failsafe is not None:
-        ctl, legs, failsafe_text = with_failsafe(ctl, legs, config.failsafe, path_of, float(recent.t[-1]))
+        ctl, legs, failsafe_text, known_s = with_failsafe(ctl, legs, config.failsafe, path_of, float(recent.t[-1]))
         sentence = " ".join(filter(None, (failsafe_text, sentence)))
     path = path_of(ctl, legs, ahead)
     start_seq = int(seq[-1]) if config.override is None else config.override.seq
-    return KinematicRollout(path, start_seq, sentence, guidance.controller)
+    return KinematicRollout(path, start_seq, sentence, guidance.controller, known_s)
 
 
 @dataclass(frozen=True)

@@ -230,6 +230,7 @@ def _update_link(twin: Twin, now: float) -> list[Message]:
     plan = failsafe_plan(twin) if lost else None
     if plan is not None and plan.steps:  # another route than that of the open predictions, which say nothing of it
         twin.confidence.tracker.censor_open()
+        twin.prediction.expire()  # the newest ensemble flew that route as well
     twin.prediction.set_state(TwinState.LINK_LOST if lost else model_state)
     record_event(
         twin, Event.LINK_LOST if lost else Event.LINK_RESTORED, now, f"no sample for {silence_s:.1f} s" if lost else ""

@@ -37,6 +37,7 @@ class PathForecast:
         seq: mission item at the start, -1 none
         sentence: basis of the prediction, or the reason why there is none
         control: controller model used
+        known_s: look-ahead at which a failsafe begins whose route is not known [s]
     """
 
     path: np.ndarray | None
@@ -45,6 +46,7 @@ class PathForecast:
     seq: int
     sentence: str
     control: ControllerTwin | None = None
+    known_s: float = np.inf
 
 
 def no_prediction(sentence: str, seq: int = -1) -> PathForecast:
@@ -184,7 +186,8 @@ def predict_without_model(twin: Twin, recent: Track, ahead: np.ndarray) -> PathF
     if forecast.path is None:
         return no_prediction(forecast.sentence, forecast.seq)
     text = f"{kinematic.describe(twin.models.kinematic)}. {forecast.sentence}".strip(". ")
-    return PathForecast(forecast.path, "greybox", greybox.LAW, forecast.seq, text, forecast.controller)
+    control, known_s = forecast.controller, forecast.known_s
+    return PathForecast(forecast.path, "greybox", greybox.LAW, forecast.seq, text, control, known_s)
 
 
 def _with_speed_override(recent: Track, override: RouteOverride) -> Track:

@@ -39,7 +39,7 @@ def predict_route(twin: Twin, window: Window, recent: Track, ahead: np.ndarray) 
     if isinstance(initial, Rollout):
         return no_prediction(initial.sentence, initial.seq)
     _store_controller_state(twin, situation.onboard.law, initial)
-    initial, failsafe_text = _with_failsafe(twin, situation, initial)
+    initial, failsafe_text, known_s = _with_failsafe(twin, situation, initial)
     t = float(window.t[-1])
     due = twin.prediction.selector.is_due(t)
     candidates, reason = method_paths(twin, (situation, initial), ahead, due)
@@ -48,7 +48,8 @@ def predict_route(twin: Twin, window: Window, recent: Track, ahead: np.ndarray) 
     _update_ensemble(twin, (situation, initial))
     sentence, control = " ".join(filter(None, (failsafe_text, initial.sentence))), initial.controller
     forecasts = {
-        name: PathForecast(path, name, control.law, initial.seq, sentence, control) for name, path in candidates.items()
+        name: PathForecast(path, name, control.law, initial.seq, sentence, control, known_s)
+        for name, path in candidates.items()
     }
     return select_method(twin, t, forecasts, recent, ahead)
 
@@ -87,11 +88,13 @@ def select_method(
     return replace(chosen, sentence=" ".join(filter(None, (selector.describe(chosen.method), chosen.sentence))))
 
 
-def _with_failsafe(twin: Twin, situation: PredictionContext, initial: InitialCondition) -> tuple[InitialCondition, str]:
-    """Return the start with the failsafe after a link loss, and its description."""
+def _with_failsafe(
+    twin: Twin, situation: PredictionContext, initial: InitialCondition
+) -> tuple[InitialCondition, str, float]:
+    """Return the start with the failsafe after a link loss, its description, and how far its route is known [s]."""
     plan = situation.onboard.failsafe
     if plan is None:
-        return initial, ""
+        return initial, "", np.inf
     ctl, par, legs = initial.synchronised
 
     def position_at(ctl: np.ndarray, legs: np.ndarray, times: np.ndarray) -> np.ndarray | None:
@@ -99,8 +102,8 @@ def _with_failsafe(twin: Twin, situation: PredictionContext, initial: InitialCon
         paths, _ = method_paths(twin, (situation, start), times, False)
         return next(iter(paths.values()), None)
 
-    ctl, legs, text = with_failsafe(ctl, legs, plan, position_at, float(initial.window.t[-1]))
-    return replace(initial, synchronised=(ctl, par, legs)), text
+    ctl, legs, text, known_s = with_failsafe(ctl, legs, plan, position_at, float(initial.window.t[-1]))
+    return replace(initial, synchronised=(ctl, par, legs)), text, known_s
 
 
 def method_paths(
