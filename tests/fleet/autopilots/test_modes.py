@@ -177,16 +177,16 @@ RADIO = {"THR_FAILSAFE": 1.0, "RC_FS_TIMEOUT": 1.0, "FS_LONG_TIMEOUT": 5.0}
     ("mode", "short", "long", "expected"),
     [
         ("AUTO", 0, 0, []),
-        ("AUTO", 0, 1, [(5.0, "RTL")]),
-        ("AUTO", 1, 0, [(1.2, "CIRCLE"), (5.0, "RTL")]),  # a circle never continues
+        ("AUTO", 0, 1, [(6.2, "RTL")]),
+        ("AUTO", 1, 0, [(1.2, "CIRCLE"), (6.2, "RTL")]),  # a circle never continues
         ("AUTO", 3, 2, [(5.0, "FBWA")]),
-        ("AUTO", 2, 4, [(1.2, "FBWA"), (5.0, "AUTO")]),
-        ("GUIDED", 4, 0, [(1.2, "FBWB"), (5.0, "RTL")]),
-        ("LOITER", 0, 0, [(5.0, "RTL")]),
-        ("CRUISE", 0, 0, [(1.2, "CIRCLE"), (5.0, "RTL")]),
+        ("AUTO", 2, 4, [(1.2, "FBWA"), (6.2, "AUTO")]),
+        ("GUIDED", 4, 0, [(1.2, "FBWB"), (6.2, "RTL")]),
+        ("LOITER", 0, 0, [(6.2, "RTL")]),
+        ("CRUISE", 0, 0, [(1.2, "CIRCLE"), (6.2, "RTL")]),
         ("CRUISE", 3, 1, [(5.0, "RTL")]),
         ("RTL", 1, 1, []),
-        ("RTL", 1, 4, [(5.0, "AUTO")]),
+        ("RTL", 1, 4, [(6.2, "AUTO")]),
         ("LOITER", 0, 3, []),  # a parachute is no mode
     ],
 )

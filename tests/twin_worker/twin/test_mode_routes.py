@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from fleet.autopilots.control_law import eas2tas
+from fleet.autopilots.failsafe import FailsafeStep
 from fleet.contract import Event, Prediction, TwinState
 from fleet.frames import Origin, to_geodetic, to_ned
 from fleet.mission import RADIUS
 from tests.support.flights import ROUTE, drive, predictions, sample, status
-from twin_worker.twin.state.routes import identified_radius, present_route
+from twin_worker.prediction.failsafe_route import FailsafePlan
+from twin_worker.twin.state.routes import identified_radius, mode_change_time, present_route
 from twin_worker.twin.step import Twin, advance
 
 MODELS = (*ROUTE, "greybox")
@@ -190,7 +192,7 @@ def test_a_lost_link_is_followed_by_the_return_that_the_parameters_describe(wing
     with_params(winged, **RADIO, FS_SHORT_ACTN=0.0, FS_LONG_ACTN=1.0)
     made = lost(winged)
     ahead, path = path_of(made)
-    assert "RTL 5.0 s after the loss (FS_LONG_ACTN 1)" in made.sentence and "every radio link" in made.sentence
+    assert "RTL 6.2 s after the loss (FS_LONG_ACTN 1)" in made.sentence and "every radio link" in made.sentence
     late = path[ahead >= 150]
     assert np.linalg.norm((late - home_of(winged))[:, :2], axis=1) == pytest.approx(radius_of(winged), abs=40.0)
 
@@ -213,7 +215,7 @@ def test_a_hand_flown_aircraft_circles_and_returns_after_the_loss(twin):
     with_params(twin, **RADIO, FS_SHORT_ACTN=0.0, FS_LONG_ACTN=0.0)
     entered(twin, "FBWA")
     made = lost(twin)
-    assert made.method in MODELS and "CIRCLE 1.2 s" in made.sentence and "RTL 5.0 s" in made.sentence
+    assert made.method in MODELS and "CIRCLE 1.2 s" in made.sentence and "RTL 6.2 s" in made.sentence
 
 
 @pytest.mark.parametrize(("action", "mode"), [(2.0, "FBWA"), (4.0, "FBWB")])
@@ -227,3 +229,80 @@ def test_wings_level_failsafes_fly_straight(twin, action, mode):
     assert abs(course - course[0]).max() < 0.15
     sink = path[ahead <= 40][-1, 2] - path[0, 2]
     assert (sink > 25.0) if mode == "FBWA" else (abs(sink) < 25.0)
+
+
+# --- the change itself -----------------------------------------------------------------------------------------------
+
+
+def with_command(twin: Twin, ahead_s: float, *errors: tuple[float, float]) -> float:
+    """Report crosstrack and height errors every 0.2 s; return the time of the last."""
+    t = twin.telemetry.history.newest + ahead_s + 0.2 * np.arange(len(errors))
+    rows = np.array([(0.1, 0.05, crosstrack, height, 0.0) for crosstrack, height in errors])
+    position = np.repeat(twin.telemetry.history.rows("position")[1][-1:], len(t), axis=0)
+    velocity = np.repeat(twin.telemetry.history.rows("velocity")[1][-1:], len(t), axis=0)
+    advance(twin, (sample(1, t[-1], command=(t, rows), position=(t, position), velocity=(t, velocity)),))
+    return float(t[-1])
+
+
+@pytest.mark.parametrize("errors", [(320.0, 0.0), (0.0, 45.0)])
+def test_a_mode_begins_where_the_reported_path_errors_jump(winged, errors):
+    now = with_command(winged, 0.2, *[(1.0, 0.5)] * 4, errors, errors, errors)
+    assert mode_change_time(winged, now) == pytest.approx(now - 0.5, abs=0.01)
+    entered(winged, "LOITER")
+    assert winged.onboard.entry.t == winged.onboard.plan_changed_t == pytest.approx(now - 0.5, abs=0.01)
+
+
+def test_without_a_jump_a_mode_begins_at_its_report(winged):
+    now = with_command(winged, 0.2, *[(4.0 * k, 0.3 * k) for k in range(7)])  # as fast as it flies
+    assert mode_change_time(winged, now) == now
+
+
+def test_the_controller_continues_its_speed_and_height_state(winged):
+    advance(winged, (), winged.telemetry.history.newest + 1.0)
+    states = tuple(winged.prediction.controller_states)
+    t, law, _ = states[-1]
+    assert law == "arduplane" and t == pytest.approx(winged.telemetry.history.newest, abs=2.5)
+    entered(winged, "LOITER")
+    known, memory = winged.onboard.controller_memory
+    assert known == law and np.isfinite(memory).all(), np.flatnonzero(~np.isfinite(memory))
+    assert memory in [one[2] for one in states]
+    winged.onboard.plan_changed(winged.onboard.plan_changed_t)
+    assert winged.onboard.controller_memory == ("", ())
+
+
+def test_on_the_way_to_a_circle_its_sign_is_that_of_the_parameter(winged):
+    with_params(winged, WP_LOITER_RAD=70.0)
+    origin, start = winged.telemetry.origin, winged.telemetry.history.newest + 0.2
+    entered(winged, "GUIDED")
+    target, t = np.array([400.0, 100.0, -140.0]), start + 0.2 * np.arange(60)
+    r = 500.0 - 20.0 * (t - start)
+    p = target + np.column_stack([r, 0.0 * t, 0.0 * t])
+    commands = np.column_stack([np.full(60, -0.02), 0.0 * t, r - 70.0, 0.0 * t, 0.0 * t])  # banks left, nearly straight
+    centre = np.repeat(to_geodetic(origin, target)[None], 60, axis=0)
+    advance(
+        winged, (sample(1, t[-1], target=(t, centre), position=(t, to_geodetic(origin, p)), command=(t, commands)),)
+    )
+    assert identified_radius(winged) > 0.0
+
+
+def test_a_failsafe_counts_from_the_newest_telemetry_and_not_from_the_start_of_the_rollout():
+    step = FailsafeStep(6.2, "RTL", "FS_LONG_ACTN 1")
+    plan = FailsafePlan((step,), lambda mode, p, course: None, lost_t=1000.0)
+    assert plan.steps_from(999.5)[0].after_s == pytest.approx(6.7)
+    assert plan.steps_from(1000.0) == (step,)
+
+
+@pytest.mark.parametrize("long", [0.0, 1.0])
+def test_predictions_of_the_route_before_a_failsafe_are_not_scored_on_it(winged, long):
+    with_params(winged, **RADIO, FS_SHORT_ACTN=0.0, FS_LONG_ACTN=long)
+    advance(winged, (), winged.telemetry.history.newest + 1.0)
+    assert winged.confidence.tracker.has_open
+    lost(winged)
+    assert winged.confidence.tracker.has_open == (long == 0.0)
+
+
+def test_the_horizon_ends_where_a_failsafe_begins_whose_path_is_not_known(winged):
+    with_params(winged, **RADIO, FS_SHORT_ACTN=0.0, FS_LONG_ACTN=5.0)  # AUTOLAND
+    made = lost(winged)
+    assert "whose path is not predicted" in made.sentence and not made.horizon_open
+    assert made.coast_s + made.horizon_s == pytest.approx(6.2, abs=0.2) or made.horizon_s == 0.0

@@ -34,7 +34,11 @@ if TYPE_CHECKING:
 
 ROUTE_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
 _MAX_ENTRY_AGE_S = 2.0  # maximum age of the position where a mode was entered [s]
+HEARTBEAT_S = 2.0  # the mode is reported once a second; one heartbeat may be lost [s]
+_MAX_COMMAND_GAP_S = 1.0  # between two reports of path errors that are compared [s]
+_ERROR_ROUNDING_M = 1.0  # of the reported path errors [m]
 _TARGET_MOVED_M = 2.0  # a guidance target that moves further is a new one [m]
+_CIRCLING = 0.3  # largest median crosstrack error on a circle, in radii [-]
 _RADIUS_S, _MIN_RADIUS_ROWS = 20.0, 10  # newest flight, and reports in it, that tell the radius of a circle [s]
 _MIN_RADIUS, _RADIUS_SPREAD = 10.0, 0.1  # smallest radius [m], and largest median deviation from it [-]
 _PATH_S, _PATH_FIT_S = 0.6, 20.0  # newest reports that give curvature and course of a path, and of its law [s]
@@ -162,7 +166,7 @@ def identified_radius(twin: "Twin") -> float:
     """Return the radius of the circle that ArduPlane flies about its target, positive clockwise; nan: unknown [m].
 
     The reported crosstrack error is the distance to the target minus the radius, which grows with the square of true
-    over equivalent airspeed. The sign is that of the commanded banks.
+    over equivalent airspeed. On the circle, the sign is that of the commanded banks; before, that of WP_LOITER_RAD.
     """
     target, entry, newest = twin.onboard.target, twin.onboard.entry, twin.telemetry.history.newest
     if twin.mode not in TARGET_MODES or twin.autopilot != "ardupilot" or target is None or entry is None:
@@ -178,7 +182,10 @@ def identified_radius(twin: "Twin") -> float:
     if middle < _MIN_RADIUS or np.median(np.abs(radius - middle)) > _RADIUS_SPREAD * middle:  # no circle about it
         return float("nan")
     widened = eas2tas(target[2] * 1e-3) ** 2
-    return float(np.copysign(middle / widened, np.median(commands[:, 0])))
+    sign = twin.received_params.get("WP_LOITER_RAD", 1.0)
+    if np.median(np.abs(commands[:, 2])) < _CIRCLING * middle:  # on the way to the circle its banks are not yet known
+        sign = float(np.median(commands[:, 0]))
+    return float(np.copysign(middle / widened, sign))
 
 
 def _course_hold(twin: "Twin", situation: ModeSituation) -> ModeSituation | None:
@@ -218,7 +225,7 @@ def failsafe_plan(twin: "Twin") -> FailsafePlan | None:
             return _mission_from_here(twin)
         return mode_route(law, mode, _situation(twin, p, course, None), params, failsafe=True)
 
-    return FailsafePlan(steps, route_of, "(assumes that every radio link is lost)")
+    return FailsafePlan(steps, route_of, "(assumes that every radio link is lost)", twin.telemetry.history.newest)
 
 
 def _no_route(mode: str, p: np.ndarray, course: float) -> None:
@@ -260,15 +267,39 @@ def _ned(origin: Origin, position: Sequence[float] | np.ndarray) -> np.ndarray:
     return to_ned(origin, *(np.array([x], float) for x in position))[0]
 
 
+def mode_change_time(twin: "Twin", t: float) -> float:
+    """Return when a mode began that a heartbeat reports at `t` [s since 1970].
+
+    The reported crosstrack and height errors jump with the route, by more
+    than the aircraft can have flown between two reports; without a jump the time is that of the report.
+    """
+    since = t - HEARTBEAT_S
+    t_c, command = twin.telemetry.history.rows_since("command", since - _MAX_COMMAND_GAP_S)
+    velocity = _newest(twin, "velocity")
+    if len(t_c) < 2 or velocity is None:
+        return t
+    jump = np.nan_to_num(np.abs(np.diff(command[:, 2:4], axis=0))).max(axis=1)
+    reach = 2.0 * float(np.linalg.norm(velocity)) * np.diff(t_c)  # errors to both sides of a line
+    candidates = np.where((t_c[1:] >= since) & (t_c[1:] <= t) & (jump > reach + _ERROR_ROUNDING_M), jump - reach, 0.0)
+    k = int(candidates.argmax())
+    return float(t_c[k : k + 2].mean()) if candidates[k] > 0.0 else t
+
+
 def mode_entry(twin: "Twin", t: float) -> ModeEntry | None:
-    """Return the newest position and course as the entry of a mode at `t`; None without either."""
+    """Return position and course at `t`, from the rows next before it, as the entry of a mode; None without either."""
     t_p, positions = twin.telemetry.history.rows_since("position", t - _MAX_ENTRY_AGE_S)
-    _, velocities = twin.telemetry.history.rows_since("velocity", t - _MAX_ENTRY_AGE_S)
+    t_v, velocities = twin.telemetry.history.rows_since("velocity", t - _MAX_ENTRY_AGE_S)
     if not len(t_p) or not len(velocities) or twin.telemetry.origin is None:
         return None
-    v, since = velocities[-1], min(max(t - float(t_p[-1]), 0.0), _MAX_ENTRY_AGE_S)
-    lat, lon, alt = to_geodetic(Origin(*(int(x) for x in positions[-1])), v * since)
+    row, v = _row_before(t_p, t), velocities[_row_before(t_v, t)]
+    since = min(t - float(t_p[row]), _MAX_ENTRY_AGE_S)
+    lat, lon, alt = to_geodetic(Origin(*(int(x) for x in positions[row])), v * since)
     return ModeEntry(t, (float(lat), float(lon), float(alt)), atan2(v[1], v[0]))
+
+
+def _row_before(times: np.ndarray, t: float) -> int:
+    """Return the number of the last row until `t`, else of the first."""
+    return max(int(np.searchsorted(times, t, side="right")) - 1, 0)
 
 
 def lock_course(twin: "Twin") -> None:

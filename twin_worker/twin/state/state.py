@@ -32,9 +32,11 @@ from twin_worker.twin.state.inputs import Environment, OnboardState, Telemetry
 from twin_worker.twin.state.models import Identification, ModelBank
 from twin_worker.twin.state.outputs import AlertingState, ConfidenceState, PredictionState
 from twin_worker.twin.state.routes import (
+    HEARTBEAT_S,
     ROUTE_MODES,
     failsafe_plan,
     lock_course,
+    mode_change_time,
     mode_entry,
     present_route,
     update_target,
@@ -194,6 +196,7 @@ class Twin(msgspec.Struct):
             self.onboard.entry,
             present_route(self),
             failsafe_plan(self),
+            self.onboard.controller_memory,
             tuple(self.onboard.jumps),
         )
         return PredictionContext(
@@ -278,9 +281,13 @@ def _ingest_status(twin: Twin, status: Status) -> None:
     if 0 < (step := status.clock_advance_s - previous.clock_advance_s) < np.inf:
         _shift_clock(twin, step)
     if status.mode != previous.mode:
-        twin.onboard.enter_mode(mode_entry(twin, status.t))
+        changed_t = mode_change_time(twin, status.t)
+        twin.onboard.enter_mode(mode_entry(twin, changed_t))
         details = f"{status.mode[:20]}, previously {previous.mode[:20]}"
-        invalidate_prediction(twin, Event.MODE if previous.mode else None, status.t, details)
+        event = Event.MODE if previous.mode else None
+        known_t = changed_t if changed_t < status.t else status.t - HEARTBEAT_S
+        invalidate_prediction(twin, event, changed_t, details, known_t=known_t)
+        update_target(twin)
 
 
 def _shift_clock(twin: Twin, step: float) -> None:
