@@ -134,6 +134,17 @@ def test_px4_returns_by_climb_flight_home_and_descent():
     assert len(at_home) == 1
 
 
+def test_px4_returns_by_the_mission_are_not_predicted_and_say_so():
+    landing = (Item(seq=3, command=21, lat_e7=470_000_000, lon_e7=80_000_000),)
+    for kind, items in ((2.0, ()), (4.0, ()), (1.0, landing), (3.0, landing)):
+        route = modes.mode_route("px4", "RTL", situation(items=items), {"RTL_TYPE": kind})
+        assert not len(route.legs) and f"RTL_TYPE {kind:.0f}" in route.summary
+    for kind, items in ((0.0, landing), (1.0, ()), (3.0, ())):
+        assert legs_of("px4", "RTL", {"RTL_TYPE": kind}, items=items)[-1, m.P_N] == HOME[0]
+    low = {"RTL_RETURN_ALT": 128.0}  # 8 m above the entry
+    assert len(legs_of("px4", "RTL", low)) == 2 and len(legs_of("px4", "RTL", low | {"NAV_FW_ALT_RAD": 5.0})) == 3
+
+
 def test_hand_flown_and_unknown_modes_have_no_route():
     for law, mode in (("arduplane", "FBWA"), ("arduplane", "MANUAL"), ("px4", "POSCTL"), ("textbook", "RTL"), ("", "")):
         assert modes.mode_route(law, mode, situation(), {}) is None

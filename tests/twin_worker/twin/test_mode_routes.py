@@ -10,7 +10,7 @@ from fleet.autopilots.control_law import eas2tas
 from fleet.autopilots.failsafe import FailsafeStep
 from fleet.contract import Event, Prediction, TwinState
 from fleet.frames import Origin, to_geodetic, to_ned
-from fleet.mission import RADIUS
+from fleet.mission import P_N, RADIUS
 from tests.support.flights import ROUTE, drive, predictions, sample, status
 from twin_worker.prediction.failsafe_route import FailsafePlan
 from twin_worker.twin.state.routes import identified_radius, mode_change_time, present_route
@@ -150,6 +150,30 @@ def test_an_unknown_home_is_said(winged):
     winged.onboard.set_mission(msgspec.structs.replace(winged.onboard.mission, items=()), winged.first_item)
     made = entered(winged, "RTL")
     assert made.method == "imm" and "home position unknown" in made.sentence
+
+
+def px4_home(twin: Twin, north_m: float) -> tuple[int, int, int]:
+    lat, lon, alt = to_geodetic(twin.telemetry.origin, np.array([north_m, 300.0, 100.0]))
+    return int(lat), int(lon), int(alt)
+
+
+def centre_of(twin: Twin) -> np.ndarray:
+    return present_route(twin).legs[-1, P_N : P_N + 2]
+
+
+def test_the_return_of_px4_ends_at_the_reported_home_which_may_come_late_and_move(winged):
+    drive(winged, [status(winged, autopilot="px4", mode="MISSION")])
+    drive(winged, [status(winged, autopilot="px4", mode="RTL")])
+    assert winged.home is None and "home position unknown" in winged.no_route_reason()
+    entered_t = winged.onboard.plan_changed_t
+    drive(winged, [status(winged, autopilot="px4", mode="RTL", home=px4_home(winged, -900.0))])
+    assert centre_of(winged) == pytest.approx([-900.0, 300.0], abs=0.5)
+    assert winged.onboard.plan_changed_t == entered_t  # the return began before its home was known
+    drive(winged, [status(winged, autopilot="px4", mode="RTL", home=px4_home(winged, -900.5))])
+    assert winged.onboard.plan_changed_t == entered_t  # less than a new route
+    drive(winged, [status(winged, autopilot="px4", mode="RTL", home=px4_home(winged, 700.0))])
+    assert centre_of(winged) == pytest.approx([700.0, 300.0], abs=0.5)
+    assert winged.onboard.plan_changed_t == winged.onboard.status.t
 
 
 def test_the_state_does_not_alternate_before_the_first_model(heard):

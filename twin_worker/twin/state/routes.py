@@ -340,6 +340,19 @@ def update_target(twin: "Twin") -> None:
     invalidate_prediction(twin, Event.TARGET if commanded else None, t_target)
 
 
+def update_home(twin: "Twin", previous: Origin | None, t: float) -> None:
+    """Make a prediction due whose route depends on home, which became known or moved at `t` [s since 1970].
+
+    A home that becomes known was there before: the route is flown since the mode change. One that moves is a new route.
+    """
+    if twin.mode != "RTL" or twin.home is None:
+        return
+    if previous is None:
+        twin.prediction.expire()
+    elif _has_moved(previous, twin.home):
+        invalidate_prediction(twin, None, t)
+
+
 def _has_moved(previous: tuple[float, float, float], new: tuple[float, float, float]) -> bool:
     distance = np.linalg.norm(_ned(Origin(*(int(x) for x in previous)), new))
     return bool(distance > _TARGET_MOVED_M)

@@ -39,6 +39,7 @@ from twin_worker.twin.state.routes import (
     mode_change_time,
     mode_entry,
     present_route,
+    update_home,
     update_target,
 )
 from twin_worker.validation.verify import FIT_THRESHOLD
@@ -210,13 +211,14 @@ class Twin(msgspec.Struct):
 
     @property
     def home(self) -> Origin | None:
-        """Return home: item 0 of an ArduPilot mission, else the last disarmed position; None if unknown."""
+        """Return home: item 0 of an ArduPilot mission, as reported, or the last disarmed position; None if unknown."""
         items = self.onboard.mission.items if self.onboard.mission is not None else ()
         first = next((item for item in items if item.seq == 0), None)
         ardupilot = self.onboard.status is not None and self.onboard.status.autopilot == "ardupilot"
-        if first is None or not ardupilot or not (first.lat_e7 or first.lon_e7) or not abs(first.alt_m) < 1e5:
-            return self.alerts.home_fallback
-        return Origin(first.lat_e7, first.lon_e7, round(first.alt_m * 1e3))
+        if first is not None and ardupilot and (first.lat_e7 or first.lon_e7) and abs(first.alt_m) < 1e5:
+            return Origin(first.lat_e7, first.lon_e7, round(first.alt_m * 1e3))
+        reported = self.onboard.status.home if self.onboard.status is not None else None
+        return self.alerts.home_fallback if reported is None else Origin(*reported)
 
     def no_route_reason(self) -> str:
         """Return why the aircraft follows no known route; empty if it does."""
@@ -280,6 +282,8 @@ def _ingest_status(twin: Twin, status: Status) -> None:
         return
     if 0 < (step := status.clock_advance_s - previous.clock_advance_s) < np.inf:
         _shift_clock(twin, step)
+    if status.home != previous.home and status.mode == previous.mode:
+        update_home(twin, None if previous.home is None else Origin(*previous.home), status.t)
     if status.mode != previous.mode:
         changed_t = mode_change_time(twin, status.t)
         twin.onboard.enter_mode(mode_entry(twin, changed_t))

@@ -3,7 +3,7 @@
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from fleet.contract import Mission
+from fleet.contract import Mission, Status
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
 from gateway.onboard import RequestSender
 from tests.support.talker import T0, Ears, Talker, of
@@ -70,3 +70,15 @@ def test_home_is_requested_where_the_mission_came_before_it():
     intake.receive(T0 + 3.5, home(Talker()), "air")
     intake.flush(T0 + 4)
     assert not requested(T0 + 6)
+
+
+def test_every_status_carries_the_newest_home_and_none_before_the_autopilot_has_one():
+    intake, talker, news = MavlinkReceiver(), Talker(), []
+    for k, part in enumerate([b"", home(talker, 0, 0, 0), home(talker), home(talker, lat=465_000_500, alt_mm=399_000)]):
+        intake.receive(T0 + k, talker.heartbeat(autopilot=PX4) + part, "air")
+        news += intake.flush(T0 + k + 0.5)
+    assert [status.home for status in of(Status, news)[-3:]] == [
+        None,
+        (465_000_000, 70_000_000, 400_100),
+        (465_000_500, 70_000_000, 399_000),
+    ]
