@@ -182,6 +182,11 @@ class SimulatedUav:
         return replies + self._endpoint.stream_parameters(len(self.params))
 
     @property
+    def controller(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return state and route of the autopilot's controller."""
+        return self._ctl.copy(), self._legs
+
+    @property
     def leg(self) -> np.ndarray:
         """Current leg, columns as in `fleet.mission`."""
         return self._legs[int(self._ctl[memory.LEG])]

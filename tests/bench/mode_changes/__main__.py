@@ -8,7 +8,9 @@ route of the new mode, and its error 10 s later over the median error of predict
 within 40 s).
 
 Seeds: JSBSim flights in a wind of 4 m/s, with mode changes commanded by MAVLink, and with a lost link for every
-failsafe. The error is that of the newest prediction 2 s after the change; undisturbed is the same seed without changes.
+failsafe. The error is that of the newest prediction 2 s after the change, beside that of undisturbed predictions of the
+same flight: of all, and of those whose flight turns by a similar angle; and beside that with the state and route of the
+aircraft's own controller, which no better knowledge of the change can improve.
 """
 
 import argparse

@@ -1,17 +1,37 @@
-"""Commanded mode changes in simulated flight: when the prediction follows, and its error 10 s ahead."""
+"""Commanded mode changes in simulated flight: when the prediction follows, and its error 10 s ahead.
 
-from collections.abc import Iterable, Sequence
+It is compared with undisturbed predictions of the same flight: made `SETTLED_S` after a change or later, and flown
+before the next one. A change begins with a turn, and errors grow with turns: beside all of them stand the undisturbed
+predictions whose flight turns by the most similar angle. Beside both stands the same prediction with the state and
+route of the aircraft's own controller: its error is that of model, wind and present state, and no part of the change.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from fleet.contract import Prediction
-from tests.bench.mode_changes.flown import Command, Flight, Predicted, epoch, error_at, fly, make, predict
+from tests.bench.mode_changes.flown import (
+    Command,
+    Flight,
+    Predicted,
+    epoch,
+    error_at,
+    fly,
+    make,
+    predict,
+    with_own_controller,
+)
 from twin_worker.numerics.prediction_errors import along_cross_down, track_frame
+from twin_worker.twin.step import Twin
 
 AHEAD_S, FOLLOW_S = 10.0, 2.0
 WARM_UP_S = 120.0  # before predictions of undisturbed flight count [s]
+SETTLED_S = 12.0  # after a change: a half turn and the capture of a circle [s]
+N_SIMILAR = 15  # predictions in the median of similar turns
 LATEST_S = 30.0  # a later first prediction counts as none [s]
 SCHEDULES = {
     "ardupilot": (
@@ -36,7 +56,10 @@ class Change:
         known_s: from the change to the first prediction along the route of the new mode; None: before the next: none
         first_m: its error `AHEAD_S` ahead [m]
         error_m: the same of the newest prediction `FOLLOW_S` after the change [m]
-        usual_m: median over the undisturbed flight of the same seed [m]
+        usual_m: median of the undisturbed predictions of the same flight [m]
+        similar_m: median of those whose flight turns by the most similar angle [m]
+        own_m: error of the same prediction with the aircraft's own controller [m]
+        turn_deg: angle that the flight turns in those `AHEAD_S`, left and right added
         inside: share of look-aheads 5 and 10 s of that prediction inside its region
         horizon_s: confidence horizon of that prediction
     """
@@ -49,6 +72,9 @@ class Change:
     first_m: float
     error_m: float
     usual_m: float
+    similar_m: float
+    own_m: float
+    turn_deg: float
     inside: float
     horizon_s: float
     method: str
@@ -65,29 +91,67 @@ def follows_route(made: Predicted) -> bool:
     return made.prediction.method != "imm"
 
 
-def undisturbed(seed: int, autopilot: str, folder: Path) -> np.ndarray:
-    """Return the errors `AHEAD_S` ahead in the undisturbed flight of a seed, along a route, (n,) [m]."""
-    flight = fly(make(seed, autopilot), seed, END_S, folder)
-    made = [m for m in predict(flight.messages, {}) if m.prediction.t >= epoch(WARM_UP_S)]
-    return np.array([error_at(flight, m.prediction, AHEAD_S) for m in made if follows_route(m)])
+@dataclass(frozen=True)
+class Undisturbed:
+    """Undisturbed predictions of one flight: errors `AHEAD_S` ahead [m] and turned angles [deg], (n,)."""
+
+    errors: np.ndarray
+    turns: np.ndarray
+
+    def similar(self, turn_deg: float) -> float:
+        """Return the median error of the predictions whose flight turns by the most similar angle [m]."""
+        nearest = np.argsort(np.abs(self.turns - turn_deg), kind="stable")[:N_SIMILAR]
+        return float(np.median(self.errors[nearest])) if len(nearest) else float("nan")
+
+
+def undisturbed(flight: Flight, made: Iterable[Predicted], commands: Iterable[Command]) -> Undisturbed:
+    """Return the predictions along a route that no change of mode disturbs."""
+    changes = np.array([epoch(command.t) for command in commands])
+    on_route = [m.prediction for m in made if follows_route(m) and m.prediction.t >= epoch(WARM_UP_S)]
+    settled = [p for p in on_route if not ((p.t - changes > -AHEAD_S) & (p.t - changes < SETTLED_S)).any()]
+    rows = [(error_at(flight, p, AHEAD_S), turned_angle(flight, p)) for p in settled]
+    errors, turns = np.array(rows).reshape(-1, 2).T
+    known = np.isfinite(errors) & np.isfinite(turns)
+    return Undisturbed(errors[known], turns[known])
+
+
+def turned_angle(flight: Flight, p: Prediction) -> float:
+    """Return the angle that the flight turns over ground in the next `AHEAD_S`, left and right added [deg]."""
+    steps = np.diff(flight.positions(p.ned_origin(), p.t + np.arange(0.0, AHEAD_S + 0.5, 0.5))[:, :2], axis=0)
+    return float(np.degrees(np.abs(np.diff(np.unwrap(np.arctan2(steps[:, 1], steps[:, 0])))).sum()))
 
 
 def measure(seed: int, autopilot: str, folder: Path) -> list[Change]:
-    """Fly a seed without and with changes of mode; return the changes."""
-    usual = float(np.nanmedian(undisturbed(seed, autopilot, folder)))
+    """Fly a seed with changes of mode; return the changes."""
     commands = schedule(seed, autopilot)
     flight = fly(make(seed, autopilot), seed, END_S, folder, commands)
-    made = predict(flight.messages, {})
-    return [_change((seed, autopilot), command, flight, made, usual) for command in commands]
+    made: list[Predicted] = []
+    own: dict[float, float] = {}  # error with the aircraft's own controller, by the time of the prediction
+    twins: dict[int, Twin] = {}
+    changes = np.array([epoch(command.t) for command in commands])
+    for newest in predict(flight.messages, twins):
+        made.append(newest)
+        p = newest.prediction
+        if ((p.t >= changes) & (p.t <= changes + FOLLOW_S)).any():
+            replaced = with_own_controller(flight, deepcopy(twins[p.uav]), p)
+            own[p.t] = float("nan") if replaced is None else error_at(flight, replaced, AHEAD_S)
+    usual = undisturbed(flight, made, commands)
+    return [_change((seed, autopilot), command, flight, (made, own), usual) for command in commands]
 
 
 def _change(
-    flown: tuple[int, str], command: Command, flight: Flight, made: Iterable[Predicted], usual: float
+    flown: tuple[int, str],
+    command: Command,
+    flight: Flight,
+    predicted: tuple[Iterable[Predicted], Mapping[float, float]],
+    usual: Undisturbed,
 ) -> Change:
+    made, own = predicted
     changed, mode = epoch(command.t), SHOWN.get(command.mode, command.mode)
     new = [m for m in made if m.prediction.t >= changed]
     first = next((m.prediction for m in new if m.mode == mode and follows_route(m)), None)
     newest = [m.prediction for m in new if m.prediction.t <= changed + FOLLOW_S][-1]
+    turn_deg = turned_angle(flight, newest)
     return Change(
         *flown,
         command.t,
@@ -95,7 +159,10 @@ def _change(
         None if first is None or first.t > changed + LATEST_S else round(first.t - changed, 2),
         float("nan") if first is None else error_at(flight, first, AHEAD_S),
         error_at(flight, newest, AHEAD_S),
-        usual,
+        float(np.median(usual.errors)) if len(usual.errors) else float("nan"),
+        usual.similar(turn_deg),
+        own[newest.t],
+        turn_deg,
         _inside(flight, newest, (5.0, AHEAD_S)),
         newest.horizon_s,
         newest.method,
@@ -111,13 +178,28 @@ def _inside(flight: Flight, p: Prediction, look_aheads: tuple[float, ...]) -> fl
 
 def report(changes: Sequence[Change]) -> Iterable[str]:
     """Yield a table by autopilot and mode: medians over the flights."""
-    yield "| autopilot, into | changes | known after [s] | error at 10 s [m] | undisturbed [m] | ratio | in region |"
-    yield "|---|---|---|---|---|---|---|"
-    for autopilot, mode in sorted({(c.autopilot, c.mode) for c in changes}):
-        rows = [c for c in changes if (c.autopilot, c.mode) == (autopilot, mode)]
+    yield (
+        "| autopilot, into | changes | known after [s] | error at 10 s [m] | undisturbed [m] | ratio "
+        "| similar turns [m] | ratio | own controller [m] | in region |"
+    )
+    yield "|---|---|---|---|---|---|---|---|---|---|"
+    modes = sorted({(c.autopilot, c.mode) for c in changes})
+    for autopilot, mode in [*modes, *((name, "") for name in sorted({c.autopilot for c in changes})), ("all", "")]:
+        rows = [c for c in changes if autopilot in ("all", c.autopilot) and mode in ("", c.mode)]
         known = [LATEST_S if c.known_s is None else c.known_s for c in rows]
-        error, usual = (float(np.nanmedian([getattr(c, name) for c in rows])) for name in ("error_m", "usual_m"))
-        yield (
-            f"| {autopilot}, {mode} | {len(rows)} | {np.median(known):.1f} (worst {max(known):.1f}) | {error:.1f} "
-            f"| {usual:.1f} | {error / usual:.2f} | {np.mean([c.inside for c in rows]):.0%} |"
+        error, usual, similar, own = (
+            float(np.nanmedian([getattr(c, name) for c in rows]))
+            for name in ("error_m", "usual_m", "similar_m", "own_m")
         )
+        columns = (
+            autopilot + (f", {mode}" if mode else ""),
+            f"{len(rows)}",
+            f"{np.median(known):.1f} (worst {max(known):.1f})",
+            *(f"{x:.1f}" for x in (error, usual)),
+            f"{error / usual:.2f}",
+            f"{similar:.1f}",
+            f"{error / similar:.2f}",
+            f"{own:.1f}",
+            f"{np.mean([c.inside for c in rows]):.0%}",
+        )
+        yield f"| {' | '.join(columns)} |"

@@ -62,7 +62,8 @@ def measure(seed: int, autopilot: str, folder: Path) -> list[Loss]:
     lost_t = round(float(np.random.default_rng((seed, 14)).uniform(FIRST_S, LAST_S)), 1)
     flight = fly(make(seed, autopilot), seed, lost_t, folder)
     twins: dict[int, Twin] = {}
-    predict(flight.messages, twins)
+    for _ in predict(flight.messages, twins):
+        pass
     (twin,) = twins.values()
     return [_loss((seed, autopilot, lost_t), twin, *setting) for setting in SETTINGS[autopilot].items()]
 

@@ -281,6 +281,55 @@ def test_without_a_jump_a_mode_begins_at_its_report(winged):
     assert mode_change_time(winged, now) == now
 
 
+def test_without_path_errors_a_mode_begins_where_the_commanded_bank_moves_as_never_before(winged):
+    start = winged.telemetry.history.newest + 0.2
+    t = start + 0.1 * np.arange(120)
+    banks = 0.1 * np.sin(0.5 * (t - start))
+    nothing = np.full(len(t), np.nan)
+    banks[t > start + 11.25] += np.clip(3.0 * (t[t > start + 11.25] - start - 11.2), 0.0, 0.6)
+    velocity = np.repeat(winged.telemetry.history.rows("velocity")[1][-1:], len(t), axis=0)
+    rows = np.column_stack([banks, 0.0 * t, nothing, nothing, nothing])
+    empty = Twin.of(2)
+    advance(empty, (sample(2, t[-1], command=(t, rows), velocity=(t, velocity)),))
+    assert mode_change_time(empty, t[-1]) == pytest.approx(start + 11.25, abs=0.051)
+    rows[:, 0] = 0.1 * np.sin(0.5 * (t - start))
+    quiet = Twin.of(2)
+    advance(quiet, (sample(2, t[-1], command=(t, rows), velocity=(t, velocity)),))
+    assert mode_change_time(quiet, t[-1]) == t[-1]
+
+
+def with_target(twin: Twin, t: float, north_m: float) -> None:
+    rows = to_geodetic(twin.telemetry.origin, np.array([north_m, -700.0, -140.0]))[None]
+    advance(twin, (sample(1, t, target=(np.array([t]), rows)),))
+
+
+def test_the_first_target_belongs_to_the_mode_change_and_the_next_is_a_new_route(winged):
+    now = winged.telemetry.history.newest
+    with_target(winged, now, -500.0)  # of the mode before
+    with_target(winged, now + 0.1, -500.0)
+    entered(winged, "GUIDED")
+    changed_t, memory = winged.onboard.plan_changed_t, winged.onboard.controller_memory
+    with_target(winged, now + 0.2, -500.0)
+    assert winged.onboard.target is None  # it may have been sent before the change
+    with_target(winged, now + 0.4, 900.0)
+    assert winged.onboard.target is not None
+    assert (winged.onboard.plan_changed_t, winged.onboard.controller_memory) == (changed_t, memory)
+    with_target(winged, now + 1.4, -900.0)
+    assert winged.onboard.plan_changed_t == pytest.approx(now + 1.4)
+
+
+@pytest.mark.parametrize("n_before", [1, 2])
+def test_a_target_that_is_repeated_after_the_change_is_that_of_the_new_mode_too(winged, n_before):
+    now = winged.telemetry.history.newest
+    for k in range(n_before):
+        with_target(winged, now + 0.1 * k, -500.0)
+    entered(winged, "RTL")
+    with_target(winged, now + 0.2, -500.0)
+    assert (winged.onboard.target is None) == (n_before == 2)
+    with_target(winged, now + 0.6, -500.0)
+    assert centre_of(winged) == pytest.approx([-500.0, -700.0], abs=0.5)
+
+
 def test_the_controller_continues_its_speed_and_height_state(winged):
     advance(winged, (), winged.telemetry.history.newest + 1.0)
     states = tuple(winged.prediction.controller_states)

@@ -25,6 +25,13 @@ def record_event(twin: "Twin", event: Event, t: float, details: str = "") -> Non
     twin.prediction.predict_timer.expire()
 
 
+def discard_prediction(twin: "Twin", *, is_first: bool = False) -> None:
+    """End the running prediction: more is known of the route that the aircraft already flies."""
+    twin.prediction.invalidate(is_first=is_first)
+    twin.confidence.tracker.censor_open()
+    twin.prediction.selector.clear()
+
+
 def invalidate_prediction(
     twin: "Twin", event: Event | None, t: float, details: str = "", *, is_first: bool = False, known_t: float = inf
 ) -> None:
@@ -36,8 +43,6 @@ def invalidate_prediction(
     first parameters, with which that worker made the rollout.
     """
     twin.onboard.plan_changed(t, twin.prediction.controller_memory(min(t, known_t)))
-    twin.prediction.invalidate(is_first=is_first)
-    twin.confidence.tracker.censor_open()
-    twin.prediction.selector.clear()
+    discard_prediction(twin, is_first=is_first)
     if event is not None:
         record_event(twin, event, t, details)

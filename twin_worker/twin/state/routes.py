@@ -27,7 +27,7 @@ from fleet.mission import FIRST_ITEM, KIND, LOITER_UNLIMITED, RADIUS, WAYPOINT, 
 from twin_worker.prediction.autopilot_identification import LAW_OF_AUTOPILOT
 from twin_worker.prediction.failsafe_route import FailsafePlan
 from twin_worker.prediction.multirotor.rollout import item_in_force
-from twin_worker.twin.state.events import invalidate_prediction
+from twin_worker.twin.state.events import discard_prediction, invalidate_prediction
 
 if TYPE_CHECKING:
     from twin_worker.twin.state.state import Twin
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 ROUTE_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
 _MAX_ENTRY_AGE_S = 2.0  # maximum age of the position where a mode was entered [s]
 HEARTBEAT_S = 2.0  # the mode is reported once a second; one heartbeat may be lost [s]
-_MAX_COMMAND_GAP_S = 1.0  # between two reports of path errors that are compared [s]
+_BANK_S = 10.0  # commanded banks before the change, in which none is unusual [s]
 _ERROR_ROUNDING_M = 1.0  # of the reported path errors [m]
 _TARGET_MOVED_M = 2.0  # a guidance target that moves further is a new one [m]
 _CIRCLING = 0.3  # largest median crosstrack error on a circle, in radii [-]
@@ -270,19 +270,30 @@ def _ned(origin: Origin, position: Sequence[float] | np.ndarray) -> np.ndarray:
 def mode_change_time(twin: "Twin", t: float) -> float:
     """Return when a mode began that a heartbeat reports at `t` [s since 1970].
 
-    The reported crosstrack and height errors jump with the route, by more
-    than the aircraft can have flown between two reports; without a jump the time is that of the report.
+    The reported crosstrack and height errors jump with the route, by more than the aircraft can have flown between two
+    reports. Without them, the commanded bank first moves by more than between any two reports of the seconds before.
+    Without either the time is that of the report.
     """
     since = t - HEARTBEAT_S
-    t_c, command = twin.telemetry.history.rows_since("command", since - _MAX_COMMAND_GAP_S)
+    t_c, command = twin.telemetry.history.rows_since("command", since - _BANK_S)
     velocity = _newest(twin, "velocity")
     if len(t_c) < 2 or velocity is None:
         return t
+    if not np.isfinite(command[:, 2:4]).any():
+        return _first_unusual_bank(t_c, command[:, 0], since, t)
     jump = np.nan_to_num(np.abs(np.diff(command[:, 2:4], axis=0))).max(axis=1)
     reach = 2.0 * float(np.linalg.norm(velocity)) * np.diff(t_c)  # errors to both sides of a line
     candidates = np.where((t_c[1:] >= since) & (t_c[1:] <= t) & (jump > reach + _ERROR_ROUNDING_M), jump - reach, 0.0)
     k = int(candidates.argmax())
     return float(t_c[k : k + 2].mean()) if candidates[k] > 0.0 else t
+
+
+def _first_unusual_bank(t_c: np.ndarray, banks: np.ndarray, since: float, t: float) -> float:
+    """Return when the commanded bank first moves faster than ever before `since`; `t` if it does not [s since 1970]."""
+    rates = np.abs(np.diff(np.nan_to_num(banks))) / np.maximum(np.diff(t_c), 1e-3)
+    before = rates[t_c[1:] < since]
+    unusual = np.flatnonzero((t_c[1:] >= since) & (t_c[1:] <= t) & (rates > (before.max() if len(before) else np.inf)))
+    return float(t_c[unusual[0] : unusual[0] + 2].mean()) if len(unusual) else t
 
 
 def mode_entry(twin: "Twin", t: float) -> ModeEntry | None:
@@ -323,21 +334,38 @@ def lock_course(twin: "Twin") -> None:
 
 
 def update_target(twin: "Twin") -> None:
-    """Store the newest guidance target of the present mode; one that moved invalidates the prediction."""
+    """Store the newest guidance target of the present mode.
+
+    The first one tells where the aircraft flies since the mode change; one that moved is a new route from now on.
+    """
     t, targets = twin.telemetry.history.rows("target")
     if twin.mode not in TARGET_MODES or twin.telemetry.origin is None or not len(t):
         return
     t_target, target = float(t[-1]), targets[-1].astype(float)
     if twin.onboard.entry is None:  # the first status arrived in this mode
         twin.onboard.enter_mode(mode_entry(twin, t_target))
+        invalidate_prediction(twin, None, t_target)
     elif not t_target > twin.onboard.entry.t:
         return
     previous, new = twin.onboard.target, (float(target[0]), float(target[1]), float(target[2]))
-    if previous is not None and not _has_moved(previous, new):
-        return
-    twin.onboard.set_target(new)
-    commanded = previous is not None and twin.mode == "GUIDED"
-    invalidate_prediction(twin, Event.TARGET if commanded else None, t_target)
+    if previous is None:
+        if not _is_of_mode_before(t, targets, twin.onboard.entry):
+            twin.onboard.set_target(new)
+            discard_prediction(twin)
+    elif _has_moved(previous, new):
+        twin.onboard.set_target(new)
+        invalidate_prediction(twin, Event.TARGET if twin.mode == "GUIDED" else None, t_target)
+
+
+def _is_of_mode_before(t: np.ndarray, targets: np.ndarray, entry: ModeEntry | None) -> bool:
+    """Return whether the only target since the mode change repeats that of the mode before.
+
+    It may have been sent before the change, whose time is known to the period of the commands.
+    """
+    if entry is None or not 1 < int(np.searchsorted(t, entry.t, side="right")) == len(t) - 1:
+        return False
+    *older, new = ((float(x[0]), float(x[1]), float(x[2])) for x in targets[-3:])
+    return not any(_has_moved(one, new) for one in older)
 
 
 def update_home(twin: "Twin", previous: Origin | None, t: float) -> None:
