@@ -207,7 +207,7 @@ def after_steering(situation: ModeSituation, course: float, bank: float, height_
 
 def _px4_return(situation: ModeSituation, params: Mapping[str, float]) -> Route:
     """Climb to RTL_RETURN_ALT in a circle, fly home, descend to RTL_DESCEND_ALT in a circle, and stay there."""
-    home, here = situation.home, situation.position
+    home, here = situation.home, situation.entry
     kind = int(_parameter(params, (("RTL_TYPE", 1.0),), 0.0))
     lands = any(item.command in _PX4_LANDINGS for item in situation.items)
     if kind in _PX4_BY_MISSION or (kind in _PX4_ANY_LANDING and lands):

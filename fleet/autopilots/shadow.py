@@ -120,7 +120,8 @@ def replay_controller(
         leg = int(ctl[S.LEG])
         refuted = refuted and leg_done
         if leg_done and not refuted and switched < 0 and leg + 1 < legs.shape[0] and legs[leg, SEQ] == seq[k]:
-            reported_ctl, switched = ctl.copy(), k
+            if legs[leg + 1, SEQ] != seq[k]:  # else no report follows, as within a route without items
+                reported_ctl, switched = ctl.copy(), k
             begin(ctl, par, legs, leg + 1, p[k])
     if last >= 0:
         reported = np.array([phi_c[n - 1], theta_c[n - 1], delta[n - 1, 3], Va[n - 1]])

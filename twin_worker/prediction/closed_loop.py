@@ -16,6 +16,7 @@ from fleet.physics.simulate import N_STATE, simulate
 from fleet.window import Window
 from twin_worker.estimation.airspeed_setpoint import (
     MIN_DIFFERENCE,
+    STEADY_S,
     apply_setpoint,
     inferred_setpoint,
     reported_demand,
@@ -133,7 +134,8 @@ def _align_speed_demand(ctl: np.ndarray, par: np.ndarray, demand: float) -> None
 def _airspeed_setpoint(context: PredictionContext, t: float, cruise: float) -> float:
     """Return the airspeed set-point: reported, else the flown one of the mission speeds; nan if unknown [m/s].
 
-    A mode change resets the set-point of ArduPlane to cruise.
+    A mode change resets the set-point of ArduPlane to cruise. With others the speed flown before it tells nothing: PX4
+    flies a mode without mission at cruise, and commands the speed of the mission again when it returns to it.
     """
     entry = context.onboard.entry
     entered_t = -np.inf if entry is None else entry.t
@@ -142,6 +144,8 @@ def _airspeed_setpoint(context: PredictionContext, t: float, cruise: float) -> f
         return setpoint
     if context.onboard.law == "arduplane" and t < entered_t + _RESET_S:
         return cruise
+    if context.onboard.law != "arduplane" and t < entered_t + STEADY_S:
+        return float("nan")
     mission_speeds = {
         item.param2 for item in context.onboard.items if item.command == SPEED and 0 < item.param2 < np.inf
     }

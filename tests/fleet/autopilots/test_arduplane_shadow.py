@@ -75,6 +75,16 @@ def test_the_shadow_run_follows_the_reported_item_not_its_own_opinion():
     assert np.isfinite(ctl).all()
 
 
+def test_legs_of_one_number_are_left_without_a_report_as_in_a_return():
+    legs, _, rows, deltas, true = recorded(60)
+    assert int(true[ap.LEG]) > 0
+    unnumbered = rows.copy()
+    unnumbered[:, 14] = -1
+    legs[:, m.SEQ] = -1
+    _, ctl, rms = shadowed(legs, unnumbered, deltas, 0)
+    assert int(ctl[ap.LEG]) == int(true[ap.LEG]) and rms < radians(2)
+
+
 def circled(until_s, delay_s):
     """Fly a circle and leave it; the items are reported once a second and late. Give route, record, surfaces."""
     legs = route(leg(m.LOITER_TURNS, n=400.0, radius=80.0, turns=1.0), leg(n=400.0, e=2000.0))

@@ -130,8 +130,10 @@ def test_px4_returns_by_climb_flight_home_and_descent():
     assert circle[m.KIND] == m.LOITER_UNLIMITED and circle[m.P_D] == -50.0 and circle[m.RADIUS] == 90.0
     high = legs_of("px4", "RTL", params, entry=np.array([1000, 50, -300.0]), position=np.array([1000, 50, -300.0]))
     assert len(high) == 2 and high[0, m.P_D] == -300.0  # it does not descend on the way
-    at_home = legs_of("px4", "RTL", params, position=HOME + np.array([20.0, 0.0, -180.0]))
+    at_home = legs_of("px4", "RTL", params, entry=HOME + np.array([20.0, 0.0, -180.0]))
     assert len(at_home) == 1
+    arrived = legs_of("px4", "RTL", params, position=HOME + np.array([20.0, 0.0, -180.0]))
+    assert np.array_equal(arrived, np.array([climb, cruise, circle]))  # the route stays that of the mode change
 
 
 def test_px4_returns_by_the_mission_are_not_predicted_and_say_so():
