@@ -1,9 +1,9 @@
 """Calibration table of one group: error standard deviation and half-axes by look-ahead, from uncertainty features.
 
-By axis sigma^2 = scale^2 s^2 + lag^2 r^2 + turn^2 d^2 + floor^2, with the ensemble spread s, the forecast revision r and
-the displacement d of an aircraft that is one along-track sigma early or late on the predicted path: across and
-vertical only, and zero where the path is straight and level. Half-axes are factor sigma: all axes have the same coverage, and
-`NOMINAL_COVERAGE` of the flights lie within all three at once.
+By axis sigma^2 = scale^2 s^2 + lag^2 r^2 + turn^2 d^2 + floor^2, with the ensemble spread s, the forecast revision r,
+and the displacement d of an aircraft that is one along-track sigma early or late on the predicted path: across and
+vertical only, and zero where the path is straight and level. Half-axes are factor sigma: all axes have the same
+coverage, and `NOMINAL_COVERAGE` of the flights lie within all three at once.
 """
 
 from dataclasses import dataclass, field
