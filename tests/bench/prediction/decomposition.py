@@ -6,6 +6,7 @@ misses the flight with all of them is an error of law, route or model; what they
 Missions, point mass in closed loop: airspeed, height, wind with heading error (mean of 10 s), and turn rate at a bank
 (mean of 10 s), which an error of the attitude estimate changes. The last row has the recorded bank: kinematics alone.
 GUIDED along a reported path: the later reports of the path, then height, then the distance flown along the path.
+Where most starts have neither (multirotors): height and distance on the predicted path.
 """
 
 import argparse
@@ -52,6 +53,7 @@ PARTS = {  # what is known of the later flight
     "airspeed, height, wind, turn rate at a bank": ("airspeed", "height", "wind", "turn"),
     "the same and the bank: kinematics": ("airspeed", "height", "wind", "turn", "bank"),
 }
+ON_PATH = ("height", "height, distance")
 GUIDED = ("later path", "later path, height", "later path, height, distance")
 
 
@@ -189,9 +191,13 @@ def guided_paths(start: Start, history: TelemetryHistory, case: EvaluationCase) 
     path = kinematic.fly(track, np.zeros(len(track)), config, model, np.maximum(ahead, 0.0)).path
     if path is None:
         return {}
-    high = path.copy()
-    high[:, 2] = np.where(np.isfinite(case.positions[:, 2]), case.positions[:, 2], path[:, 2])
-    return dict(zip(GUIDED, (path, high, along(high, case.positions)), strict=True))
+    return dict(zip(GUIDED, (path, *with_later_motion(path, case.positions)), strict=True))
+
+
+def with_later_motion(path: np.ndarray, flown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a path at the heights flown later, and also at the distances flown along it, (k, 3) [m]."""
+    high = np.column_stack([path[:, :2], np.where(np.isfinite(flown[:, 2]), flown[:, 2], path[:, 2])])
+    return high, along(high, flown)
 
 
 def along(path: np.ndarray, flown: np.ndarray) -> np.ndarray:
@@ -235,7 +241,8 @@ def evaluate(path: Path) -> dict[str, Any]:
                     starts[evaluated.starts[-1].t] = capture(evaluated.twin, evaluated.starts[-1].t)
 
     cases = [case for case in driver.run(messages()) if not case.exclusion and OURS in case.start.forecasts]
-    kept, flights = [], {}
+    by_variants: dict[tuple[str, ...], list[EvaluationCase]] = {}
+    flights: dict[str, Flight] = {}
     for case in cases:
         start, history = starts[case.start.t], histories[case.start.uav]
         paths: dict[str, np.ndarray] = {}
@@ -248,9 +255,13 @@ def evaluate(path: Path) -> dict[str, Any]:
             for name, known in PARTS.items():
                 flown = fly(start, flights[key], known)
                 paths[name] = np.column_stack([np.interp(AHEAD, times, x, right=np.nan) for x in flown.T])
+        else:
+            paths = dict(zip(ON_PATH, with_later_motion(case.start.forecasts[OURS].path, case.positions), strict=True))
         if paths:
-            kept.append(with_paths(case, paths))
-    ordered = [name for name in (OURS, *SIMPLE, *GUIDED, *PARTS) if kept and name in kept[0].start.forecasts]
+            by_variants.setdefault(tuple(paths), []).append(with_paths(case, paths))
+    kept = max(by_variants.values(), key=len, default=[])
+    variants = (OURS, *SIMPLE, *ON_PATH, *GUIDED, *PARTS)
+    ordered = [name for name in variants if kept and all(name in case.start.forecasts for case in kept)]
     return {"recording": path.name, "starts": len(cases), "compared": len(kept), "variants": scores(kept, ordered)}
 
 
