@@ -15,9 +15,18 @@ from viewer.store.states import notices
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.text.missed_events import missed_events_html, parse_click
-from viewer.text.words import MAX_ROWS, alerts_html, empty_html, legend_html, severity, summary_html, table
+from viewer.text.words import (
+    MAX_ROWS,
+    alerts_html,
+    empty_html,
+    legend_html,
+    severity,
+    state_style,
+    summary_html,
+    table,
+)
 from viewer.theme.events import TimelineEvent
-from viewer.theme.palette import STATE_TEXT, Palette, triple
+from viewer.theme.palette import Palette, triple
 
 MAX_EVENT_ROWS = 40  # events shown; earlier ones are counted
 
@@ -149,7 +158,7 @@ class Panels:
             (self._table, table(shown, palette, now, total=len(fleet), pick=pick, selected=selected) if fleet else ""),
             (self._legend, legend_html(fleet, palette)),
             (self._missed, missed),
-            (self._alerts, alerts_html(fleet, store, palette, pick)),
+            (self._alerts, alerts_html(fleet, palette, now, pick)),
             (self._facts, figures_html(selected_vehicle, now) if selected_vehicle is not None else ""),
         )
         with self._browser.client.atomic():  # contents first: the block delays all other messages
@@ -186,7 +195,7 @@ class Panels:
         if not (terms := self._search.value.lower().split()):
             return True
         mode = vehicle.status.mode if vehicle.status is not None else ""
-        text = f"{vehicle.name} {vehicle.uav} {STATE_TEXT[vehicle.state(now)]} {mode}".lower()
+        text = f"{vehicle.name} {vehicle.uav} {state_style(vehicle.record(now))[2]} {mode}".lower()
         return all(term in text for term in terms)
 
     def _handler(self) -> str:

@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fleet.contract import TwinState
-from viewer.scene.fleet_arrays import FleetArrays
+from viewer.scene.fleet_arrays import LOST, MISMATCH, FleetArrays, display_status
 from viewer.store.vehicle import Vehicle
-from viewer.text.words import age_text, in_force, severity, short_text
+from viewer.text.words import in_force, lost_text, severity, short_text
 from viewer.theme.palette import STATE_STYLE
 
 MAX_LABELS = 8
@@ -107,9 +107,13 @@ def _box(tag: Tag, point: np.ndarray) -> np.ndarray:
 MAX_ALERT_LABELS = 6  # most labels at once; overlapping ones are omitted
 
 
-def alert_labels(fleet_arrays: FleetArrays, selected: int | None, unit: float) -> list[Tag]:
-    """Return labels at the most severe UAVs; `unit` is the drawn span of an aircraft [10 m]."""
-    exceptional = [(v, i) for v, i in fleet_arrays.exceptional if v.uav != selected and not v.ended]
+def alert_labels(fleet_arrays: FleetArrays, shown: dict[int, Vehicle], selected: int | None, unit: float) -> list[Tag]:
+    """Return labels at the most severe UAVs.
+
+    `shown` are the snapshots in the panels, by UAV; `unit` is the drawn span of an aircraft [10 m].
+    """
+    listed = [(shown.get(v.uav, v), i) for v, i in fleet_arrays.exceptional if v.uav != selected and not v.ended]
+    exceptional = [(v, i) for v, i in listed if display_status(v, fleet_arrays.now) in (MISMATCH, LOST)]
     rows = sorted(exceptional, key=lambda entry: severity(entry[0], fleet_arrays.now))[:MAX_ALERT_LABELS]
     above = np.array([0.0, 0.0, 0.9 * unit])
     return [
@@ -125,8 +129,9 @@ def alert_labels(fleet_arrays: FleetArrays, selected: int | None, unit: float) -
 
 def alert_text(vehicle: Vehicle, now: float) -> str:
     """Describe the problems of a UAV in a short label."""
-    if vehicle.state(now) is TwinState.LINK_LOST:
-        return f"{STATE_STYLE[TwinState.LINK_LOST][0]} {vehicle.name} link lost {age_text(vehicle.sample_age_s(now))}"
+    record = vehicle.record(now)
+    if record.state is TwinState.LINK_LOST:
+        return f"{STATE_STYLE[TwinState.LINK_LOST][0]} {vehicle.name} {lost_text(record)}"
     kinds = ", ".join(dict.fromkeys(alert.kind.value.replace("_", " ") for alert in vehicle.alerts.values()))
     if vehicle.mismatch is not None and in_force(vehicle.mismatch):
         kinds = ", ".join(filter(None, (short_text(vehicle.mismatch), kinds)))
