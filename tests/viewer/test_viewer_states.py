@@ -159,8 +159,8 @@ def test_the_newest_verification_says_which_fit_the_predictions_use(clock: Clock
     ("fit", "horizon_s", "text", "colour", "told"),
     [
         (88.0, 34.0, "verified", DARK.verified, "measured on past predictions."),
-        (8.0, 34.0, "verified, low fit", DARK.predicting, "although the model alone is inaccurate"),
-        (88.0, 6.0, "verified, short horizon", DARK.predicting, "wind, route or control law are not"),
+        (8.0, 34.0, "low fit", DARK.predicting, "although the model alone is inaccurate"),
+        (88.0, 6.0, "short horizon", DARK.predicting, "wind, route or control law are not"),
     ],
 )
 def test_a_verified_model_is_green_only_with_fit_and_horizon(

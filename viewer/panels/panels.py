@@ -7,7 +7,7 @@ from typing import Any
 
 import viser
 
-from viewer.browser.http_server import Browser
+from viewer.browser.http_server import Browser, parse_layout
 from viewer.panels.charts import Charts
 from viewer.panels.detail import figures_html, status_html
 from viewer.store.inbox import date_text, time_of_day, timestamp
@@ -86,9 +86,12 @@ class Panels:
         )
         self._gui.set_panel_label("ParaUAV")
         self._gui.main_panel.dock_left()
-        self._gui.main_panel.set_width(340)
         css = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
         self._gui.add_html(f"<style>:root{{--muted:{palette.muted}}}{css}</style>")
+        self._legend_place, layout_input = self._gui.add_html(""), self._gui.add_text("layout", "", visible=False)
+        layout_input.on_update(lambda _: self._set_layout(layout_input.value))
+        report = f"window.reportLayout('{layout_input._impl.uuid}')"  # defined in first.html
+        self._gui.add_html(f'<img src="data:," alt="" style="display:none" onerror="{report}">')
         self._banner, self._error, self._legend = (self._gui.add_html("") for _ in range(3))
         self._build_left()
         self._build_right()
@@ -131,7 +134,22 @@ class Panels:
             self._events = self._gui.add_html("")
             self._facts = self._gui.add_html("")
         panel.dock_right()
-        panel.set_width(350)
+        self._right, self._widths = panel, (0, 0)
+        self._fit_panels()
+
+    def _set_layout(self, text: str) -> None:
+        """Fit the panels to the window that the page reports."""
+        if (layout := parse_layout(text)) is not None:
+            self._browser.layout = layout
+            self._fit_panels()
+
+    def _fit_panels(self) -> None:
+        if (widths := self._browser.layout.panel_widths()) != self._widths:
+            self._widths = widths
+            self._gui.main_panel.set_width(widths[0])
+            self._right.set_width(widths[1])
+            sides = f"--left:{widths[0] + 4}px;--right:{widths[1] + 4}px"
+            self._legend_place.content = f"<style>:root{{{sides}}}</style>"
 
     def _pick(self, text: str) -> None:
         """Select the UAV that a click wrote into the hidden input."""

@@ -55,7 +55,7 @@ class View:
         self.panels.seek = self.timeline.send_code()
         with self.timeline.tab("Export", viser.Icon.DOWNLOAD):
             Export(client, store, recordings, palette, lambda: self.selected)
-        self.camera = Camera(client)
+        self.camera = Camera(browser)
         self.selected: int | None = None
         self.dirty = True  # the selection changed and is not drawn yet
         self.offset = 0  # tick of the second at which slow content is drawn
@@ -172,6 +172,7 @@ class View:
         tags, marks = self.selection.tags, self.selection.marks
         alerts = alert_labels(fleet_arrays, self._shown, self.selected, scene.glyphs.unit)
         self._labels.draw([*tags, *marks[:1], *alerts, *marks[1:]], camera_view)
+        self.selection.move_numbers(self._labels.boxes, camera_view)
 
     def draw_slow(self, fleet_arrays: FleetArrays, now: float, ground: float) -> None:
         """Draw slow content once per second and on a new selection: trails, predictions, routes, panels."""
@@ -236,7 +237,7 @@ class View:
             lines, track = mission_lines(vehicle.mission, scene_frame, ground), self._store.track(vehicle)[:, 1:]
         content = np.vstack([points, lines.points, lines.circles.reshape(-1, 3), track])
         points = within_reach(content, IN_VIEW_M / UNIT_M)
-        key = (*key, bool(len(lines.points)), round(self.camera.aspect, 1))
+        key = (*key, bool(len(lines.points)), round(self.camera.aspect, 1), round(self.camera.bottom_share, 1))
         if key == self._framed_key and not outgrown(points, self._framed_box):
             return
         grown, self._framed_key = key == self._framed_key, key

@@ -129,9 +129,9 @@ def state_style(record: StatusRecord) -> tuple[str, str, str]:
     text = STATE_TEXT[record.state]
     if record.state is TwinState.VERIFIED:
         if record.fit is None or record.fit < LOW_FIT:
-            return glyph, STATE_STYLE[TwinState.PREDICTING][1], f"{text}, low fit"
+            return glyph, STATE_STYLE[TwinState.PREDICTING][1], "low fit"
         if record.prediction_age_s is not None and not record.horizon_open and record.horizon_s < SHORT_HORIZON_S:
-            return glyph, STATE_STYLE[TwinState.PREDICTING][1], f"{text}, short horizon"
+            return glyph, STATE_STYLE[TwinState.PREDICTING][1], "short horizon"
     return glyph, colour, text
 
 
@@ -222,14 +222,16 @@ def table(fleet: list[Vehicle], palette: Palette, now: float, *, total: int, pic
     return (
         '<div class="uav list"><table><tr><th></th><th>UAV</th><th>status</th><th class="num">fit %</th>'
         f'<th class="num">horizon</th></tr>{rows}</table>'
-        f'<div class="foot">{len(worst)} of {total} · alerts and worst state first, then shortest horizon</div></div>'
+        f'<div class="foot">{len(worst)} of {total} · alerts and worst state first, then shortest horizon '
+        "· keys J, K: next, previous</div></div>"
     )
 
 
 def _row(vehicle: Vehicle, palette: Palette, now: float, pick: str, *, on: bool, longest: float) -> str:
     label, record = status_label(vehicle, palette, now), vehicle.record(now)
     text = lost_text(record) if label.text == STATE_TEXT[TwinState.LINK_LOST] else label.text
-    text += f", {lag_text(record)}" if record.prediction_lag_s else ""
+    if record.prediction_lag_s and record.state is not TwinState.LINK_LOST:
+        text += f", {age_text(record.prediction_lag_s)} old"
     bar = f'<i><i style="width:{min(record.horizon_s / longest, 1) * 100:.0f}%;background:{label.colour}"></i></i>'
     percent, problem = fit_text(record).removesuffix(" %"), escape(_problem_text(vehicle, text, now))
     return (

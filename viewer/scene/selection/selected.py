@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from fleet.contract import DiagnosisOutcome, Mismatch, TwinState
-from viewer.scene.labels import CameraView, Tag
+from viewer.scene.labels import CameraView, Tag, overlap
 from viewer.scene.routes import NOTHING, RouteLines
 from viewer.scene.selection.pins import EventMarkers, curtain, marked_look_aheads, rings, sample_paths, tube_faces
 from viewer.scene.strokes import Strokes, chain, circle, closed_loops, dash_lines, dashed
@@ -27,6 +27,7 @@ from viewer.theme.palette import Palette, mix, rgb, triple
 from viewer.theme.shapes import digit_strokes, face_camera
 
 MAX_NUMBERS = 60  # items up to which numbers are drawn
+NUMBER_SIZE, NUMBER_SHIFT = 0.36, 0.34  # height of a number and its offset from the item [drawn spans of an aircraft]
 Parts = list[tuple[np.ndarray, np.ndarray]]  # segments (n, 2, 3) [10 m] and their colour (3,)
 
 
@@ -89,6 +90,9 @@ class Selection:
         self._event_markers = EventMarkers(scene, palette)
         self._trail_start = np.inf  # start of the bright newest stretch of the path [s since 1970]
         self._track_colour = mix(palette.actual, palette.ground, 0.5)
+        self._label_boxes: list[np.ndarray] = []  # labels shown last
+        self._hidden_numbers = np.zeros(0, bool)  # items whose number a label covers
+        self._drawn_route: tuple[Vehicle, RouteLines, CameraView, float] | None = None
         self.tube = True
         self.tags: list[Tag] = []  # moving labels
         self.marks: list[Tag] = []  # labels at fixed positions
@@ -111,7 +115,7 @@ class Selection:
         for strokes in (self._thin, self._track, self._bold, self._horizon, self._mismatch):
             strokes.draw(NOTHING.legs)
         self._hide_tube()
-        self.tags, self.marks = [], []
+        self.tags, self.marks, self._drawn_route = [], [], None
 
     def draw(self, vehicle: Vehicle, store: FleetStore, now: float, *, ground: float, unit: float) -> None:
         """Draw the moving content of the UAV; `unit` is the drawn span of an aircraft [10 m]."""
@@ -196,11 +200,33 @@ class Selection:
         if mismatch is not None and onset is not None:
             self.marks.insert(0, Tag("mismatch", f"▲ {short_text(mismatch)} from here", onset))
 
+    def move_numbers(self, boxes: list[np.ndarray], camera_view: CameraView) -> None:
+        """Draw the route again when labels, (2, 2) [image heights], cover other numbers than before."""
+        self._label_boxes = boxes
+        if self._drawn_route is not None:
+            _, route, _, unit = self._drawn_route
+            if not np.array_equal(self._hidden_numbers, self._covered(route, camera_view, unit)):
+                self.draw_route(*self._drawn_route[:2], camera_view, unit)
+
+    def _covered(self, route: RouteLines, camera_view: CameraView, unit: float) -> np.ndarray:
+        """Return a mask (n,) of the items whose number lies in the box of a label."""
+        right, up = camera_view.axes()
+        size = NUMBER_SIZE * unit
+        corners = [np.zeros(3), 2 * size * right + size * up] + NUMBER_SHIFT * unit * (right + up)
+        covered = np.zeros(len(route.points), bool)
+        for k, point in enumerate(route.points if self._label_boxes else ()):
+            number, depth = camera_view.project(point + corners)
+            covered[k] = (depth > 0).all() and any(overlap(number, box) for box in self._label_boxes)
+        return covered
+
     def draw_route(self, vehicle: Vehicle, route: RouteLines, camera_view: CameraView, unit: float) -> None:
         """Draw its mission: legs and loiters solid, jumps and returns dashed, a ring and a number at each item.
 
-        The numbers face the camera. The active item and its leg are highlighted. `unit` is as for `draw`.
+        The numbers face the camera and give way to labels. The active item and its leg are highlighted. `unit` is as
+        for `draw`.
         """
+        self._drawn_route = vehicle, route, camera_view, unit
+        self._hidden_numbers = self._covered(route, camera_view, unit)
         p, seq = self._palette, active_seq(vehicle)
         right, up = camera_view.axes()
         lines = [
@@ -208,16 +234,16 @@ class Selection:
             (dash_lines(route.returns, 1.2 * unit), mix(p.route, p.ground, 0.5)),
         ]
         leg = []
-        for point, item in zip(route.points, route.items.tolist(), strict=True):
+        for point, item, hidden in zip(route.points, route.items.tolist(), self._hidden_numbers, strict=True):
             ring = circle(point, 0.22 * unit, 14)
             if item == seq:
                 leg.append((ring, rgb(p.ink)))
             else:
                 lines.append((ring, rgb(p.route)))
-            if len(route.items) <= MAX_NUMBERS:
-                number = face_camera(digit_strokes(str(item), 0.42 * unit), right, up)
+            if len(route.items) <= MAX_NUMBERS and not hidden:
+                number = face_camera(digit_strokes(str(item), NUMBER_SIZE * unit), right, up)
                 colour = rgb(p.ink) if item == seq else mix(p.ink, p.route, 0.35)
-                lines.append((number + point + 0.34 * unit * (right + up), colour))
+                lines.append((number + point + NUMBER_SHIFT * unit * (right + up), colour))
         leg.append((route.legs[route.ends == seq], rgb(p.route)))
         self._route.draw_parts(lines)
         self._leg.draw_parts(leg)
