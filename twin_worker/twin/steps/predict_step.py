@@ -65,6 +65,8 @@ def predict(twin: Twin, now: float) -> list[Message]:
         ensemble_spread(twin, path_forecast.method, ahead[:n]),
     )
     confidence = twin.confidence.tracker.confidence_of(forecast)
+    if path_forecast.known_s < confidence.horizon_s:
+        confidence = replace(confidence, horizon_s=path_forecast.known_s, horizon_open=False)
     prediction = _to_message(twin, forecast, confidence)
     prediction = msgspec.structs.replace(
         prediction,
