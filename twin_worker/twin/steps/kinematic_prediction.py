@@ -40,6 +40,7 @@ class PathForecast:
         seq: mission item at the start, -1 none
         sentence: basis of the prediction, or the reason why there is none
         control: controller model used
+        known_s: look-ahead at which a failsafe begins whose route is not known [s]
     """
 
     path: np.ndarray | None
@@ -48,6 +49,7 @@ class PathForecast:
     seq: int
     sentence: str
     control: ControllerTwin | None = None
+    known_s: float = np.inf
 
 
 def no_prediction(sentence: str, seq: int = -1) -> PathForecast:
@@ -191,7 +193,8 @@ def predict_without_model(twin: Twin, recent: Track, ahead: np.ndarray) -> PathF
     text = f"{kinematic.describe(twin.models.kinematic)}. {forecast.sentence}".strip(". ")
     reported = reported_path(twin)
     path = forecast.path if reported is None or reported.repeats else _turn_after(forecast.path, ahead, reported)
-    return PathForecast(path, "greybox", greybox.LAW, forecast.seq, text, forecast.controller)
+    control, known_s = forecast.controller, forecast.known_s
+    return PathForecast(path, "greybox", greybox.LAW, forecast.seq, text, control, known_s)
 
 
 def _turn_after(path: np.ndarray, ahead: np.ndarray, reported: ReportedPath) -> np.ndarray:
