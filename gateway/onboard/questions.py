@@ -9,6 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
 from fleet.telemetry.mavlink.parsing.decode import IDS, layout
+from gateway import DEFAULT_BUDGET
 from gateway.link_spec import LinkSpec
 from gateway.onboard.parameter_cache_check import ANY, DIALECTS, STREAMS, Cache, CacheCheck, RequestDialect
 from gateway.record.tape import read_size
@@ -25,7 +26,6 @@ IMU_HZ = 25.0  # for diagnosis [Hz]
 IMU_MESSAGES = {"ardupilot": "RAW_IMU", "px4": "SCALED_IMU"}  # requested, by autopilot
 DIAGNOSIS_HZ: dict[str, float] = {**dict.fromkeys(IMU_MESSAGES.values(), IMU_HZ), "LOCAL_POSITION_NED": 10}
 """Rates that only diagnosis needs; an aircraft is asked for one of the IMU messages [Hz]."""
-DEFAULT_BUDGET = "1M"  # default rate that the aircraft of one link may send together [bytes/s]
 _FRAME_BYTES = 12  # bytes of a frame without payload
 _SERIAL_SHARE = 0.7  # share of a serial line that telemetry may fill
 

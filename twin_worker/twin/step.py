@@ -234,7 +234,7 @@ def _update_link(twin: Twin, now: float) -> list[Message]:
     record_event(
         twin, Event.LINK_LOST if lost else Event.LINK_RESTORED, now, f"no sample for {silence_s:.1f} s" if lost else ""
     )
-    return list(link_alerts(twin, now, silence_s))
+    return list(link_alerts(twin, now))
 
 
 def _score_predictions(twin: Twin) -> None:

@@ -247,18 +247,18 @@ def _mission(survey: Survey) -> MissionStatistics:
 
 def _surfaces(survey: Survey) -> tuple[dict[int, str], str]:
     """Return the control surface or motor of each output, and what was assumed about a rotorcraft."""
-    found = {
+    surfaces = {
         n: surface
         for n in range(1, SERVO_COUNT + 1)
         if (surface := _SURFACES.get(int(survey.values.get(f"SERVO{n}_FUNCTION", -1))))
     }
     for parameter, before in _PX4_PORTS:
         numbers = {before + n: int(survey.values.get(f"{parameter}{n}", 0)) for n in range(1, 9)}
-        found |= {n: _PX4_SURFACES[number] for n, number in numbers.items() if number in _PX4_SURFACES}
+        surfaces |= {n: _PX4_SURFACES[number] for n, number in numbers.items() if number in _PX4_SURFACES}
     if not survey.vehicle_class.is_rotorcraft:
-        return found or _DEFAULT_SURFACES, ""
-    if found:
-        return found, ""
+        return surfaces or _DEFAULT_SURFACES, ""
+    if surfaces:
+        return surfaces, ""
     count = _MOTOR_COUNT.get(int(survey.values.get("FRAME_CLASS", 1)), 4)
     return {n: f"motor {n}" for n in range(1, count + 1)}, _MOTORS_ASSUMED
 

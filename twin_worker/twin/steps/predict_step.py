@@ -15,7 +15,7 @@ from twin_worker.prediction.closed_loop import MIN_ROLLOUT_S
 from twin_worker.prediction.method_selection import constant_turn_prediction
 from twin_worker.telemetry.track import Track
 from twin_worker.twin.state.events import record_event
-from twin_worker.twin.state.routes import reported_path
+from twin_worker.twin.state.reported_path import reported_path
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.kinematic_prediction import (
     PathForecast,
@@ -112,7 +112,7 @@ def _publish_expiry(twin: Twin, coast_s: float, now: float) -> list[Message]:
     if twin.prediction.coasting_expired or twin.prediction.latest is None:
         return []
     twin.prediction.set_coasting_expired(True)
-    record_event(twin, Event.COASTING_EXPIRED, now, f"{_coast_text(twin, coast_s)}")
+    record_event(twin, Event.COASTING_EXPIRED, now, f"{_coast_text(twin, coast_s)} for {coast_s:.0f} s")
     _set_state(twin, twin.prediction.state)
     twin.prediction.predict_timer.restart(now)
     prediction = msgspec.structs.replace(
@@ -129,11 +129,10 @@ def _publish_expiry(twin: Twin, coast_s: float, now: float) -> list[Message]:
 
 
 def _coast_text(twin: Twin, coast_s: float) -> str:
-    return (
-        f"{'link lost' if twin.telemetry.link_lost else 'positions stopped'} {coast_s:.0f} s ago"
-        if coast_s or twin.telemetry.link_lost
-        else ""
-    )
+    """Describe the missing telemetry; its age is `coast_s`, as the last text is shown while the age grows."""
+    if not (coast_s or twin.telemetry.link_lost):
+        return ""
+    return "link lost" if twin.telemetry.link_lost else "positions stopped"
 
 
 def _effects_text(twin: Twin, path_forecast: PathForecast) -> str:
