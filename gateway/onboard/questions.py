@@ -159,8 +159,10 @@ class RequestScheduler:
         return [dialect.MAVLink_mission_request_int_message(*self._to, seq)]
 
     def _home(self, now: float) -> list[Any]:
-        """Return a request for HOME_POSITION where the mission was downloaded before the autopilot had a home."""
-        if not self.aircraft.mission.needs_home or not self._home_wait.due(now):
+        """Return a request for HOME_POSITION where the mission came before it, or, with PX4, never contains home."""
+        px4_needs_it = self.aircraft.autopilot == "px4" and self.aircraft.home is None
+        needs_home = self.aircraft.mission.needs_home or (px4_needs_it and self.aircraft.mission.complete)
+        if not needs_home or not self._home_wait.due(now):
             return []
         request = (dialect.MAV_CMD_REQUEST_MESSAGE, 0, dialect.MAVLINK_MSG_ID_HOME_POSITION, 0, 0, 0, 0, 0, 0)
         return [dialect.MAVLink_command_long_message(*self._to, *request)]

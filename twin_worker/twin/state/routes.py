@@ -1,8 +1,8 @@
 """Routes that no mission describes: of the present mode, and of the failsafe after a link loss."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from math import atan2, copysign, isfinite, pi, radians
+from dataclasses import replace
+from math import atan2, isfinite
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -18,32 +18,28 @@ from fleet.autopilots.modes import (
     ModeSituation,
     after_steering,
     hold_bank,
-    make_leg,
     mode_route,
 )
 from fleet.contract import Event
-from fleet.frames import G, Origin, to_geodetic, to_ned, wrap
-from fleet.mission import FIRST_ITEM, KIND, LOITER_UNLIMITED, RADIUS, WAYPOINT, Route, unroll_route
+from fleet.frames import Origin, to_geodetic, to_ned
+from fleet.mission import FIRST_ITEM, KIND, LOITER_UNLIMITED, RADIUS, Route, unroll_route
 from twin_worker.prediction.autopilot_identification import LAW_OF_AUTOPILOT
 from twin_worker.prediction.failsafe_route import FailsafePlan
 from twin_worker.prediction.multirotor.rollout import item_in_force
-from twin_worker.twin.state.events import invalidate_prediction
+from twin_worker.twin.state.events import discard_prediction, invalidate_prediction
 
 if TYPE_CHECKING:
     from twin_worker.twin.state.state import Twin
 
 ROUTE_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
 _MAX_ENTRY_AGE_S = 2.0  # maximum age of the position where a mode was entered [s]
+HEARTBEAT_S = 2.0  # the mode is reported once a second; one heartbeat may be lost [s]
+_BANK_S = 10.0  # commanded banks before the change, in which none is unusual [s]
+_ERROR_ROUNDING_M = 1.0  # of the reported path errors [m]
 _TARGET_MOVED_M = 2.0  # a guidance target that moves further is a new one [m]
+_CIRCLING = 0.3  # largest median crosstrack error on a circle, in radii [-]
 _RADIUS_S, _MIN_RADIUS_ROWS = 20.0, 10  # newest flight, and reports in it, that tell the radius of a circle [s]
 _MIN_RADIUS, _RADIUS_SPREAD = 10.0, 0.1  # smallest radius [m], and largest median deviation from it [-]
-_PATH_S, _PATH_FIT_S = 0.6, 20.0  # newest reports that give curvature and course of a path, and of its law [s]
-_PATH_LAG_S = 2.0  # flight on the reported path in the replay of the law [s]
-_MIN_OFF_TARGET = radians(15.0)  # a bearing that differs more from that of the target belongs to another path [rad]
-_MIN_TURN_RATE = radians(3.0)  # slower turns of the reported course are rounding to degrees [rad/s]
-_ARC_STEP, _ARC_STEPS, _PATH_M = radians(15.0), 12, 1e5  # of a curved path; length of its straight end [m]
-_MAX_PATH_BANK_ERROR = radians(6.0)  # largest median error of the law to the commanded banks [rad]
-_PATH_PERIODS, _PATH_DAMPINGS = np.arange(8.0, 31.0, 2.0), np.arange(0.6, 1.05, 0.1)  # tried values of L1 [s, -]
 _FAILSAFE_PARAMETERS = {"arduplane": ("FS_LONG_ACTN", "FS_GCS_ENABL"), "px4": ("NAV_DLL_ACT",)}
 
 
@@ -67,88 +63,6 @@ def present_route(twin: "Twin") -> Route | None:
     return _manual_until_failsafe(twin, law)
 
 
-@dataclass(frozen=True)
-class ReportedPath:
-    """Path that an autopilot reports to follow, without any list of points.
-
-    Attributes:
-        route: from the point abeam the aircraft on
-        since: time from which the flight is on it, as far as known [s since 1970]
-        law: period and damping of L1 that match the commanded banks, by their names with ArduPlane
-    """
-
-    route: Route
-    since: float
-    law: dict[str, float]
-
-
-def reported_path(twin: "Twin") -> ReportedPath | None:
-    """Return the path that NAV_CONTROLLER_OUTPUT describes in GUIDED; None where it flies to the reported target.
-
-    An onboard computer may command a path point by point. Its course is the reported bearing, the aircraft is left of
-    it by the crosstrack error. A course that turns continues as an arc; what follows is not known.
-    """
-    history, origin, newest = twin.telemetry.history, twin.telemetry.origin, twin.telemetry.history.newest
-    if twin.mode != "GUIDED" or twin.autopilot != "ardupilot" or origin is None or twin.prediction.override is not None:
-        return None
-    t, bearings = history.rows_since("bearing", max(newest - _PATH_FIT_S, twin.onboard.plan_changed_t))
-    (t_c, commands), (t_p, positions) = (
-        history.rows_since(name, t[0] - 2.0 if len(t) else 0.0) for name in ("command", "position")
-    )
-    t_v, velocities = history.rows_since("velocity", t[0] - 2.0 if len(t) else 0.0)
-    if len(t) < _MIN_RADIUS_ROWS or newest - t[-1] > _MAX_ENTRY_AGE_S or min(len(t_p), len(t_v), len(t_c)) < 2:
-        return None
-    p = _at(t, t_p, to_ned(origin, *positions.T))
-    bearing, crosstrack = np.unwrap(bearings[:, 0]), np.interp(t, t_c, commands[:, 2])
-    if twin.onboard.target is not None:
-        offset = _ned(origin, twin.onboard.target)[:2] - p[:, :2]
-        off_target = np.abs(wrap(bearing - np.arctan2(offset[:, 1], offset[:, 0])))
-        if np.median(off_target) < _MIN_OFF_TARGET:
-            return None
-    v = _at(t, t_v, velocities)
-    law = _path_law(bearing, crosstrack, v, np.interp(t, t_c, commands[:, 0]))
-    if law is None or not np.isfinite(crosstrack[-1]):
-        return None
-    recent = t > t[-1] - _PATH_S
-    rate = float(np.polyfit(t[recent] - t[-1], bearing[recent], 1)[0]) if recent.sum() > 3 else 0.0
-    course, speed = float(bearing[-1]), max(float(np.hypot(*v[-1, :2])), 1.0)
-    start = p[-1] + crosstrack[-1] * np.array([-np.sin(course), np.cos(course), 0.0])
-    points = [start]
-    if abs(rate) > _MIN_TURN_RATE:
-        step = copysign(_ARC_STEP, rate)
-        for _ in range(_ARC_STEPS):
-            chord, course = 2.0 * speed / rate * np.sin(0.5 * step), course + step
-            points.append(
-                points[-1] + chord * np.array([np.cos(course - 0.5 * step), np.sin(course - 0.5 * step), 0.0])
-            )
-    points.append(points[-1] + _PATH_M * np.array([np.cos(course), np.sin(course), 0.0]))
-    legs = np.array([make_leg(WAYPOINT, point) for point in points[1:]])
-    remark = ("the path beyond the reported course is not known",)
-    return ReportedPath(Route(origin, legs, start, remark), float(t[-1]) - _PATH_LAG_S, law)
-
-
-def _at(t: np.ndarray, sample_t: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    return np.column_stack([np.interp(t, sample_t, column) for column in rows.T])
-
-
-def _path_law(bearing: np.ndarray, crosstrack: np.ndarray, v: np.ndarray, banks: np.ndarray) -> dict[str, float] | None:
-    """Return period and damping of L1 that match the commanded banks; None where L1 does not.
-
-    phi = atan(4 zeta pi v sin(nu) / (T g)),  nu = asin(e / L1) + bearing - course,  L1 = zeta T v / pi
-    """
-    speed = np.maximum(np.hypot(v[:, 0], v[:, 1]), 1.0)
-    nu2 = wrap(bearing - np.arctan2(v[:, 1], v[:, 0]))
-    best, law = _MAX_PATH_BANK_ERROR, None
-    for T in _PATH_PERIODS:
-        for zeta in _PATH_DAMPINGS:
-            nu = nu2 + np.arcsin(np.clip(crosstrack * pi / (zeta * T * speed), -0.7071, 0.7071))
-            phi = np.arctan(4.0 * zeta * pi * speed / (T * G) * np.sin(np.clip(nu, -pi / 2, pi / 2)))
-            error = float(np.median(np.abs(np.clip(phi, banks.min(), banks.max()) - banks)))
-            if error < best:
-                best, law = error, {"NAVL1_PERIOD": float(T), "NAVL1_DAMPING": float(zeta)}
-    return law
-
-
 def _with_radius(route: Route, radius: float) -> Route:
     """Return the route with a radius [m] for circles that have none of their own; nan: unchanged."""
     if not isfinite(radius):
@@ -162,7 +76,7 @@ def identified_radius(twin: "Twin") -> float:
     """Return the radius of the circle that ArduPlane flies about its target, positive clockwise; nan: unknown [m].
 
     The reported crosstrack error is the distance to the target minus the radius, which grows with the square of true
-    over equivalent airspeed. The sign is that of the commanded banks.
+    over equivalent airspeed. On the circle, the sign is that of the commanded banks; before, that of WP_LOITER_RAD.
     """
     target, entry, newest = twin.onboard.target, twin.onboard.entry, twin.telemetry.history.newest
     if twin.mode not in TARGET_MODES or twin.autopilot != "ardupilot" or target is None or entry is None:
@@ -178,7 +92,10 @@ def identified_radius(twin: "Twin") -> float:
     if middle < _MIN_RADIUS or np.median(np.abs(radius - middle)) > _RADIUS_SPREAD * middle:  # no circle about it
         return float("nan")
     widened = eas2tas(target[2] * 1e-3) ** 2
-    return float(np.copysign(middle / widened, np.median(commands[:, 0])))
+    sign = twin.received_params.get("WP_LOITER_RAD", 1.0)
+    if np.median(np.abs(commands[:, 2])) < _CIRCLING * middle:  # on the way to the circle its banks are not yet known
+        sign = float(np.median(commands[:, 0]))
+    return float(np.copysign(middle / widened, sign))
 
 
 def _course_hold(twin: "Twin", situation: ModeSituation) -> ModeSituation | None:
@@ -218,7 +135,7 @@ def failsafe_plan(twin: "Twin") -> FailsafePlan | None:
             return _mission_from_here(twin)
         return mode_route(law, mode, _situation(twin, p, course, None), params, failsafe=True)
 
-    return FailsafePlan(steps, route_of, "(assumes that every radio link is lost)")
+    return FailsafePlan(steps, route_of, "(assumes that every radio link is lost)", twin.telemetry.history.newest)
 
 
 def _no_route(mode: str, p: np.ndarray, course: float) -> None:
@@ -260,15 +177,50 @@ def _ned(origin: Origin, position: Sequence[float] | np.ndarray) -> np.ndarray:
     return to_ned(origin, *(np.array([x], float) for x in position))[0]
 
 
+def mode_change_time(twin: "Twin", t: float) -> float:
+    """Return when a mode began that a heartbeat reports at `t` [s since 1970].
+
+    The reported crosstrack and height errors jump with the route, by more than the aircraft can have flown between two
+    reports. Without them, the commanded bank first moves by more than between any two reports of the seconds before.
+    Without either the time is that of the report.
+    """
+    since = t - HEARTBEAT_S
+    t_c, command = twin.telemetry.history.rows_since("command", since - _BANK_S)
+    velocity = _newest(twin, "velocity")
+    if len(t_c) < 2 or velocity is None:
+        return t
+    if not np.isfinite(command[:, 2:4]).any():
+        return _first_unusual_bank(t_c, command[:, 0], since, t)
+    jump = np.nan_to_num(np.abs(np.diff(command[:, 2:4], axis=0))).max(axis=1)
+    reach = 2.0 * float(np.linalg.norm(velocity)) * np.diff(t_c)  # errors to both sides of a line
+    candidates = np.where((t_c[1:] >= since) & (t_c[1:] <= t) & (jump > reach + _ERROR_ROUNDING_M), jump - reach, 0.0)
+    k = int(candidates.argmax())
+    return float(t_c[k : k + 2].mean()) if candidates[k] > 0.0 else t
+
+
+def _first_unusual_bank(t_c: np.ndarray, banks: np.ndarray, since: float, t: float) -> float:
+    """Return when the commanded bank first moves faster than ever before `since`; `t` if it does not [s since 1970]."""
+    rates = np.abs(np.diff(np.nan_to_num(banks))) / np.maximum(np.diff(t_c), 1e-3)
+    before = rates[t_c[1:] < since]
+    unusual = np.flatnonzero((t_c[1:] >= since) & (t_c[1:] <= t) & (rates > (before.max() if len(before) else np.inf)))
+    return float(t_c[unusual[0] : unusual[0] + 2].mean()) if len(unusual) else t
+
+
 def mode_entry(twin: "Twin", t: float) -> ModeEntry | None:
-    """Return the newest position and course as the entry of a mode at `t`; None without either."""
+    """Return position and course at `t`, from the rows next before it, as the entry of a mode; None without either."""
     t_p, positions = twin.telemetry.history.rows_since("position", t - _MAX_ENTRY_AGE_S)
-    _, velocities = twin.telemetry.history.rows_since("velocity", t - _MAX_ENTRY_AGE_S)
+    t_v, velocities = twin.telemetry.history.rows_since("velocity", t - _MAX_ENTRY_AGE_S)
     if not len(t_p) or not len(velocities) or twin.telemetry.origin is None:
         return None
-    v, since = velocities[-1], min(max(t - float(t_p[-1]), 0.0), _MAX_ENTRY_AGE_S)
-    lat, lon, alt = to_geodetic(Origin(*(int(x) for x in positions[-1])), v * since)
+    row, v = _row_before(t_p, t), velocities[_row_before(t_v, t)]
+    since = min(t - float(t_p[row]), _MAX_ENTRY_AGE_S)
+    lat, lon, alt = to_geodetic(Origin(*(int(x) for x in positions[row])), v * since)
     return ModeEntry(t, (float(lat), float(lon), float(alt)), atan2(v[1], v[0]))
+
+
+def _row_before(times: np.ndarray, t: float) -> int:
+    """Return the number of the last row until `t`, else of the first."""
+    return max(int(np.searchsorted(times, t, side="right")) - 1, 0)
 
 
 def lock_course(twin: "Twin") -> None:
@@ -292,21 +244,51 @@ def lock_course(twin: "Twin") -> None:
 
 
 def update_target(twin: "Twin") -> None:
-    """Store the newest guidance target of the present mode; one that moved invalidates the prediction."""
+    """Store the newest guidance target of the present mode.
+
+    The first one tells where the aircraft flies since the mode change; one that moved is a new route from now on.
+    """
     t, targets = twin.telemetry.history.rows("target")
     if twin.mode not in TARGET_MODES or twin.telemetry.origin is None or not len(t):
         return
     t_target, target = float(t[-1]), targets[-1].astype(float)
     if twin.onboard.entry is None:  # the first status arrived in this mode
         twin.onboard.enter_mode(mode_entry(twin, t_target))
+        invalidate_prediction(twin, None, t_target)
     elif not t_target > twin.onboard.entry.t:
         return
     previous, new = twin.onboard.target, (float(target[0]), float(target[1]), float(target[2]))
-    if previous is not None and not _has_moved(previous, new):
+    if previous is None:
+        if not _is_of_mode_before(t, targets, twin.onboard.entry):
+            twin.onboard.set_target(new)
+            discard_prediction(twin)
+    elif _has_moved(previous, new):
+        twin.onboard.set_target(new)
+        invalidate_prediction(twin, Event.TARGET if twin.mode == "GUIDED" else None, t_target)
+
+
+def _is_of_mode_before(t: np.ndarray, targets: np.ndarray, entry: ModeEntry | None) -> bool:
+    """Return whether the only target since the mode change repeats that of the mode before.
+
+    It may have been sent before the change, whose time is known to the period of the commands.
+    """
+    if entry is None or not 1 < int(np.searchsorted(t, entry.t, side="right")) == len(t) - 1:
+        return False
+    *older, new = ((float(x[0]), float(x[1]), float(x[2])) for x in targets[-3:])
+    return not any(_has_moved(one, new) for one in older)
+
+
+def update_home(twin: "Twin", previous: Origin | None, t: float) -> None:
+    """Make a prediction due whose route depends on home, which became known or moved at `t` [s since 1970].
+
+    A home that becomes known was there before: the route is flown since the mode change. One that moves is a new route.
+    """
+    if twin.mode != "RTL" or twin.home is None:
         return
-    twin.onboard.set_target(new)
-    commanded = previous is not None and twin.mode == "GUIDED"
-    invalidate_prediction(twin, Event.TARGET if commanded else None, t_target)
+    if previous is None:
+        twin.prediction.expire()
+    elif _has_moved(previous, twin.home):
+        invalidate_prediction(twin, None, t)
 
 
 def _has_moved(previous: tuple[float, float, float], new: tuple[float, float, float]) -> bool:
