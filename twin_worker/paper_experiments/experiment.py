@@ -136,8 +136,8 @@ class ExperimentPlan:
 
     seen_s: float = 40.0
     unseen_s: float = 4.0
-    every_s: float = 2.0
-    each: int = 150
+    every_s: float = 1.0
+    each: int = 200
 
 
 @dataclass(frozen=True)
