@@ -210,6 +210,11 @@ def test_wrong_use_is_one_sentence(words, sentence, capfd):
     assert sentence in said and "Traceback" not in said
 
 
+def test_no_experiment_of_a_mode_is_an_error(capfd):
+    assert __main__.main(["identify", "flight.tlog", "--each", "0"]) == 2
+    assert "--each: found 0, expected 1 or more" in capfd.readouterr().err
+
+
 def test_too_short_a_recording_is_said(tmp_path, capfd):
     path = tmp_path / "short.tlog"
     to_tlog(path, [SimulatedUav(0, 5)], seconds=30, loss=0.0, seed=5)

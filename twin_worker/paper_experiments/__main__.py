@@ -115,6 +115,8 @@ def format_summary(first: str, table: dict[str, dict[str, Any]], plan: Experimen
 
 
 def _run(args: argparse.Namespace) -> int:
+    if args.each < 1:
+        raise ValueError(f"--each: found {args.each}, expected 1 or more; write e.g. 100")
     flights: list[RecordedFlight] = []
     for path in args.files:
         report_progress("paper", f"reading {path.name}")
