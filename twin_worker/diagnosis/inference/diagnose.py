@@ -8,7 +8,7 @@ import numpy as np
 from fleet.effects import Onset, Stage, catalogue
 from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.data.flight import FlightData, decimated
-from twin_worker.diagnosis.inference.isolation.decision import CLASS_PROBABILITY, TURBULENCE, Decision, decide
+from twin_worker.diagnosis.inference.isolation.decision import TURBULENCE, Decision, decide
 from twin_worker.diagnosis.inference.isolation.isolate import MIN_R2, ScoredHypothesis
 from twin_worker.diagnosis.inference.isolation.search import Search, turbulence_evidence
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
@@ -31,6 +31,7 @@ from twin_worker.diagnosis.model.weather import own_weather
 
 # least probability that effects of the catalogue, and nothing else, act; and of each from held-out data alone [-]
 NAMED_PROBABILITY = 0.5
+SUSPECTED_PROBABILITY = 0.2  # the same, for a suspicion [-]
 MAX_CLASS = 4  # largest number of effects that a name may stand for
 MAX_RATIO = 3.0  # largest mean square of a channel over its usual without a better explanation [-]
 _MAX_SPEED_RATIO = 1.7  # a larger speed ratio means another aircraft
@@ -175,15 +176,16 @@ def _validated(
 
     Where held-out data confirm none of them, the last one and False.
     """
-    named = decision.best.members if decision.best and decision.effects > 1.0 - CLASS_PROBABILITY else ()
+    named = decision.best.members if decision.best and decision.effects > SUSPECTED_PROBABILITY else ()
     while named:
+        named = search.estimated(named)
         hypotheses = tuple(member.hypothesis for member in named)
         proof = cross_validate.fit_and_validate(search.whitened, hypotheses, before, search.blocks, search.weights)
         probability = [proof.probability(k) for k in range(len(named))]
         weakest = int(np.argmin(probability))
         if probability[weakest] > NAMED_PROBABILITY or len(named) == 1:
             return named, proof, probability[weakest] > NAMED_PROBABILITY
-        named = search.without(named, named[weakest])
+        named = (*named[:weakest], *named[weakest + 1 :])
     return (), CrossValidation(np.nan, np.nan, (), ()), False
 
 
@@ -278,4 +280,4 @@ def _outcome(decision: Decision, confirmed: bool, fits: bool) -> ReportOutcome:
     separable = all(1 + len(member.rivals) <= MAX_CLASS for member in members)
     if confirmed and separable and decision.effects > NAMED_PROBABILITY:
         return ReportOutcome.NAMED
-    return ReportOutcome.SUSPECTED if decision.effects > 1.0 - CLASS_PROBABILITY else ReportOutcome.NONE
+    return ReportOutcome.SUSPECTED if decision.effects > SUSPECTED_PROBABILITY else ReportOutcome.NONE

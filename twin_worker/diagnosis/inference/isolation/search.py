@@ -1,6 +1,7 @@
 """Search sets of up to three effects that explain a flight: a beam over the best names, then backward elimination."""
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from itertools import combinations
 
@@ -75,11 +76,15 @@ class Search:
         sets = [one for one in self.explanations if one.members and not one.change]
         return sets[int(np.argmax(self._evidence(sets)))] if sets else None
 
-    def without(self, members: Sequence[ScoredHypothesis], omitted: ScoredHypothesis) -> tuple[ScoredHypothesis, ...]:
-        """Return the other members refined, with their rivals."""
-        others = [member for member in members if member is not omitted]
-        refined = self._refined(others).members
-        return tuple(replace(one, rivals=other.rivals) for one, other in zip(refined, others, strict=True))
+    def estimated(self, members: Sequence[ScoredHypothesis]) -> tuple[ScoredHypothesis, ...]:
+        """Return the members refined given the others, the nuisances estimated anew with these; rivals as they are."""
+        refined = list(members)
+        for i, member in enumerate(members):
+            given = copy(self.whitened)
+            others = (one.hypothesis for k, one in enumerate(refined) if k != i)
+            given.condition_on((*self.whitened.conditions, *others))
+            refined[i] = replace(refine(given, member.hypothesis), rivals=member.rivals)
+        return tuple(refined)
 
     def _evidence(self, explanations: Sequence[Explanation]) -> np.ndarray:
         reference = [*explanations, *self.explanations]
