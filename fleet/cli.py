@@ -1,15 +1,21 @@
 """The `fleet` command, one verb per file in `fleet/commands/`, and functions common to all console commands."""
 
 import argparse
+import ast
+import difflib
 import importlib
+import math
 import os
 import pkgutil
 import queue
+import re
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any, NoReturn
 
 from fleet import __version__, commands
 from fleet.process.children import run_until
@@ -21,13 +27,88 @@ ORPHAN_GRACE_S = 30.0  # time for an orphan process to shut down in order [s]
 Command = Callable[[argparse.Namespace], int]
 
 
-def make_parser(prog: str, summary: str, examples: str) -> argparse.ArgumentParser:
+_INT = re.compile(r"[-+]?\d+")
+_REWORDED = (  # message of argparse, and what is said instead: `argument NAME` is already removed from it
+    (r"(.*): invalid choice: (.*) \(choose from (.*)\)", r"\1: found \2, expected \3"),
+    (r"(.*): expected (?:one|at least one|\d+) arguments?", r"\1: found no value, expected one; write it after \1"),
+    (r"(.*): ignored explicit argument (.*)", r"\1: found value \2, expected none; leave it out"),
+    (r"(.*): not allowed with argument (.*)", r"\1: found \2 as well, expected one of both; leave one out"),
+    (r"ambiguous option: (\S*) could match (.*)", r"\1: found an abbreviation of \2; write one in full"),
+    (r"the following arguments are required: (.*)", r"\1: found none, expected one; add it"),
+)
+
+
+class Parser(argparse.ArgumentParser):
+    """Parser whose errors state what was found and expected, with the nearest valid word, after the usage."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **options)
+        self.register("type", int, _whole_number)
+        self.register("type", float, _finite_number)
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:  # type: ignore[override]
+        """Parse all arguments; an unknown one is an error of the verb, with its usage."""
+        parsed, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            verb: Parser = getattr(parsed, "parser", self)
+            verb.error(verb.describe_unknown(unknown[0]))
+        return parsed
+
+    def error(self, message: str) -> NoReturn:
+        """Print usage and error and exit with code 2."""
+        text = message.removeprefix("argument ")
+        for pattern, replacement in _REWORDED:
+            if match := re.fullmatch(pattern, text, re.S):
+                text = match.expand(replacement)
+                if "invalid choice" in pattern:
+                    known = [word.strip("' ") for word in match[3].split(",")]
+                    text = f"{match[1]}: found {match[2]}, expected {', '.join(known)}"
+                    text += did_you_mean(match[2].strip("'"), known)
+                break
+        self.print_usage(sys.stderr)
+        report_failure(self.prog, text, logged=False)
+        raise SystemExit(2)
+
+    def option_strings(self) -> list[str]:
+        """Return all option names, in the order of the help."""
+        return [name for action in self._actions for name in action.option_strings]
+
+    def describe_unknown(self, word: str) -> str:
+        """Describe an argument that no option and no position takes."""
+        name = word.partition("=")[0]
+        if not name.startswith("-"):
+            return f"found {word!r} behind all arguments, expected nothing more; leave it out or quote spaces"
+        return f"found no option {name!r}, expected one of the usage above{did_you_mean(name, self.option_strings())}"
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Return `; did you mean X?` with the nearest known word; without a near one, a remedy."""
+    near = difflib.get_close_matches(word.lower(), list(known), n=1, cutoff=0.5)
+    return f"; did you mean {near[0]}?" if near else "; see --help"
+
+
+def _whole_number(text: str) -> int:
+    if not _INT.fullmatch(text):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number; correct it")
+    return int(text)
+
+
+def _finite_number(text: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a number; correct it")
+    return number
+
+
+def make_parser(prog: str, summary: str, examples: str) -> Parser:
     """Create a parser whose help ends with examples."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog=prog,
         description=summary,
         epilog="examples:\n" + examples.strip("\n"),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"parauav {__version__}")
     return parser
@@ -43,11 +124,27 @@ def run_command(prog: str, run: Command, args: argparse.Namespace) -> int:
     try:
         code = run_interruptible(lambda: run(args))
     except (ValueError, OSError) as error:
-        report_failure(prog, str(error), logged=logs)
+        report_failure(prog, describe_error(error), logged=logs)
         return set_exit_code(2)
     if code == INTERRUPTED and not os.environ.get(PARENT):  # otherwise the parent reports it
         report_failure(prog, "interrupted", logged=logs)
     return set_exit_code(code)
+
+
+def describe_error(error: Exception) -> str:
+    """Return the text of an expected failure; one of the operating system with what was expected and the remedy."""
+    if not isinstance(error, OSError) or error.filename is None or error.errno is None:
+        return str(error)
+    name = repr(str(error.filename))
+    if isinstance(error, FileNotFoundError):
+        return f"found no file {name}, expected one; check the path"
+    if isinstance(error, IsADirectoryError):
+        return f"found a folder {name}, expected a file; name a file in it"
+    if isinstance(error, NotADirectoryError):
+        return f"found a file in place of a folder in {name}, expected a folder; check the path"
+    if isinstance(error, PermissionError):
+        return f"found no permission for {name}, expected to be allowed; change it with chmod, or choose another"
+    return f"found an error with {name} ({error.strerror}), expected none; check disk and path"
 
 
 def stop_on_signal() -> threading.Event:
@@ -102,6 +199,28 @@ def check_parent(option: str, path: Path | str | None) -> None:
         raise ValueError(f"{option}: found no folder {str(Path(path).parent)!r}, expected one; create it first")
 
 
+def check_file(option: str, path: Path | str, expected: str = "a recording") -> None:
+    """Check that an input is a file.
+
+    Raises:
+        ValueError: when it does not exist or is a folder; the text names the option.
+    """
+    if Path(path).is_dir():
+        raise ValueError(f"{option}: found a folder {str(path)!r}, expected {expected}; name a file in it")
+    if not Path(path).exists():
+        raise ValueError(f"{option}: found no file {str(path)!r}, expected {expected}; check the path")
+
+
+def check_port(option: str, port: int) -> None:
+    """Check the number of a TCP port.
+
+    Raises:
+        ValueError: when it is out of range; the text names the option.
+    """
+    if not 0 < port < 65_536:
+        raise ValueError(f"{option}: found {port}, expected 1 to 65535; choose another port")
+
+
 def host_and_port(option: str, text: str) -> tuple[str, int]:
     """Parse HOST:PORT.
 
@@ -134,30 +253,48 @@ def command_modules() -> dict[str, str]:
     return {module.name.rpartition(".")[2]: module.name for module in modules if not module.ispkg}
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run `fleet <verb>`."""
+def _summary(module: str) -> str:
+    """Return the first line of a module's docstring without importing it."""
+    spec = find_spec(module)
+    assert spec is not None and spec.origin is not None
+    document = ast.get_docstring(ast.parse(Path(spec.origin).read_text(encoding="utf-8"))) or ""
+    return document.partition("\n")[0]
+
+
+def fleet_parser(complete: Iterable[str]) -> Parser:
+    """Return the parser of `fleet`: all verbs, with the options of those in `complete`, whose modules are imported."""
     parser = make_parser(
         "fleet",
         "Digital twins for UAV swarms.",
         "  fleet up --uavs 8\n  fleet status --json\n  fleet schema prediction\n",
     )
     verbs = parser.add_subparsers(title="verbs", dest="verb", metavar="VERB", required=True)
-    listed = command_modules()
-    requested = (sys.argv[1:] if argv is None else argv)[:1]
-    # one verb needs no import of the others
-    for name in requested if requested and requested[0] in listed else sorted(listed):
-        module = importlib.import_module(listed[name])
-        summary = (module.__doc__ or "").strip().splitlines()[0]
+    wanted = frozenset(complete)
+    for name, path in sorted(command_modules().items()):
+        summary = _summary(path)
+        if name not in wanted:
+            verbs.add_parser(name, help=summary)
+            continue
+        module = importlib.import_module(path)
         verb = verbs.add_parser(
-            name,
-            help=summary,
-            description=summary,
-            epilog="examples:\n" + module.EXAMPLES.strip("\n"),
-            formatter_class=argparse.RawDescriptionHelpFormatter,
+            name, help=summary, description=summary, epilog="examples:\n" + module.EXAMPLES.strip("\n")
         )
         module.arguments(verb)
-        verb.set_defaults(run=module.run)
-    args = parser.parse_args(argv)
+        verb.set_defaults(run=module.run, parser=verb)
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run `fleet <verb>`."""
+    words = sys.argv[1:] if argv is None else argv
+    requested = words[0] if words else ""
+    parser, verbs = fleet_parser([requested]), command_modules()  # one verb needs no import of the others
+    if requested.startswith("-") and not any(name.startswith(requested) for name in parser.option_strings()):
+        parser.error(parser.describe_unknown(requested))
+    if not requested or not (requested.startswith("-") or requested in verbs):
+        absent = f"verb {requested!r}" if requested else "verb"
+        parser.error(f"found no {absent}, expected {', '.join(sorted(verbs))}{did_you_mean(requested, verbs)}")
+    args = parser.parse_args(words)
     return run_command(f"fleet {args.verb}", args.run, args)
 
 

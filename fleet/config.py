@@ -8,6 +8,7 @@ from fleet.access.entry import ROUTER, BusConfig
 from fleet.access.roles import TOOLS
 
 KEYS = ("at", "certificates", "passwords")
+MAX_UAVS = 2_000  # aircraft of one gateway, over all links, unless `--most-uavs` is given
 
 
 def router_arguments(parser: argparse.ArgumentParser) -> None:

@@ -187,6 +187,10 @@ class Status(Message, frozen=True, kw_only=True):
     gps_offset_s: Annotated[
         float | None, about("fleet time minus satellite time of the same instant (SYSTEM_TIME) [s]; null: not reported")
     ] = None
+    home: Annotated[
+        tuple[int, int, int] | None,
+        about("home: latitude, longitude [1e-7 deg], altitude above mean sea level [mm]; null: not reported yet"),
+    ] = None
     sentence: Annotated[str, about("note for the operator, or empty")] = ""
 
 

@@ -8,30 +8,12 @@ import sys
 import threading
 from pathlib import Path
 
-from rich.console import Console
-
 from fleet.access.roles import GATEWAY
-from fleet.bus.session import connect
 from fleet.cli import make_parser, run_command, stop_on_signal
-from fleet.config import bus_config_from, router_arguments
-from fleet.metrics import serve
+from fleet.config import MAX_UAVS, bus_config_from, router_arguments
 from fleet.process.logs import log_arguments, report_status
 from fleet.process.malloc_trim import enable_malloc_trim
-from fleet.report.progress import show_progress
-from fleet.telemetry.mavlink.intake import MAX_UAVS
-from fleet.telemetry.mavlink.warm import warm_up
-from fleet.telemetry.recording.ids import IdAllocator
-from gateway.admission import make_admissions
-from gateway.link_spec import read_forward, read_spec
-from gateway.links.link import Endpoint
-from gateway.links.opening import open_link
-from gateway.links.recorded import ReplayLink, replay_process, split_replays
-from gateway.onboard.parameter_cache_check import Cache
-from gateway.onboard.questions import DEFAULT_BUDGET
-from gateway.pipeline import Pipeline
-from gateway.record.recorder import LinkRecorder
-from gateway.record.tape import DiskBudget, read_size
-from gateway.status import counters, status_display
+from gateway import DEFAULT_BUDGET
 
 SWITCH_S = 5e-4  # longest wait of a receiving thread for the interpreter [s]
 COLD_S = 2.0  # compilation that takes longer is logged [s]
@@ -71,6 +53,22 @@ _log = logging.getLogger(__name__)
 
 def run(args: argparse.Namespace) -> int:
     """Open the links, connect to the bus, and run until a stop signal or the end of all recordings."""
+    from rich.console import Console  # here, as --help and --version need none of these
+
+    from fleet.bus.session import connect
+    from fleet.metrics import serve
+    from fleet.report.progress import show_progress
+    from fleet.telemetry.recording.ids import IdAllocator
+    from gateway.admission import make_admissions
+    from gateway.link_spec import read_forward, read_spec
+    from gateway.links.opening import open_link
+    from gateway.links.recorded import ReplayLink, replay_process, split_replays
+    from gateway.onboard.parameter_cache_check import Cache
+    from gateway.pipeline import Pipeline
+    from gateway.record.recorder import LinkRecorder
+    from gateway.record.tape import DiskBudget, read_size
+    from gateway.status import counters, status_display
+
     specs = [read_spec(text, args.offset) for text in args.link or [DEFAULT_LINK]]
     specs, files = split_replays(specs)
     specs += [read_forward(text) for text in args.forward]
@@ -86,8 +84,7 @@ def run(args: argparse.Namespace) -> int:
     enable_malloc_trim(TRIM_BYTES)
     with connect(bus_config_from(args, GATEWAY), retry=disk is not None) as bus, contextlib.ExitStack() as stack:
         stack.enter_context(replay_process(files, args))
-        links: list[Endpoint] = []
-        ids = IdAllocator()
+        links, ids = [], IdAllocator()
         for spec in specs:
             link = open_link(spec, ids)
             stack.callback(link.close)
@@ -123,6 +120,8 @@ def run(args: argparse.Namespace) -> int:
 
 def compile_decoder() -> None:
     """Compile the decoder, or load it from the cache; log a warning if it takes long, once per machine."""
+    from fleet.telemetry.mavlink.warm import warm_up
+
     timer = threading.Timer(COLD_S, _log.warning, (COMPILING,))
     timer.start()
     try:

@@ -6,6 +6,7 @@ from urllib.parse import parse_qsl, unquote
 
 import numpy as np
 
+from fleet.cli import did_you_mean
 from fleet.telemetry.mavlink.parsing.decode import IDS
 from fleet.telemetry.mavlink.parsing.scan import COMPONENT, ID, SYSTEM
 from fleet.telemetry.recording.opening import read_speed
@@ -108,6 +109,13 @@ def read_spec(text: str, offset: int = 0) -> LinkSpec:
         spec = spec._replace(
             message_filter=read_filter(settings), sign=settings.pop("sign", ""), key=settings.pop("key", "")
         )
+    if kind not in KINDS:
+        near = did_you_mean(kind, KINDS) if kind != "udp" else "; did you mean udpin:0.0.0.0:14550?"
+        raise ValueError(f"--link: found {text!r}, expected {', '.join(KINDS)}, each with an address behind a :{near}")
+    if spec is None and kind in NETWORK:
+        raise ValueError(f"--link: found {text!r}, expected {kind}:HOST:PORT; write e.g. {kind}:127.0.0.1:14550")
+    if spec is None and kind == "serial":
+        raise ValueError(f"--link: found {text!r}, expected serial:PATH:BAUD; write e.g. serial:/dev/ttyUSB0:57600")
     if spec is None or settings or spec.sign not in ("", *SIGN) or (spec.key and not spec.sign):
         raise ValueError(
             f"--link: found {text!r}, expected udpin:HOST:PORT, udpout, udpbcast, tcpin or tcp with HOST:PORT, "

@@ -10,9 +10,10 @@ import msgspec
 
 from fleet.bus.codec import EncodedMessage
 from fleet.bus.session import Bus
+from fleet.config import MAX_UAVS
 from fleet.contract import Message
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
-from fleet.telemetry.mavlink.intake import MAX_UAVS, MavlinkReceiver
+from fleet.telemetry.mavlink.intake import MavlinkReceiver
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
 from gateway.admission import Admission, make_admissions
 from gateway.forwarding import FrameForwarder

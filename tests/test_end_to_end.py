@@ -164,14 +164,14 @@ def _children(pid: int) -> list[int]:
 REFUSED = {  # before anything is begun
     ("--uavs", "0"): "--uavs: found 0, expected 1 to 250",
     ("--for", "-1"): "--for: found -1.0 s, expected 0",
-    ("--replay", "none.tlog"): "--replay: found no recording 'none.tlog', expected",
+    ("--replay", "none.tlog"): "--replay: found no file 'none.tlog', expected a recording",
     ("--summary", "none/s.json"): "--summary: found no folder 'none', expected one",
     ("--mavlink", "14550"): "--mavlink: found '14550', expected HOST:PORT",
 }
 REFUSED_LATER = {
     ("--router", "nowhere"): "--router: found 'nowhere', expected",
     ("--router", "tcp/192.0.2.1:7447"): "no response, and no router can be opened here",
-    ("--link", "ftp:a:1"): "--link: found 'ftp:a:1', expected udpin:HOST:PORT",
+    ("--link", "ftp:a:1"): "--link: found 'ftp:a:1', expected udpin, udpout",
 }
 
 

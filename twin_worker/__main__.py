@@ -12,12 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fleet.access.roles import WORKER
-from fleet.airframes import GENERIC, load
-from fleet.bus.session import connect
 from fleet.cli import id_range, make_parser, run_command, stop_on_signal
 from fleet.config import bus_config_from, router_arguments
-from fleet.contract import FleetState
-from fleet.metrics import parse_address, serve
 from fleet.process.children import Children
 from fleet.process.logs import log_arguments, report_progress, report_status
 from fleet.process.malloc_trim import enable_malloc_trim
@@ -100,7 +96,12 @@ def _prepare() -> None:
 
 def _run(args: argparse.Namespace) -> int:
     enable_malloc_trim(MMAP_THRESHOLD_B, MALLOC_TRIM_THRESHOLD_B)  # before other threads have heaps of their own
-    airframe, baselines = load(args.airframe), _load_baselines(args.baseline)
+    from fleet.airframes import GENERIC, load  # here, as --help and --version need none of these
+    from fleet.bus.session import connect
+    from fleet.contract import FleetState
+    from fleet.metrics import serve
+
+    airframe, baselines = load(args.airframe or GENERIC), _load_baselines(args.baseline)
     stop = stop_on_signal()
     threading.Thread(target=_force_exit, args=(stop,), daemon=True).start()
     with connect(bus_config_from(args, WORKER)) as bus:
@@ -145,6 +146,8 @@ def _run_many(args: argparse.Namespace) -> int:
         raise ValueError(f"--processes: found {args.processes}, expected 1 to 256; set one per core")
     options_by_name = {f"worker {k}": [*args.options, "--processes=1"] for k in range(args.processes)}
     if args.metrics:
+        from fleet.metrics import parse_address
+
         host, port = parse_address(args.metrics)
         for k, options in enumerate(options_by_name.values()):
             options.append(f"--metrics={host}:{port + k}")
@@ -177,7 +180,7 @@ def main(argv: list[str] | None = None) -> int:
         help="prediction model: derivatives (dynamics), point mass (hybrid), the better (auto), or linear axes (paper)",
     )
     parser.add_argument(
-        "--airframe", default=GENERIC, metavar="NAME|FILE", help=f"airframe data, a TOML file ({GENERIC})"
+        "--airframe", metavar="NAME|FILE", help="airframe data, a TOML file (that of a small fixed wing)"
     )
     parser.add_argument("--omega", type=float, default=0.0, help="minimum mean fit to verify, %% (0, as in the paper)")
     parser.add_argument(

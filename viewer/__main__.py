@@ -5,14 +5,10 @@ import gc
 import sys
 
 from fleet.access.roles import VIEWER
-from fleet.bus.session import connect
-from fleet.cli import make_parser, run_command, stop_on_signal
+from fleet.cli import check_port, make_parser, run_command, stop_on_signal
 from fleet.config import bus_config_from, router_arguments
 from fleet.process.logs import log_arguments, report_status
 from fleet.process.malloc_trim import enable_malloc_trim
-from viewer.browser.http_server import serve, without_stdout
-from viewer.scene.terrain import TerrainLayer, read_raster
-from viewer.server.app import App
 
 GC_THRESHOLDS = 50_000, 10, 10  # a large fleet allocates 10,000 objects per second, almost none in cycles
 LARGE_BLOCK_BYTES = 48 * 1024  # below a receive buffer of the bus, which one queued message keeps allocated [bytes]
@@ -60,13 +56,18 @@ def run(args: argparse.Namespace) -> int:
         ValueError: when the port is out of range.
         OSError: when the port is in use.
     """
-    if not 0 < args.port < 65536:
-        raise ValueError(f"--port: found {args.port}, expected 1 to 65535; choose another port")
+    check_port("--port", args.port)
+    from fleet.bus.session import connect  # here, as --help and --version need none of these
+    from viewer.browser.http_server import serve, without_stdout
+    from viewer.scene.terrain import TerrainLayer, read_raster
+    from viewer.server.app import App
+
+    terrain = read_raster(args.terrain, colours=False) if args.terrain else None
+    imagery = read_raster(args.imagery, colours=True) if args.imagery else None
     stop = stop_on_signal()
     gc.set_threshold(*GC_THRESHOLDS)
     enable_malloc_trim(LARGE_BLOCK_BYTES)
-    terrain = read_raster(args.terrain, colours=False) if args.terrain else None
-    terrain_layer = TerrainLayer(terrain, read_raster(args.imagery, colours=True) if args.imagery else None)
+    terrain_layer = TerrainLayer(terrain, imagery)
     with connect(bus_config_from(args, VIEWER), retry=True) as bus:  # the page shows a missing router
         server = serve(args.host, args.port, args.name)
         try:

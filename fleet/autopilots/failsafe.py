@@ -1,16 +1,19 @@
 """What an autopilot does after the radio link is lost: the mode changes that its parameters describe, one rule per law.
 
-    link_loss_steps("arduplane", "AUTO", params)  ->  (FailsafeStep(5.0, "RTL", "FS_LONG_ACTN 1"),)
+    link_loss_steps("arduplane", "AUTO", params)  ->  (FailsafeStep(6.2, "RTL", "FS_LONG_ACTN 1"),)
 
-A lost link is assumed to be lost in both directions, together with the remote control. Then ArduPlane takes the short
-action at RC_FS_TIMEOUT and the long action at FS_LONG_TIMEOUT if THR_FAILSAFE is 1, and the long action alone if only
-FS_GCS_ENABL is set. PX4 takes NAV_DLL_ACT at COM_DL_LOSS_T, and holds for COM_FAIL_ACT_T before it. NAV_RCL_ACT is
-followed only where the remote control arrives by the same link (COM_RC_IN_MODE 1). A parameter that is not received
-causes no action.
-Source: ArduPlane failsafe documentation and parameter reference; PX4 user guide, "Safety configuration (failsafes)".
+A lost link is assumed to be lost in both directions, together with the remote control. Then ArduPlane begins the short
+failsafe 0.2 s after RC_FS_TIMEOUT, but not before FS_SHORT_TIMEOUT, if THR_FAILSAFE is 1. The long action follows
+FS_LONG_TIMEOUT after that, also where the short one does not change the mode; after the last contact where
+FS_SHORT_ACTN disables it, and by FS_GCS_ENABL. PX4 takes NAV_DLL_ACT at COM_DL_LOSS_T, and holds for COM_FAIL_ACT_T
+before it. NAV_RCL_ACT is followed only where the remote control arrives by the same link (COM_RC_IN_MODE 1). A
+parameter that is not received causes no action.
+Source: ArduPlane failsafe documentation, parameter reference and the timing of its checks; PX4 user guide, "Safety
+configuration (failsafes)".
 """
 
 from collections.abc import Mapping
+from math import inf, isfinite
 from typing import NamedTuple
 
 GLIDE, LEVEL, LAND_SEQUENCE = "FBWA", "FBWB", "AUTO"
@@ -59,24 +62,31 @@ def _arduplane_long(mode: str, action: int) -> str:
 
 def _arduplane_steps(mode: str, params: Mapping[str, float]) -> tuple[FailsafeStep, ...]:
     steps: list[FailsafeStep] = []
-    radio = params.get("THR_FAILSAFE") == 1
-    gcs = params.get("FS_GCS_ENABL", 0)
-    if radio and "FS_SHORT_ACTN" in params:
-        action = int(params["FS_SHORT_ACTN"])
-        short_mode = _arduplane_short(mode, action)
-        after_s = params.get("RC_FS_TIMEOUT", 1.0) + params.get("FS_SHORT_TIMEOUT", 0.0) + _DETECTION_S
-        if short_mode and short_mode != mode:
-            steps.append(FailsafeStep(after_s, short_mode, f"FS_SHORT_ACTN {action}"))
-    by_gcs = gcs in _GCS_HEARTBEAT or (gcs == _GCS_AUTO_ONLY and mode == "AUTO")
-    if (radio or by_gcs) and "FS_LONG_ACTN" in params:
+    gcs, timeout_s = params.get("FS_GCS_ENABL", 0), params.get("FS_LONG_TIMEOUT", 5.0)
+    rc_lost_s = params.get("RC_FS_TIMEOUT", 1.0) + _DETECTION_S
+    long_s = inf
+    if params.get("THR_FAILSAFE") == 1:
+        action = int(params.get("FS_SHORT_ACTN", _SHORT_DISABLED))
+        if action == _SHORT_DISABLED:
+            long_s = max(timeout_s, rc_lost_s)
+        else:
+            short_s = max(rc_lost_s, params.get("FS_SHORT_TIMEOUT", 0.0))
+            long_s = short_s + timeout_s
+            short_mode = _arduplane_short(mode, action)
+            if short_mode and short_mode != mode:
+                steps.append(FailsafeStep(short_s, short_mode, f"FS_SHORT_ACTN {action}"))
+    before = steps[-1].mode if steps else mode
+    by_gcs = gcs in _GCS_HEARTBEAT or (gcs == _GCS_AUTO_ONLY and before == "AUTO")
+    if by_gcs:
+        long_s = min(long_s, timeout_s)
+    if isfinite(long_s) and "FS_LONG_ACTN" in params:
         action = int(params["FS_LONG_ACTN"])
+        steps = [step for step in steps if step.after_s < long_s]
         before = steps[-1].mode if steps else mode
         long_mode = _arduplane_long(before, action)
-        after_s = params.get("FS_LONG_TIMEOUT", 5.0)
         if long_mode and long_mode != before:
             cause = f"FS_LONG_ACTN {action}" + (f", FS_GCS_ENABL {gcs:.0f}" if by_gcs else "")
-            steps = [step for step in steps if step.after_s < after_s]
-            steps.append(FailsafeStep(after_s, long_mode, cause))
+            steps.append(FailsafeStep(long_s, long_mode, cause))
     return tuple(steps)
 
 

@@ -24,15 +24,23 @@ from fleet.autopilots.arduplane.guide import assume_commanded_speed
 from fleet.autopilots.arduplane.guide import fly as fly_arduplane
 from fleet.autopilots.control_law import (
     ARDUPLANE,
+    COURSE,
     FOLLOW_LINE,
+    H_IN,
+    HAS_VELOCITY,
     LAW,
     LEG,
+    N_LEG,
     NEXT_LEG,
     NEXT_S,
     PX4,
     SWITCH_LEG,
     SWITCH_S,
     TEXTBOOK,
+    V_D,
+    V_E,
+    V_HAT,
+    V_N,
     W_E,
     W_N,
     ParameterSpec,
@@ -155,6 +163,35 @@ def engage(
     if law_code(par) >= ARDUPLANE:
         assume_commanded_speed(ctl, par, legs)
     return ctl
+
+
+@kernel
+def _height_states(par: np.ndarray) -> int:
+    """Return how many of the states from H_IN on are heights: one with PX4, which has a rate after it."""
+    return 1 if law_code(par) == PX4 else 4
+
+
+@array_kernel
+def remember(ctl: np.ndarray, par: np.ndarray, h: float) -> np.ndarray:
+    """Return the state for `restore`, with heights relative to the aircraft at height `h` [m], (N_CTL,)."""
+    memory = ctl.copy()
+    memory[H_IN : H_IN + _height_states(par)] -= h
+    return memory
+
+
+@kernel
+def restore(ctl: np.ndarray, par: np.ndarray, memory: np.ndarray, h: float) -> None:
+    """Continue speed, height and attitude control from an earlier state, at height `h` [m].
+
+    An autopilot resets none of these when its route changes. The leg, and what is measured, stay as they are in `ctl`.
+    """
+    if law_code(par) == TEXTBOOK:  # its states beyond the leg describe the route as well
+        return
+    for j in range(N_LEG, COURSE):
+        if j not in (V_N, V_E, V_D, HAS_VELOCITY, V_HAT):
+            ctl[j] = memory[j]
+    for j in range(H_IN, H_IN + _height_states(par)):
+        ctl[j] += h
 
 
 @kernel

@@ -46,7 +46,8 @@ from fleet.mission_jumps import nearest_landing
 NO_ITEM = -1.0  # mission item of a leg that belongs to no mission
 _HOLD_LEG_M = 1e5  # length of the line of a heading-hold mode [m]
 _TARGET_TOLERANCE_M = 5.0  # distance at which two points are the same [m]
-_PX4_ALT_TOLERANCE_M = 10.0  # NAV_FW_ALT_RAD: height error at which a climb is complete [m]
+_PX4_BY_MISSION, _PX4_ANY_LANDING = (2, 4, 5), (1, 3)  # RTL_TYPE: not directly home; not if the mission lands
+_PX4_LANDINGS = (21, 85, 189)  # MAV_CMD: NAV_LAND, NAV_VTOL_LAND, DO_LAND_START
 _STEERED_M, _STEERED_RAD = 50.0, radians(10.0)  # off the line or off its course by more: the pilot has steered
 _STEERING_BANK = radians(10.0)  # a steered aircraft with more bank is still being steered [rad]
 _SHORT_GLIDE = 2  # FS_SHORT_ACTN
@@ -124,7 +125,7 @@ def _circle_at_target(situation: ModeSituation, params: Mapping[str, float]) -> 
 
 
 def _no_home(situation: ModeSituation) -> Route:
-    return _route(situation, remark="home position unknown: no prediction of the return; download the mission")
+    return _route(situation, remark="home position unknown: no prediction of the return; request HOME_POSITION")
 
 
 def _arduplane_return(situation: ModeSituation, params: Mapping[str, float]) -> Route:
@@ -206,7 +207,13 @@ def after_steering(situation: ModeSituation, course: float, bank: float, height_
 
 def _px4_return(situation: ModeSituation, params: Mapping[str, float]) -> Route:
     """Climb to RTL_RETURN_ALT in a circle, fly home, descend to RTL_DESCEND_ALT in a circle, and stay there."""
-    home, here = situation.home, situation.position
+    home, here = situation.home, situation.entry
+    kind = int(_parameter(params, (("RTL_TYPE", 1.0),), 0.0))
+    lands = any(item.command in _PX4_LANDINGS for item in situation.items)
+    if kind in _PX4_BY_MISSION or (kind in _PX4_ANY_LANDING and lands):
+        return _route(
+            situation, remark=f"RTL_TYPE {kind}: the return by the mission or to its landing is not predicted"
+        )
     if home is None:
         target = situation.target
         return _no_home(situation) if target is None else _route(situation, make_leg(LOITER_UNLIMITED, target))
@@ -217,13 +224,13 @@ def _px4_return(situation: ModeSituation, params: Mapping[str, float]) -> Route:
     legs = [make_leg(LOITER_UNLIMITED, circle, radius=radius)]
     if hypot(*(here - home)[:2]) > 2.0 * abs(radius):
         legs.insert(0, make_leg(WAYPOINT, np.array([*home[:2], cruise_d])))
-        climbs = here[2] - cruise_d > _PX4_ALT_TOLERANCE_M
+        climbs = here[2] - cruise_d > _parameter(params, (("NAV_FW_ALT_RAD", 1.0),), 10.0)
         at_home = situation.target is not None and hypot(*(situation.target - home)[:2]) < _TARGET_TOLERANCE_M
         if climbs and not at_home:
             centre = situation.entry if situation.target is None else situation.target
             legs.insert(0, make_leg(LOITER_TO_ALT, np.array([*centre[:2], cruise_d])))
-    lands = _parameter(params, (("RTL_LAND_DELAY", 1.0),), -1.0) >= 0
-    return _route(situation, *legs, remark="the landing after the return is not predicted" if lands else "")
+    stays = _parameter(params, (("RTL_LAND_DELAY", 1.0),), -1.0) < 0
+    return _route(situation, *legs, remark="" if stays else "the landing after the return is not predicted")
 
 
 def hold_bank(situation: ModeSituation, bank: float) -> Route:

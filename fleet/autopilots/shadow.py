@@ -1,7 +1,9 @@
 """Replay of the controller on telemetry, to synchronise its state with the controller on board.
 
 The replay reconstructs states that telemetry does not contain: filters, integrators, angle flown on a circle. Initial
-integrator values are unknown; a shift at the end aligns the outputs with the reported ones.
+integrator values are unknown; a shift at the end aligns the outputs with the reported ones. Where the route changed at
+the start, its controllers continue from the state before: then the outputs just after the change, whose time is known
+to a fraction of a second, do not shift them.
 
 The current mission item is reported once a second. The replay switches legs when its law does, and waits for the
 report; without a report in time it returns to the reported leg and replays the rows since then.
@@ -14,11 +16,12 @@ import numpy as np
 from fleet.autopilots import control_law as S
 from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.control_law import array_kernel, kernel
-from fleet.autopilots.laws import align_integrators, begin, engage, fly, stabilise
+from fleet.autopilots.laws import align_integrators, begin, engage, fly, restore, stabilise
 from fleet.frames import wrap
 from fleet.mission import SEQ
 
 _MATCH_WINDOW = 5.0  # window at the end for matching the outputs [s]
+NO_MEMORY = np.empty(0)  # the state before the first row is unknown
 _REPORT_DELAY = 2.0  # maximum delay of a reported item behind the switch to it [s]
 _MAX_STEP = 0.2  # step length for longer gaps in telemetry [s]
 
@@ -55,6 +58,7 @@ def replay_controller(
     theta_c: np.ndarray,
     delta: np.ndarray,
     seq: np.ndarray,
+    memory: np.ndarray,
 ) -> tuple[np.ndarray, float]:
     """Synchronise the controller with telemetry at about 10 Hz; rows with nan are skipped.
 
@@ -69,6 +73,7 @@ def replay_controller(
         phi_c, theta_c: reported commands, nan where missing, (n,) [rad]
         delta: reported delta_a, delta_e, delta_r, delta_t, nan where missing, (n, 4) [-1..1, throttle 0..1]
         seq: reported mission item, (n,)
+        memory: state before the first row from `laws.remember`, (S.N_CTL,), or `NO_MEMORY`
     Returns:
         ctl at t[n-1], (S.N_CTL,)
         root mean square of replayed minus reported phi_c [rad]; nan if none is reported
@@ -86,6 +91,8 @@ def replay_controller(
             continue
         if last < 0:
             ctl = engage(par, legs, start, p[k], v[k], euler[k], Va[k], theta_c[k], delta[k, 3])
+            if memory.shape[0] > 0:
+                restore(ctl, par, memory, -p[k, 2])
             last = k
         if switched >= 0 and seq[k] == seq[switched] and t[k] - t[switched] > _REPORT_DELAY:
             ctl, refuted = reported_ctl, True
@@ -113,11 +120,13 @@ def replay_controller(
         leg = int(ctl[S.LEG])
         refuted = refuted and leg_done
         if leg_done and not refuted and switched < 0 and leg + 1 < legs.shape[0] and legs[leg, SEQ] == seq[k]:
-            reported_ctl, switched = ctl.copy(), k
+            if legs[leg + 1, SEQ] != seq[k]:  # else no report follows, as within a route without items
+                reported_ctl, switched = ctl.copy(), k
             begin(ctl, par, legs, leg + 1, p[k])
     if last >= 0:
         reported = np.array([phi_c[n - 1], theta_c[n - 1], delta[n - 1, 3], Va[n - 1]])
-        align_integrators(ctl, par, _typical_residual(residual[t >= t[n - 1] - _MATCH_WINDOW]), reported)
+        since = max(t[n - 1] - _MATCH_WINDOW, t[0] + _MATCH_WINDOW if memory.shape[0] > 0 else t[0])
+        align_integrators(ctl, par, _typical_residual(residual[t >= since]), reported)
     return ctl, sqrt(_mean(residual[:, 5] ** 2, nan))
 
 

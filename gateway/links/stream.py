@@ -1,6 +1,7 @@
 """Open byte stream over TCP or a serial line: send queue and reconnecting client."""
 
 import contextlib
+import glob
 import logging
 import os
 import selectors
@@ -19,6 +20,8 @@ from gateway.links.link import FIRST_RETRY_S, LAST_RETRY_S, POLL_S, Endpoint
 MAX_BYTES = 65_536  # capacity of a send queue; eleven seconds at 57,600 baud [bytes]
 CHUNK = 65_536  # bytes read at once
 CONNECT_S = 3.0  # timeout of one attempt [s]
+LOG_PERIOD_S = 60.0  # between two warnings with the same reason [s]
+MAX_LISTED = 8  # serial devices named in a warning
 
 _log = logging.getLogger(__name__)
 
@@ -118,7 +121,7 @@ class StreamClient(Endpoint):
         self._stream: Stream | None = None
 
     def _run(self) -> None:
-        self._wait_s, logged = FIRST_RETRY_S, ""
+        self._wait_s, logged, logged_at = FIRST_RETRY_S, "", 0.0
         while not self._stop.is_set():
             try:
                 stream = self._stream = self._open()
@@ -130,12 +133,20 @@ class StreamClient(Endpoint):
                     self._stream = None
                     self.unsent += stream.close()
             except OSError as error:
-                reason = error.strerror or str(error)
-                if reason != logged:
+                reason = self._missing_device() or error.strerror or str(error)
+                if reason != logged or time.monotonic() >= logged_at + LOG_PERIOD_S:
                     _log.warning("link %s: %s; trying again", self.spec.text, reason)
-                    logged = reason
+                    logged, logged_at = reason, time.monotonic()
                 self._stop.wait(self._wait_s)
                 self._wait_s = min(2 * self._wait_s, LAST_RETRY_S)
+
+    def _missing_device(self) -> str:
+        """Describe a serial device that does not exist, with those that do; empty if it exists."""
+        if self.spec.kind != "serial" or os.path.exists(self.spec.address):
+            return ""
+        present = ", ".join(sorted(glob.glob("/dev/ttyUSB*") + glob.glob("/dev/ttyACM*"))[:MAX_LISTED]) or "none"
+        problem = f"found no device {self.spec.address!r} (present: {present}), expected a telemetry radio"
+        return f"{problem}; plug it in, or correct the link"
 
     def _open(self) -> Stream:
         if self.spec.kind == "tcp":

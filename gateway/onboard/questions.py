@@ -9,6 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
 from fleet.telemetry.mavlink.parsing.decode import IDS, layout
+from gateway import DEFAULT_BUDGET
 from gateway.link_spec import LinkSpec
 from gateway.onboard.parameter_cache_check import ANY, DIALECTS, STREAMS, Cache, CacheCheck, RequestDialect
 from gateway.record.tape import read_size
@@ -25,7 +26,6 @@ IMU_HZ = 25.0  # for diagnosis [Hz]
 IMU_MESSAGES = {"ardupilot": "RAW_IMU", "px4": "SCALED_IMU"}  # requested, by autopilot
 DIAGNOSIS_HZ: dict[str, float] = {**dict.fromkeys(IMU_MESSAGES.values(), IMU_HZ), "LOCAL_POSITION_NED": 10}
 """Rates that only diagnosis needs; an aircraft is asked for one of the IMU messages [Hz]."""
-DEFAULT_BUDGET = "1M"  # default rate that the aircraft of one link may send together [bytes/s]
 _FRAME_BYTES = 12  # bytes of a frame without payload
 _SERIAL_SHARE = 0.7  # share of a serial line that telemetry may fill
 
@@ -159,8 +159,10 @@ class RequestScheduler:
         return [dialect.MAVLink_mission_request_int_message(*self._to, seq)]
 
     def _home(self, now: float) -> list[Any]:
-        """Return a request for HOME_POSITION where the mission was downloaded before the autopilot had a home."""
-        if not self.aircraft.mission.needs_home or not self._home_wait.due(now):
+        """Return a request for HOME_POSITION where the mission came before it, or, with PX4, never contains home."""
+        px4_needs_it = self.aircraft.autopilot == "px4" and self.aircraft.home is None
+        needs_home = self.aircraft.mission.needs_home or (px4_needs_it and self.aircraft.mission.complete)
+        if not needs_home or not self._home_wait.due(now):
             return []
         request = (dialect.MAV_CMD_REQUEST_MESSAGE, 0, dialect.MAVLINK_MSG_ID_HOME_POSITION, 0, 0, 0, 0, 0, 0)
         return [dialect.MAVLink_command_long_message(*self._to, *request)]

@@ -45,7 +45,7 @@ def scored(flights: int, starts: int, seed: int, *, loud: float = 1.0, group: st
     return ScoredPredictions(
         t0=t0,
         path=path,
-        features=UncertaintyFeatures(spread, np.where(np.isfinite(revision), revision, spread)),
+        features=UncertaintyFeatures(spread, np.where(np.isfinite(revision), revision, spread), path),
         flown=flown,
         length=np.where(np.isfinite(flown[..., 0]), length, np.nan),
         predicted_length=length,

@@ -99,17 +99,17 @@ def test_an_alert_comes_and_goes(clock: Clock) -> None:
     feed, _, bus = feed_of(clock, 1)
     for active, n in ((True, 1), (False, 0)):
         bus.publish(Alert(uav=0, t=T, kind=AlertKind.GROUND, active=active, sentence="x"))
-        assert len(feed.alerts()) == n
+        assert len(feed.get(0).alerts) == n
 
 
 def test_of_two_conflicts_one_may_end(clock: Clock) -> None:
     feed, _, bus = feed_of(clock, 1)
     for other, active in ((4, True), (5, True), (4, False)):
         bus.publish(Alert(uav=0, t=T, kind=AlertKind.CONFLICT, other=other, active=active, sentence=f"near {other}"))
-    assert [alert.other for _, alert in feed.alerts()] == [5]
+    assert [alert.other for alert in feed.get(0).alerts.values()] == [5]
     for other in range(100):
         bus.publish(Alert(uav=0, t=T, kind=AlertKind.CONFLICT, other=other, sentence="x"))
-    assert len(feed.alerts()) == MAX_ALERTS
+    assert len(feed.get(0).alerts) == MAX_ALERTS
 
 
 def test_a_worker_that_died_is_not_believed_for_ever(clock: Clock) -> None:

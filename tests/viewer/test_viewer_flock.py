@@ -9,7 +9,7 @@ from fleet.frames import Origin
 from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import STAMP, Clock, PretendUav, T, feed_of
 from viewer.scene.fleet_arrays import LARGE_FLEET, LOST, MISMATCH, READ_PARTS, TRAIL_AGES_S, FleetArrays, display_status
-from viewer.scene.labels import MAX_LABELS, CameraView, Tag, visible_labels
+from viewer.scene.labels import MAX_LABELS, CameraView, Tag, overlap, visible_labels
 from viewer.scene.selection.pins import BAND_SIGMA, sample_paths
 from viewer.scene.selection.selected import active_seq
 from viewer.server.app import Backfill
@@ -215,10 +215,11 @@ def test_another_continent_is_refused_in_words_and_harms_nobody(clock: Clock) ->
 def test_labels_are_few_in_the_picture_and_clear_of_each_other() -> None:
     near, far = np.zeros(3), np.array([0.0, -300.0, 80.0])  # behind the camera
     tags = [Tag("a", "first", near), Tag("b", "upon the first", near), Tag("c", "behind", far)]
-    assert [tag.key for tag in visible_labels(tags, SIGHT)] == ["a"]
+    shown, boxes = visible_labels(tags, SIGHT)
+    assert [tag.key for tag in shown] == ["a", "b"] and not overlap(*boxes)  # the second below the point
     many = [Tag(str(k), "x", np.array([6.0 * (k % 5), 12.0 * (k // 5), 0.0])) for k in range(20)]
-    assert len(visible_labels(many, SIGHT)) == MAX_LABELS
-    assert visible_labels([], SIGHT) == []
+    assert len(visible_labels(many, SIGHT)[0]) == MAX_LABELS
+    assert visible_labels([], SIGHT) == ([], [])
 
 
 def test_the_sight_projects_as_the_camera_does() -> None:

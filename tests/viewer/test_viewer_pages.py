@@ -6,12 +6,15 @@ import threading
 import time
 from collections.abc import Iterator
 from types import SimpleNamespace
+from typing import Any
 from unittest.mock import MagicMock, call
 
+import msgspec
 import numpy as np
 import pytest
 from conftest import unused_port
 
+from fleet.contract import Model, Prediction, TwinState
 from tests.bench.viewing.watcher import Watcher
 from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import PretendFleet
@@ -39,7 +42,7 @@ def site() -> Iterator[SimpleNamespace]:
 
     while len(app.views) < 2:  # each is there once it has told its camera
         run()
-    yield SimpleNamespace(app=app, run=run, views=[app.views[n] for n in sorted(app.views)])
+    yield SimpleNamespace(app=app, bus=bus, fleet=fleet, run=run, views=[app.views[n] for n in sorted(app.views)])
     for page in pages:
         page.close()
     with without_stdout():
@@ -205,3 +208,72 @@ def test_the_menu_offers_the_rows_of_the_table_and_both_those_that_pass_the_sear
     panels._search.value = "uav-003"
     site.run()
     assert rows() == ("UAV-003",) and panels._menu.options == (NO_UAV, "UAV-003")
+
+
+# --- one record per aircraft and instant ---
+
+
+def places(view: View, uav: int) -> dict[str, tuple[str, ...]]:
+    """State or age, fit and horizon of the selected UAV in every place of a page; what a place leaves out is empty."""
+    row = re.search(rf'<tr [^>]*data-uav="{uav}".*?</tr>', view.panels._table.content)[0]
+    cells = [re.sub("<[^>]*>", "", cell) for cell in re.findall("<td.*?</td>", row)]
+    tile = dict(re.findall(r'<span class="soft">(\w+)</span><b>([^<]*)</b>', view.panels._about.content))
+    tags = {tag.key: tag.text for tag in view.selection.tags}
+    lost = re.search(r"link lost ([\d.]+ \w+)", cells[2])
+    found = {
+        "row": (cells[3] + " %" if cells[3] != "–" else "–", cells[4]),
+        "tile": (tile["fit"], tile["horizon"]),
+        "ring": ("", re.match("horizon (.*):", tags["horizon"])[1] if "horizon" in tags else "–"),
+    }
+    name = re.search(r"fit (\S+(?: %)?)  (?:no )?horizon ?(.*)", tags["name"])
+    if name:
+        found["label"] = (name[1], name[2] or "–")
+    if lost:
+        said = re.search(r"No sample for ([\d.]+ \w+):", view.panels._about.content)
+        figure = re.search(r"sample</td><td[^>]*>([\d.]+ \w+) old", view.panels._facts.content)
+        label = re.search(r"link lost ([\d.]+ \w+)", tags["name"])
+        found |= {"age": (lost[1],), "said": (said[1],), "figure": (figure[1],), "label age": (label[1],)}
+        assert "link lost" in view.panels._about.content
+    return found
+
+
+def test_every_place_of_a_page_shows_one_record(site) -> None:
+    """Twelve seconds of data, horizons and fits that change with each message, one aircraft that falls silent."""
+    sent: dict[tuple[type, int, float], Any] = {}
+    publish, ring_errors, seen, fleet, start = site.bus.publish, [], set(), site.fleet, time.time() + 1.0
+
+    def record(message, *more):
+        if isinstance(message, Prediction | Model):
+            horizon = 5.0 + (message.t * 7.0) % 23.0
+            changed = {"horizon_s": horizon} if isinstance(message, Prediction) else {}
+            message = msgspec.structs.replace(message, **changed)
+            sent[type(message), message.uav, message.t] = message
+        publish(message, *more)
+
+    site.bus.publish = record
+    fleet.uavs[4].state = TwinState.LINK_LOST
+    for k in range(120):
+        fleet.advance(start + 0.1 * k, lost_since=start + 4.0)
+        site.app.tick(k % 10)
+        for view, uav in zip(site.views, (0, 4), strict=True):
+            if view.selected != uav:
+                view.select(uav)
+                continue
+            if not view.panels._facts.content or k < 20:
+                continue
+            found = places(view, uav)
+            ages = {found.pop(name)[0] for name in ("age", "said", "figure", "label age") if name in found}
+            assert len(ages) <= 1, ages
+            for i in range(2):
+                assert len({place[i] for place in found.values() if place[i]}) == 1, found
+            vehicle = view.selected_vehicle()
+            message = sent.get((Prediction, uav, vehicle.forecast.t))  # else it was queried at the start
+            if message is not None and found["row"][1] != "–":  # what the bus said of the same instant
+                assert found["row"][1] == f"{message.horizon_s:.0f} s"
+                ring = view.selection._horizon._node.points.reshape(-1, 3).mean(axis=0)
+                ring_errors.append(np.linalg.norm(ring - vehicle.forecast.position_at(message.horizon_s)))
+            if (model := sent.get((Model, uav, vehicle.model.t))) is not None:
+                assert found["row"][0] == f"{np.mean(list(model.active_verdict.fit.values())):.0f} %"
+            seen.add((uav, found["row"], *ages))
+    assert len({one for one in seen if one[0] == 0}) > 5 and len({one[2] for one in seen if len(one) > 2}) > 1
+    assert len(ring_errors) > 20 and max(ring_errors) < 1e-3

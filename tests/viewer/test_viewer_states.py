@@ -17,14 +17,16 @@ from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import HOSTILE, STAMP, Clock, PretendUav, T, feed_of
 from viewer.panels.detail import status_html
 from viewer.scene.camera import set_initial_view
+from viewer.scene.fleet_arrays import display_status
 from viewer.scene.ground import RINGS_M
 from viewer.scene.labels import CameraView
+from viewer.scene.selection.selected import selection_text
 from viewer.store import store as feeds
 from viewer.store.place import UNIT_M
 from viewer.store.states import MAX_TEXT, notices
 from viewer.store.store import FleetStore
-from viewer.text.words import empty_html, summary_html
-from viewer.theme.palette import DARK
+from viewer.text.words import empty_html, horizon_text, status_label, summary_html
+from viewer.theme.palette import DARK, STATUS_COLOURS
 
 
 @pytest.fixture
@@ -151,3 +153,38 @@ def test_the_newest_verification_says_which_fit_the_predictions_use(clock: Clock
     bus.publish(msgspec.structs.replace(model, t=T + 2, active_verdict=earlier), STAMP)
     page = status_html(feed.vehicles[0], DARK, clock.now)
     assert "predictions use an earlier model with fit 3 %" in page and "3 %" in page.split("newest verification")[0]
+
+
+@pytest.mark.parametrize(
+    ("fit", "horizon_s", "text", "colour", "told"),
+    [
+        (88.0, 34.0, "verified", DARK.verified, "measured on past predictions."),
+        (8.0, 34.0, "low fit", DARK.predicting, "although the model alone is inaccurate"),
+        (88.0, 6.0, "short horizon", DARK.predicting, "wind, route or control law are not"),
+    ],
+)
+def test_a_verified_model_is_green_only_with_fit_and_horizon(
+    clock: Clock, fit: float, horizon_s: float, text: str, colour: str, told: str
+) -> None:
+    feed, _, bus = feed_of(clock, 5)
+    one = PretendUav(4)
+    verdict = msgspec.structs.replace(one.model(T).verdict, fit={"u": fit})
+    bus.publish(msgspec.structs.replace(one.model(T + 1), verdict=verdict, active_verdict=verdict), STAMP)
+    bus.publish(msgspec.structs.replace(one.prediction(T + 1, 0.0), horizon_s=horizon_s), STAMP)
+    vehicle = feed.get(4)
+    label = status_label(vehicle, DARK, clock.now)
+    assert (label.text, label.colour) == (text, colour)
+    assert STATUS_COLOURS[display_status(vehicle, clock.now)] == ("verified" if text == "verified" else "predicting")
+    page = status_html(vehicle, DARK, clock.now)
+    assert told in page and "without the route" in page and f"{horizon_s:.0f} s" in page
+    assert (f"border-color:{DARK.verified}" in page) == (fit > 50)
+
+
+def test_a_horizon_that_has_passed_is_none_everywhere(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 1)
+    bus.publish(msgspec.structs.replace(PretendUav(0).prediction(T + 1, 0.0), horizon_s=4.0), STAMP)
+    assert feed.get(0).record(clock.now).horizon_s == 4.0
+    clock.now += 9.0
+    record = feed.get(0).record(0.0)  # a snapshot has its own instant
+    assert record.horizon_s == 0.0 and horizon_text(record) == "–" and record.prediction_age_s > 5.0
+    assert "link lost 9 s" in selection_text(feed.get(0), clock.now) and "prediction" in selection_text(feed.get(0), 0)

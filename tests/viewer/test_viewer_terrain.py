@@ -127,7 +127,7 @@ def test_what_is_no_raster_is_refused_in_one_sentence(tmp_path: Path, degrees: s
     Image.fromarray(np.zeros((9, 9, 3), np.uint8)).save(colour)
     with pytest.raises(ValueError, match="expected one band of metres"):
         read_raster(f"{colour}@1,2,3,4", colours=False)
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(ValueError, match="check the path"):
         read_raster(str(tmp_path / "none.tif"), colours=False)
 
 

@@ -1,7 +1,9 @@
 """Calibration table of one group: error standard deviation and half-axes by look-ahead, from uncertainty features.
 
-By axis sigma^2 = scale^2 s^2 + lag^2 r^2 + floor^2, with the ensemble spread s and the forecast revision r. Half-axes
-are factor sigma: all axes have the same coverage, and `NOMINAL_COVERAGE` of the flights lie within all three at once.
+By axis sigma^2 = scale^2 s^2 + lag^2 r^2 + turn^2 d^2 + floor^2, with the ensemble spread s, the forecast revision r,
+and the displacement d of an aircraft that is one along-track sigma early or late on the predicted path: across and
+vertical only, and zero where the path is straight and level. Half-axes are factor sigma: all axes have the same
+coverage, and `NOMINAL_COVERAGE` of the flights lie within all three at once.
 """
 
 from dataclasses import dataclass, field
@@ -11,7 +13,7 @@ import numpy as np
 from scipy.special import erfinv
 
 from twin_worker.numerics.interpolation import interpolate_rows
-from twin_worker.numerics.prediction_errors import AHEAD, NOMINAL_COVERAGE
+from twin_worker.numerics.prediction_errors import AHEAD, NOMINAL_COVERAGE, displacement_along_path
 
 KNOTS = np.array([1.0, 2, 3, 5, 8, 12, 18, 27, 40, 60, 80, 120, 180])  # look-aheads of the table rows [s]
 COLUMN = np.searchsorted(AHEAD, KNOTS)  # of each in AHEAD
@@ -41,6 +43,7 @@ class CalibrationTable:
         starts, flights: number of predictions and flights it was fitted to
         scale: coefficient of the ensemble spread, by knot and axis, (13, 3) [-]
         lag: coefficient of the forecast revision, (13, 3) [-]
+        turn: coefficient of the displacement along the path, zero along, (13, 3) [-]
         floor: constant part of sigma, (13, 3) [m]
         factor: from sigma to half-axes, (13, 3) [-]
         scores: largest error over its half-axis, `ATOMS` quantiles [-]
@@ -54,6 +57,7 @@ class CalibrationTable:
     flights: int
     scale: np.ndarray
     lag: np.ndarray
+    turn: np.ndarray
     floor: np.ndarray
     factor: np.ndarray
     scores: np.ndarray
@@ -63,15 +67,17 @@ class CalibrationTable:
 
     def sigma(self, features: "UncertaintyFeatures", ahead: np.ndarray) -> np.ndarray:
         """Return the expected error standard deviation, extrapolated beyond the last knot, (..., n, 3) [m]."""
-        scale, lag, floor, _ = self._curves(ahead)
-        return np.sqrt((scale * features.spread) ** 2 + (lag * features.revision) ** 2 + floor**2)
+        scale, lag, turn, floor, _ = self._curves(ahead)
+        sigma2 = (scale * features.spread) ** 2 + (lag * features.revision) ** 2 + floor**2
+        displacement = displacement_along_path(features.path, np.sqrt(sigma2[..., 0]), ahead)
+        return np.sqrt(sigma2 + (turn * displacement) ** 2)
 
     def half_axes(self, features: "UncertaintyFeatures", ahead: np.ndarray) -> np.ndarray:
         """Return the half-axes of coverage `NOMINAL_COVERAGE` at each look-ahead, (..., n, 3) [m]."""
-        return self._curves(ahead)[3] * self.sigma(features, ahead)
+        return self._curves(ahead)[4] * self.sigma(features, ahead)
 
     def _curves(self, ahead: np.ndarray) -> np.ndarray:
-        """Return scale, lag, floor and factor by look-ahead, (4, n, 3)."""
+        """Return scale, lag, turn, floor and factor by look-ahead, (5, n, 3)."""
         n = len(ahead)
         return self._on_grid[:, :n] if np.array_equal(ahead, AHEAD[:n]) else self._interpolated(ahead)
 
@@ -80,8 +86,9 @@ class CalibrationTable:
         return self._interpolated(AHEAD)
 
     def _interpolated(self, ahead: np.ndarray) -> np.ndarray:
-        out = np.array([at_look_aheads(ahead, rows) for rows in (self.scale, self.lag, self.floor, self.factor)])
-        out[2] *= np.maximum(ahead / KNOTS[-1], 1.0)[:, None]
+        rows_by_name = self.scale, self.lag, self.turn, self.floor, self.factor
+        out = np.array([at_look_aheads(ahead, rows) for rows in rows_by_name])
+        out[3] *= np.maximum(ahead / KNOTS[-1], 1.0)[:, None]
         return out
 
 
@@ -92,10 +99,12 @@ class UncertaintyFeatures:
     Attributes:
         spread: ensemble spread along, cross, vertical; `error_growth` without an ensemble, (..., n, 3) [m]
         revision: departure from the predictions made just before; the spread without any, (..., n, 3) [m]
+        path: predicted positions, NED, (..., n, 3) [m]
     """
 
     spread: np.ndarray
     revision: np.ndarray
+    path: np.ndarray
 
 
 def at_look_aheads(ahead: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -110,11 +119,11 @@ def error_growth(method: str, ahead: np.ndarray) -> np.ndarray:
 
 
 def uncertainty_features(
-    spread: np.ndarray | None, revision: np.ndarray | None, method: str, ahead: np.ndarray
+    spread: np.ndarray | None, revision: np.ndarray | None, path: np.ndarray, method: str, ahead: np.ndarray
 ) -> UncertaintyFeatures:
     """Return the features of a prediction, with `error_growth` where the spread is absent or invalid."""
     complete = _fill_invalid(spread, error_growth(method, ahead))
-    return UncertaintyFeatures(complete, _fill_invalid(revision, complete))
+    return UncertaintyFeatures(complete, _fill_invalid(revision, complete), path)
 
 
 def _fill_invalid(values: np.ndarray | None, default: np.ndarray) -> np.ndarray:
@@ -130,5 +139,6 @@ def default_table(method: str) -> CalibrationTable:
     shape = np.sqrt(2.0) * erfinv(np.cbrt(LEVELS))  # the largest of three normal errors
     shape = shape / np.interp(NOMINAL_COVERAGE, LEVELS, shape)
     lag = np.tile((KNOTS / (KNOTS + _LAG_TIME_S))[:, None], 3)
+    turn = np.tile([0.0, 1.0, 1.0], (len(KNOTS), 1))
     factor = np.full_like(law, 2.0)
-    return CalibrationTable(method, 0, 0, np.ones_like(law), lag, law, factor, shape, shape, alone=INDEPENDENT)
+    return CalibrationTable(method, 0, 0, np.ones_like(law), lag, turn, law, factor, shape, shape, alone=INDEPENDENT)

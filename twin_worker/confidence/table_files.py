@@ -53,7 +53,7 @@ def group_setting(group: str) -> str:
     return group.partition("/")[2]
 
 
-FORMAT = 1
+FORMAT = 2
 UNCALIBRATED = "not calibrated"  # begins the sentence of a prediction without a calibrated table
 _FOLDER = Path(__file__).parent
 _INNERMOST = re.compile(r"\[[^\[\]{}]*\]")  # innermost lists: one per line
@@ -121,7 +121,7 @@ def _array(_: type, values: list) -> np.ndarray:
 
 
 def _check(file: str, table: CalibrationTable) -> None:
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("scale", "lag", "floor", "factor"), (len(KNOTS), 3))
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("scale", "lag", "turn", "floor", "factor"), (len(KNOTS), 3))
     shapes |= dict.fromkeys(("scores", "risks"), (ATOMS,))
     for name, shape in shapes.items():
         array = getattr(table, name)

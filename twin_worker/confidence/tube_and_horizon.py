@@ -155,7 +155,8 @@ class ConfidenceTracker:
         scale = self._factors(forecast.group, table)
         revision = self._lagged.revision(forecast.t, forecast.ahead, forecast.path)
         half_axes = table.half_axes(
-            uncertainty_features(forecast.spread, revision, forecast.method, forecast.ahead), forecast.ahead
+            uncertainty_features(forecast.spread, revision, forecast.path, forecast.method, forecast.ahead),
+            forecast.ahead,
         )
         length = path_length(forecast.path, forecast.speed, forecast.speed * float(forecast.ahead[0]))
         ratio = running_max_error_ratio(half_axes, length)

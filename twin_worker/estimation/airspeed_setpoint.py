@@ -12,7 +12,7 @@ from twin_worker.telemetry.history import TelemetryHistory
 
 _MEDIAN_S = 3.0  # window of the median [s]
 _MIN_REPORTS = 3  # minimum reports in the window
-_STEADY_S = 20.0  # window in which the airspeed must be steady
+STEADY_S = 20.0  # window in which the airspeed must be steady
 _MAX_CHANGE, _MAX_OFFSET = 0.04, 0.06  # largest change and largest offset, relative to the airspeed [-]
 MIN_DIFFERENCE = 0.5  # smaller differences are rounding and noise [m/s]
 
@@ -46,7 +46,7 @@ def _setpoint_reports(history: TelemetryHistory, t: float, since: float) -> np.n
 
 def inferred_setpoint(history: TelemetryHistory, t: float, speeds: np.ndarray) -> float:
     """Return the one of `speeds` [m/s] that was flown just before `t`; nan if the airspeed matches none of them."""
-    t_air, air = history.rows_since("air", t - _STEADY_S)
+    t_air, air = history.rows_since("air", t - STEADY_S)
     Va = air[t_air <= t, 0]
     if len(Va) < 2 * _MIN_REPORTS or not len(speeds) or Va.min() < 3.0:
         return float("nan")

@@ -47,6 +47,64 @@ def along_cross_down(tangent: np.ndarray, error: np.ndarray) -> np.ndarray:
     return np.stack([along_error, cross_error, error[..., 2]], axis=-1)
 
 
+def displacement_along_path(path: np.ndarray, along_error: np.ndarray, ahead: np.ndarray = AHEAD) -> np.ndarray:
+    """Return the cross-track and vertical errors of an aircraft that flies the predicted path early or late.
+
+    It then lies `along_error` ahead of or behind the predicted position. On a straight and level path both errors are
+    zero; where the path turns or climbs they are not.
+
+    Args:
+        path: predicted positions, NED, (..., n, 3) [m]
+        along_error: along-track error at each position, not negative, (..., n) [m]
+        ahead: look-ahead of each position, (n,) [s]
+    Returns:
+        zero along; root mean square of both displacements across and vertical, (..., n, 3) [m]
+    """
+    out = np.zeros(path.shape)
+    n = path.shape[-2]
+    paths = np.ascontiguousarray(path, float).reshape(-1, n, 3)
+    errors = np.ascontiguousarray(along_error, float).reshape(-1, n)
+    _fill_displacements(paths, track_frame(paths, ahead), errors, out.reshape(-1, n, 3))
+    return out
+
+
+@nb.njit(cache=True, error_model="numpy", nogil=True)
+def _fill_displacements(path: np.ndarray, tangent: np.ndarray, along_error: np.ndarray, out: np.ndarray) -> None:
+    """Compute the displacements of each path into `out`, (m, n, 3); beyond an end of the path the other side counts."""
+    n = path.shape[1]
+    length = np.zeros(n)
+    for i in range(len(path)):
+        for k in range(1, n):
+            north, east = path[i, k, 0] - path[i, k - 1, 0], path[i, k, 1] - path[i, k - 1, 1]
+            length[k] = length[k - 1] + sqrt(north * north + east * east)
+        for k in range(n):
+            cross2 = vertical2 = 0.0
+            sides = 0
+            for sign in (-1.0, 1.0):
+                target, j = length[k] + sign * along_error[i, k], k
+                if target < 0.0 if sign < 0.0 else target > length[n - 1] and sides:
+                    continue  # the path does not reach so far; the other side counts
+                sides += 1
+                while j > 0 and length[j] > target:
+                    j -= 1
+                while j < n - 2 and length[j + 1] < target:
+                    j += 1
+                step = length[j + 1] - length[j] if j < n - 1 else 0.0
+                fraction = min(max((target - length[j]) / step, 0.0), 1.0) if step > 0.0 else 0.0
+                following, rest = min(j + 1, n - 1), 1.0 - fraction
+                # Hermite cubic between the tangents at both positions, because an arc of several seconds is no chord
+                weight, slope = fraction * fraction * (3.0 - 2.0 * fraction), step * fraction * rest
+                start, end = tangent[i, j], tangent[i, following]
+                north = path[i, j, 0] + weight * (path[i, following, 0] - path[i, j, 0]) - path[i, k, 0]
+                east = path[i, j, 1] + weight * (path[i, following, 1] - path[i, j, 1]) - path[i, k, 1]
+                north += slope * (rest * start[0] - fraction * end[0])
+                east += slope * (rest * start[1] - fraction * end[1])
+                down = path[i, j, 2] + fraction * (path[i, following, 2] - path[i, j, 2]) - path[i, k, 2]
+                cross = east * tangent[i, k, 0] - north * tangent[i, k, 1]
+                cross2, vertical2 = cross2 + cross * cross, vertical2 + down * down
+            out[i, k, 1], out[i, k, 2] = sqrt(cross2 / sides), sqrt(vertical2 / sides)
+
+
 def axes_error(path: np.ndarray, actual: np.ndarray, ahead: np.ndarray = AHEAD) -> np.ndarray:
     """Split errors of paths (..., n, 3) into along, cross, vertical and distance, (..., n, 4) [m]."""
     error = actual - path

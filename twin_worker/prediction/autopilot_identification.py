@@ -14,7 +14,7 @@ from math import atan2, degrees, isfinite, pi, radians
 import numpy as np
 
 from fleet.autopilots import laws
-from fleet.autopilots.shadow import replay_controller
+from fleet.autopilots.shadow import NO_MEMORY, replay_controller
 from fleet.frames import wrap
 from fleet.mission import P_D, P_N, SEQ, VA_C, WAYPOINT
 from twin_worker.estimation.airspeed_setpoint import reported_setpoint
@@ -224,7 +224,7 @@ def _bank_rms(law: str, replay_data: tuple[PredictionContext, ReplayWindow], val
     context, replay = replay_data
     controller = fixed_wing_controller(context.onboard.params, values, law=law)
     par = laws.with_wind(controller.par(replay.altitude_m), *autopilot_wind(context, replay.window))
-    _, rms = replay_controller(par, replay.legs, replay.start_point, *replay.rows, replay.seq)  # type: ignore[call-arg]
+    _, rms = replay_controller(par, replay.legs, replay.start_point, *replay.rows, replay.seq, NO_MEMORY)  # type: ignore[call-arg]
     return float(rms) if isfinite(rms) else np.inf
 
 

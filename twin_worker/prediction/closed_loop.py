@@ -10,12 +10,13 @@ import numpy as np
 from fleet.autopilots import arduplane, laws
 from fleet.autopilots.arduplane.params import EAS2TAS
 from fleet.autopilots.control_law import V_DEM
-from fleet.autopilots.shadow import replay_controller
+from fleet.autopilots.shadow import NO_MEMORY, replay_controller
 from fleet.mission import KIND, LAND, P_D, P_N, SPEED, TAKEOFF
 from fleet.physics.simulate import N_STATE, simulate
 from fleet.window import Window
 from twin_worker.estimation.airspeed_setpoint import (
     MIN_DIFFERENCE,
+    STEADY_S,
     apply_setpoint,
     inferred_setpoint,
     reported_demand,
@@ -30,10 +31,19 @@ from twin_worker.prediction.autopilot_parameters import (
     fixed_wing_controller,
     transfer_controller,
 )
-from twin_worker.prediction.replay_window import PredictionContext, Rollout, replay_inputs, reported, route_error
+from twin_worker.prediction.replay_window import (
+    AutopilotConfig,
+    PredictionContext,
+    ReplayWindow,
+    Rollout,
+    replay_inputs,
+    reported,
+    route_error,
+)
 
 MIN_ROLLOUT_S = 60.0  # shortest valid rollout [s]
 _REPORT_DELAY_S = 0.5  # reports sooner after a mode change may be older than it [s]
+_AT_CHANGE_S = 0.5  # a replay that begins this near to a change of the route continues the state before it [s]
 _RESET_S = 10.0  # without reports, the set-point is that of the mode change for so long [s]
 _WIND_MAX_AGE_S = 10.0  # maximum age of the autopilot's wind estimate [s]
 _NOT_MODELLED = {TAKEOFF: "take-off", LAND: "landing"}
@@ -91,7 +101,7 @@ def synchronise_controller(context: PredictionContext) -> InitialCondition | Rol
     par = laws.with_wind(controller.par(replay.altitude_m), *autopilot_wind(context, replay.window))
     setpoint = _airspeed_setpoint(context, float(replay.window.t[-1]), float(controller.values[CRUISE_OF[onboard.law]]))
     legs = apply_setpoint(replay.legs, float(seq), float(controller.values[CRUISE_OF[onboard.law]]), setpoint)
-    ctl, rms = replay_controller(par, legs, replay.start_point, *replay.rows, replay.seq)  # type: ignore[call-arg]
+    ctl, rms = replay_controller(par, legs, replay.start_point, *replay.rows, replay.seq, _memory(onboard, replay))  # type: ignore[call-arg]
     if error := route_error(onboard.mode_route, float(rms), replay.phi_c, replay.window.seconds):
         return Rollout(None, seq, error)
     if onboard.law == "arduplane":
@@ -107,6 +117,13 @@ def synchronise_controller(context: PredictionContext) -> InitialCondition | Rol
     )
 
 
+def _memory(onboard: AutopilotConfig, replay: ReplayWindow) -> np.ndarray:
+    """Return the state of the controller before the route changed, if the replay begins there."""
+    law, values = onboard.memory
+    begins_there = abs(float(replay.window.t[0]) - onboard.changed_t) < _AT_CHANGE_S
+    return np.array(values) if begins_there and values and law == onboard.law else NO_MEMORY
+
+
 def _align_speed_demand(ctl: np.ndarray, par: np.ndarray, demand: float) -> None:
     """Set the speed demand of ArduPlane to the reported equivalent airspeed [m/s], where it is on its way elsewhere."""
     V = demand * par[EAS2TAS]
@@ -117,7 +134,8 @@ def _align_speed_demand(ctl: np.ndarray, par: np.ndarray, demand: float) -> None
 def _airspeed_setpoint(context: PredictionContext, t: float, cruise: float) -> float:
     """Return the airspeed set-point: reported, else the flown one of the mission speeds; nan if unknown [m/s].
 
-    A mode change resets the set-point of ArduPlane to cruise.
+    A mode change resets the set-point of ArduPlane to cruise. With others the speed flown before it tells nothing: PX4
+    flies a mode without mission at cruise, and commands the speed of the mission again when it returns to it.
     """
     entry = context.onboard.entry
     entered_t = -np.inf if entry is None else entry.t
@@ -126,6 +144,8 @@ def _airspeed_setpoint(context: PredictionContext, t: float, cruise: float) -> f
         return setpoint
     if context.onboard.law == "arduplane" and t < entered_t + _RESET_S:
         return cruise
+    if context.onboard.law != "arduplane" and t < entered_t + STEADY_S:
+        return float("nan")
     mission_speeds = {
         item.param2 for item in context.onboard.items if item.command == SPEED and 0 < item.param2 < np.inf
     }

@@ -14,7 +14,7 @@ from fleet.autopilots import arduplane
 from fleet.autopilots import greybox as law
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.modes import NO_ITEM, ModeEntry
-from fleet.autopilots.shadow import replay_controller
+from fleet.autopilots.shadow import NO_MEMORY, replay_controller
 from fleet.contract import Item
 from fleet.frames import G, Origin
 from fleet.mission import KIND, TAKEOFF, VA_C, Route
@@ -87,6 +87,7 @@ class KinematicRollout:
     seq: int
     sentence: str
     controller: ControllerTwin | None = None
+    known_s: float = np.inf  # look-ahead at which a failsafe begins whose route is not known [s]
 
 
 def wind_and_airspeed(track: Track, wind: np.ndarray | None) -> tuple[np.ndarray, float]:
@@ -180,13 +181,13 @@ def _fly_route(
         law.follow(ctl.copy(), guidance.par, legs, guidance.lags, state, w, STEP, out)
         return interpolate_rows(times, STEP * np.arange(len(out)), out)
 
-    ctl, legs = guidance.ctl, guidance.route.legs
+    ctl, legs, known_s = guidance.ctl, guidance.route.legs, np.inf
     if config.failsafe is not None:
-        ctl, legs, failsafe_text = with_failsafe(ctl, legs, config.failsafe, path_of)
+        ctl, legs, failsafe_text, known_s = with_failsafe(ctl, legs, config.failsafe, path_of, float(recent.t[-1]))
         sentence = " ".join(filter(None, (failsafe_text, sentence)))
     path = path_of(ctl, legs, ahead)
     start_seq = int(seq[-1]) if config.override is None else config.override.seq
-    return KinematicRollout(path, start_seq, sentence, guidance.controller)
+    return KinematicRollout(path, start_seq, sentence, guidance.controller, known_s)
 
 
 @dataclass(frozen=True)
@@ -236,7 +237,7 @@ def _synchronise(
     euler = np.column_stack([banks, 0.0 * psi, psi])
     triple, quad = np.full((n, 3), np.nan), np.full((n, 4), np.nan)
     rows = (recent.t - recent.t[0], recent.p, recent.v, euler, triple, missing, banks, missing, quad, seq)
-    ctl, rms = replay_controller(*par_legs_start, *(np.ascontiguousarray(row) for row in rows))  # type: ignore[call-arg]
+    ctl, rms = replay_controller(*par_legs_start, *(np.ascontiguousarray(row) for row in rows), NO_MEMORY)  # type: ignore[call-arg]
     return ctl, float(rms), banks
 
 

@@ -29,6 +29,8 @@ _MIN_AIRSPEED = 3.0  # a lower reading in flight is no airspeed [m/s]
 _ITEM_REPORT_S = 2.0  # longest period of reports of the current mission item [s]
 _ITEM_DELAY_S = 2.0  # between the mission and the telemetry that report the same item, at most [s]
 _SHADOW_STEP = 2  # window rows per shadow step
+ControllerMemory = tuple[str, tuple[float, ...]]
+"""Law, and state of its controller as from `laws.remember`; empty: unknown."""
 JumpCounts = tuple[float, int, dict[int, int]]
 """Time [s since 1970], the item that became current, and the jumps taken until then at each jump."""
 
@@ -67,6 +69,7 @@ class AutopilotConfig:
     entry: ModeEntry | None = None  # where the mode was entered; None: before the first status
     mode_route: Route | None = None  # of a mode without mission, which replaces the items
     failsafe: FailsafePlan | None = None  # after a link loss
+    memory: ControllerMemory = ("", ())  # before the change at `changed_t`
     jumps: tuple[JumpCounts, ...] = ()  # jumps taken after each change of the current item, oldest first
 
     def jumps_taken(self, t: float, seq: int) -> dict[int, int]:

@@ -5,7 +5,7 @@ import numpy as np
 from fleet.airframes import GENERIC, load
 from fleet.airframes.airframe import servo_map
 from fleet.autopilots import arduplane, copter, greybox
-from fleet.autopilots.shadow import replay_controller
+from fleet.autopilots.shadow import NO_MEMORY, replay_controller
 from fleet.contract import Array, Item, Prediction, TwinState
 from fleet.frames import Origin, to_geodetic, wrap
 from fleet.mission import unroll_route
@@ -46,7 +46,7 @@ def warm_up() -> None:
     euler, rates = np.ascontiguousarray(window.x[:, 6:]), np.ascontiguousarray(window.x[:, 3:6])
     inputs = [np.full(n, _SPEED), np.zeros(n), np.zeros(n), window.u, np.ones(n, np.int64)]
     rows = [window.t - window.t[0], window.p, window.v, euler, rates, *inputs]
-    ctl, _ = replay_controller(par, legs, window.p[0], *rows)  # type: ignore
+    ctl, _ = replay_controller(par, legs, window.p[0], *rows, NO_MEMORY)  # type: ignore
     state = np.concatenate([window.p[-1], window.x[-1]])
     linear = linear_plant(*(part for axis in axes for part in (axis.physical(), axis.means)))
     coupled = coupled_plant(identify(window, np.zeros(2), load(GENERIC)).par, np.array([_SPEED, 0.0]))

@@ -1,7 +1,10 @@
 """Measure the actual rates of heavy work, describe those that are too low, and export metrics."""
 
+import os
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
@@ -15,10 +18,31 @@ _OVERLOAD_FACTOR = 1.3  # ratio of actual to scheduled period that is reported [
 _MAX_EVENTS = 20_000
 
 
+class CpuTimes(NamedTuple):
+    """CPU times since the start [s]."""
+
+    own: float  # of this process and its ended children
+    used: float  # of all programs on all cores, the hypervisor's share included
+    total: float  # used and idle
+
+
+def read_cpu_times() -> CpuTimes | None:
+    """Read the CPU times; None where the system does not report them. Source: proc(5), /proc/stat."""
+    try:
+        fields = Path("/proc/stat").read_text(encoding="ascii").partition("\n")[0].split()[1:9]
+        user, nice, system, idle, wait, irq, softirq, steal = (int(x) / os.sysconf("SC_CLK_TCK") for x in fields)
+    except (OSError, ValueError):
+        return None
+    used = user + nice + system + irq + softirq + steal
+    return CpuTimes(sum(os.times()[:4]), used, used + idle + wait)
+
+
 class WorkRates:
     """Work of one worker: recent rates and totals."""
 
-    def __init__(self) -> None:
+    def __init__(self, cpu_times: Callable[[], CpuTimes | None] = read_cpu_times) -> None:
+        self._cpu_times = cpu_times
+        self._cpu: deque[tuple[float, CpuTimes]] = deque(maxlen=_MAX_EVENTS)  # monotonic [s]
         self._done: dict[Work, deque[float]] = {work: deque(maxlen=_MAX_EVENTS) for work in Work}
         self._since: float | None = None
         self.total: Counter[Work] = Counter()
@@ -43,11 +67,36 @@ class WorkRates:
         scheduled = {Work.PREDICT: schedule.predict, Work.IDENTIFY: schedule.identify}
         periods = {work: self.period(work, aircraft, now) for work in scheduled}
         late = [
-            f"{work.value} every {periods[work]:.1f} s instead of {scheduled[work]:.1f} s"
+            _period_text(work, periods[work], scheduled[work])
             for work in scheduled
             if periods[work] > _OVERLOAD_FACTOR * max(scheduled[work], 1.0)
         ]
-        return [f"too many UAVs for this worker: {', '.join(late)}"] if late else []
+        others = self._others_share(now)
+        if not late:
+            return []
+        if others is not None and others > 0.5:
+            usage = f"other programs use {others:.0%} of this machine's CPU: {', '.join(late)}"
+            return [f"{usage}; stop them, or move this worker"]
+        return [f"too many UAVs for this worker: {', '.join(late)}"]
+
+    def _others_share(self, now: float) -> float | None:
+        """Return the share of all cores that other programs used in the window, 0..1; None where it is unknown."""
+        if (times := self._cpu_times()) is None:
+            return None
+        while self._cpu and self._cpu[0][0] < now - RATE_WINDOW_S:
+            self._cpu.popleft()
+        self._cpu.append((now, times))
+        first = self._cpu[0][1]
+        if times.total - first.total < 1.0:
+            return None
+        return max(times.used - first.used - (times.own - first.own), 0.0) / (times.total - first.total)
+
+
+def _period_text(work: Work, period_s: float, scheduled_s: float) -> str:
+    """Describe the period of late work."""
+    if period_s == float("inf"):
+        return f"no {work.value} for {RATE_WINDOW_S:.0f} s instead of every {scheduled_s:.1f} s"
+    return f"{work.value} every {period_s:.1f} s instead of {scheduled_s:.1f} s"
 
 
 _INSTANT_FIELDS = {"horizon_s", "sample_age_s", "prediction_age_s", "t10_s", "t10_censored", "t10_n", "epoch"}

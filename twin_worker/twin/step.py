@@ -12,6 +12,7 @@ from twin_worker.twin.state.budget import EARLY_FRACTION, Work
 from twin_worker.twin.state.events import record_event
 from twin_worker.twin.state.flight_phase import update_flight_phase
 from twin_worker.twin.state.home import complete_home
+from twin_worker.twin.state.routes import failsafe_plan
 from twin_worker.twin.state.state import Twin, ingest
 from twin_worker.twin.steps.alerts import link_alerts, prediction_alerts
 from twin_worker.twin.steps.extrapolate import can_propagate, extrapolate, rollout_overdue
@@ -225,11 +226,15 @@ def _update_link(twin: Twin, now: float) -> list[Message]:
         return []
     twin.telemetry.set_link(lost, now)
     model_state = TwinState.WAITING if twin.models.active_model is None else TwinState.VERIFIED
+    plan = failsafe_plan(twin) if lost else None
+    if plan is not None and plan.steps:  # another route than that of the open predictions, which say nothing of it
+        twin.confidence.tracker.censor_open()
+        twin.prediction.expire()  # the newest ensemble flew that route as well
     twin.prediction.set_state(TwinState.LINK_LOST if lost else model_state)
     record_event(
         twin, Event.LINK_LOST if lost else Event.LINK_RESTORED, now, f"no sample for {silence_s:.1f} s" if lost else ""
     )
-    return list(link_alerts(twin, now, silence_s))
+    return list(link_alerts(twin, now))
 
 
 def _score_predictions(twin: Twin) -> None:

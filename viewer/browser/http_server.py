@@ -14,7 +14,7 @@ import zipfile
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import viser
 import websockets.asyncio.server as sockets
@@ -236,6 +236,29 @@ def _response(status: http.HTTPStatus, body: bytes, more: dict[str, str]) -> Res
     return Response(status.value, status.phrase, headers, body)
 
 
+class Layout(NamedTuple):
+    """Size of the window and the parts of its height that panels over the scene cover, in CSS pixels."""
+
+    width: int = 1280
+    height: int = 720
+    top: int = 40
+    bottom: int = 170
+
+    def panel_widths(self) -> tuple[int, int]:
+        """Return the widths of the left and the right panel: a fifth of the window each, within bounds."""
+        return min(max(self.width // 5, 240), 340), min(max(19 * self.width // 100, 230), 350)
+
+
+def parse_layout(text: str) -> Layout | None:
+    """Parse `1280 720 40 170` as the page sends it; None for any other text."""
+    words = text[:40].split()
+    if len(words) != len(Layout._fields) or not all(word.isascii() and word.isdecimal() for word in words):
+        return None
+    layout = Layout(*map(int, words))
+    valid = 0 < layout.width < 1e5 and 0 < layout.height < 1e5 and layout.top + layout.bottom < layout.height
+    return layout if valid else None
+
+
 PREFERENCES_KEY, SEEN_KEY = "parauav-page", "parauav-seen"  # in the local storage of the browser
 LOAD_TIMEOUT_S = 60.0  # a busy browser answers late, and unread preferences would be overwritten
 MIN_ABSENCE_S = 5.0  # a shorter interruption is ignored [s]
@@ -251,6 +274,7 @@ class Browser:
         self.absence: Absence | None = None  # until its events are marked as read
         self.uav: int | None = None  # stored selection, until a UAV is selected
         self.light: bool | None = None  # light theme; None: not chosen
+        self.layout = Layout()
         self._saved, self._loaded = "", False
         self._selected: int | None = None  # UAV stored last
         for load in (self._load_absence, self._load_preferences):

@@ -36,7 +36,10 @@ class Charts:
         self._alt = self._chart("Altitude, m", (("flown", p.actual), ("predicted", p.predicting)), (placeholder,) * 3)
 
     def _chart(self, title: str, lines: tuple, data: tuple) -> tuple[Any, Any]:
-        legend = " ".join(f'<span style="color:{colour};white-space:nowrap">━ {name}</span>' for name, colour in lines)
+        legend = " ".join(
+            f'<span class="soft" style="white-space:nowrap"><span style="color:{colour}">━</span> {name}</span>'
+            for name, colour in lines
+        )
         head = self._gui.add_html(f'<div class="uav" style="padding-bottom:0"><b>{title}</b> {legend}</div>')
         series = tuple(
             uplot.Series(label=name, stroke=colour, width=2, points={"show": False}) for name, colour in lines

@@ -3,10 +3,22 @@
 from html import escape
 from math import isfinite
 
-from fleet.contract import Controller, Outcome, TwinState
+from fleet.contract import AlertKind, Controller, Outcome, TwinState
 from viewer.store.inbox import rate_text, timestamp
-from viewer.store.vehicle import Vehicle
-from viewer.text.words import MIN_HORIZON_S, age_text, fit, horizon_s, key_value_table, mismatch_html, status_label
+from viewer.store.vehicle import StatusRecord, Vehicle, mean_fit
+from viewer.text.words import (
+    LOW_FIT,
+    SHORT_HORIZON_S,
+    age_text,
+    alert_sentence,
+    fit_colour,
+    fit_text,
+    horizon_text,
+    key_value_table,
+    lag_text,
+    mismatch_html,
+    status_label,
+)
 from viewer.theme.events import clip
 from viewer.theme.palette import Palette
 
@@ -17,9 +29,10 @@ REFUSED_S = 10.0  # how long a rejected message is reported [s]
 def status_html(vehicle: Vehicle, palette: Palette, now: float) -> str:
     """Return the status of the UAV and its twin as HTML. Received texts are escaped here."""
     label = status_label(vehicle, palette, now)
+    cards = _cards(vehicle, vehicle.record(now)) + _sentences(vehicle, palette, now)
     return (
         f'<div class="uav"><div class="head"><h1>{vehicle.name}</h1><b style="color:{label.colour}">'
-        f"{label.glyph} {label.text}</b></div>{_cards(vehicle)}{_sentences(vehicle, palette, now)}</div>"
+        f"{label.glyph} {label.text}</b></div>{cards}</div>"
     )
 
 
@@ -28,44 +41,64 @@ def figures_html(vehicle: Vehicle, now: float) -> str:
     return f'<div class="uav">{_fits(vehicle)}{_facts(vehicle, now)}{law_html(vehicle.controller)}</div>'
 
 
-def _cards(vehicle: Vehicle) -> str:
-    forecast, mean = vehicle.forecast, fit(vehicle)
-    horizon = "–"
-    if forecast is not None and forecast.horizon_s >= MIN_HORIZON_S:
-        horizon = f"{'≥ ' if forecast.message.horizon_open else ''}{horizon_s(vehicle):.0f} s"
+def _cards(vehicle: Vehicle, record: StatusRecord) -> str:
     cards = {
-        "fit": "–" if mean is None else f"{mean:.0f} %",
-        "horizon": horizon,
+        "fit": fit_text(record),
+        "horizon": horizon_text(record),
         "airspeed": f"{vehicle.Va:.1f} m/s" if isfinite(vehicle.Va) else "–",
     }
     html = "".join(f'<div class="card"><span class="soft">{k}</span><b>{v}</b></div>' for k, v in cards.items())
-    return f'<div class="cards">{html}</div>'
+    return f'<div class="cards">{html}</div><div class="soft">{escape(fit_and_horizon(vehicle, record))}</div>'
+
+
+IDENTIFIED_METHODS = {"dynamics": "coupled", "paper": "linear"}  # methods that roll out the identified model, its kind
+
+
+def fit_and_horizon(vehicle: Vehicle, record: StatusRecord) -> str:
+    """State what fit and horizon measure, and how one can be low and the other high; plain text, not escaped."""
+    verdict = (vehicle.model.active_verdict or vehicle.model.verdict) if vehicle.model is not None else None
+    length = f" over {verdict.horizon_s:.0f} s" if verdict is not None and isfinite(verdict.horizon_s) else ""
+    texts = [f"Fit: free run of the model alone{length}, without the route."] if record.fit is not None else []
+    if not record.horizon_s or vehicle.prediction is None:
+        return " ".join(texts)
+    method = vehicle.prediction.method
+    if method not in IDENTIFIED_METHODS:
+        return " ".join([*texts, f"Horizon: method {method[:40]}, which does not use the identified model."])
+    kind = IDENTIFIED_METHODS[method]
+    texts.append(f"Horizon: {kind} model and control law in closed loop on the route, measured on past predictions.")
+    if record.fit is not None and record.fit < LOW_FIT and record.horizon_s >= SHORT_HORIZON_S:
+        texts.append("The control law holds the route although the model alone is inaccurate.")
+    elif record.fit is not None and record.fit >= LOW_FIT and record.horizon_s < SHORT_HORIZON_S:
+        texts.append("The model alone is accurate; wind, route or control law are not.")
+    return " ".join(texts)
 
 
 def limitations(vehicle: Vehicle, now: float) -> list[str]:
     """Return why there is no prediction, or what limits it; plain text, not escaped."""
-    state, texts = vehicle.state(now), []
+    record = vehicle.record(now)
+    state, texts = record.state, []
     if vehicle.ended:
         texts.append("The recording has ended; the page shows its last instant.")
     elif state is TwinState.LINK_LOST:
-        note = "the position shown is predicted by the twin" if vehicle.forecast is not None else "no twin yet"
-        texts.append(f"No sample for {age_text(vehicle.sample_age_s(now))}: {note}.")
+        note = "the twin predicts the position shown" if vehicle.forecast is not None else "no twin yet"
+        texts.append(f"No sample for {age_text(record.sample_age_s)}: {note}; check the radio link.")
     elif state in (TwinState.WAITING, TwinState.UNCLAIMED) and vehicle.model is None:
         texts.append("No worker result for this UAV yet; check that `twin_worker` runs on this router.")
     elif state is TwinState.UNCLAIMED:
         texts.append(
-            f"No worker result for this UAV for {age_text(now - vehicle.result_accepted)}; the page shows the "
+            f"No worker result for this UAV for {age_text(record.result_age_s)}; the page shows the "
             "last one; check that `twin_worker` runs on this router."
         )
     elif vehicle.forecast is None:
         rows = vehicle.track_rows()
-        observed_s = vehicle.data_time(now) - float(rows[0, 0]) if len(rows) else 0.0
+        observed_s = record.t - float(rows[0, 0]) if len(rows) else 0.0
         texts.append(f"No horizon yet after {age_text(observed_s)} of telemetry; it needs a verified model.")
-    if lag_s := vehicle.prediction_lag_s(now):
+    if record.prediction_lag_s:
         replay_advice = "play the recording more slowly, or " if vehicle.recorded else ""
         advice = f": its worker is overloaded; {replay_advice}assign fewer UAVs to each worker"
-        texts.append(f"The newest prediction is {age_text(lag_s)} old{'' if state is TwinState.LINK_LOST else advice}.")
-    messages = (vehicle.prediction, vehicle.status, vehicle.mission)
+        texts.append(f"Newest {lag_text(record)}{'' if state is TwinState.LINK_LOST else advice}.")
+    gateway_text = vehicle.status if state is not TwinState.LINK_LOST else None  # else it repeats the age
+    messages = (vehicle.prediction, gateway_text, vehicle.mission)
     texts += [message.sentence for message in messages if message is not None and message.sentence]
     if now - vehicle.refusal[0] < REFUSED_S:
         texts.append(vehicle.refusal[1])
@@ -74,15 +107,17 @@ def limitations(vehicle: Vehicle, now: float) -> list[str]:
 
 def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
     alert = f'<div class="say" style="border-color:{palette.mismatch}">▲ '
-    cards = [mismatch_html(vehicle.mismatch, palette)]
-    cards += [f"{alert}{escape(clip(a.sentence, MAX_TEXT))}</div>" for a in vehicle.alerts.values()]
+    record, cards = vehicle.record(now), [mismatch_html(vehicle.mismatch, palette)]
+    alerts = [a for a in vehicle.alerts.values() if a.kind is not AlertKind.LINK_LOST]  # said by `limitations`
+    cards += [f"{alert}{escape(clip(alert_sentence(a, record), MAX_TEXT))}</div>" for a in alerts]
     texts = limitations(vehicle, now)
     cards += [f'<div class="say">{escape(clip(text, MAX_TEXT))}</div>' for text in texts]
     verdict = vehicle.model.verdict if vehicle.model is not None else None
     if vehicle.model is not None and verdict is not None:
-        mean, is_active = fit(vehicle), vehicle.model.active_verdict in (None, verdict)
-        active = "" if is_active or mean is None else f"; predictions use an earlier model with fit {mean:.0f} %"
-        colour = palette.verified if verdict.outcome is Outcome.VERIFIED else palette.identifying
+        is_active = vehicle.model.active_verdict in (None, verdict) or record.fit is None
+        active = "" if is_active else f"; predictions use an earlier model with fit {fit_text(record)}"
+        colour = fit_colour(mean_fit(verdict.fit), palette) if verdict.outcome is Outcome.VERIFIED else ""
+        colour = colour or palette.identifying
         least = f", threshold {verdict.threshold:.0f} %" if verdict.threshold > 0 else ""
         cards.append(
             f'<div class="say" style="border-color:{colour}"><b>{escape(verdict.outcome.value.replace("_", " "))}</b> '
@@ -145,7 +180,8 @@ def law_html(controller: Controller | None) -> str:
 
 def _facts(vehicle: Vehicle, now: float) -> str:
     prediction, status, row = vehicle.prediction, vehicle.status, vehicle.row
-    at, age_s, rate = vehicle.data_time(now), vehicle.sample_age_s(now), vehicle.time.rate
+    record = vehicle.record(now)
+    at, age_s, rate = record.t, record.sample_age_s, vehicle.time.rate
     time_name = "recorded" if vehicle.recorded else "data time"
     names = "calibration", "method", "mode", "link", time_name, "sample", "prediction", "within 10 %", "worker"
     figures = {"coverage": coverage_text(vehicle)} | dict.fromkeys(names, "–")
@@ -156,9 +192,9 @@ def _facts(vehicle: Vehicle, now: float) -> str:
     if prediction is not None:
         figures["calibration"] = prediction.calibration or "–"
         figures["method"] = f"{prediction.method} · {prediction.law or 'no law'}"
-        if vehicle.forecast is not None:
-            prediction_age_s = max(at - vehicle.forecast.t, 0.0)
-            figures["prediction"] = f"{age_text(prediction_age_s)} old, coasted {prediction.coast_s:.0f} s"
+        if record.prediction_age_s is not None:
+            coasted = f", coasted {age_text(prediction.coast_s)}" if prediction.coast_s > 0 else ""
+            figures["prediction"] = f"{age_text(record.prediction_age_s)} old{coasted}"
     if status is not None:
         armed = "armed" if status.armed else "disarmed"
         figures["mode"] = f"{status.mode or '–'} · {status.autopilot} · {armed}"

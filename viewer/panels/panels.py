@@ -7,7 +7,7 @@ from typing import Any
 
 import viser
 
-from viewer.browser.http_server import Browser
+from viewer.browser.http_server import Browser, parse_layout
 from viewer.panels.charts import Charts
 from viewer.panels.detail import figures_html, status_html
 from viewer.store.inbox import date_text, time_of_day, timestamp
@@ -15,9 +15,18 @@ from viewer.store.states import notices
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.text.missed_events import missed_events_html, parse_click
-from viewer.text.words import MAX_ROWS, alerts_html, empty_html, legend_html, severity, summary_html, table
+from viewer.text.words import (
+    MAX_ROWS,
+    alerts_html,
+    empty_html,
+    legend_html,
+    severity,
+    state_style,
+    summary_html,
+    table,
+)
 from viewer.theme.events import TimelineEvent
-from viewer.theme.palette import STATE_TEXT, Palette, triple
+from viewer.theme.palette import Palette, triple
 
 MAX_EVENT_ROWS = 40  # events shown; earlier ones are counted
 
@@ -77,9 +86,12 @@ class Panels:
         )
         self._gui.set_panel_label("ParaUAV")
         self._gui.main_panel.dock_left()
-        self._gui.main_panel.set_width(340)
         css = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
         self._gui.add_html(f"<style>:root{{--muted:{palette.muted}}}{css}</style>")
+        self._legend_place, layout_input = self._gui.add_html(""), self._gui.add_text("layout", "", visible=False)
+        layout_input.on_update(lambda _: self._set_layout(layout_input.value))
+        report = f"window.reportLayout('{layout_input._impl.uuid}')"  # defined in first.html
+        self._gui.add_html(f'<img src="data:," alt="" style="display:none" onerror="{report}">')
         self._banner, self._error, self._legend = (self._gui.add_html("") for _ in range(3))
         self._build_left()
         self._build_right()
@@ -122,7 +134,22 @@ class Panels:
             self._events = self._gui.add_html("")
             self._facts = self._gui.add_html("")
         panel.dock_right()
-        panel.set_width(350)
+        self._right, self._widths = panel, (0, 0)
+        self._fit_panels()
+
+    def _set_layout(self, text: str) -> None:
+        """Fit the panels to the window that the page reports."""
+        if (layout := parse_layout(text)) is not None:
+            self._browser.layout = layout
+            self._fit_panels()
+
+    def _fit_panels(self) -> None:
+        if (widths := self._browser.layout.panel_widths()) != self._widths:
+            self._widths = widths
+            self._gui.main_panel.set_width(widths[0])
+            self._right.set_width(widths[1])
+            sides = f"--left:{widths[0] + 4}px;--right:{widths[1] + 4}px"
+            self._legend_place.content = f"<style>:root{{{sides}}}</style>"
 
     def _pick(self, text: str) -> None:
         """Select the UAV that a click wrote into the hidden input."""
@@ -149,7 +176,7 @@ class Panels:
             (self._table, table(shown, palette, now, total=len(fleet), pick=pick, selected=selected) if fleet else ""),
             (self._legend, legend_html(fleet, palette)),
             (self._missed, missed),
-            (self._alerts, alerts_html(fleet, store, palette, pick)),
+            (self._alerts, alerts_html(fleet, palette, now, pick)),
             (self._facts, figures_html(selected_vehicle, now) if selected_vehicle is not None else ""),
         )
         with self._browser.client.atomic():  # contents first: the block delays all other messages
@@ -186,7 +213,7 @@ class Panels:
         if not (terms := self._search.value.lower().split()):
             return True
         mode = vehicle.status.mode if vehicle.status is not None else ""
-        text = f"{vehicle.name} {vehicle.uav} {STATE_TEXT[vehicle.state(now)]} {mode}".lower()
+        text = f"{vehicle.name} {vehicle.uav} {state_style(vehicle.record(now))[2]} {mode}".lower()
         return all(term in text for term in terms)
 
     def _handler(self) -> str:

@@ -4,19 +4,24 @@ from typing import Any
 
 import numpy as np
 
+from viewer.browser.http_server import Browser
 from viewer.scene.labels import CameraView
 
 FOV = np.radians(50.0)  # vertical field of view [rad]
 IN_VIEW_M = 20_000.0  # points farther from the centre of the fleet are not framed [m]
 FOCUS_MARGIN = 1.3  # margin around a focused aircraft for its labels [-]
-BOTTOM_SHARE = 0.12  # share of the image height below the timeline [-]
+BOTTOM_SHARE, MAX_BOTTOM_SHARE = 0.12, 0.6  # least and greatest share of the image height left free below [-]
 CLOSEST = 5.0  # smallest distance [10 m]
 EMPTY_VIEW = 60.0 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)  # framed without UAVs [10 m]
 VIEW_ANGLES = (np.radians(-125.0), np.radians(38.0))  # camera direction: azimuth from east, elevation [rad]
 
 
 def frame(
-    points: np.ndarray, aspect: float, margin: float = 1.1, direction: np.ndarray | None = None
+    points: np.ndarray,
+    aspect: float,
+    margin: float = 1.1,
+    direction: np.ndarray | None = None,
+    bottom_share: float = BOTTOM_SHARE,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute the camera position so that every point is in view.
 
@@ -25,6 +30,7 @@ def frame(
         aspect: width over height of the image [-]
         margin: relative size of the frame, 1 is tight [-]
         direction: from the points to the camera, (3,); None: `VIEW_ANGLES`
+        bottom_share: share of the image height that panels cover from below [-]
     Returns:
         position and look-at, two (3,) [10 m]
     """
@@ -38,11 +44,11 @@ def frame(
     look_at = (points.min(axis=0) + points.max(axis=0)) / 2
     for _ in range(3):  # centre and distance depend on each other: iterate
         x, y, z = (points - look_at) @ right, (points - look_at) @ up, (points - look_at) @ to_camera
-        wide, tall = np.tan(FOV / 2) * aspect, np.tan(FOV / 2) * (1 - BOTTOM_SHARE)
+        wide, tall = np.tan(FOV / 2) * aspect, np.tan(FOV / 2) * (1 - bottom_share)
         distance = max(float(np.max(np.maximum(np.abs(x) / wide, np.abs(y) / tall) * margin + z)), CLOSEST)
         depth = distance - z
         look_at = look_at + right * _middle(x / depth) * distance + up * _middle(y / depth) * distance
-    position = look_at + to_camera * distance - up * BOTTOM_SHARE * np.tan(FOV / 2) * distance
+    position = look_at + to_camera * distance - up * bottom_share * np.tan(FOV / 2) * distance
     ground_distance = (position[2] - float(points[:, 2].mean())) / to_camera[2]  # orbit about the height of the fleet
     return position, position - to_camera * max(ground_distance, CLOSEST / 2)
 
@@ -60,8 +66,8 @@ def within_reach(points: np.ndarray, reach: float) -> np.ndarray:
 class Camera:
     """Camera of one page: frames new content until the operator moves it."""
 
-    def __init__(self, client: Any) -> None:
-        self._client = client
+    def __init__(self, browser: Browser) -> None:
+        self._client, self._browser = browser.client, browser
         self._placed: np.ndarray | None = None
         self._moved_by_page = False  # camera moved by this page, maybe not yet reported by the client
 
@@ -73,8 +79,15 @@ class Camera:
 
     def view(self) -> CameraView:
         """Return the current camera view."""
-        camera = self._client.camera
-        return CameraView(np.array(camera.position), np.array(camera.look_at), float(camera.fov), self.aspect)
+        camera, layout = self._client.camera, self._browser.layout
+        sides = float(layout.height), float(layout.top), float(layout.bottom)
+        return CameraView(np.array(camera.position), np.array(camera.look_at), float(camera.fov), self.aspect, *sides)
+
+    @property
+    def bottom_share(self) -> float:
+        """Return the share of the image height that panels cover from below [-]."""
+        layout = self._browser.layout
+        return min(max(layout.bottom / layout.height, BOTTOM_SHARE), MAX_BOTTOM_SHARE)
 
     def show(self, points: np.ndarray, *, force: bool = False) -> None:
         """Frame the points (n, 3) [10 m]; keep a camera that the operator moved, unless `force`."""
@@ -83,7 +96,7 @@ class Camera:
         if (moved or self._moved_by_page) and not force:
             return
         self._moved_by_page = False
-        camera.position, camera.look_at = frame(points, self.aspect)
+        camera.position, camera.look_at = frame(points, self.aspect, bottom_share=self.bottom_share)
         self._placed = np.array(camera.position)
 
     def fly_to(self, points: np.ndarray) -> None:
@@ -91,7 +104,9 @@ class Camera:
         camera = self._client.camera
         self._moved_by_page = True
         direction = np.array(camera.position) - np.array(camera.look_at)
-        camera.position, camera.look_at = frame(points, self.aspect, FOCUS_MARGIN, direction)
+        placed = frame(points, self.aspect, FOCUS_MARGIN, direction, self.bottom_share)
+        with self._client.atomic():
+            camera.position, camera.look_at = placed
 
     def follow(self, step: np.ndarray) -> None:
         """Translate by the step (3,) of the followed UAV [10 m]."""

@@ -7,8 +7,8 @@ from viewer.store.inbox import LARGE_FLEET
 from viewer.store.place import UNIT_M, scene_quat
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
-from viewer.text.words import in_force
-from viewer.theme.palette import STATE_STYLE, STATUS_COLOURS
+from viewer.text.words import in_force, state_style
+from viewer.theme.palette import STATUS_COLOURS
 
 CHUNKS, STEPS = 5, 12  # the trail: chunks of 12 s and a head of up to 12 s, one point per second
 TRAIL_AGES_S = np.arange(float(CHUNKS + 1) * STEPS, -1.0, -1.0)  # age of each trail point, (73,) [s]
@@ -23,12 +23,12 @@ WAITING, LOST, MISMATCH = (STATUS_COLOURS.index(name) for name in ("muted", "los
 
 def display_status(vehicle: Vehicle, now: float) -> int:
     """Return the display status of a UAV; a mismatch or an alert takes precedence over all but a lost link."""
-    state = vehicle.state(now)
+    record = vehicle.record(now)
     if vehicle.ended:
         return WAITING
-    if state is not TwinState.LINK_LOST and (vehicle.alerts or in_force(vehicle.mismatch)):
+    if record.state is not TwinState.LINK_LOST and (vehicle.alerts or in_force(vehicle.mismatch)):
         return MISMATCH
-    return STATUS_COLOURS.index(STATE_STYLE[state][1])
+    return STATUS_COLOURS.index(state_style(record)[1])
 
 
 class FleetArrays:

@@ -5,17 +5,23 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fleet.contract import TwinState
-from viewer.scene.fleet_arrays import FleetArrays
+from viewer.scene.fleet_arrays import LOST, MISMATCH, FleetArrays, display_status
 from viewer.store.vehicle import Vehicle
-from viewer.text.words import age_text, in_force, severity, short_text
+from viewer.text.words import in_force, lost_text, severity, short_text
 from viewer.theme.palette import STATE_STYLE
 
 MAX_LABELS = 8
-SCALE = 0.82  # font scale of every label: one size, as the page rasterises each size separately
-CHAR_WIDTH, LINE_HEIGHT = 0.0068 * SCALE, 0.020 * SCALE  # character width and line height over image height [-]
-EDGE_MARGIN = 0.02  # margin to the image edge [image heights]
+SCALE = 0.92  # font scale of every label: one size, as the page rasterises each size separately
+EM_PX = 12.0 * SCALE  # font size, independent of the window [CSS px]. Source: viser 1.1, LabelRenderer.tsx
+CHAR_EM, PADDING_EM, LINE_EM = 0.56, 1.0, 1.8  # widest mean advance of a label, padding of its box, its height [em]
+EDGE_PX = 4.0  # margin to the edge of the visible part of the image [CSS px]
 _SHIFT = {"bottom": 0.0, "top": -1.0, "left": 0.0, "center": -0.5, "right": -1.0}  # anchor to low corner [label sizes]
-_OTHER_SIDE = {"bottom-left": "bottom-right", "top-left": "top-right"}  # fallback anchor at the image edge
+_ANCHORS = {  # anchors to try in turn
+    "bottom-left": ("bottom-left", "bottom-right", "top-left", "top-right"),
+    "top-left": ("top-left", "top-right", "bottom-left", "bottom-right"),
+    "bottom-center": ("bottom-center", "top-center", "bottom-left", "bottom-right"),
+    "top-center": ("top-center", "bottom-center", "top-left", "top-right"),
+}
 
 
 class Tag(NamedTuple):
@@ -36,10 +42,11 @@ class Labels:
             for k in range(MAX_LABELS)
         ]
         self._assigned: dict[str, Any] = {}  # key -> node
+        self.boxes: list[np.ndarray] = []  # corners of the labels shown, (2, 2) [image heights]
 
     def draw(self, tags: list[Tag], camera_view: "CameraView") -> None:
         """Show the labels that fit, in order of priority."""
-        shown = visible_labels(tags, camera_view)
+        shown, self.boxes = visible_labels(tags, camera_view)
         for key in self._assigned.keys() - {tag.key for tag in shown}:
             self._assigned.pop(key).visible = False
         free = iter([node for node in self._nodes if not any(node is used for used in self._assigned.values())])
@@ -58,6 +65,9 @@ class CameraView(NamedTuple):
     look_at: np.ndarray  # (3,) [10 m]
     fov: float  # vertical [rad]
     aspect: float  # width over height [-]
+    height_px: float = 720.0  # height of the image [CSS px]
+    top_px: float = 0.0  # covered by the legend [CSS px]
+    bottom_px: float = 0.0  # covered by a panel [CSS px]
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Project points (n, 3): right and up of the image centre in image heights, (n, 2), and depth (n,)."""
@@ -75,30 +85,38 @@ class CameraView(NamedTuple):
         return right, np.cross(right, forward)
 
 
-def visible_labels(tags: list[Tag], camera_view: CameraView) -> list[Tag]:
-    """Return the labels inside the image without overlap, at most `MAX_LABELS`."""
+def visible_labels(tags: list[Tag], camera_view: CameraView) -> tuple[list[Tag], list[np.ndarray]]:
+    """Return the labels inside the visible part of the image without overlap, at most `MAX_LABELS`, and their boxes."""
     if not tags:
-        return []
+        return [], []
     points, depth = camera_view.project(np.array([tag.at for tag in tags]))
     shown: list[Tag] = []
     boxes: list[np.ndarray] = []
-    half = np.array([camera_view.aspect / 2 - EDGE_MARGIN, 0.5 - EDGE_MARGIN])
+    height = camera_view.height_px
+    half = camera_view.aspect / 2 - EDGE_PX / height
+    lowest = np.array([-half, -0.5 + (camera_view.bottom_px + EDGE_PX) / height])
+    highest = np.array([half, 0.5 - (camera_view.top_px + EDGE_PX) / height])
     for tag, point, label_depth in zip(tags, points, depth, strict=True):
-        for anchor in (tag.anchor, *filter(None, (_OTHER_SIDE.get(tag.anchor),))):
-            box = _box(candidate := tag._replace(anchor=anchor), point)
-            inside = label_depth > 0 and (np.abs(box) <= half).all()
-            if inside and not any((box[0] < other[1]).all() and (other[0] < box[1]).all() for other in boxes):
+        for anchor in _ANCHORS[tag.anchor]:
+            box = _box(candidate := tag._replace(anchor=anchor), point, height)
+            inside = label_depth > 0 and (box[0] >= lowest).all() and (box[1] <= highest).all()
+            if inside and not any(overlap(box, other) for other in boxes):
                 shown.append(candidate)
                 boxes.append(box)
                 break
         if len(shown) == MAX_LABELS:
             break
-    return shown
+    return shown, boxes
 
 
-def _box(tag: Tag, point: np.ndarray) -> np.ndarray:
+def overlap(box: np.ndarray, other: np.ndarray) -> bool:
+    """Return whether two boxes, low and high corner (2, 2), overlap."""
+    return bool((box[0] < other[1]).all() and (other[0] < box[1]).all())
+
+
+def _box(tag: Tag, point: np.ndarray, height_px: float) -> np.ndarray:
     """Return the corners of a label in the image, (2, 2) [image heights]."""
-    size = np.array([CHAR_WIDTH * len(tag.text), LINE_HEIGHT])
+    size = np.array([CHAR_EM * len(tag.text) + PADDING_EM, LINE_EM]) * EM_PX / height_px
     vertical, horizontal = tag.anchor.split("-")
     low = point + np.array([_SHIFT[horizontal], _SHIFT[vertical]]) * size
     return np.stack([low, low + size])
@@ -107,9 +125,13 @@ def _box(tag: Tag, point: np.ndarray) -> np.ndarray:
 MAX_ALERT_LABELS = 6  # most labels at once; overlapping ones are omitted
 
 
-def alert_labels(fleet_arrays: FleetArrays, selected: int | None, unit: float) -> list[Tag]:
-    """Return labels at the most severe UAVs; `unit` is the drawn span of an aircraft [10 m]."""
-    exceptional = [(v, i) for v, i in fleet_arrays.exceptional if v.uav != selected and not v.ended]
+def alert_labels(fleet_arrays: FleetArrays, shown: dict[int, Vehicle], selected: int | None, unit: float) -> list[Tag]:
+    """Return labels at the most severe UAVs.
+
+    `shown` are the snapshots in the panels, by UAV; `unit` is the drawn span of an aircraft [10 m].
+    """
+    listed = [(shown.get(v.uav, v), i) for v, i in fleet_arrays.exceptional if v.uav != selected and not v.ended]
+    exceptional = [(v, i) for v, i in listed if display_status(v, fleet_arrays.now) in (MISMATCH, LOST)]
     rows = sorted(exceptional, key=lambda entry: severity(entry[0], fleet_arrays.now))[:MAX_ALERT_LABELS]
     above = np.array([0.0, 0.0, 0.9 * unit])
     return [
@@ -125,8 +147,9 @@ def alert_labels(fleet_arrays: FleetArrays, selected: int | None, unit: float) -
 
 def alert_text(vehicle: Vehicle, now: float) -> str:
     """Describe the problems of a UAV in a short label."""
-    if vehicle.state(now) is TwinState.LINK_LOST:
-        return f"{STATE_STYLE[TwinState.LINK_LOST][0]} {vehicle.name} link lost {age_text(vehicle.sample_age_s(now))}"
+    record = vehicle.record(now)
+    if record.state is TwinState.LINK_LOST:
+        return f"{STATE_STYLE[TwinState.LINK_LOST][0]} {vehicle.name} {lost_text(record)}"
     kinds = ", ".join(dict.fromkeys(alert.kind.value.replace("_", " ") for alert in vehicle.alerts.values()))
     if vehicle.mismatch is not None and in_force(vehicle.mismatch):
         kinds = ", ".join(filter(None, (short_text(vehicle.mismatch), kinds)))

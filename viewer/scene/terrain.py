@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from PIL import Image
 
+from fleet.cli import check_file
 from fleet.frames import to_geodetic
 from viewer.scene.strokes import Strokes, chain
 from viewer.store.place import UNIT_M, SceneFrame
@@ -75,6 +76,7 @@ def read_raster(text: str, *, colours: bool) -> Raster:
         OSError: when it cannot be opened.
     """
     path, bounds = _split(text)
+    check_file("--imagery" if colours else "--terrain", path, "a raster file")
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as image:  # errors are reported below
             if image.width * image.height > MAX_PIXELS:

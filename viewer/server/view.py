@@ -55,7 +55,7 @@ class View:
         self.panels.seek = self.timeline.send_code()
         with self.timeline.tab("Export", viser.Icon.DOWNLOAD):
             Export(client, store, recordings, palette, lambda: self.selected)
-        self.camera = Camera(client)
+        self.camera = Camera(browser)
         self.selected: int | None = None
         self.dirty = True  # the selection changed and is not drawn yet
         self.offset = 0  # tick of the second at which slow content is drawn
@@ -63,6 +63,7 @@ class View:
         self._force_framing = False  # frame again even if the camera was moved
         self._framed_box = np.zeros((2, 3))  # corners of the box last framed [10 m]
         self._followed: tuple[int, np.ndarray] | None = None
+        self._shown: dict[int, Vehicle] = {}  # snapshots in the panels; the scene shows the same until the next ones
         self._error, self._error_time = "", 0.0  # last drawing error and its time, monotonic [s]
 
     def restore(self, previous: "View") -> None:
@@ -87,7 +88,7 @@ class View:
 
     def _redraw(self) -> None:
         """Request an immediate redraw after a change of the time shown."""
-        self.dirty = True
+        self.dirty, self._shown = True, {}
         self._wake()
 
     def show_all(self) -> None:
@@ -107,8 +108,10 @@ class View:
         self.panels.follow.value = not self.panels.follow.value
 
     def selected_vehicle(self) -> Vehicle | None:
-        """Return the selected UAV at the time shown; None when there is none."""
-        return self.timeline.vehicle(self.selected) if self.selected is not None else None
+        """Return the selected UAV as the panels show it, at its newest pose; None when there is none."""
+        newest = self.timeline.vehicle(self.selected) if self.selected is not None else None
+        shown = self._shown.get(newest.uav) if newest is not None else None
+        return newest if newest is None or shown is None else shown.at_pose_of(newest, time.monotonic())
 
     def select(self, uav: int) -> None:
         """Select a known UAV and draw it immediately."""
@@ -167,13 +170,14 @@ class View:
         else:
             self.selection.draw(vehicle, self._store, now, ground=scene.ground.height, unit=scene.glyphs.unit)
         tags, marks = self.selection.tags, self.selection.marks
-        alerts = alert_labels(fleet_arrays, self.selected, scene.glyphs.unit)
+        alerts = alert_labels(fleet_arrays, self._shown, self.selected, scene.glyphs.unit)
         self._labels.draw([*tags, *marks[:1], *alerts, *marks[1:]], camera_view)
+        self.selection.move_numbers(self._labels.boxes, camera_view)
 
     def draw_slow(self, fleet_arrays: FleetArrays, now: float, ground: float) -> None:
         """Draw slow content once per second and on a new selection: trails, predictions, routes, panels."""
         fleet_arrays = self.timeline.fleet_arrays(fleet_arrays, self.selected, now)
-        self.dirty = False
+        self.dirty, self._shown = False, {vehicle.uav: vehicle for vehicle in fleet_arrays.fleet}
         self._restore_selection(fleet_arrays)
         self.timeline.draw(self.selected)
         self.panels.draw(fleet_arrays.fleet, self._store, fleet_arrays.now, self.selected)
@@ -233,7 +237,7 @@ class View:
             lines, track = mission_lines(vehicle.mission, scene_frame, ground), self._store.track(vehicle)[:, 1:]
         content = np.vstack([points, lines.points, lines.circles.reshape(-1, 3), track])
         points = within_reach(content, IN_VIEW_M / UNIT_M)
-        key = (*key, bool(len(lines.points)), round(self.camera.aspect, 1))
+        key = (*key, bool(len(lines.points)), round(self.camera.aspect, 1), round(self.camera.bottom_share, 1))
         if key == self._framed_key and not outgrown(points, self._framed_box):
             return
         grown, self._framed_key = key == self._framed_key, key

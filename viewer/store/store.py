@@ -368,11 +368,3 @@ class FleetStore:
             vehicle = self._vehicle(row.uav)
             if row.state is not TwinState.UNCLAIMED and self._accept(vehicle, stamp_of(row), now):
                 vehicle.row = row
-
-    def alerts(self) -> list[tuple[Vehicle, Alert]]:
-        """Return the active alerts, newest first."""
-        with self.lock:
-            now = self._clock()
-            copies = [vehicle.snapshot(now) for vehicle in self._vehicles.values() if vehicle.alerts]
-            active = [(copy, alert) for copy in copies for alert in copy.alerts.values()]
-        return sorted(active, key=lambda entry: -entry[1].t)

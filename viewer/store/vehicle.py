@@ -4,7 +4,7 @@ import re
 from collections import deque
 from dataclasses import dataclass, field
 from math import isfinite
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,9 +34,25 @@ from viewer.theme.events import TimelineEvent, closed_at, merged
 SILENT_S = 3.0  # without a sample for this long the link counts as lost [s]
 UNCLAIMED_S = 30.0  # without a worker message for this long the UAV counts as unclaimed [s]
 LATE_S = 5.0  # a prediction older than this is reported as late, wall time [s]
+POSE_FIELDS = ("t", "at", "alt_m", "attitude", "Va", "time", "sample_received", "shown_t")  # change between records
+MIN_HORIZON_S = 0.5  # a shorter horizon counts as none [s]
 ENDED_S = 3.0  # a replay without messages for this long has ended [s]
 JUMP_S = 5.0  # a larger step back in time is another flight: reset [s]
 OTHER_FLIGHT_S = 86_400.0  # a status farther from the sample time belongs to another flight [s]
+
+
+class StatusRecord(NamedTuple):
+    """State, fit, horizon and ages of one UAV at one instant: every text and colour of the page is made from it."""
+
+    t: float  # data time [s since 1970]
+    state: TwinState
+    fit: float | None  # mean over the states of the active model, else of the newest verdict [%]; None before any
+    horizon_s: float  # from the time of the prediction, as in its message [s]; 0: none, or its end has passed
+    horizon_open: bool  # still below 10 % at the end of the prediction
+    sample_age_s: float  # since the newest sample, data time [s]; inf before the first
+    prediction_age_s: float | None  # since the newest prediction, data time [s]; None before the first
+    prediction_lag_s: float  # the same where it is late, else 0 [s]
+    result_age_s: float  # since the last accepted worker result, wall time [s]; inf before the first
 
 
 @dataclass
@@ -62,7 +78,8 @@ class Vehicle:
     row: FleetRow | None = None
     time: DataTime = field(default_factory=DataTime)
     replay_seen: float = -np.inf  # last message of the replaying gateway, monotonic [s]; -inf: live
-    state_cache: tuple[float, TwinState] | None = None  # of a snapshot: time and value of the last computed state
+    instant: float | None = None  # of a snapshot: its time, monotonic [s]
+    record_cache: StatusRecord | None = None  # of a snapshot: the record of its instant
     ended: bool = False  # the recording has ended: the page shows its last instant
     detector_state: DetectorState = field(default_factory=DetectorState)
     events: tuple[TimelineEvent, ...] = ()  # oldest first; immutable, replaced as a whole
@@ -89,13 +106,6 @@ class Vehicle:
 
     def state(self, now: float) -> TwinState:
         """Return the state of the twin; the most severe condition wins. `now` is monotonic [s]."""
-        if self.state_cache is None:
-            return self._compute_state(now)
-        if self.state_cache[0] != now:
-            self.state_cache = now, self._compute_state(now)
-        return self.state_cache[1]
-
-    def _compute_state(self, now: float) -> TwinState:
         is_silent = now - self.sample_received > SILENT_S / min(self.time.rate, 1.0)  # a slow replay has longer gaps
         if is_silent or (self.status is not None and self.status.link is Link.LOST):
             return TwinState.LINK_LOST
@@ -109,6 +119,46 @@ class Vehicle:
             return TwinState.VERIFIED if self.model.active_verdict is not None else TwinState.IDENTIFYING
         return TwinState.WAITING
 
+    def record(self, now: float) -> StatusRecord:
+        """Return the record of this instant, monotonic [s]; a snapshot has only that of its own instant."""
+        if self.instant is None:
+            return self._compute_record(now)
+        if self.record_cache is None:
+            self.record_cache = self._compute_record(self.instant)
+        return self.record_cache
+
+    def _compute_record(self, now: float) -> StatusRecord:
+        data_t, forecast = self.data_time(now), self.forecast
+        age_s = None if forecast is None or not isfinite(data_t) else max(data_t - forecast.t, 0.0)
+        horizon_s = forecast.horizon_s if forecast is not None else 0.0
+        if age_s is not None and (age_s >= horizon_s or horizon_s < MIN_HORIZON_S):
+            horizon_s = 0.0
+        return StatusRecord(
+            data_t,
+            self.state(now),
+            self._fit(),
+            horizon_s,
+            bool(horizon_s) and forecast is not None and forecast.message.horizon_open,
+            self.sample_age_s(now),
+            age_s,
+            self.prediction_lag_s(now),
+            now - self.result_accepted,
+        )
+
+    def _fit(self) -> float | None:
+        source: dict[str, float] = self.row.fit if self.row is not None else {}
+        if self.model is not None:
+            source = (self.model.active_verdict or self.model.verdict).fit
+        return mean_fit(source)
+
+    def at_pose_of(self, newest: "Vehicle", now: float) -> "Vehicle":
+        """Return this snapshot at the newer pose and data time of another snapshot of the same UAV."""
+        moved = object.__new__(type(self))
+        moved.__dict__.update(self.__dict__)
+        moved.__dict__.update({name: newest.__dict__[name] for name in POSE_FIELDS if name in newest.__dict__})
+        moved.record_cache = self.record(now)
+        return moved
+
     def snapshot(self, now: float) -> "Vehicle":
         """Return an immutable copy; the histories stay shared, read them through the store.
 
@@ -116,7 +166,7 @@ class Vehicle:
         """
         copy = object.__new__(Vehicle)
         copy.__dict__.update(self.__dict__)
-        copy.state_cache = np.nan, TwinState.WAITING
+        copy.instant, copy.record_cache = now, None
         if self.recorded and now - self.replay_seen > ENDED_S and now - self.sample_received > ENDED_S:
             copy.ended, copy.events = True, closed_at(self.events, self.time.t)
             copy.alerts = {key: alert for key, alert in self.alerts.items() if alert.kind is not AlertKind.LINK_LOST}
@@ -162,7 +212,7 @@ class Vehicle:
         """Return the position to draw, (3,) [10 m]: last sample, or the prediction when the link is lost."""
         if self.ended and self.at is not None:
             return self.at
-        if self.forecast is not None and (self.at is None or self.state(now) is TwinState.LINK_LOST):
+        if self.forecast is not None and (self.at is None or self.record(now).state is TwinState.LINK_LOST):
             return self.forecast.position_at(self.data_time(now) - self.forecast.t)
         return self.at
 
@@ -209,6 +259,12 @@ class Vehicle:
         self.controller = self.mismatch = self.last_updated_forecast = None
         for history in (self.trail, self.past, self.fits, self.track):
             history.clear()
+
+
+def mean_fit(fit: dict[str, float]) -> float | None:
+    """Return the mean of the fits per state [%]; None without a finite one."""
+    values = [value for value in fit.values() if isfinite(value)]
+    return sum(values) / len(values) if values else None
 
 
 def stamp_of(row: FleetRow) -> Stamp:

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.contract import DiagnosisOutcome, Mismatch, TwinState
+from fleet.contract import Alert, AlertKind, DiagnosisOutcome, Mismatch, TwinState
 from viewer.store.inbox import rate_text, time_of_day, timestamp
 from viewer.store.store import FleetStore
-from viewer.store.vehicle import Vehicle
+from viewer.store.vehicle import StatusRecord, Vehicle
 from viewer.text.missed_events import encode_click
 from viewer.theme.events import EventKind
 from viewer.theme.palette import STATE_STYLE, STATE_TEXT, Palette
@@ -93,7 +93,8 @@ def _proof(mismatch: Mismatch) -> list[tuple[str, str]]:
 
 
 MAX_ROWS = 50
-MIN_HORIZON_S = 0.5  # a shorter horizon counts as none [s]
+LOW_FIT = 50.0  # below this fit the residual exceeds half of the motion, RMS; a verified model has little power [%]
+SHORT_HORIZON_S = 10.0  # a shorter horizon is reported; the alert of the worker has the same threshold [s]
 FULL_BAR_S = 10.0  # smallest horizon of a full bar in the table [s]
 
 
@@ -109,33 +110,67 @@ def status_label(vehicle: Vehicle, palette: Palette, now: float) -> StatusLabel:
     """Return the status of a UAV: state of its twin, mismatch, alert or end of recording."""
     if vehicle.ended:
         return StatusLabel(EventKind.END.glyph, "recording ended", palette.event(EventKind.END))
-    state = vehicle.state(now)
-    if state is not TwinState.LINK_LOST and in_force(vehicle.mismatch):
+    record = vehicle.record(now)
+    if record.state is not TwinState.LINK_LOST and in_force(vehicle.mismatch):
         return StatusLabel("▲", "mismatch", palette.mismatch)
-    if state is not TwinState.LINK_LOST and vehicle.alerts:
+    if record.state is not TwinState.LINK_LOST and vehicle.alerts:
         return StatusLabel("▲", next(iter(vehicle.alerts.values())).kind.value.replace("_", " "), palette.mismatch)
-    glyph, colour = STATE_STYLE[state]
-    return StatusLabel(glyph, STATE_TEXT[state], getattr(palette, colour))
+    glyph, colour, text = state_style(record)
+    return StatusLabel(glyph, text, getattr(palette, colour))
+
+
+def state_style(record: StatusRecord) -> tuple[str, str, str]:
+    """Return glyph, `Palette` field and text of a state.
+
+    A verified model has the colour of verification only with a fit of `LOW_FIT` and, where there is a prediction, a
+    horizon of `SHORT_HORIZON_S` or more: verification alone states only that the model is better than none.
+    """
+    glyph, colour = STATE_STYLE[record.state]
+    text = STATE_TEXT[record.state]
+    if record.state is TwinState.VERIFIED:
+        if record.fit is None or record.fit < LOW_FIT:
+            return glyph, STATE_STYLE[TwinState.PREDICTING][1], "low fit"
+        if record.prediction_age_s is not None and not record.horizon_open and record.horizon_s < SHORT_HORIZON_S:
+            return glyph, STATE_STYLE[TwinState.PREDICTING][1], "short horizon"
+    return glyph, colour, text
+
+
+def fit_colour(fit: float | None, palette: Palette) -> str:
+    """Return the colour of a verified model by its fit [%]."""
+    return palette.verified if fit is not None and fit >= LOW_FIT else palette.predicting
 
 
 def severity(vehicle: Vehicle, now: float) -> tuple[bool, int, float, int]:
     """Return a sort key: alerts first, then worst state, then shortest horizon; ended recordings last."""
-    rank = len(STATE_STYLE) if vehicle.ended else list(STATE_STYLE).index(vehicle.state(now))
-    return (not (vehicle.alerts or in_force(vehicle.mismatch)), rank, horizon_s(vehicle), vehicle.uav)
+    record = vehicle.record(now)
+    rank = len(STATE_STYLE) if vehicle.ended else list(STATE_STYLE).index(record.state)
+    return (not (vehicle.alerts or in_force(vehicle.mismatch)), rank, record.horizon_s, vehicle.uav)
 
 
-def horizon_s(vehicle: Vehicle) -> float:
-    """Return the current horizon [s]; 0 without a prediction."""
-    return vehicle.forecast.horizon_s if vehicle.forecast is not None else 0.0
+def horizon_text(record: StatusRecord) -> str:
+    """Format the horizon: 34 s, ≥ 180 s where it does not end, – where there is none."""
+    if not record.horizon_s:
+        return "–"
+    return f"{'≥ ' if record.horizon_open else ''}{record.horizon_s:.0f} s"
 
 
-def fit(vehicle: Vehicle) -> float | None:
-    """Return the mean fit over the states of the active model [%]; None before the first."""
-    source: dict[str, float] = vehicle.row.fit if vehicle.row is not None else {}
-    if vehicle.model is not None:
-        source = (vehicle.model.active_verdict or vehicle.model.verdict).fit
-    values = [value for value in source.values() if isfinite(value)]
-    return sum(values) / len(values) if values else None
+def fit_text(record: StatusRecord) -> str:
+    """Format the mean fit: 88 %, – before the first."""
+    return "–" if record.fit is None else f"{record.fit:.0f} %"
+
+
+def lost_text(record: StatusRecord) -> str:
+    """Describe a lost link."""
+    return f"{STATE_TEXT[TwinState.LINK_LOST]} {age_text(record.sample_age_s)}"
+
+
+def alert_sentence(alert: Alert, record: StatusRecord) -> str:
+    """Return the text of an alert, not escaped; ages and horizons in it are those of the record, not of its start."""
+    if alert.kind is AlertKind.LINK_LOST:
+        return f"no sample for {age_text(record.sample_age_s)}; the twin predicts without telemetry"
+    if alert.kind is AlertKind.SHORT_HORIZON:
+        return f"confidence horizon {horizon_text(record)}; raised below {SHORT_HORIZON_S:.0f} s"
+    return alert.sentence
 
 
 def empty_html(store: FleetStore, now: float) -> str:
@@ -159,7 +194,7 @@ def summary_html(fleet: list[Vehicle], store: FleetStore, palette: Palette, now:
         f'<span class="soft">{label.text}</span></span>'
         for label, n in Counter(status_label(vehicle, palette, now) for vehicle in ordered).items()
     )
-    horizons = sorted(h for vehicle in fleet if (h := horizon_s(vehicle)) >= MIN_HORIZON_S)
+    horizons = sorted(h for vehicle in fleet if (h := vehicle.record(now).horizon_s))
     median = f" · median horizon {horizons[len(horizons) // 2]:.0f} s" if horizons else ""
     n, coverage, quantile = fleet_coverage(fleet)
     covered = f" · cov. {coverage * 100:.0f}/{quantile * 100:.0f} %" if n else ""
@@ -182,43 +217,52 @@ def _recording(fleet: list[Vehicle], now: float) -> str:
 def table(fleet: list[Vehicle], palette: Palette, now: float, *, total: int, pick: str, selected: int | None) -> str:
     """Return the table of up to 50 UAVs, most severe first; `pick` is the click handler with `{}` for the UAV."""
     worst = sorted(fleet, key=lambda vehicle: severity(vehicle, now))[:MAX_ROWS]
-    longest = max([FULL_BAR_S, *(horizon_s(vehicle) for vehicle in worst)])
+    longest = max([FULL_BAR_S, *(vehicle.record(now).horizon_s for vehicle in worst)])
     rows = "".join(_row(vehicle, palette, now, pick, on=vehicle.uav == selected, longest=longest) for vehicle in worst)
     return (
         '<div class="uav list"><table><tr><th></th><th>UAV</th><th>status</th><th class="num">fit %</th>'
         f'<th class="num">horizon</th></tr>{rows}</table>'
-        f'<div class="foot">{len(worst)} of {total} · alerts and worst state first, then shortest horizon</div></div>'
+        f'<div class="foot">{len(worst)} of {total} · alerts and worst state first, then shortest horizon '
+        "· keys J, K: next, previous</div></div>"
     )
 
 
 def _row(vehicle: Vehicle, palette: Palette, now: float, pick: str, *, on: bool, longest: float) -> str:
-    label, horizon, mean = status_label(vehicle, palette, now), horizon_s(vehicle), fit(vehicle)
-    is_lost = label.text == STATE_TEXT[TwinState.LINK_LOST]
-    text = f"{label.text} {age_text(vehicle.sample_age_s(now))}" if is_lost else label.text
-    bar = f'<i><i style="width:{min(horizon / longest, 1) * 100:.0f}%;background:{label.colour}"></i></i>'
-    percent, seconds = "–" if mean is None else f"{mean:.0f}", f"{horizon:.0f} s" if horizon >= MIN_HORIZON_S else "–"
+    label, record = status_label(vehicle, palette, now), vehicle.record(now)
+    text = lost_text(record) if label.text == STATE_TEXT[TwinState.LINK_LOST] else label.text
+    if record.prediction_lag_s and record.state is not TwinState.LINK_LOST:
+        text += f", {age_text(record.prediction_lag_s)} old"
+    bar = f'<i><i style="width:{min(record.horizon_s / longest, 1) * 100:.0f}%;background:{label.colour}"></i></i>'
+    percent, problem = fit_text(record).removesuffix(" %"), escape(_problem_text(vehicle, text, now))
     return (
-        f'<tr class="pick{" on" if on else ""}" data-uav="{vehicle.uav}" title="{escape(_problem_text(vehicle))}" '
+        f'<tr class="pick{" on" if on else ""}" data-uav="{vehicle.uav}" title="{problem}" '
         f'onpointerdown="{pick.format(vehicle.uav)}">'
         f'<td style="color:{label.colour}">{label.glyph}</td><td>{vehicle.name}</td>'
         f'<td style="color:{label.colour}">{text}</td><td class="num">{percent}</td>'
-        f'<td><div class="bar">{bar}<span class="num" style="width:30px">{seconds}</span>'
+        f'<td><div class="bar">{bar}<span class="num">{horizon_text(record)}</span>'
         "</div></td></tr>"
     )
 
 
-def _problem_text(vehicle: Vehicle) -> str:
-    """Return mismatch and alert texts of a UAV for the tooltip of its row; not escaped."""
+def lag_text(record: StatusRecord) -> str:
+    """Describe a late prediction."""
+    return f"prediction {age_text(record.prediction_lag_s)} old"
+
+
+def _problem_text(vehicle: Vehicle, status: str, now: float) -> str:
+    """Return status, mismatch and alert texts of a UAV for the tooltip of its row; not escaped."""
     texts = [short_text(vehicle.mismatch)] if vehicle.mismatch is not None and in_force(vehicle.mismatch) else []
-    return "; ".join([*texts, *(alert.sentence[:200] for alert in vehicle.alerts.values())])
+    sentences = (alert_sentence(alert, vehicle.record(now))[:200] for alert in vehicle.alerts.values())
+    return "; ".join([status, *texts, *sentences])
 
 
-def alerts_html(fleet: list[Vehicle], store: FleetStore, palette: Palette, pick: str = "") -> str:
+def alerts_html(fleet: list[Vehicle], palette: Palette, now: float, pick: str = "") -> str:
     """Return active mismatches and alerts, newest first, at most 50 each; `pick` is the click handler."""
     mismatched = [(v, v.mismatch) for v in fleet if v.mismatch is not None and in_force(v.mismatch)]
     mismatched = sorted(mismatched, key=lambda item: -item[1].t)[:MAX_ROWS]
     mismatch_rows = [(v, "mismatch", mismatch.t, short_text(mismatch)) for v, mismatch in mismatched]
-    alert_rows = [(v, a.kind.value.replace("_", " "), a.t, a.sentence) for v, a in store.alerts()[:MAX_ROWS]]
+    alerts = sorted(((v, a) for v in fleet for a in v.alerts.values()), key=lambda item: -item[1].t)[:MAX_ROWS]
+    alert_rows = [(v, a.kind.value.replace("_", " "), a.t, alert_sentence(a, v.record(now))) for v, a in alerts]
     cards = "".join(
         f'<div class="say pick" style="border-color:{palette.mismatch}" '
         f'onpointerdown="{pick.format(encode_click(vehicle.uav, t))}">'

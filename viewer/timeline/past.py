@@ -98,6 +98,7 @@ def vehicle_at(vehicle: Vehicle, recording: UavRecording, shown_t: float, rate: 
     past = object.__new__(PastVehicle)
     past.__dict__.update({name: value for name, value in vehicle.__dict__.items() if name not in _OVERRIDDEN})
     past.recording, past.shown_t, past.state_record = recording, shown_t, record
+    past.record_cache = None
     past.t, past.time = float(min(shown_t, recording.t[-1])), DataTime(shown_t, rate=rate)
     past.at, past.Va = row[:3], float(row[6])
     past.alt_m = vehicle.alt_m + (row[2] - vehicle.at[2]) * UNIT_M if vehicle.at is not None else np.nan

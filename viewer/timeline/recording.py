@@ -10,7 +10,6 @@ from fleet.frames import wrap
 from viewer.store.forecast import ScenePrediction
 from viewer.store.track import TRAIL_ROWS
 from viewer.store.vehicle import JUMP_S, Vehicle
-from viewer.text.words import fit
 from viewer.theme.events import TimelineEvent
 
 
@@ -31,16 +30,16 @@ class StateRecord(NamedTuple):
 
 def state_record(vehicle: Vehicle, at: float, now: float) -> StateRecord:
     """Return the state of a UAV at data time `at` [s since 1970]; `now` is monotonic [s]."""
-    status, mean = vehicle.status or Status(uav=vehicle.uav, t=at), fit(vehicle)
+    status, record = vehicle.status or Status(uav=vehicle.uav, t=at), vehicle.record(now)
     return StateRecord(
         at,
-        vehicle.state(now),
+        record.state,
         status.link,
         status.mode,
         status.armed,
         status.sentence,
         vehicle.model.verdict.sentence if vehicle.model is not None else "",
-        None if mean is None else float(round(mean)),
+        None if record.fit is None else float(round(record.fit)),
         vehicle.alerts,
         vehicle.mismatch,
     )

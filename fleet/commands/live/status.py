@@ -3,6 +3,7 @@
 import argparse
 import json
 import sys
+from math import isfinite
 
 import msgspec
 from rich.console import Console
@@ -16,6 +17,7 @@ from fleet.contract import Claim, FleetRow, FleetState, GatewayCounters, Status,
 from fleet.process.sanitise import printable
 from fleet.report.report_text import id_ranges
 
+LATE_S = 5.0  # an older prediction is shown in red; the viewer reports it as late from the same age on [s]
 EXAMPLES = """
   fleet status
   fleet status --json
@@ -97,14 +99,22 @@ def fleet_table(rows: list[FleetRow]) -> Table:
     for heading, justify in (("UAV", "right"), ("state", "left"), ("fit %", "right"), ("horizon s", "right")):
         out.add_column(heading, justify=justify)  # type: ignore[arg-type]
     out.add_column("sample age s", justify="right")
+    out.add_column("prediction age s", justify="right")
     out.add_column("alerts and verdict", overflow="fold")
     for row in rows:
-        fit = f"{sum(row.fit.values()) / len(row.fit):.0f}" if row.fit else "-"
-        horizon = f"{row.horizon_s:.0f}" if row.horizon_s else "-"
-        age = "-" if row.sample_age_s is None else f"{row.sample_age_s:.1f}"
+        fit = _number(sum(row.fit.values()) / len(row.fit) if row.fit else None, 0)
+        horizon = _number(row.horizon_s or None, 0)
+        age = _number(row.prediction_age_s, 1)
+        late = row.prediction_age_s is not None and row.prediction_age_s > LATE_S
+        ages = _number(row.sample_age_s, 1), f"[red]{age}[/red]" if late else age
         mismatch = [f"▲ mismatch: {escape(printable(row.mismatch))}"] if row.mismatch else []
         details = "\n".join(
             (*(f"! {escape(printable(alert))}" for alert in row.alerts), *mismatch, escape(printable(row.verdict)))
         )
-        out.add_row(str(row.uav), row.state.value, fit, horizon, age, details)
+        out.add_row(str(row.uav), row.state.value, fit, horizon, *ages, details)
     return out
+
+
+def _number(value: float | None, digits: int) -> str:
+    """Format a number; a dash where there is none."""
+    return "-" if value is None or not isfinite(value) else f"{value:.{digits}f}"

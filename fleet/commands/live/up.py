@@ -14,7 +14,7 @@ from rich.text import Text
 
 from fleet.access.knock import probe_router
 from fleet.bus.session import Bus, connect, open_router
-from fleet.cli import check_parent, host_and_port, stop_on_signal
+from fleet.cli import check_file, check_parent, check_port, host_and_port, stop_on_signal
 from fleet.commands.live.fly import AIRCRAFT, AUTOPILOTS, fault_arguments, faults_of
 from fleet.commands.live.replay import check_arguments as check_playing
 from fleet.commands.live.replay import replay_link
@@ -105,8 +105,11 @@ def _check(args: argparse.Namespace) -> None:
     if args.results and not args.replay:
         raise ValueError("--results: found no --replay, expected a recording made by `fleet record`; name one")
     for name in args.replay:
-        if not Path(name).is_file():
-            raise ValueError(f"--replay: found no recording {name!r}, expected a file; check the path")
+        check_file("--replay", name)
+    for option in ("terrain", "imagery"):
+        if (file := getattr(args, option)) and not args.no_viewer:
+            check_file(f"--{option}", file if Path(file).exists() else file.rpartition("@")[0] or file, "a raster file")
+    check_port("--port", args.port)
     check_parent("--summary", args.summary)
     if not (args.link or args.replay):
         _check_free(args.mavlink)

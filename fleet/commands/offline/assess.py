@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from fleet.cli import check_parent, run_module
+from fleet.cli import check_file, check_parent, run_module
 from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
 
 EXAMPLES = """
@@ -54,8 +54,7 @@ def check_arguments(args: argparse.Namespace) -> None:
     if not 1 <= args.jobs <= 64:
         raise ValueError(f"--jobs: found {args.jobs}, expected 1..64; change it")
     for path in args.file:
-        if not path.is_file():
-            raise ValueError(f"FILE: found no recording {str(path)!r}, expected a file; check the path")
+        check_file("FILE", path)
     check_parent("--json", args.json)
     if args.json and any(args.json.exists() and path.samefile(args.json) for path in args.file):
         raise ValueError(f"--json: found the recording {str(args.json)!r} itself, expected another file; rename it")

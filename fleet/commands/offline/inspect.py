@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 from rich.console import Console
 
-from fleet.cli import check_parent
+from fleet.cli import check_file, check_parent
 from fleet.commands.offline.schema import fields_of, parts_of, summary
 from fleet.process.children import run_to_end
 from fleet.process.interrupt import interrupt_deferred
@@ -120,8 +120,7 @@ def _check(args: argparse.Namespace) -> None:
     if not args.file:
         raise ValueError("FILE: found none, expected at least one recording; name one")
     for path in args.file:
-        if not path.is_file():
-            raise ValueError(f"FILE: found no recording {str(path)!r}, expected a file; check the path")
+        check_file("FILE", path)
     if args.plot and args.plot.suffix not in PLOTS:
         raise ValueError(f"--plot: found {args.plot.name!r}, expected a name in {' '.join(PLOTS)}; change the suffix")
     for option, name in (("--plot", args.plot), ("--json", args.json)):

@@ -6,13 +6,21 @@ Source: MAVLink common and ardupilotmega dialects.
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from math import lcm
-from typing import Any
+from math import isfinite, lcm
+from typing import Any, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from fleet.contract import Item
-from fleet.simulator.flight.mavlink_messages import DIALECTS, MavlinkDialect, TelemetryState, param_value_message
+from fleet.simulator.flight.mavlink_messages import (
+    ARDUPLANE_MODES,
+    DIALECTS,
+    PX4_AUTO,
+    PX4_MODES,
+    MavlinkDialect,
+    TelemetryState,
+    param_value_message,
+)
 
 TICK_HZ = 100
 COMPONENT = mav.MAV_COMP_ID_AUTOPILOT1
@@ -24,7 +32,15 @@ _CAPABILITIES = (
     | mav.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
     | mav.MAV_PROTOCOL_CAPABILITY_MAVLINK2
 )
+_RELATIVE_FRAMES = (mav.MAV_FRAME_GLOBAL_RELATIVE_ALT, mav.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT)
 _PARAMS_PER_TICK = 2  # rate limit of the parameter stream
+
+
+class ModeRequest(NamedTuple):
+    """A commanded mode, and the point to fly to: latitude, longitude, height above home [1e-7 deg, 1e-7 deg, m]."""
+
+    mode: str
+    target: tuple[int, int, float] | None = None
 
 
 class MavlinkEndpoint:
@@ -52,6 +68,7 @@ class MavlinkEndpoint:
         self._names = sorted(params)
         self._params, self._dialect = params, dialect
         self._pending_params: deque[int] = deque()  # indices of parameters to send
+        self.mode_requests: deque[ModeRequest] = deque()  # received, not yet executed
         schedule = [(round(TICK_HZ / rate), phase, build) for rate, phase, build in dialect.telemetry]
         self._due = [  # message functions of each tick, repeated
             [build for period, phase, build in schedule if (tick - phase) % period == 0]
@@ -67,7 +84,8 @@ class MavlinkEndpoint:
         """Return the frames due at this tick of 10 ms; `state` is called only if one is due."""
         due = self._due[tick % len(self._due)]
         snapshot = state() if due else None
-        frames = [self._pack(make(snapshot)) for make in due if snapshot is not None]
+        messages = [make(snapshot) for make in due if snapshot is not None]
+        frames = [self._pack(message) for message in messages if message is not None]
         return frames + self.stream_parameters(_PARAMS_PER_TICK)
 
     def stream_parameters(self, limit: int) -> list[bytes]:
@@ -118,12 +136,43 @@ class MavlinkEndpoint:
             return [mav.MAVLink_mission_item_int_message(*head, item.lat_e7, item.lon_e7, item.alt_m)]
         return [mav.MAVLink_mission_item_message(*head, item.lat_e7 * 1e-7, item.lon_e7 * 1e-7, item.alt_m)]
 
+    def _request_mode(self, mode: str | None, target: tuple[int, int, float] | None = None) -> bool:
+        """Store a commanded mode; return whether it is one that is simulated."""
+        if mode is not None:
+            self.mode_requests.append(ModeRequest(mode, target))
+        return mode is not None
+
+    def _set_mode(self, message: Any, t: float) -> list[Any]:
+        self._request_mode(self._mode_name(message.custom_mode))
+        return []
+
+    def _mode_name(self, custom_mode: int) -> str | None:
+        """Return the name of a custom mode; None: not simulated."""
+        if self._dialect.is_px4:
+            names = {sub << 24 | PX4_AUTO << 16: name for name, sub in PX4_MODES.items() if name != "LAND"}
+        else:
+            names = {number: name for name, number in ARDUPLANE_MODES.items()}
+        return names.get(custom_mode)
+
+    def _command_int(self, message: Any, t: float) -> list[Any]:
+        """Process DO_REPOSITION: fly to a point at a height above home, in GUIDED (ArduPlane) or Hold (PX4)."""
+        accepted = message.command == mav.MAV_CMD_DO_REPOSITION and message.frame in _RELATIVE_FRAMES
+        if accepted:
+            mode = "LOITER" if self._dialect.is_px4 else "GUIDED"
+            self._request_mode(mode, (message.x, message.y, float(message.z)))
+        result = mav.MAV_RESULT_ACCEPTED if accepted else mav.MAV_RESULT_UNSUPPORTED
+        return [mav.MAVLink_command_ack_message(message.command, result, 0, 0, *_sender(message))]
+
     def _command(self, message: Any, t: float) -> list[Any]:
         version_id = mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION
         is_version_request = message.command == mav.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES or (
             message.command == mav.MAV_CMD_REQUEST_MESSAGE and message.param1 == version_id  # may be nan
         )
         accepted = is_version_request or message.command == mav.MAV_CMD_SET_MESSAGE_INTERVAL  # rates are fixed
+        if message.command == mav.MAV_CMD_DO_SET_MODE and all(map(isfinite, (message.param2, message.param3))):
+            custom, sub = int(message.param2), int(message.param3)
+            mode = self._mode_name((sub << 24 | custom << 16) if self._dialect.is_px4 else custom)
+            accepted = self._request_mode(mode)
         result = mav.MAV_RESULT_ACCEPTED if accepted else mav.MAV_RESULT_UNSUPPORTED
         ack = mav.MAVLink_command_ack_message(message.command, result, 0, 0, *_sender(message))
         if not is_version_request:
@@ -150,6 +199,8 @@ _HANDLERS: dict[str, Callable[[MavlinkEndpoint, Any, float], list[Any]]] = {
     "MISSION_REQUEST_INT": MavlinkEndpoint._mission_item,
     "MISSION_REQUEST": MavlinkEndpoint._mission_item,
     "COMMAND_LONG": MavlinkEndpoint._command,
+    "COMMAND_INT": MavlinkEndpoint._command_int,
+    "SET_MODE": MavlinkEndpoint._set_mode,
     "TIMESYNC": MavlinkEndpoint._timesync,
 }
 

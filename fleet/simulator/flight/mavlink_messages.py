@@ -13,8 +13,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from fleet.simulator.vehicle.sensors import SEA_LEVEL_RHO, Estimate
 
-AUTO = 10  # ArduPlane custom_mode
-MISSION = 4 << 24 | 4 << 16  # PX4 custom_mode: sub mode MISSION of main mode AUTO
+ARDUPLANE_MODES = {"CIRCLE": 1, "FBWA": 5, "FBWB": 6, "CRUISE": 7, "AUTO": 10, "RTL": 11, "LOITER": 12, "GUIDED": 15}
+PX4_MODES = {"LOITER": 3, "MISSION": 4, "RTL": 5, "LAND": 6}  # sub modes of main mode AUTO
+PX4_AUTO = 4  # main mode
 _ARMED = (
     mav.MAV_MODE_FLAG_SAFETY_ARMED
     | mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
@@ -42,6 +43,8 @@ class TelemetryState(NamedTuple):
     n_items: int  # number of mission items
     home: tuple[int, int, int]  # [1e-7 deg, 1e-7 deg, mm above mean sea level]
     wind: tuple[float, float]  # estimate of the autopilot, NED, direction it blows to [m/s]
+    mode: str  # flight mode, a name in the tables of the autopilot
+    destination: tuple[int, int, int] | None  # of a mode without mission [1e-7 deg, 1e-7 deg, mm above mean sea level]
 
 
 def _boot_ms(t: float) -> int:
@@ -93,7 +96,24 @@ def _mission_current(f: TelemetryState) -> Any:
 
 def _heartbeat(f: TelemetryState) -> Any:
     return mav.MAVLink_heartbeat_message(
-        mav.MAV_TYPE_FIXED_WING, mav.MAV_AUTOPILOT_ARDUPILOTMEGA, _ARMED, AUTO, mav.MAV_STATE_ACTIVE, 3
+        mav.MAV_TYPE_FIXED_WING,
+        mav.MAV_AUTOPILOT_ARDUPILOTMEGA,
+        _ARMED,
+        ARDUPLANE_MODES[f.mode],
+        mav.MAV_STATE_ACTIVE,
+        3,
+    )
+
+
+def _destination(f: TelemetryState) -> Any:
+    """Create POSITION_TARGET_GLOBAL_INT in a mode without mission that flies to a point; None in other modes."""
+    if f.destination is None:
+        return None
+    lat, lon, alt = f.destination
+    only_position = 0b0000111111111000  # ignores velocity, acceleration and yaw
+    zeros = (0.0,) * 8
+    return mav.MAVLink_position_target_global_int_message(
+        _boot_ms(f.t), mav.MAV_FRAME_GLOBAL_INT, only_position, lat, lon, alt * 1e-3, *zeros
     )
 
 
@@ -106,9 +126,9 @@ def _sys_status(f: TelemetryState) -> Any:
 
 
 def _heartbeat_px4(f: TelemetryState) -> Any:
-    mode = _ARMED | mav.MAV_MODE_FLAG_AUTO_ENABLED
+    base_mode, mode = _ARMED | mav.MAV_MODE_FLAG_AUTO_ENABLED, PX4_MODES[f.mode] << 24 | PX4_AUTO << 16
     return mav.MAVLink_heartbeat_message(
-        mav.MAV_TYPE_FIXED_WING, mav.MAV_AUTOPILOT_PX4, mode, MISSION, mav.MAV_STATE_ACTIVE, 3
+        mav.MAV_TYPE_FIXED_WING, mav.MAV_AUTOPILOT_PX4, base_mode, mode, mav.MAV_STATE_ACTIVE, 3
     )
 
 
@@ -171,6 +191,7 @@ TELEMETRY: MessageSchedule = (
     (1, 11, _mission_current),
     (1, 23, _heartbeat),
     (1, 37, _sys_status),
+    (2, 41, _destination),
 )
 TELEMETRY_PX4: MessageSchedule = (
     *_COMMON,
@@ -178,6 +199,7 @@ TELEMETRY_PX4: MessageSchedule = (
     (1, 11, _mission_current),
     (1, 23, _heartbeat_px4),
     (1, 37, _sys_status),
+    (1, 41, _destination),
     (1, 43, _wind_cov),
     (0.5, 53, _home),
 )
@@ -203,11 +225,12 @@ class MavlinkDialect(NamedTuple):
     telemetry: MessageSchedule
     version: int  # encoded as in AUTOPILOT_VERSION
     integer_params: tuple[str, ...]  # name prefixes of integers, sent as raw bytes
+    is_px4: bool = False
 
 
 DIALECTS = {
     "ardupilot": MavlinkDialect(TELEMETRY, 0x040600FF, ()),  # 4.6.0, official release
-    "px4": MavlinkDialect(TELEMETRY_PX4, 0x011000FF, _INTEGER_PARAMS),  # 1.16.0
+    "px4": MavlinkDialect(TELEMETRY_PX4, 0x011000FF, _INTEGER_PARAMS, is_px4=True),  # 1.16.0
 }
 ONBOARD_DIALECT = MavlinkDialect(TELEMETRY_ONBOARD, 0x040600FF, ())
 

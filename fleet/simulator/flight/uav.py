@@ -1,7 +1,7 @@
 """One simulated aircraft: flight dynamics, sensors, autopilot and MAVLink interface."""
 
 from collections.abc import Mapping, Sequence
-from math import pi, sin
+from math import atan2, pi, sin
 from types import MappingProxyType
 
 import numpy as np
@@ -9,13 +9,16 @@ import numpy as np
 from fleet import mission as legs_of
 from fleet.autopilots import control_law as memory
 from fleet.autopilots import laws
+from fleet.autopilots.arduplane import l1, params
 from fleet.autopilots.control_law import W_E, W_N
+from fleet.autopilots.modes import TARGET_MODES, ModeSituation, mode_route
 from fleet.contract import Item
-from fleet.frames import G, Origin, to_geodetic
+from fleet.frames import G, Origin, to_geodetic, to_ned
 from fleet.simulator.faults.carried import FaultSet
 from fleet.simulator.faults.physics import Fault
 from fleet.simulator.flight.mavlink import MAX_AIRCRAFT, TICK_HZ, MavlinkEndpoint, ground_requests
 from fleet.simulator.flight.mavlink_messages import DIALECTS, ONBOARD_DIALECT, TelemetryState
+from fleet.simulator.flight.modes import FlightMode
 from fleet.simulator.flight.tuning import tuned_parameters
 from fleet.simulator.vehicle.altered import instrumented_type
 from fleet.simulator.vehicle.jsbsim import Aircraft
@@ -34,7 +37,10 @@ _MIN_HEIGHT_M = 3.0  # height above home below which the flight ends
 
 
 class SimulatedUav:
-    """Simulated aircraft on a mission; `step` advances it and returns telemetry, `receive` returns replies."""
+    """Simulated aircraft on a mission; `step` advances it and returns telemetry, `receive` returns replies.
+
+    It enters another mode by command (DO_SET_MODE, SET_MODE, DO_REPOSITION) or by a failsafe while `link_lost`.
+    """
 
     def __init__(
         self,
@@ -87,6 +93,10 @@ class SimulatedUav:
         self.tick = 0
         self.crashed = False  # reached the ground
         self.silent = False  # sends no telemetry, which saves most of the time of a flight
+        self.link_lost = False  # no link to the ground in any direction, the remote control included
+        self.mode = FlightMode(autopilot, self.params)
+        self._mission_seq = start.seq  # current mission item
+        self._target: np.ndarray | None = None  # commanded point, NED, (3,) [m]
         self._wind = setup.weather.wind(rng, DT * _OUTER)
         scale_rng = altitude_rng = self._jitter = None
         dialect = DIALECTS[autopilot]
@@ -133,14 +143,48 @@ class SimulatedUav:
         return frames
 
     def receive(self, data: bytes) -> list[bytes]:
-        """Process bytes from the ground and return the replies."""
-        return self._endpoint.receive(data, self.boot_s + self.tick * DT)
+        """Process bytes from the ground and return the replies; none arrive while the link is lost."""
+        if self.link_lost:
+            return []
+        replies = self._endpoint.receive(data, self.boot_s + self.tick * DT)
+        while self._endpoint.mode_requests:
+            request = self._endpoint.mode_requests.popleft()
+            self._target = None if request.target is None else self._commanded_point(request.target)
+            self.mode.command(request.mode)
+            self._enter_mode()
+        return replies
+
+    def _commanded_point(self, target: tuple[int, int, float]) -> np.ndarray:
+        """Return a commanded point, latitude, longitude [1e-7 deg] and height above home [m], NED, (3,) [m]."""
+        lat, lon, height = target
+        alt_mm = self.origin.alt_mm + 1e3 * height
+        return to_ned(self.origin, *(np.array([x], float) for x in (lat, lon, alt_mm)))[0]
+
+    def _enter_mode(self) -> None:
+        """Start the route of the present mode from here; speed and height controllers continue."""
+        p, v = self.estimate.p, self.estimate.v
+        if self.mode.follows_mission:
+            self._legs, _ = self._route(self._mission_seq)
+        else:
+            home = np.zeros(3)
+            situation = ModeSituation(self.origin, p, atan2(v[1], v[0]), p, home, self._target, self.items)
+            route = mode_route(self._law, self.mode.name, situation, self.params, failsafe=self.mode.by_failsafe)
+            if route is None:
+                raise ValueError(f"uav-{self.uav_id}: mode {self.mode.name} is not simulated; choose another failsafe")
+            self._legs = route.legs
+        self._ctl[memory.LEG] = 0
+        laws.begin(self._ctl, self._par, self._legs, 0, p)
 
     def initial_frames(self) -> list[bytes]:
         """Return the frames for the start of a recording: version, mission, parameters."""
         requests = ground_requests(self.uav_id + 1, len(self.items))
         replies = [frame for request in requests for frame in self.receive(request)]
         return replies + self._endpoint.stream_parameters(len(self.params))
+
+    @property
+    def controller(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return state and route of the autopilot's controller."""
+        return self._ctl.copy(), self._legs
 
     @property
     def leg(self) -> np.ndarray:
@@ -155,7 +199,7 @@ class SimulatedUav:
         if self.fault_set is not None:
             self.fault_set.apply_to_physics(self.tick * DT)
             self.aircraft.set_controls(*self.fault_set.apply_to_commands(self.tick * DT, servo_commands(self.pulses)))
-        frames = [] if self.silent else self._endpoint.telemetry(self.tick, self._telemetry_state)
+        frames = [] if self.silent or self.link_lost else self._endpoint.telemetry(self.tick, self._telemetry_state)
         self.aircraft.step()
         self.tick += 1
         return frames
@@ -184,14 +228,17 @@ class SimulatedUav:
         e = self.estimate = self._measure()
         self.crashed = not -e.p[2] > _MIN_HEIGHT_M
         if self.tick % _OUTER == 0:
+            self._update_mode()
             Va_dot = float(e.force[0]) - G * sin(e.euler[1])
             self._par[[W_N, W_E]] = self._wind_estimate
             self._phi_c, self._theta_c, self._delta_t = laws.guide(
                 self._ctl, self._par, self._legs, e.p, e.v, e.euler, e.Va, Va_dot, DT * _OUTER
             )
-            if self._ctl[memory.LEG] >= len(self._legs) - 2:
-                self._legs, _ = self._route(int(self.leg[legs_of.SEQ]))  # the mission is endless
-                self._ctl[memory.LEG] = 0
+            if self.mode.follows_mission:
+                self._mission_seq = int(self.leg[legs_of.SEQ])
+                if self._ctl[memory.LEG] >= len(self._legs) - 2:
+                    self._legs, _ = self._route(self._mission_seq)  # the mission is endless
+                    self._ctl[memory.LEG] = 0
         delta_a, delta_e, delta_r = laws.stabilise(
             self._ctl, self._par, self._phi_c, self._theta_c, e.euler, e.rates, e.Va, DT * _INNER
         )
@@ -201,6 +248,14 @@ class SimulatedUav:
             delta_a, delta_e, delta_r, delta_t = delta_a + a, delta_e + b, delta_r + r, delta_t + t
         self.pulses = servo_pulses(delta_a, delta_e, delta_r, delta_t)
         self.aircraft.set_controls(*servo_commands(self.pulses))
+
+    def _update_mode(self) -> None:
+        """Run the failsafes."""
+        if not self.link_lost:
+            self.mode.contact(self.tick * DT)
+        elif self.mode.update(self.tick * DT):
+            self._target = None
+            self._enter_mode()
 
     def _telemetry_state(self) -> TelemetryState:
         time_jitter = 0.0 if self._jitter is None else float(self._jitter.uniform(-JITTER_S, JITTER_S))
@@ -224,12 +279,21 @@ class SimulatedUav:
             alt_error=float(laws.height_demand(self._ctl, self._par, self._legs, e.p, e.v) + e.p[2]),
             Va_error=float(commanded - e.Va),
             xtrack_error=self._xtrack(),
-            seq=int(leg[legs_of.SEQ]),
+            seq=self._mission_seq,
             n_items=len(self.items),
             home=(self.origin.lat_e7, self.origin.lon_e7, self.origin.alt_mm),
             wind=self._wind_estimate,
+            mode=self.mode.name,
+            destination=self._destination(),
         )
         return self._newest_state
+
+    def _destination(self) -> tuple[int, int, int] | None:
+        """Return the point that a mode without mission flies to [1e-7 deg, 1e-7 deg, mm]; None: there is none."""
+        if self.mode.follows_mission or self.mode.name not in TARGET_MODES:
+            return None
+        lat, lon, alt = to_geodetic(self.origin, self.leg[legs_of.P_N : legs_of.P_D + 1])
+        return int(lat), int(lon), int(alt)
 
     def _xtrack(self) -> float:
         """Return the distance to the right of the line, or outside the circle [m]."""
@@ -237,6 +301,9 @@ class SimulatedUav:
         centre = leg[legs_of.P_N : legs_of.P_D]
         if leg[legs_of.KIND] != legs_of.WAYPOINT:
             radius = abs(leg[legs_of.RADIUS])
+            if radius == 0.0 and self._law == "arduplane":
+                speed = ctl[memory.V_DEM] / self._par[params.EAS2TAS]
+                radius = l1.circle_radius(self._par, abs(self._par[params.LOITER_RAD]), speed)
             return float(np.hypot(*(e.p[:2] - centre)) - radius)
         a = ctl[[memory.PREV_N, memory.PREV_E]]
         line, offset = centre - a, e.p[:2] - a

@@ -32,6 +32,7 @@ MIN_ROUTE_S = 5.0  # time on a route that a route prediction requires [s]
 MIN_EXCITATION = {"phi": 0.04, "theta": 0.04, "q": 0.05}  # standard deviations [rad, rad, rad/s]
 MIN_AIRSPEED, MAX_PAIR_AGE_S = 3.0, 0.5  # airspeed [m/s], age of rows paired with a ground velocity [s]
 MIN_WIND_TRIANGLES = 50  # wind triangles that a wind estimate requires
+MIN_TILT_S, MIN_VELOCITY_CHANGE = 20.0, 3.0  # wind of a multirotor from its tilt [s, m/s]
 ROUTE_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
 MIN_DIAGNOSE_S, MIN_DIAGNOSE_ROWS = 25.0, 50  # gap-free flight, and rows of each required field, for a diagnosis
 MIN_OWN_PAST_S = 50.0  # gap-free flight for a comparison with earlier flight data [s]
@@ -74,7 +75,7 @@ def abilities(survey: Survey) -> list[AbilityResult]:
         "verify": _check_verify(survey, unidentified, overlap(complete, in_air)),
         "predict on the route": _check_route(survey, unidentified, in_air),
         "predict by turn rate": _check_turn_rate(survey, complete),
-        "estimate wind": _check_wind(survey),
+        "estimate wind": _check_wind(survey, in_air),
         "diagnose": _check_diagnose(survey, in_air),
     }
     return [AbilityResult(name, can, why) for name, (can, why) in checks.items()]
@@ -107,7 +108,7 @@ def max_coverage(spans: list[TimeInterval], window_s: float) -> float:
 def _obstacle(survey: Survey, in_air: list[TimeInterval], complete: list[TimeInterval]) -> str:
     """Return what prevents an identification, or an empty string."""
     if survey.vehicle_class.is_rotorcraft:
-        return f"a {survey.vehicle} is not modelled, turn-rate prediction only"
+        return f"the dynamics of a {survey.vehicle} are not identified"
     if missing := _missing_fields(survey):
         return missing
     if not in_air:
@@ -225,7 +226,9 @@ def _check_turn_rate(survey: Survey, complete: list[TimeInterval]) -> tuple[bool
     return True, f"{seconds(long_enough):.0f} s of complete data"
 
 
-def _check_wind(survey: Survey) -> tuple[bool, str]:
+def _check_wind(survey: Survey, in_air: list[TimeInterval]) -> tuple[bool, str]:
+    if survey.vehicle_class.is_rotorcraft:
+        return _check_wind_from_tilt(survey, in_air)
     missing = [kind for kind in ("velocity", "air", "attitude") if not survey.rows[kind].count]
     if missing:
         return False, f"no {', '.join(missing)} rows in the recording"
@@ -243,6 +246,21 @@ def _check_wind(survey: Survey) -> tuple[bool, str]:
         reached = f"airspeed reaches {float(air[:, 0].max()):.1f} m/s"
         return False, f"{pairs} wind triangles, {MIN_WIND_TRIANGLES} are required; {reached}"
     return True, f"{pairs} wind triangles of ground velocity, airspeed and heading"
+
+
+def _check_wind_from_tilt(survey: Survey, in_air: list[TimeInterval]) -> tuple[bool, str]:
+    """Check the wind estimate of a multirotor: its tilt against its acceleration, without an airspeed sensor."""
+    if missing := [kind for kind in ("velocity", "attitude") if not survey.rows[kind].count]:
+        return False, f"no {', '.join(missing)} rows in the recording"
+    t, v = survey.rows["velocity"].rows()
+    selected = v[inside(t, in_air), :2]
+    if seconds(in_air) < MIN_TILT_S or not len(selected):
+        return False, f"{format_below(seconds(in_air), MIN_TILT_S)} s in flight, {MIN_TILT_S:.0f} s are required"
+    change = float(np.ptp(selected, axis=0).max())
+    if change < MIN_VELOCITY_CHANGE:
+        available = format_below(change, MIN_VELOCITY_CHANGE)
+        return False, f"horizontal velocity changes by {available} m/s, {MIN_VELOCITY_CHANGE:.0f} m/s are required"
+    return True, f"from tilt and acceleration in {seconds(in_air):.0f} s of flight"
 
 
 def _check_diagnose(survey: Survey, in_air: list[TimeInterval]) -> tuple[bool, str]:

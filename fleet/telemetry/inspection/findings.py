@@ -17,7 +17,12 @@ from fleet.telemetry.inspection.thinned import inside, seconds
 _SURFACES = {4: "aileron", 19: "elevator", 21: "rudder", 70: "throttle", 77: "left elevon", 78: "right elevon"}
 _SURFACES |= {79: "left V-tail", 80: "right V-tail", 24: "left flaperon", 25: "right flaperon"}
 _SURFACES |= {73: "left throttle", 74: "right throttle"}
+_SURFACES |= {33 + n: f"motor {n + 1}" for n in range(8)} | {82 + n: f"motor {n + 9}" for n in range(4)}
+_PX4_SURFACES = {101 + n: f"motor {n + 1}" for n in range(12)}  # PWM_MAIN_FUNCn, PWM_AUX_FUNCn
+_PX4_PORTS = (("PWM_MAIN_FUNC", 0), ("PWM_AUX_FUNC", 8))  # parameter, number of outputs before its first
 _DEFAULT_SURFACES = {1: "aileron", 2: "elevator", 3: "throttle", 4: "rudder"}
+_MOTOR_COUNT = {1: 4, 2: 6, 3: 8, 4: 8, 5: 6, 7: 3}  # by FRAME_CLASS: quad, hexa, octo, octaquad, Y6, tri
+_MOTORS_ASSUMED = "motors assumed (no SERVOn_FUNCTION)"
 _MIN_STD_US = 5.0  # standard deviation below which a channel is constant [us]
 _SATURATION_US = 1.0  # distance from SERVOn_MIN or _MAX below which a channel is saturated [us]
 _MIN_AIRSPEED_STD = 0.05  # standard deviation below which airspeed is constant [m/s]
@@ -62,7 +67,7 @@ class ServoStatistics(msgspec.Struct, frozen=True):
     """One output channel, in flight if the aircraft flew, else over the whole recording."""
 
     channel: int
-    surface: Annotated[str, Meta(description="control surface by the servo map, or empty")]
+    surface: Annotated[str, Meta(description="control surface or motor by the servo map, or empty")]
     low_us: Annotated[float, Meta(description="minimum pulse width [us]")]
     high_us: Annotated[float, Meta(description="maximum pulse width [us]")]
     moves: Annotated[bool, Meta(description="standard deviation above 5 us")]
@@ -130,7 +135,7 @@ class AircraftFindings(msgspec.Struct, frozen=True, kw_only=True):
     mission: MissionStatistics = MissionStatistics()
     params: Annotated[int, Meta(description="parameters received")] = 0
     params_complete: bool = False
-    servo_map: Annotated[str, Meta(description="assignment of output channels to control surfaces")] = ""
+    servo_map: Annotated[str, Meta(description="assignment of output channels to control surfaces or motors")] = ""
     servos: tuple[ServoStatistics, ...] = ()
     airspeed: AirspeedStatistics = AirspeedStatistics("unknown", "")
     wind: Annotated[WindStatistics | None, Meta(description="null if the autopilot reports no wind")] = None
@@ -240,21 +245,35 @@ def _mission(survey: Survey) -> MissionStatistics:
     return MissionStatistics(len(mission.items), mission.complete, survey.mission_count, flown, mission.sentence)
 
 
-def _surface(survey: Survey, channel: int) -> str:
-    functions = {n: int(survey.values.get(f"SERVO{n}_FUNCTION", -1)) for n in range(1, SERVO_COUNT + 1)}
-    if not any(function in _SURFACES for function in functions.values()):
-        return _DEFAULT_SURFACES.get(channel, "")
-    return _SURFACES.get(functions[channel], "")
+def _surfaces(survey: Survey) -> tuple[dict[int, str], str]:
+    """Return the control surface or motor of each output, and what was assumed about a rotorcraft."""
+    surfaces = {
+        n: surface
+        for n in range(1, SERVO_COUNT + 1)
+        if (surface := _SURFACES.get(int(survey.values.get(f"SERVO{n}_FUNCTION", -1))))
+    }
+    for parameter, before in _PX4_PORTS:
+        numbers = {before + n: int(survey.values.get(f"{parameter}{n}", 0)) for n in range(1, 9)}
+        surfaces |= {n: _PX4_SURFACES[number] for n, number in numbers.items() if number in _PX4_SURFACES}
+    if not survey.vehicle_class.is_rotorcraft:
+        return surfaces or _DEFAULT_SURFACES, ""
+    if surfaces:
+        return surfaces, ""
+    count = _MOTOR_COUNT.get(int(survey.values.get("FRAME_CLASS", 1)), 4)
+    return {n: f"motor {n}" for n in range(1, count + 1)}, _MOTORS_ASSUMED
 
 
 def _servo_map_text(survey: Survey) -> str:
-    entries = [f"{n} {surface}" for n in range(1, SERVO_COUNT + 1) if (surface := _surface(survey, n))]
-    return servo_map(survey.values).sentence or ", ".join(entries)
+    surfaces, assumed = _surfaces(survey)
+    text = ", ".join(f"{n} {surface}" for n, surface in sorted(surfaces.items()))
+    if survey.vehicle_class.is_rotorcraft:
+        return f"{assumed}: {text}" if assumed else text
+    return servo_map(survey.values).sentence or text
 
 
 def _servos(survey: Survey) -> tuple[ServoStatistics, ...]:
     pulses = _rows_in_air(survey, "servo")
-    servos = []
+    surfaces, servos = _surfaces(survey)[0], []
     for n in range(1, pulses.shape[1] + 1 if len(pulses) else 1):
         us = pulses[:, n - 1]
         if us.max() < 500:  # not a servo pulse
@@ -263,7 +282,7 @@ def _servos(survey: Survey) -> tuple[ServoStatistics, ...]:
         at_end = (us <= low + _SATURATION_US) | (us >= high - _SATURATION_US)
         low_us, high_us = float(us.min()), float(us.max())
         moves = bool(us.std() > _MIN_STD_US)
-        servos.append(ServoStatistics(n, _surface(survey, n), low_us, high_us, moves, round(float(at_end.mean()), 4)))
+        servos.append(ServoStatistics(n, surfaces.get(n, ""), low_us, high_us, moves, round(float(at_end.mean()), 4)))
     return tuple(servos)
 
 

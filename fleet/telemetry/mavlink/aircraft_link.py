@@ -3,6 +3,7 @@
 import bisect
 from collections import deque
 from collections.abc import Callable, Hashable
+from math import isfinite
 from operator import itemgetter
 from typing import Any
 
@@ -28,6 +29,7 @@ _FIRMWARE_TEXTS = ("ArduPlane V", "ArduCopter V", "APM:", "PX4 v", "Blimp V", "A
 _MISSION_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
 _ARRIVAL: Callable[[tuple[Any, ...]], float] = itemgetter(0)  # of an entry of the queue
 _ABSOLUTE_FRAMES = (0, 5)  # MAV_FRAME: altitude above sea level
+_ON_EARTH = (900_000_000, 1_800_000_000, 100_000_000)  # largest latitude, longitude, altitude [1e-7 deg, 1e-7 deg, mm]
 
 
 class AircraftLink:
@@ -61,6 +63,7 @@ class AircraftLink:
         self.board_id = ""  # hardware id and firmware version of the autopilot, or empty
         self.texts: deque[tuple[float, int, str]] = deque(maxlen=MAX_TEXTS)  # fleet time, severity, text
         self.params, self.mission = ParamCollector(uav), MissionCollector(uav)
+        self.home: tuple[int, int, int] | None = None  # latitude, longitude, altitude [1e-7 deg, 1e-7 deg, mm]
         self.rates: dict[str, float] = {}
         self.timing = LinkTiming(lambda: arrays.clocks[self.number])
         self._queue: list[tuple[float, Callable[..., None], tuple[Any, ...]]] = []
@@ -145,10 +148,17 @@ class AircraftLink:
     def _process_home(self, message: Any) -> None:
         """Process HOME_POSITION: item 0 of an ArduPilot mission, the reference of relative altitudes of PX4."""
         altitude_m = message.altitude * 1e-3
+        self._set_home(message.latitude, message.longitude, message.altitude)
         if self.autopilot == "px4":
             self.mission.set_home_altitude(altitude_m)
         elif self.autopilot == "ardupilot":
             self.mission.set_home(message.latitude, message.longitude, altitude_m)
+
+    def _set_home(self, lat_e7: int, lon_e7: int, alt_mm: int) -> None:
+        """Store home, unless it is no position on earth: an autopilot sends zeros before it has one."""
+        home = (lat_e7, lon_e7, alt_mm)
+        if (lat_e7 or lon_e7) and all(abs(x) <= limit for x, limit in zip(home, _ON_EARTH, strict=True)):
+            self.home = home
 
     def process_uplink(self, message: Any, now: float) -> None:
         """Process one mission protocol message from a ground station to this aircraft."""
@@ -172,7 +182,10 @@ class AircraftLink:
         elif event.kind == "partial mission":
             self.mission.set_partial(*event.value)
         elif event.kind == "home":
-            self.mission.set_home_altitude(event.value)
+            lat, lon, altitude_m = event.value
+            self.mission.set_home_altitude(altitude_m)
+            if isfinite(lat) and isfinite(lon):
+                self._set_home(round(lat * 1e7), round(lon * 1e7), round(altitude_m * 1e3))
         elif event.kind == "text":
             severity, text = event.value
             self._process_text(severity, text, now)
@@ -215,7 +228,7 @@ class AircraftLink:
     def _status(self, now: float) -> Status | None:
         counters = self.arrays.counts.state[self.number]
         self.link = Link.LOST if now - counters[LAST_COUNTED] > LINK_LOST_S else Link.LIVE
-        state = (self.link, self.mode, self.armed, self._clock_jumps, self._clock_advance_s)
+        state = (self.link, self.mode, self.armed, self._clock_jumps, self._clock_advance_s, self.home)
         elapsed = now - self._published_t
         if state == self._published_state and 0 <= elapsed < STATUS_PERIOD_S:
             return None
@@ -239,6 +252,7 @@ class AircraftLink:
             **self.timing.status_fields(now),
             clock_jumps=self._clock_jumps,
             clock_advance_s=self._clock_advance_s,
+            home=self.home,
             sentence=self._status_text(now),
         )
 

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from fleet.bus.codec import EncodedMessage
+from fleet.config import MAX_UAVS
 from fleet.contract import Alert, Mission, Params, Sample, Status
 from fleet.telemetry.mavlink.aircraft_link import LINK_LOST_S, AircraftLink
 from fleet.telemetry.mavlink.arrays.counts import LAST_ARRIVAL
@@ -30,7 +31,6 @@ from fleet.telemetry.mavlink.parsing.scan import COMPONENT, EXTRA, ID, SEQ, SYST
 from fleet.telemetry.mavlink.targets import queue_targets
 from fleet.telemetry.mavlink.timing import update_timings
 
-MAX_UAVS = 2_000  # over all links
 SECOND_SENDER = "second sender for a live id"
 NO_HEARTBEAT = "no aircraft heartbeat yet"
 MAX_EARLY = 4096  # messages of one system buffered until its first heartbeat

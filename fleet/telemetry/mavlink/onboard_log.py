@@ -15,8 +15,9 @@ class OnboardEvent(NamedTuple):
     t: float  # log time [s]
     kind: str  # one of those below
     value: Any
-    """Of mode: name · armed: bool · param: (name, value) · text: (severity, text) · home: altitude [m] ·
-    mission: tuple[Item, ...] · partial mission: (tuple[Item, ...], number of items on board, 0 unknown)"""
+    """Of mode: name · armed: bool · param: (name, value) · text: (severity, text) · mission: tuple[Item, ...] ·
+    home: (latitude, longitude [deg], altitude above sea level [m]), latitude and longitude nan where unknown ·
+    partial mission: (tuple[Item, ...], number of items on board, 0 unknown)"""
 
 
 class Chunk(NamedTuple):

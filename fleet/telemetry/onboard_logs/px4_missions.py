@@ -67,8 +67,11 @@ def _home_events(topics: dict[str, Topic]) -> list[OnboardEvent]:
     if home is None or not hasattr(home, "alt"):
         return []
     valid = home.valid_alt != 0 if hasattr(home, "valid_alt") else np.ones(len(home), bool)
-    rows = zip(home.t[valid].tolist(), home.alt[valid].tolist(), strict=True)
-    return [OnboardEvent(t, "home", alt) for t, alt in list(rows)[:_MAX_RUNS] if np.isfinite(alt)]
+    place = np.stack([getattr(home, name, np.full(len(home), np.nan)) for name in ("lat", "lon", "alt")], axis=-1)
+    if hasattr(home, "valid_hpos"):
+        place[home.valid_hpos == 0, :2] = np.nan
+    rows = zip(home.t[valid].tolist(), place[valid].tolist(), strict=True)
+    return [OnboardEvent(t, "home", tuple(row)) for t, row in list(rows)[:_MAX_RUNS] if np.isfinite(row[2])]
 
 
 # --- logged items ----------------------------------------------------------------------------------------------------

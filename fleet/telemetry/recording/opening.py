@@ -38,6 +38,8 @@ class RecordingFile:
         except OSError as error:
             reason = error.strerror or "not there"
             raise OSError(f"{self.path}: found no such file ({reason}), expected a recording; check the path") from None
+        if stat.S_ISDIR(status.st_mode):
+            raise OSError(f"{self.path}: found a folder, expected a recording; name a file in it")
         if not stat.S_ISREG(status.st_mode):
             raise OSError(f"{self.path}: found no regular file, expected a recording; copy it into one")
         self.size = status.st_size

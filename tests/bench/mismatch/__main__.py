@@ -32,12 +32,26 @@ MINUTE_S = 60.0
 def judged(fault: str, flown: Flown) -> dict[str, Any]:
     """Judge one flight: when it was flagged and named, as what, and the errors with and without what was named."""
     since = flown.begin + ONSET_S
-    told = [m for m in flown.adapting if isinstance(m, Mismatch) and m.t > since]
+    told = [m for m in flown.adapting if isinstance(m, Mismatch)]
+    row = found(fault, told, since)
+    row["before_the_fault"] = [one for one in alarms(flown)["said"] if one[0] <= ONSET_S]
+    if row["named_s"] is None:
+        return row
+    named_t = since + row["named_s"]
+    row["adapted"] = any(m.adapted for m in told if since < m.t <= named_t + MINUTE_S)
+    spans = {"before": (flown.adapting, since, named_t), "after": (flown.adapting, named_t, named_t + MINUTE_S)}
+    spans["beside"] = flown.plain, named_t, named_t + MINUTE_S
+    row["error_m"] = {which: errors(said, flown.truth, *span) for which, (said, *span) in spans.items()}
+    return row
+
+
+def found(fault: str, told: list[Mismatch], since: float) -> dict[str, Any]:
+    """Judge what was said of one aircraft: when its fault, from `since` on [s since 1970], was flagged and named."""
+    told = [m for m in told if m.t > since]
     flagged = next((m.t - since for m in told if m.outcome is not DiagnosisOutcome.NONE), None)
     named = next((m for m in told if m.outcome is DiagnosisOutcome.NAMED), None)
     name, _, of = fault.split(",")[0].partition(":")
     row: dict[str, Any] = {"fault": fault, "flagged_s": flagged, "named_s": named and named.t - since}
-    row["before_the_fault"] = [one for one in alarms(flown)["said"] if one[0] <= ONSET_S]
     if named is None:
         return row
     first = named.causes[0]
@@ -45,10 +59,6 @@ def judged(fault: str, flown: Flown) -> dict[str, Any]:
     row["verdict"] = "right" if right else "in class" if name in first.confusable_with else "wrong"
     row["named"] = [(one.name, one.surface, one.confusable_with, one.parameters) for one in named.causes]
     row["onset_error_s"] = first.segments[0][0] - since
-    row["adapted"] = any(m.adapted for m in told if m.t <= named.t + MINUTE_S)
-    spans = {"before": (flown.adapting, since, named.t), "after": (flown.adapting, named.t, named.t + MINUTE_S)}
-    spans["beside"] = flown.plain, named.t, named.t + MINUTE_S
-    row["error_m"] = {which: errors(said, flown.truth, *span) for which, (said, *span) in spans.items()}
     return row
 
 

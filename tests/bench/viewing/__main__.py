@@ -43,6 +43,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=30.0, help="watched with every client")
     parser.add_argument("--plain", type=float, default=15.0, help="seconds of the plain scene; 0: without it")
     parser.add_argument("--floor", type=float, default=10.0, help="seconds of merely hearing the feed; 0: without it")
+    parser.add_argument("--consistency", type=float, default=0.0, help="seconds of comparing list and tiles (0)")
     parser.add_argument("--no-page", action="store_true", help="without a browser")
     parser.add_argument("--chromium", default="/usr/bin/chromium")
     parser.add_argument("--picture", type=Path, help="keep the last frame of the page here")
@@ -101,6 +102,8 @@ def with_page(args: argparse.Namespace, router: str, feeder: Any) -> dict[str, A
         found["page"] = page.seen()
         for watcher in watchers:
             watcher.close()
+        if args.consistency:
+            found["consistency"] = page.consistency(args.consistency)
         found["selection"] = page.clicks(12)
         if args.picture:
             page.picture(args.picture)

@@ -51,7 +51,30 @@ ECHO = """() => new Promise(done => {
     : performance.now() - began > 5000 ? done(5000) : setTimeout(look, 2);
   look();
 })"""
+PLACES = """seconds => new Promise(done => {
+  const text = (root, what) => { const e = root && root.querySelector(what); return e ? e.textContent.trim() : ''; };
+  const found = [], until = performance.now() + 1e3 * seconds;
+  const look = () => {
+    const row = document.querySelector('.uav.list tr.on'), cards = document.querySelectorAll('.uav .cards .card b');
+    const sheet = cards.length && cards[0].closest('.uav'), said = sheet && sheet.textContent;
+    if (row && sheet && text(sheet, 'h1') === row.cells[1].textContent) {
+      const age = / for ([\\d.]+ \\w+):/.exec(said), lost = /link lost ([\\d.]+ \\w+)/.exec(row.cells[2].textContent);
+      found.push({
+        row: [row.cells[3].textContent + ' %', row.cells[4].textContent.trim(), lost ? lost[1] : ''],
+        tile: [cards[0].textContent, cards[1].textContent, age ? age[1] : ''],
+        state: [row.cells[2].textContent.replace(/ [\\d.]+ \\w+$/, ''), text(sheet, '.head b').slice(2)],
+      });
+    }
+    performance.now() < until ? setTimeout(look, 50) : done(found);
+  };
+  look();
+})"""
 ROWS = "[...document.querySelectorAll('tr.pick')].map(e => Number(e.dataset.uav))"
+
+
+def differing(samples: list[dict[str, list[str]]]) -> list[dict[str, list[str]]]:
+    """Give the samples of `PLACES` in which a row and the selected aircraft's tiles tell different things."""
+    return [one for one in samples if one["row"] != one["tile"] or one["state"][0] != one["state"][1]]
 
 
 class Page:
@@ -134,3 +157,8 @@ class Page:
     def picture(self, file: Path) -> None:
         """Keep what is on the screen."""
         self.page.screenshot(path=str(file))
+
+    def consistency(self, seconds: float) -> dict[str, int]:
+        """Compare fit, horizon, state and age in the list with those in the tiles; give samples and differences."""
+        samples = self.page.evaluate(PLACES, seconds)
+        return {"samples": len(samples), "different": len(differing(samples))}

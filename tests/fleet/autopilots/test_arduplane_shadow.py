@@ -9,7 +9,7 @@ from fleet import mission as m
 from fleet.autopilots import arduplane as ap
 from fleet.autopilots import control_law as S
 from fleet.autopilots.arduplane import params as P
-from fleet.autopilots.shadow import replay_controller
+from fleet.autopilots.shadow import NO_MEMORY, replay_controller
 from tests.support.point_mass import HERE, PAR, Plane, begin, fly, leg, route
 
 LAP = [(800.0, 0.0, 100.0), (800.0, 700.0, 130.0), (0.0, 700.0, 130.0), (0.0, 0.0, 90.0), (800.0, 0.0, 100.0)]
@@ -37,6 +37,7 @@ def shadowed(legs, rows, deltas, begin_s, start=HERE, **changed):
     ctl, rms = replay_controller(
         PAR, ahead, np.array(start, float), r[:, 0].copy(), columns["p"], r[:, 4:7].copy(), r[:, 7:10].copy(),
         np.zeros((len(r), 3)), r[:, 10].copy(), columns["phi_c"], columns["theta_c"], columns["delta"], r[:, 14].copy(),
+        NO_MEMORY,
     )  # fmt: skip
     return ahead, ctl, rms
 
@@ -72,6 +73,16 @@ def test_the_shadow_run_follows_the_reported_item_not_its_own_opinion():
     unknown[:, 14] = 50
     _, ctl, _ = shadowed(legs, unknown, deltas, 0)
     assert np.isfinite(ctl).all()
+
+
+def test_legs_of_one_number_are_left_without_a_report_as_in_a_return():
+    legs, _, rows, deltas, true = recorded(60)
+    assert int(true[ap.LEG]) > 0
+    unnumbered = rows.copy()
+    unnumbered[:, 14] = -1
+    legs[:, m.SEQ] = -1
+    _, ctl, rms = shadowed(legs, unnumbered, deltas, 0)
+    assert int(ctl[ap.LEG]) == int(true[ap.LEG]) and rms < radians(2)
 
 
 def circled(until_s, delay_s):

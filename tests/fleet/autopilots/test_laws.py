@@ -14,7 +14,7 @@ from fleet.autopilots import control_law as parameter_vector
 from fleet.autopilots.px4_fixedwing import l1
 from fleet.autopilots.px4_fixedwing import params as P
 from fleet.autopilots.px4_fixedwing import path as npfg
-from fleet.autopilots.shadow import replay_controller
+from fleet.autopilots.shadow import NO_MEMORY, replay_controller
 from fleet.autopilots.textbook import params as T
 from fleet.frames import G
 from tests.support.point_mass import HERE, PLANE, TRIM_ALPHA, Plane, begin, fly, leg, route
@@ -234,7 +234,8 @@ def test_the_shadow_run_meets_the_memory_of_the_controller_that_flew(law, second
     now = int(np.argmax(legs[:, m.SEQ] == r[0, 14]))
     ahead, start = legs[now:], legs[now - 1, m.P_N : m.P_D + 1].copy() if now else np.array([0.0, 0.0, -100.0])
     told = (np.ascontiguousarray(c) for c in (r[:, 0], r[:, 1:4], r[:, 4:7], r[:, 7:10], np.zeros((600, 3)), r[:, 10]))
-    ctl, rms = replay_controller(par, ahead, start, *told, r[:, 11].copy(), r[:, 12].copy(), d.copy(), r[:, 14].copy())
+    told = (*told, r[:, 11].copy(), r[:, 12].copy(), d.copy(), r[:, 14].copy())
+    ctl, rms = replay_controller(par, ahead, start, *told, NO_MEMORY)
     assert rms < radians(4)  # a fillet begun before is not seen
     assert ahead[int(ctl[S.LEG]), m.SEQ] == r[-1, 14]
     for _ in range(60):
@@ -373,3 +374,15 @@ def test_a_scheduled_change_starts_its_leg_in_time_and_the_next_one_after_it(law
     switches = rows[np.flatnonzero(np.diff(rows[:, 14])) + 1]
     assert switches[:, 14].tolist() == [3, 4]
     assert switches[:, 0] == pytest.approx([3.0, 8.0], abs=0.15)
+
+
+@pytest.mark.parametrize("law", ["arduplane", "px4"])
+def test_a_controller_continues_on_another_route_at_another_height(law):
+    par = laws.parameters(law, {}, 0.0)[0]
+    ctl = np.arange(float(S.N_CTL))
+    fresh = np.full(S.N_CTL, -1.0)
+    laws.restore(fresh, par, laws.remember(ctl, par, 100.0), 130.0)
+    heights = 4 if law == "arduplane" else 1
+    assert fresh[S.H_IN : S.H_IN + heights] == pytest.approx(ctl[S.H_IN : S.H_IN + heights] + 30.0)
+    assert fresh[[S.I_THR, S.I_SEB, S.I_KE]] == pytest.approx(ctl[[S.I_THR, S.I_SEB, S.I_KE]])
+    assert (fresh[: S.N_LEG] == -1.0).all() and fresh[S.V_HAT] == fresh[S.HAS_VELOCITY] == -1.0  # leg, measurements

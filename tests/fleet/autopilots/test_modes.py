@@ -130,8 +130,21 @@ def test_px4_returns_by_climb_flight_home_and_descent():
     assert circle[m.KIND] == m.LOITER_UNLIMITED and circle[m.P_D] == -50.0 and circle[m.RADIUS] == 90.0
     high = legs_of("px4", "RTL", params, entry=np.array([1000, 50, -300.0]), position=np.array([1000, 50, -300.0]))
     assert len(high) == 2 and high[0, m.P_D] == -300.0  # it does not descend on the way
-    at_home = legs_of("px4", "RTL", params, position=HOME + np.array([20.0, 0.0, -180.0]))
+    at_home = legs_of("px4", "RTL", params, entry=HOME + np.array([20.0, 0.0, -180.0]))
     assert len(at_home) == 1
+    arrived = legs_of("px4", "RTL", params, position=HOME + np.array([20.0, 0.0, -180.0]))
+    assert np.array_equal(arrived, np.array([climb, cruise, circle]))  # the route stays that of the mode change
+
+
+def test_px4_returns_by_the_mission_are_not_predicted_and_say_so():
+    landing = (Item(seq=3, command=21, lat_e7=470_000_000, lon_e7=80_000_000),)
+    for kind, items in ((2.0, ()), (4.0, ()), (1.0, landing), (3.0, landing)):
+        route = modes.mode_route("px4", "RTL", situation(items=items), {"RTL_TYPE": kind})
+        assert not len(route.legs) and f"RTL_TYPE {kind:.0f}" in route.summary
+    for kind, items in ((0.0, landing), (1.0, ()), (3.0, ())):
+        assert legs_of("px4", "RTL", {"RTL_TYPE": kind}, items=items)[-1, m.P_N] == HOME[0]
+    low = {"RTL_RETURN_ALT": 128.0}  # 8 m above the entry
+    assert len(legs_of("px4", "RTL", low)) == 2 and len(legs_of("px4", "RTL", low | {"NAV_FW_ALT_RAD": 5.0})) == 3
 
 
 def test_hand_flown_and_unknown_modes_have_no_route():
@@ -177,16 +190,16 @@ RADIO = {"THR_FAILSAFE": 1.0, "RC_FS_TIMEOUT": 1.0, "FS_LONG_TIMEOUT": 5.0}
     ("mode", "short", "long", "expected"),
     [
         ("AUTO", 0, 0, []),
-        ("AUTO", 0, 1, [(5.0, "RTL")]),
-        ("AUTO", 1, 0, [(1.2, "CIRCLE"), (5.0, "RTL")]),  # a circle never continues
+        ("AUTO", 0, 1, [(6.2, "RTL")]),
+        ("AUTO", 1, 0, [(1.2, "CIRCLE"), (6.2, "RTL")]),  # a circle never continues
         ("AUTO", 3, 2, [(5.0, "FBWA")]),
-        ("AUTO", 2, 4, [(1.2, "FBWA"), (5.0, "AUTO")]),
-        ("GUIDED", 4, 0, [(1.2, "FBWB"), (5.0, "RTL")]),
-        ("LOITER", 0, 0, [(5.0, "RTL")]),
-        ("CRUISE", 0, 0, [(1.2, "CIRCLE"), (5.0, "RTL")]),
+        ("AUTO", 2, 4, [(1.2, "FBWA"), (6.2, "AUTO")]),
+        ("GUIDED", 4, 0, [(1.2, "FBWB"), (6.2, "RTL")]),
+        ("LOITER", 0, 0, [(6.2, "RTL")]),
+        ("CRUISE", 0, 0, [(1.2, "CIRCLE"), (6.2, "RTL")]),
         ("CRUISE", 3, 1, [(5.0, "RTL")]),
         ("RTL", 1, 1, []),
-        ("RTL", 1, 4, [(5.0, "AUTO")]),
+        ("RTL", 1, 4, [(6.2, "AUTO")]),
         ("LOITER", 0, 3, []),  # a parachute is no mode
     ],
 )

@@ -15,7 +15,7 @@ from fleet.frames import to_ned
 from fleet.simulator.flight import drive
 from fleet.simulator.flight.drive import RadioLink
 from fleet.simulator.flight.mavlink import MavlinkEndpoint
-from fleet.simulator.flight.mavlink_messages import AUTO, TELEMETRY
+from fleet.simulator.flight.mavlink_messages import ARDUPLANE_MODES, TELEMETRY
 from fleet.simulator.flight.tuning import tuned_parameters
 from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.jsbsim import DT
@@ -55,7 +55,7 @@ def test_frames_come_at_their_rates(flown: tuple[SimulatedUav, list]) -> None:
         "SYS_STATUS": 1,
     }
     assert counts == {name: rate * 40 for name, rate in wanted.items()}
-    assert len(TELEMETRY) == len(wanted)
+    assert len(TELEMETRY) == len(wanted) + 1  # a destination only outside the mission
 
 
 def test_sequence_numbers_count_and_clocks_run(flown: tuple[SimulatedUav, list]) -> None:
@@ -79,7 +79,7 @@ def test_what_it_says_agrees_with_where_it_is(flown: tuple[SimulatedUav, list]) 
     assert last["VFR_HUD"].airspeed == pytest.approx(x.Va * np.sqrt(x.rho / 1.225), abs=3)
     assert last["HIGHRES_IMU"].zacc == pytest.approx(x.force[2], abs=8)
     beat = last["HEARTBEAT"]
-    assert (beat.type, beat.autopilot, beat.custom_mode) == (1, 3, AUTO)
+    assert (beat.type, beat.autopilot, beat.custom_mode) == (1, 3, ARDUPLANE_MODES["AUTO"])
     assert beat.base_mode & mav.MAV_MODE_FLAG_SAFETY_ARMED
 
 

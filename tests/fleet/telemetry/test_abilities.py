@@ -22,6 +22,7 @@ from twin_worker.diagnosis.data import flight as smooth
 from twin_worker.diagnosis.data.card import UNKNOWN
 from twin_worker.evaluation.replay import run_offline
 from twin_worker.prediction import method_selection as turn_rate
+from twin_worker.prediction.multirotor import fit as tilt
 from twin_worker.telemetry import resample
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.twin.state import flight_phase, routes
@@ -45,6 +46,7 @@ def test_the_figures_are_those_the_twin_works_by():
     assert (needs._SKIP_BEGIN_S, needs._SKIP_END_S) == flight._TRANSIENT_S
     assert past.MIN_PAST_S + own_past.MIN_AFTER_S == needs.MIN_OWN_PAST_S
     assert flight_phase._AIRBORNE_HEIGHT_M == ROTOR_AIRBORNE_HEIGHT
+    assert (tilt._MIN_TILT_S, tilt._MIN_VELOCITY_CHANGE) == (needs.MIN_TILT_S, needs.MIN_VELOCITY_CHANGE)
 
 
 @pytest.mark.parametrize(
@@ -137,7 +139,12 @@ def test_a_plane_with_everything_can_everything():
     ("laid", "more", "name", "words"),
     [
         (lively(20), {}, "identify lateral", "20 s of complete data in flight, 30 s are required"),
-        (lively(), {"vehicle": "multirotor"}, "identify longitudinal", "multirotor is not modelled"),
+        (
+            lively(),
+            {"vehicle": "multirotor"},
+            "identify longitudinal",
+            "the dynamics of a multirotor are not identified",
+        ),
         (slower(lively(), "attitude", 90), {}, "identify lateral", "attitude at 0.3 Hz is continuous for 0 of"),
         (flights.turn(60), {}, "identify longitudinal", "elevator and throttle constant"),
         (
@@ -165,6 +172,9 @@ def test_a_copter_is_still_predicted_by_its_turn_rate():
     told = judged(known(lively(), vehicle="multirotor"))
     assert told["predict by turn rate"][0]
     assert not told["verify"][0]
+    assert told["estimate wind"] == (True, "from tilt and acceleration in 60 s of flight")
+    hovers = {name: rows for name, rows in lively().items() if name not in ("velocity", "air")}
+    assert judged(known(hovers, vehicle="multirotor"))["estimate wind"] == (False, "no velocity rows in the recording")
 
 
 def test_slow_rows_that_the_twin_still_fills_are_a_yes_with_a_but():

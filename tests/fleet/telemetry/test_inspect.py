@@ -310,6 +310,23 @@ def test_a_recorded_flight_of_another_autopilot(recordings):
     assert {can.name for can in told.abilities if not can.can} == set()
 
 
+@pytest.mark.parametrize(
+    ("params", "text"),
+    [
+        ({}, "motors assumed (no SERVOn_FUNCTION): 1 motor 1, 2 motor 2, 3 motor 3, 4 motor 4"),
+        ({"SERVO1_FUNCTION": 33.0, "SERVO9_FUNCTION": 82.0, "SERVO3_FUNCTION": 0.0}, "1 motor 1, 9 motor 9"),
+        ({"PWM_MAIN_FUNC2": 101.0, "PWM_AUX_FUNC1": 104.0}, "2 motor 1, 9 motor 4"),
+        ({"FRAME_CLASS": 7.0}, "motors assumed (no SERVOn_FUNCTION): 1 motor 1, 2 motor 2, 3 motor 3"),
+    ],
+)
+def test_outputs_of_a_multirotor_are_motors(params, text):
+    copter = known(lively(), vehicle="multirotor")
+    copter.params = Params(uav=1, t=T0, values=params)
+    told = compute_findings(copter, LinkTexts())
+    assert told.servo_map == text
+    assert {f"{one.channel} {one.surface}" for one in told.servos} >= {text.rpartition(": ")[2].split(", ")[0]}
+
+
 def test_three_aircraft_in_one_recording(recordings):
     found = survey_recording(replay_messages(recordings / S10))
     assert list(found) == [21, 22, 23]

@@ -231,6 +231,17 @@ def test_a_serial_line_is_read_written_and_missed():
         assert line.link.unsent == 1
 
 
+def test_a_serial_device_that_is_not_there_is_said_once_a_minute(caplog, monkeypatch):
+    monkeypatch.setattr(stream, "FIRST_RETRY_S", 0.01)
+    monkeypatch.setattr(stream, "LAST_RETRY_S", 0.01)
+    said = "found no device '/dev/ttyNOPE'"
+    with Line("serial:/dev/ttyNOPE") as line:
+        until(lambda: line.link._wait_s and len(caplog.records) == 1)
+        monkeypatch.setattr(stream, "LOG_PERIOD_S", 0.0)
+        until(lambda: len(caplog.records) > 2)
+    assert all(said in record.message and "correct the link" in record.message for record in caplog.records)
+
+
 def test_a_slow_stream_takes_whole_messages_or_none(monkeypatch):
     taken, room = bytearray(), [10]
 

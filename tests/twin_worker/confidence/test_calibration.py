@@ -16,7 +16,6 @@ from twin_worker.confidence.calibration.scored_predictions import ScoredPredicti
 from twin_worker.confidence.calibration_table import (
     INDEPENDENT,
     KNOTS,
-    UncertaintyFeatures,
     default_table,
     error_growth,
     uncertainty_features,
@@ -39,7 +38,13 @@ from twin_worker.confidence.weighted_quantile import (
     survival,
     weighted_quantile,
 )
-from twin_worker.numerics.prediction_errors import AHEAD, axes_error, first_passage, path_length, track_frame
+from twin_worker.numerics.prediction_errors import (
+    AHEAD,
+    axes_error,
+    first_passage,
+    path_length,
+    track_frame,
+)
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +119,7 @@ def test_survival_by_hand():
 
 
 def test_the_fit_finds_how_much_wider_errors_are_than_the_ensemble(past):
-    scale, _, _ = fit_sigma(past.features, past.errors()[..., :3])
+    scale, *_ = fit_sigma(past.features, past.errors()[..., :3])
     assert np.median(scale[4:, 0]) == pytest.approx(0.8 * 2.0, rel=0.15)  # heavy tails take a normal law for narrower
 
 
@@ -173,9 +178,9 @@ def test_horizons_hold_and_tell_easy_minutes_from_hard_ones(table):
 
 
 def test_without_an_ensemble_the_law_of_growth_is_calibrated_instead(past):
-    law = uncertainty_features(None, None, "hybrid", AHEAD)
+    law = uncertainty_features(None, None, made_up.LINE, "hybrid", AHEAD)
     bare, fresh = (
-        replace(of, features=UncertaintyFeatures(np.array([law.spread] * len(of)), of.features.revision))
+        replace(of, features=replace(of.features, spread=np.array([law.spread] * len(of))))
         for of in (past, made_up.scored(20, 30, seed=5))
     )
     assert figures(fresh, regions_of_table(fit(bare, GROUP), fresh))["coverage"] == pytest.approx(0.9, abs=0.04)
@@ -185,7 +190,7 @@ def test_nobody_followed_beyond_a_minute(past):
     flown, length = past.flown.copy(), past.length.copy()
     flown[:, 61:], length[:, 61:] = np.nan, np.nan
     short = fit(replace(past, flown=flown, length=length), GROUP)
-    for part in (short.scale, short.lag, short.floor, short.factor, short.scores, short.risks):
+    for part in (short.scale, short.lag, short.turn, short.floor, short.factor, short.scores, short.risks):
         assert np.isfinite(part).all()
     assert (short.half_axes(past.features, AHEAD)[:, -1] > 0).all()
 
@@ -251,7 +256,8 @@ def test_an_untaught_table_is_never_narrower_than_the_law_of_growth(method):
     ahead = np.concatenate([AHEAD, [200.0, 300.0]])
     law = error_growth(method, ahead)
     for spread in (None, np.zeros((93, 3)), np.full((93, 3), 5.0)):
-        axes = default_table(method).half_axes(uncertainty_features(spread, None, method, ahead), ahead)
+        path = V * ahead[:, None] * [1.0, 0.0, 0.0]
+        axes = default_table(method).half_axes(uncertainty_features(spread, None, path, method, ahead), ahead)
         assert np.isfinite(axes).all() and (axes >= law * 0.99)[1:91].all() and (axes[-1] > axes[-2]).all()
 
 
@@ -259,7 +265,7 @@ def test_an_untaught_table_is_never_narrower_than_the_law_of_growth(method):
 def test_a_spread_that_is_nonsense_is_replaced_where_it_is(noise):
     spread = np.ones((91, 3))
     spread[30:40, 1] = noise
-    got = uncertainty_features(spread, spread, "hybrid", AHEAD)
+    got = uncertainty_features(spread, spread, made_up.LINE, "hybrid", AHEAD)
     assert np.isfinite(got.spread).all() and got.spread[29, 1] == 1.0
     assert np.allclose(got.spread[30:40, 1], error_growth("hybrid", AHEAD)[30:40, 1])
     assert np.array_equal(got.revision, got.spread)
@@ -285,7 +291,7 @@ def test_tables_are_written_and_read_back(tmp_path, table):
     path = tmp_path / "a.json"
     write(path, [table], [TableSource("p.npz", 300, ("seed-1",))], "2024-05-01", "fit p.npz")
     back = read_tables(path).by_group[GROUP]
-    for name in ("scale", "lag", "floor", "factor", "scores", "risks"):
+    for name in ("scale", "lag", "turn", "floor", "factor", "scores", "risks"):
         assert np.allclose(getattr(back, name), getattr(table, name), rtol=1e-3)
     assert json.loads(path.read_text())["sources"] == [{"file": "p.npz", "starts": 300, "flights": ["seed-1"]}]
 
@@ -296,7 +302,7 @@ def test_tables_are_written_and_read_back(tmp_path, table):
         lambda text: "",
         lambda text: text[:200],
         lambda text: "[]",
-        lambda text: text.replace('"format": 1', '"format": 9'),
+        lambda text: text.replace('"format": 2', '"format": 9'),
         lambda text: text.replace('"factor": [', '"factor": [1.0, '),
         lambda text: text.replace('"floor": [\n    [', '"floor": [\n    [-1.0, '),
         lambda text: text.replace('"factor": [', '"factor": [1e9, ', 1).replace(", ", "", 1),

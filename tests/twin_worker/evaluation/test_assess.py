@@ -312,7 +312,7 @@ def test_the_papers_experiment_asks_the_papers_way_beside_ours(short, tmp_path):
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["missing.tlog"], "FILE: found no recording 'missing.tlog', expected a file; check the path"),
+        (["missing.tlog"], "FILE: found no file 'missing.tlog', expected a recording; check the path"),
         (["FILE", "--every", "0"], "--every: found 0 s, expected 1..600"),
         (["FILE", "--methods", "cv,magic"], "--methods: found magic, expected some of"),
         (["FILE", "--jobs", "0"], "--jobs: found 0, expected 1..64; change it"),

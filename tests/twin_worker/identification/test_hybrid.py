@@ -10,7 +10,9 @@ from fleet.contract import Item
 from fleet.frames import G, Origin
 from fleet.mission import unroll_route
 from fleet.physics import point_mass as H
-from tests.twin_worker.prediction.test_predict import AHEAD, NORTH, situation
+from fleet.window import Window
+from tests.support import flights
+from tests.twin_worker.prediction.test_predict import AHEAD, FLOWN_S, NORTH, level, situation
 from twin_worker.identification.fixed_wing import energy_balance
 from twin_worker.identification.fixed_wing.energy_balance import PointMassData, RegressionResult
 from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel, identify
@@ -149,6 +151,32 @@ def test_it_begins_where_and_as_fast_as_the_aircraft_is():
     v = (got.path[1] - got.path[0])[:2]
     assert np.allclose(v, ground_velocity(start.window), atol=0.4)
     assert np.allclose(unexplained_velocity(state, air, ground_velocity(start.window)), air[[H.REST_N, H.REST_E]])
+
+
+def test_an_aircraft_that_accelerates_and_climbs_begins_at_its_present_speed_and_climb():
+    """A mode change: the mean airspeed of 0.8 s lags 3 m/s2 by 1.2 m/s, and the rest would look like a gust."""
+    window = accelerating(3.0, 4.0)
+    laid = flights.turn(FLOWN_S, rate=0.0, psi=0.0, bank=0.0, Va=SPEED)
+    t, air = laid["air"]
+    air[:, 0] += 3.0 * np.clip(t - (window.t[-1] - 2.0), 0.0, None)
+    now = replace(situation(window=window), history=flights.remembered(flights.messages(laid)))
+    state, wind = start_and_air(now, now.window)
+    assert state[H.V] == pytest.approx(SPEED + 6.0, abs=0.5)
+    assert np.sin(state[H.GAMMA]) * state[H.V] == pytest.approx(8.0, abs=0.5)
+    assert np.abs(wind[[H.REST_N, H.REST_E]]).max() < 1.5  # the climb takes a part of the speed
+
+
+def accelerating(forward: float, climb: float) -> Window:
+    """Level flight to the north, but for the last two seconds: accelerations forward and up [m/s2]."""
+    steady = level()
+    since = np.clip(steady.t - (steady.t[-1] - 2.0), 0.0, None)
+    x, p, v = steady.x.copy(), steady.p.copy(), steady.v.copy()
+    x[:, 0] += forward * since
+    v[:, 0] += forward * since
+    v[:, 2] -= climb * since
+    p[:, 0] += 0.5 * forward * since**2
+    p[:, 2] -= 0.5 * climb * since**2
+    return replace(steady, x=x, p=p, v=v)
 
 
 def test_it_flies_the_route_and_turns_where_that_turns():

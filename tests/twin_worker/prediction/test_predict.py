@@ -2,17 +2,21 @@
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
 from fleet.autopilots import arduplane
+from fleet.autopilots.modes import ModeEntry, make_leg
+from fleet.frames import to_geodetic
+from fleet.mission import VA_C, WAYPOINT, Route
 from fleet.window import Window
 from tests.support import flights as f
 from tests.support.flights import DT, HERE, SPEED, T0, item, truth
 from twin_worker.estimation.wind_filter import WindFilter
 from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.prediction import closed_loop
-from twin_worker.prediction.closed_loop import fly_ahead
+from twin_worker.prediction.closed_loop import InitialCondition, fly_ahead, synchronise_controller
 from twin_worker.prediction.replay_window import AutopilotConfig, PredictionContext
 
 AHEAD = np.arange(0.0, 31.0)
@@ -184,3 +188,21 @@ def test_absurd_parameters_give_a_path_of_numbers_or_a_sentence(value):
     got = fly_ahead(situation(params=dict.fromkeys(PARAMS, value)), truth(), AHEAD)
     assert got.path is None or np.isfinite(got.path).all()
     assert got.path is not None or got.sentence
+
+
+@pytest.mark.parametrize(("ago_s", "flies_mission_speed"), [(60.0, True), (3.0, False)])
+def test_the_speed_flown_before_a_change_of_mode_is_not_that_of_px4_after_it(ago_s, flies_mission_speed):
+    """A mission at 20 m/s, and a return at cruise: PX4 flies each at its own speed at once."""
+    here = level()
+    speed = f.item(2, 178)
+    mission = (item(0, north=5000.0), msgspec.structs.replace(speed, seq=1, param2=SPEED), item(2, north=9000.0))
+    home = Route(HERE, np.array([make_leg(WAYPOINT, np.array([9000.0, 0.0, -100.0]))]), np.full(3, np.nan))
+    now = situation(mission, window=here, lost=("command",))  # PX4 reports no airspeed error
+    position = tuple(float(x) for x in to_geodetic(HERE, here.p[-1]))
+    entry = ModeEntry(float(here.t[-1]) - ago_s, position, 0.0)
+    cruise = {"FW_AIRSPD_TRIM": SPEED - 4.0, "FW_AIRSPD_MIN": 10.0, "FW_AIRSPD_MAX": 30.0}
+    changed = replace(now.onboard, autopilot="px4", law="px4", params=cruise, entry=entry, mode_route=home)
+    initial = synchronise_controller(replace(now, onboard=changed))
+    assert isinstance(initial, InitialCondition)
+    legs = initial.synchronised[2]
+    assert legs[0, VA_C] == (SPEED if flies_mission_speed else 0.0)

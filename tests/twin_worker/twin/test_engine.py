@@ -17,7 +17,7 @@ from twin_worker.__main__ import NICE_INCREMENT, _prepare
 from twin_worker.confidence.tube_and_horizon import AHEAD
 from twin_worker.service.busy_fallback import is_superseded, publish_fallbacks
 from twin_worker.service.identification_thread import MIN_SHARE, CpuShareLimiter
-from twin_worker.service.work_rates import RATE_WINDOW_S, WorkRates
+from twin_worker.service.work_rates import RATE_WINDOW_S, CpuTimes, WorkRates
 from twin_worker.service.worker import OwnedTwin, Worker, _advance_all
 from twin_worker.twin import step as loop
 from twin_worker.twin.state import budget as clocked
@@ -230,7 +230,7 @@ def test_who_waits_longest_is_renewed_first(twin: Twin, monkeypatch: pytest.Monk
 
 
 def test_what_is_shed_is_said() -> None:
-    rates, pace = WorkRates(), Schedule(predict=1.0, identify=5.0)
+    rates, pace = WorkRates(lambda: None), Schedule(predict=1.0, identify=5.0)
     for k in range(61):
         rates.record(Work.PREDICT, float(k), 10)
         if k % 3 == 0:
@@ -242,6 +242,21 @@ def test_what_is_shed_is_said() -> None:
     assert WorkRates().overload_messages(pace, 10, 60.0) == [] and rates.period(
         Work.IDENTIFY, 10, 60.0 + 2 * RATE_WINDOW_S
     ) == float("inf")
+
+
+@pytest.mark.parametrize(
+    ("own_cores", "told"),
+    [(1.9, "too many UAVs for this worker: "), (0.4, "other programs use 75% of this machine's CPU: ")],
+)
+def test_late_work_is_put_down_to_whoever_uses_the_cpu(own_cores: float, told: str) -> None:
+    """Two cores, 95 % used, by this worker or by others; nothing was identified at all."""
+    t, pace = 0.0, Schedule(predict=1.0, identify=5.0)
+    rates = WorkRates(lambda: CpuTimes(own_cores * t, 1.9 * t, 2.0 * t))
+    for k in range(61):
+        t = float(k)
+        rates.record(Work.PREDICT, t, 10)
+        (*_, last) = [[], *rates.overload_messages(pace, 10, t)]
+    assert last.startswith(told) and "no identify for 30 s instead of every 5.0 s" in last and "inf" not in last
 
 
 def test_predictions_come_ten_times_a_second_where_that_is_asked_for(heard: tuple, twin: Twin) -> None:

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from fleet.autopilots.control_law import eas2tas
+from fleet.autopilots.failsafe import FailsafeStep
 from fleet.contract import Event, Prediction, TwinState
 from fleet.frames import Origin, to_geodetic, to_ned
-from fleet.mission import RADIUS
+from fleet.mission import P_N, RADIUS
 from tests.support.flights import ROUTE, drive, predictions, sample, status
-from twin_worker.twin.state.routes import identified_radius, present_route
+from twin_worker.prediction.failsafe_route import FailsafePlan
+from twin_worker.twin.state.routes import identified_radius, mode_change_time, present_route
 from twin_worker.twin.step import Twin, advance
 
 MODELS = (*ROUTE, "greybox")
@@ -150,6 +152,30 @@ def test_an_unknown_home_is_said(winged):
     assert made.method == "imm" and "home position unknown" in made.sentence
 
 
+def px4_home(twin: Twin, north_m: float) -> tuple[int, int, int]:
+    lat, lon, alt = to_geodetic(twin.telemetry.origin, np.array([north_m, 300.0, 100.0]))
+    return int(lat), int(lon), int(alt)
+
+
+def centre_of(twin: Twin) -> np.ndarray:
+    return present_route(twin).legs[-1, P_N : P_N + 2]
+
+
+def test_the_return_of_px4_ends_at_the_reported_home_which_may_come_late_and_move(winged):
+    drive(winged, [status(winged, autopilot="px4", mode="MISSION")])
+    drive(winged, [status(winged, autopilot="px4", mode="RTL")])
+    assert winged.home is None and "home position unknown" in winged.no_route_reason()
+    entered_t = winged.onboard.plan_changed_t
+    drive(winged, [status(winged, autopilot="px4", mode="RTL", home=px4_home(winged, -900.0))])
+    assert centre_of(winged) == pytest.approx([-900.0, 300.0], abs=0.5)
+    assert winged.onboard.plan_changed_t == entered_t  # the return began before its home was known
+    drive(winged, [status(winged, autopilot="px4", mode="RTL", home=px4_home(winged, -900.5))])
+    assert winged.onboard.plan_changed_t == entered_t  # less than a new route
+    drive(winged, [status(winged, autopilot="px4", mode="RTL", home=px4_home(winged, 700.0))])
+    assert centre_of(winged) == pytest.approx([700.0, 300.0], abs=0.5)
+    assert winged.onboard.plan_changed_t == winged.onboard.status.t
+
+
 def test_the_state_does_not_alternate_before_the_first_model(heard):
     twin, states = Twin.of(1), []
     for message in heard[:350]:
@@ -190,7 +216,7 @@ def test_a_lost_link_is_followed_by_the_return_that_the_parameters_describe(wing
     with_params(winged, **RADIO, FS_SHORT_ACTN=0.0, FS_LONG_ACTN=1.0)
     made = lost(winged)
     ahead, path = path_of(made)
-    assert "RTL 5.0 s after the loss (FS_LONG_ACTN 1)" in made.sentence and "every radio link" in made.sentence
+    assert "RTL 6.2 s after the loss (FS_LONG_ACTN 1)" in made.sentence and "every radio link" in made.sentence
     late = path[ahead >= 150]
     assert np.linalg.norm((late - home_of(winged))[:, :2], axis=1) == pytest.approx(radius_of(winged), abs=40.0)
 
@@ -213,7 +239,7 @@ def test_a_hand_flown_aircraft_circles_and_returns_after_the_loss(twin):
     with_params(twin, **RADIO, FS_SHORT_ACTN=0.0, FS_LONG_ACTN=0.0)
     entered(twin, "FBWA")
     made = lost(twin)
-    assert made.method in MODELS and "CIRCLE 1.2 s" in made.sentence and "RTL 5.0 s" in made.sentence
+    assert made.method in MODELS and "CIRCLE 1.2 s" in made.sentence and "RTL 6.2 s" in made.sentence
 
 
 @pytest.mark.parametrize(("action", "mode"), [(2.0, "FBWA"), (4.0, "FBWB")])
@@ -227,3 +253,129 @@ def test_wings_level_failsafes_fly_straight(twin, action, mode):
     assert abs(course - course[0]).max() < 0.15
     sink = path[ahead <= 40][-1, 2] - path[0, 2]
     assert (sink > 25.0) if mode == "FBWA" else (abs(sink) < 25.0)
+
+
+# --- the change itself -----------------------------------------------------------------------------------------------
+
+
+def with_command(twin: Twin, ahead_s: float, *errors: tuple[float, float]) -> float:
+    """Report crosstrack and height errors every 0.2 s; return the time of the last."""
+    t = twin.telemetry.history.newest + ahead_s + 0.2 * np.arange(len(errors))
+    rows = np.array([(0.1, 0.05, crosstrack, height, 0.0) for crosstrack, height in errors])
+    position = np.repeat(twin.telemetry.history.rows("position")[1][-1:], len(t), axis=0)
+    velocity = np.repeat(twin.telemetry.history.rows("velocity")[1][-1:], len(t), axis=0)
+    advance(twin, (sample(1, t[-1], command=(t, rows), position=(t, position), velocity=(t, velocity)),))
+    return float(t[-1])
+
+
+@pytest.mark.parametrize("errors", [(320.0, 0.0), (0.0, 45.0)])
+def test_a_mode_begins_where_the_reported_path_errors_jump(winged, errors):
+    now = with_command(winged, 0.2, *[(1.0, 0.5)] * 4, errors, errors, errors)
+    assert mode_change_time(winged, now) == pytest.approx(now - 0.5, abs=0.01)
+    entered(winged, "LOITER")
+    assert winged.onboard.entry.t == winged.onboard.plan_changed_t == pytest.approx(now - 0.5, abs=0.01)
+
+
+def test_without_a_jump_a_mode_begins_at_its_report(winged):
+    now = with_command(winged, 0.2, *[(4.0 * k, 0.3 * k) for k in range(7)])  # as fast as it flies
+    assert mode_change_time(winged, now) == now
+
+
+def test_without_path_errors_a_mode_begins_where_the_commanded_bank_moves_as_never_before(winged):
+    start = winged.telemetry.history.newest + 0.2
+    t = start + 0.1 * np.arange(120)
+    banks = 0.1 * np.sin(0.5 * (t - start))
+    nothing = np.full(len(t), np.nan)
+    banks[t > start + 11.25] += np.clip(3.0 * (t[t > start + 11.25] - start - 11.2), 0.0, 0.6)
+    velocity = np.repeat(winged.telemetry.history.rows("velocity")[1][-1:], len(t), axis=0)
+    rows = np.column_stack([banks, 0.0 * t, nothing, nothing, nothing])
+    empty = Twin.of(2)
+    advance(empty, (sample(2, t[-1], command=(t, rows), velocity=(t, velocity)),))
+    assert mode_change_time(empty, t[-1]) == pytest.approx(start + 11.25, abs=0.051)
+    rows[:, 0] = 0.1 * np.sin(0.5 * (t - start))
+    quiet = Twin.of(2)
+    advance(quiet, (sample(2, t[-1], command=(t, rows), velocity=(t, velocity)),))
+    assert mode_change_time(quiet, t[-1]) == t[-1]
+
+
+def with_target(twin: Twin, t: float, north_m: float) -> None:
+    rows = to_geodetic(twin.telemetry.origin, np.array([north_m, -700.0, -140.0]))[None]
+    advance(twin, (sample(1, t, target=(np.array([t]), rows)),))
+
+
+def test_the_first_target_belongs_to_the_mode_change_and_the_next_is_a_new_route(winged):
+    now = winged.telemetry.history.newest
+    with_target(winged, now, -500.0)  # of the mode before
+    with_target(winged, now + 0.1, -500.0)
+    entered(winged, "GUIDED")
+    changed_t, memory = winged.onboard.plan_changed_t, winged.onboard.controller_memory
+    with_target(winged, now + 0.2, -500.0)
+    assert winged.onboard.target is None  # it may have been sent before the change
+    with_target(winged, now + 0.4, 900.0)
+    assert winged.onboard.target is not None
+    assert (winged.onboard.plan_changed_t, winged.onboard.controller_memory) == (changed_t, memory)
+    with_target(winged, now + 1.4, -900.0)
+    assert winged.onboard.plan_changed_t == pytest.approx(now + 1.4)
+
+
+@pytest.mark.parametrize("n_before", [1, 2])
+def test_a_target_that_is_repeated_after_the_change_is_that_of_the_new_mode_too(winged, n_before):
+    now = winged.telemetry.history.newest
+    for k in range(n_before):
+        with_target(winged, now + 0.1 * k, -500.0)
+    entered(winged, "RTL")
+    with_target(winged, now + 0.2, -500.0)
+    assert (winged.onboard.target is None) == (n_before == 2)
+    with_target(winged, now + 0.6, -500.0)
+    assert centre_of(winged) == pytest.approx([-500.0, -700.0], abs=0.5)
+
+
+def test_the_controller_continues_its_speed_and_height_state(winged):
+    advance(winged, (), winged.telemetry.history.newest + 1.0)
+    states = tuple(winged.prediction.controller_states)
+    t, law, _ = states[-1]
+    assert law == "arduplane" and t == pytest.approx(winged.telemetry.history.newest, abs=2.5)
+    entered(winged, "LOITER")
+    known, memory = winged.onboard.controller_memory
+    assert known == law and np.isfinite(memory).all(), np.flatnonzero(~np.isfinite(memory))
+    assert memory in [one[2] for one in states]
+    winged.onboard.plan_changed(winged.onboard.plan_changed_t)
+    assert winged.onboard.controller_memory == ("", ())
+
+
+def test_on_the_way_to_a_circle_its_sign_is_that_of_the_parameter(winged):
+    with_params(winged, WP_LOITER_RAD=70.0)
+    origin, start = winged.telemetry.origin, winged.telemetry.history.newest + 0.2
+    entered(winged, "GUIDED")
+    target, t = np.array([400.0, 100.0, -140.0]), start + 0.2 * np.arange(60)
+    r = 500.0 - 20.0 * (t - start)
+    p = target + np.column_stack([r, 0.0 * t, 0.0 * t])
+    commands = np.column_stack([np.full(60, -0.02), 0.0 * t, r - 70.0, 0.0 * t, 0.0 * t])  # banks left, nearly straight
+    centre = np.repeat(to_geodetic(origin, target)[None], 60, axis=0)
+    advance(
+        winged, (sample(1, t[-1], target=(t, centre), position=(t, to_geodetic(origin, p)), command=(t, commands)),)
+    )
+    assert identified_radius(winged) > 0.0
+
+
+def test_a_failsafe_counts_from_the_newest_telemetry_and_not_from_the_start_of_the_rollout():
+    step = FailsafeStep(6.2, "RTL", "FS_LONG_ACTN 1")
+    plan = FailsafePlan((step,), lambda mode, p, course: None, lost_t=1000.0)
+    assert plan.steps_from(999.5)[0].after_s == pytest.approx(6.7)
+    assert plan.steps_from(1000.0) == (step,)
+
+
+@pytest.mark.parametrize("long", [0.0, 1.0])
+def test_predictions_of_the_route_before_a_failsafe_are_not_scored_on_it(winged, long):
+    with_params(winged, **RADIO, FS_SHORT_ACTN=0.0, FS_LONG_ACTN=long)
+    advance(winged, (), winged.telemetry.history.newest + 1.0)
+    assert winged.confidence.tracker.has_open
+    lost(winged)
+    assert winged.confidence.tracker.has_open == (long == 0.0)
+
+
+def test_the_horizon_ends_where_a_failsafe_begins_whose_path_is_not_known(winged):
+    with_params(winged, **RADIO, FS_SHORT_ACTN=0.0, FS_LONG_ACTN=5.0)  # AUTOLAND
+    made = lost(winged)
+    assert "whose path is not predicted" in made.sentence and not made.horizon_open
+    assert made.coast_s + made.horizon_s == pytest.approx(6.2, abs=0.2) or made.horizon_s == 0.0

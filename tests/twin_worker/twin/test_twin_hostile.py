@@ -18,13 +18,13 @@ def test_a_lost_link_coasts_up_to_the_horizon_says_its_age_and_comes_back(twin, 
     for k in range(1, int(sighted) + 6):
         results += published(advance(twin, (), end + k))
     (alert,) = [r for r in results if isinstance(r, Alert) and r.kind is AlertKind.LINK_LOST]
-    assert alert.active and alert.sentence.startswith("uav-1: no sample for")
+    assert alert.active and alert.sentence.startswith("uav-1: no samples;")
     *coasting, last = [p for p in predictions(results) if p.coast_s]
     assert int(sighted) - 5 <= len(coasting) <= int(sighted)
     assert all(p.state is TwinState.LINK_LOST and p.event is Event.LINK_LOST and p.event_t > end for p in coasting)
     ages = [p.coast_s for p in coasting]
     assert ages == sorted(ages) and ages[-1] == pytest.approx(sighted, abs=1.5)
-    assert f"link lost {ages[-1]:.0f} s ago" in coasting[-1].sentence
+    assert all("link lost" in p.sentence and " ago" not in p.sentence for p in coasting)
     assert coasting[-1].t == pytest.approx(end + ages[-1], abs=1.0)  # it flies on
     assert all(0.0 < p.horizon_s <= sighted for p in coasting)
     tubes = [p.prediction_region_half_axes.numpy() for p in coasting if p.method == coasting[-1].method]

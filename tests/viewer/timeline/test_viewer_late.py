@@ -103,6 +103,6 @@ def test_a_rounded_path_goes_through_its_points_and_is_nearer_to_the_circle() ->
 def test_words_at_the_right_edge_go_to_the_other_side() -> None:
     sight = CameraView(np.array([0.0, -100.0, 0.0]), np.zeros(3), np.radians(50), 1.0)
     edge = Tag("horizon", "horizon 62 s: error reaches 10 %", np.array([44.0, 0.0, 0.0]), "bottom-left")
-    assert [one.anchor for one in visible_labels([edge], sight)] == ["bottom-right"]
+    assert [one.anchor for one in visible_labels([edge], sight)[0]] == ["bottom-right"]
     middle = edge._replace(at=np.zeros(3))
-    assert [one.anchor for one in visible_labels([middle], sight)] == ["bottom-left"]
+    assert [one.anchor for one in visible_labels([middle], sight)[0]] == ["bottom-left"]

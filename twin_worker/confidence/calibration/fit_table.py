@@ -24,7 +24,7 @@ from twin_worker.confidence.weighted_quantile import (
     running_max_error_ratio,
     weighted_quantile,
 )
-from twin_worker.numerics.prediction_errors import AHEAD, NOMINAL_COVERAGE, first_passage
+from twin_worker.numerics.prediction_errors import AHEAD, NOMINAL_COVERAGE, displacement_along_path, first_passage
 
 
 def conformal_factors(ratio: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, float]:
@@ -60,7 +60,7 @@ _COLUMNS_PER_KNOT = 3  # number of them, evenly spaced: neighbours are highly co
 _NU = 4.0  # degrees of freedom of the errors: heavy tails
 _USUAL_LAG = np.log(0.5)
 _USUAL_FLOOR = 0.3  # of the median error [-]
-_RIDGE = np.array([0.05, 0.01, 0.01])  # ridge penalty of scale, lag and floor towards typical values [-]
+_RIDGE = np.array([0.05, 0.01, 0.01, 0.01])  # ridge penalty of scale, lag, turn and floor towards typical values [-]
 _MAX_LOG = 3.0  # bound on |log scale| and |log lag|
 _MIN_FLIGHT_STARTS = 20  # flights with fewer predictions than this have a smaller weight
 _FOLDS = 4  # maximum number of folds when a table is fitted
@@ -73,26 +73,35 @@ def columns_near(knot: float) -> np.ndarray:
     return columns[np.unique(np.linspace(0, len(columns) - 1, _COLUMNS_PER_KNOT).round().astype(int))]
 
 
-def fit_sigma(features: UncertaintyFeatures, error: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fit scale, lag and floor by knot and axis to features and errors (s, k, 3) [m]; each (13, 3)."""
-    parameters = np.tile([1.0, 1.0, _MIN_FLOOR_M], (len(KNOTS), 3, 1))
-    for i, knot in enumerate(KNOTS):
-        columns = columns_near(knot)
-        for axis in range(3):
-            s, r, e = (x[:, columns, axis].ravel() ** 2 for x in (features.spread, features.revision, error))
+def fit_sigma(features: UncertaintyFeatures, error: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Fit scale, lag, turn and floor by knot and axis to features and errors (s, k, 3) [m]; each (13, 3).
+
+    The along axis comes first, because the displacement across and vertical depends on its sigma.
+    """
+    parameters = np.tile([1.0, 1.0, 1.0, _MIN_FLOOR_M], (len(KNOTS), 3, 1))
+    displacement = np.zeros_like(error)
+    for axis in range(3):
+        parts = features.spread[..., axis], features.revision[..., axis], displacement[..., axis], error[..., axis]
+        for i, knot in enumerate(KNOTS):
+            s, r, d, e = (x[:, columns_near(knot)].ravel() ** 2 for x in parts)
             valid = np.isfinite(e)
             if valid.any():
-                parameters[i, axis] = _max_likelihood(s[valid], r[valid], e[valid])
+                parameters[i, axis] = _max_likelihood(s[valid], r[valid], d[valid], e[valid])
             elif i:
-                parameters[i, axis] = parameters[i - 1, axis] * [1.0, 1.0, knot / KNOTS[i - 1]]
-    return parameters[..., 0], parameters[..., 1], parameters[..., 2]
+                parameters[i, axis] = parameters[i - 1, axis] * [1.0, 1.0, 1.0, knot / KNOTS[i - 1]]
+        if axis == 0:
+            scale, lag, _, floor = at_look_aheads(AHEAD, parameters[:, 0]).T
+            along = np.sqrt((scale * parts[0]) ** 2 + (lag * parts[1]) ** 2 + floor**2)
+            displacement = displacement_along_path(features.path, along)
+    parameters[:, 0, 2] = 0.0
+    return tuple(np.moveaxis(parameters, -1, 0))
 
 
-def _max_likelihood(s2: np.ndarray, r2: np.ndarray, e2: np.ndarray) -> np.ndarray:
-    """Estimate scale, lag and floor for errors of Student's t distribution with `_NU` degrees of freedom, (3,)."""
+def _max_likelihood(s2: np.ndarray, r2: np.ndarray, d2: np.ndarray, e2: np.ndarray) -> np.ndarray:
+    """Estimate scale, lag, turn and floor, (4,), for errors of Student's t distribution, `_NU` degrees of freedom."""
     typical = max(float(np.sqrt(np.median(e2))), _MIN_FLOOR_M)
-    prior = np.array([0.0, _USUAL_LAG, np.log(_USUAL_FLOOR * typical)])
-    parts = np.stack([s2, r2, np.ones_like(e2)])
+    prior = np.array([0.0, _USUAL_LAG, 0.0, np.log(_USUAL_FLOOR * typical)])
+    parts = np.stack([s2, r2, d2, np.ones_like(e2)])
 
     def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
         terms = np.exp(2 * x)[:, None] * parts
@@ -104,11 +113,10 @@ def _max_likelihood(s2: np.ndarray, r2: np.ndarray, e2: np.ndarray) -> np.ndarra
 
     min_log_floor = np.log(_MIN_FLOOR_M)
     bounds = [
-        (-_MAX_LOG, _MAX_LOG),
-        (-_MAX_LOG, _MAX_LOG),
+        *[(-_MAX_LOG, _MAX_LOG)] * 3,
         (min_log_floor, max(np.log(20 * typical), min_log_floor + 1.0)),
     ]
-    start = np.array([0.0, _USUAL_LAG, max(np.log(typical), min_log_floor)])
+    start = np.array([0.0, _USUAL_LAG, 0.0, max(np.log(typical), min_log_floor)])
     return np.exp(minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds).x)
 
 
@@ -144,9 +152,11 @@ def _score_quantiles(table: CalibrationTable, ratio: np.ndarray, weight: np.ndar
     return np.maximum.accumulate(np.maximum(quantiles, 1e-3))
 
 
-def _unscaled_table(group: str, scale: np.ndarray, lag: np.ndarray, floor: np.ndarray) -> CalibrationTable:
+def _unscaled_table(
+    group: str, scale: np.ndarray, lag: np.ndarray, turn: np.ndarray, floor: np.ndarray
+) -> CalibrationTable:
     default = default_table("imm")
-    return CalibrationTable(group, 0, 0, scale, lag, floor, default.factor, default.scores, default.risks)
+    return CalibrationTable(group, 0, 0, scale, lag, turn, floor, default.factor, default.scores, default.risks)
 
 
 def _fill_missing(factor: np.ndarray) -> np.ndarray:

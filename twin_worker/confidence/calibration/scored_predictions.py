@@ -13,6 +13,7 @@ from twin_worker.numerics.prediction_errors import AHEAD, axes_error
 
 _MIN_STARTS = 30  # minimum predictions of a setting that forms a fold of its own
 _PATH_KEYS = ("path", "spread", "flown")
+_FEATURES = ("spread", "revision", "path")
 _ROW_KEYS = ("t0", "length", "predicted_length", "group", "method", "flight")
 
 
@@ -23,7 +24,7 @@ class ScoredPredictions:
     Attributes:
         t0: start times, (s,) [s since 1970]
         path: predicted positions, NED, (s, k, 3) [m]
-        features: ensemble spread and forecast revision, (s, k, 3) [m]
+        features: ensemble spread, forecast revision and predicted path, (s, k, 3) [m]
         flown: flown positions, NED, nan where unknown, (s, k, 3) [m]
         length, predicted_length: path length so far, never below two seconds of ground speed, (s, k) [m]
         group, method, flight: names, (s,)
@@ -44,7 +45,7 @@ class ScoredPredictions:
 
     def select(self, rows: np.ndarray) -> "ScoredPredictions":
         """Return the predictions of these rows."""
-        features = UncertaintyFeatures(self.features.spread[rows], self.features.revision[rows])
+        features = UncertaintyFeatures(self.features.spread[rows], self.features.revision[rows], self.path[rows])
         return replace(
             self, features=features, **{name: getattr(self, name)[rows] for name in ("path", "flown", *_ROW_KEYS)}
         )
@@ -89,7 +90,7 @@ def read(paths: Sequence[Path]) -> ScoredPredictions:
 def concatenate(parts: Sequence[ScoredPredictions]) -> ScoredPredictions:
     """Concatenate sets of predictions."""
     features = UncertaintyFeatures(
-        *(np.concatenate([getattr(part.features, name) for part in parts]) for name in ("spread", "revision"))
+        *(np.concatenate([getattr(part.features, name) for part in parts]) for name in _FEATURES)
     )
     names = ("path", "flown", *_ROW_KEYS)
     return ScoredPredictions(
@@ -116,8 +117,10 @@ def _read_file(path: Path) -> ScoredPredictions:
     spread = arrays.pop("spread")
     revision = revisions(arrays["t0"], arrays["path"], arrays["flight"])
     methods = arrays["method"].tolist()
-    features = [uncertainty_features(*row, AHEAD) for row in zip(spread, revision, methods, strict=True)]
-    stacked = (np.array([getattr(item, name) for item in features]).reshape(s, k, 3) for name in ("spread", "revision"))
+    features = [
+        uncertainty_features(*row, AHEAD) for row in zip(spread, revision, arrays["path"], methods, strict=True)
+    ]
+    stacked = (np.array([getattr(item, name) for item in features]).reshape(s, k, 3) for name in _FEATURES)
     return ScoredPredictions(features=UncertaintyFeatures(*stacked), **arrays)
 
 

@@ -14,7 +14,7 @@ from twin_worker.telemetry.velocity import present_velocity
 
 _AIRSPEED_ROWS = 8  # rows of 0.1 s in the mean airspeed at the start
 _WINDOW_ROWS = 60  # rows of the window that they use
-_GROUND_ROWS, _CLIMB_ROWS = 3, 12  # rows of 0.04 s in the means of ground velocity and climb
+_GROUND_ROWS = 3  # rows of 0.04 s in the mean of the ground velocity
 _MAX_PATH_SINE = 0.5  # largest sine of the path angle at the start [-]
 _MIN_WIND_HEIGHT = 10.0  # minimum reference height of the wind profile [m]
 _NO_NOISE = np.empty((0, 4))
@@ -22,17 +22,25 @@ _NO_NOISE = np.empty((0, 4))
 
 def start_state(context: PredictionContext, window: Window) -> np.ndarray:
     """Return the state at the end of the window, (N_START,)."""
-    _, airspeed = airspeed_of(
-        window.part(max(len(window) - _WINDOW_ROWS, 0), len(window)), context.history, context.wind_filter.scale
-    )
-    V = float(airspeed[-_AIRSPEED_ROWS:].mean())
+    V = _present_airspeed(context, window)
     out = np.empty(H.N_START)
     out[:3], out[H.V] = window.p[-1], V
     out[[H.PHI, H.THETA, H.PSI, H.P_RATE, H.Q_RATE]] = window.x[-1, [6, 7, 8, 3, 4]]
-    climb = -float(window.v[-_CLIMB_ROWS:, 2].mean())
+    climb = -float(present_velocity(window.p, window.v, window.dt, _GROUND_ROWS)[2])
     out[H.GAMMA] = asin(float(np.clip(climb / max(V, 5.0), -_MAX_PATH_SINE, _MAX_PATH_SINE)))
     out[H.THROTTLE] = window.u[-1, 3]
     return out
+
+
+def _present_airspeed(context: PredictionContext, window: Window) -> float:
+    """Return the true airspeed at the end of the window: that by velocity and mean wind, plus the mean residual [m/s].
+
+    V = |v(t_n) - w| + mean_k(Va_k - |v_k - w|): a mean of the readings alone lags an aircraft that accelerates.
+    """
+    window = window.part(max(len(window) - _WINDOW_ROWS, 0), len(window))
+    t, airspeed = (rows[-_AIRSPEED_ROWS:] for rows in airspeed_of(window, context.history, context.wind_filter.scale))
+    by_velocity = np.linalg.norm(window.x[:, :3], axis=1)
+    return float(by_velocity[-_GROUND_ROWS:].mean() + (airspeed - np.interp(t, window.t, by_velocity)).mean())
 
 
 def air_state(context: PredictionContext, start: np.ndarray) -> np.ndarray:

@@ -16,6 +16,8 @@ from twin_worker.telemetry.track import STEP, Track
 
 _MIN_TRACK_S = 2.0  # minimum track before a rollout [s]
 _COMPARE_S = 60.0  # compared flight [s]
+_MIN_TILT_S, _TILT_ROWS = 20.0, 5  # minimum flight for drag and wind [s], rows from one to the next
+_MIN_VELOCITY_CHANGE = 3.0  # minimum range of the horizontal velocity for both [m/s]
 _START_INTERVAL_S, _RUN_S = 4.0, 10.0  # interval of starts, length of a rollout [s]
 _LAG_VALUES = (0.7, 1.0, 1.4, 2.0, 2.8)  # tried natural frequencies [rad/s]
 _FRACTIONS = (0.6, 0.8, 0.9, 1.0, 1.1, 1.25)  # tried fractions of the limits
@@ -85,9 +87,9 @@ def _rollout_error(track: Track, k: int, segments: np.ndarray, seq: int, twin: M
 
 def _fit_drag_and_wind(track: Track, config: MultirotorConfig, model: MultirotorModel) -> MultirotorModel:
     """Fit drag and wind to the tilt: horizontal thrust minus acceleration is k (v - w), linear in k and k w."""
-    rows = np.arange(len(track) - 1, max(len(track) - int(_COMPARE_S / STEP), 10), -5)
+    rows = np.arange(len(track) - 1, max(len(track) - int(_COMPARE_S / STEP), 10), -_TILT_ROWS)
     rows = rows[track.ok[rows] & np.isfinite(track.euler[rows]).all(axis=1)]
-    if len(rows) < 40:
+    if len(rows) < _MIN_TILT_S / (_TILT_ROWS * STEP):
         return model
     euler = track.euler[rows]
     cf, sf, ct, st, cp, sp = (g(euler[:, i]) for i in range(3) for g in (np.cos, np.sin))
@@ -101,7 +103,7 @@ def _fit_drag_and_wind(track: Track, config: MultirotorConfig, model: Multirotor
     A = np.vstack([np.column_stack([v[:, 0], -unit, zero]), np.column_stack([v[:, 1], zero, -unit])])
     solution = np.linalg.solve(A.T @ A + np.diag([20.0, 2.0, 2.0]), A.T @ drag.T.ravel() + [20.0 * 0.2, 0.0, 0.0])
     k = float(solution[0])
-    if not 0.03 < k < 2.0 or np.ptp(v, axis=0).max() < 3.0:
+    if not 0.03 < k < 2.0 or np.ptp(v, axis=0).max() < _MIN_VELOCITY_CHANGE:
         return model
     wind = solution[1:] / k
     if not np.hypot(*wind) < 25.0:

@@ -13,7 +13,7 @@ from fleet.frames import Origin
 from fleet.mission_jumps import JUMPS, count_jumps, resets_counters
 from twin_worker.estimation.wind_filter import WindFilter, update_from_history
 from twin_worker.prediction.autopilot_identification import AutopilotEstimate
-from twin_worker.prediction.replay_window import JumpCounts
+from twin_worker.prediction.replay_window import ControllerMemory, JumpCounts
 from twin_worker.telemetry.history import ArrivalDelay, TelemetryHistory
 from twin_worker.telemetry.resample import Resampler
 from twin_worker.twin.state.flight_phase import FlightPhase
@@ -164,6 +164,7 @@ class OnboardState(msgspec.Struct):
         params: the newest
         mode_changes: (time [s since 1970], mode), oldest first
         plan_changed_t: last change of mode, mission or parameters [s since 1970]
+        controller_memory: of the controller just before that change
         received_items: items of the newest mission as received, before home was completed
         jumps: jumps taken at each jump after each change of the current item, oldest first
         entry: where the present mode was entered; None: before telemetry began
@@ -176,6 +177,7 @@ class OnboardState(msgspec.Struct):
     params: Params | None = None
     mode_changes: deque[tuple[float, str]] = msgspec.field(default_factory=lambda: deque(maxlen=_MODE_CHANGES))
     plan_changed_t: float = -np.inf
+    controller_memory: ControllerMemory = ("", ())
     received_items: tuple[Item, ...] = ()
     jumps: deque[JumpCounts] = msgspec.field(default_factory=lambda: deque(maxlen=_ITEM_CHANGES))
     entry: ModeEntry | None = None
@@ -225,9 +227,9 @@ class OnboardState(msgspec.Struct):
         """Store parameters."""
         self.params = params
 
-    def plan_changed(self, t: float) -> None:
-        """Record a change of mode, mission or parameters at `t` [s since 1970]."""
-        self.plan_changed_t = t
+    def plan_changed(self, t: float, memory: ControllerMemory = ("", ())) -> None:
+        """Record a change of mode, mission or parameters at `t` [s since 1970]; `memory`: of the controller before."""
+        self.plan_changed_t, self.controller_memory = t, memory
 
     def shift_clock(self, step: float, plan_changed_t: float) -> None:
         """Shift all changes by `step` [s]; the newest was at `plan_changed_t` by the new clock [s since 1970]."""

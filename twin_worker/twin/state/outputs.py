@@ -1,5 +1,7 @@
 """Published state of one aircraft: predictions, their scores, and alerts."""
 
+from collections import deque
+
 import msgspec
 import numpy as np
 
@@ -9,8 +11,12 @@ from twin_worker.alerts.hysteresis import AlertState
 from twin_worker.confidence.tube_and_horizon import ConfidenceTracker
 from twin_worker.prediction.autopilot_parameters import ControllerTwin, RouteOverride
 from twin_worker.prediction.method_selection import MethodSelector
+from twin_worker.prediction.replay_window import ControllerMemory
 from twin_worker.twin.state.budget import Timer
 from twin_worker.twin.state.events import FlightEvent
+
+_STATES = 4  # stored states of the controller
+_MAX_STATE_AGE_S = 10.0  # oldest state that a controller continues from after its route changed [s]
 
 
 class PredictionState(msgspec.Struct):
@@ -26,6 +32,7 @@ class PredictionState(msgspec.Struct):
         ensemble_spread: of the newest ensemble, along, cross, vertical, (k, 3) [m]
         deferred_ensemble_t: when an ensemble was due that was deferred for lack of CPU time [s since 1970]
         controller: controller twin of the newest prediction
+        controller_states: time [s since 1970], law and state of the controller at the newest rollouts
         override: route or parameters that replace the reported ones in a what-if
         coasting_expired: without telemetry, the confidence horizon is over
         position_lost: telemetry arrives, but no positions
@@ -42,6 +49,9 @@ class PredictionState(msgspec.Struct):
     ensemble_spread: np.ndarray | None = None
     deferred_ensemble_t: float | None = None
     controller: ControllerTwin | None = None
+    controller_states: deque[tuple[float, str, tuple[float, ...]]] = msgspec.field(
+        default_factory=lambda: deque(maxlen=_STATES)
+    )
     override: RouteOverride | None = None
     coasting_expired: bool = False
     position_lost: bool = False
@@ -108,6 +118,15 @@ class PredictionState(msgspec.Struct):
     def defer_ensemble(self, t: float | None) -> None:
         """Store when an ensemble was due that has to wait; None: none waits."""
         self.deferred_ensemble_t = t
+
+    def store_controller_state(self, t: float, law: str, state: np.ndarray) -> None:
+        """Store the synchronised state of the controller at `t` [s since 1970], as from `laws.remember`."""
+        self.controller_states.append((t, law, tuple(state.tolist())))
+
+    def controller_memory(self, t: float) -> ControllerMemory:
+        """Return the newest state of the controller up to `t` [s since 1970]; empty if there is no recent one."""
+        recent = [one for one in self.controller_states if 0.0 <= t - one[0] <= _MAX_STATE_AGE_S]
+        return (recent[-1][1], recent[-1][2]) if recent else ("", ())
 
     def set_controller(self, controller: ControllerTwin, now: float) -> None:
         """Store the controller that is published at `now`."""

@@ -27,14 +27,18 @@ from fleet.mission import FIRST_ITEM, KIND, LOITER_UNLIMITED, RADIUS, WAYPOINT, 
 from twin_worker.prediction.autopilot_identification import LAW_OF_AUTOPILOT
 from twin_worker.prediction.failsafe_route import FailsafePlan
 from twin_worker.prediction.multirotor.rollout import item_in_force
-from twin_worker.twin.state.events import invalidate_prediction
+from twin_worker.twin.state.events import discard_prediction, invalidate_prediction
 
 if TYPE_CHECKING:
     from twin_worker.twin.state.state import Twin
 
 ROUTE_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
 _MAX_ENTRY_AGE_S = 2.0  # maximum age of the position where a mode was entered [s]
+HEARTBEAT_S = 2.0  # the mode is reported once a second; one heartbeat may be lost [s]
+_BANK_S = 10.0  # commanded banks before the change, in which none is unusual [s]
+_ERROR_ROUNDING_M = 1.0  # of the reported path errors [m]
 _TARGET_MOVED_M = 2.0  # a guidance target that moves further is a new one [m]
+_CIRCLING = 0.3  # largest median crosstrack error on a circle, in radii [-]
 _RADIUS_S, _MIN_RADIUS_ROWS = 20.0, 10  # newest flight, and reports in it, that tell the radius of a circle [s]
 _MIN_RADIUS, _RADIUS_SPREAD = 10.0, 0.1  # smallest radius [m], and largest median deviation from it [-]
 _PATH_S, _PATH_FIT_S = 0.6, 20.0  # newest reports that give curvature and course of a path, and of its law [s]
@@ -162,7 +166,7 @@ def identified_radius(twin: "Twin") -> float:
     """Return the radius of the circle that ArduPlane flies about its target, positive clockwise; nan: unknown [m].
 
     The reported crosstrack error is the distance to the target minus the radius, which grows with the square of true
-    over equivalent airspeed. The sign is that of the commanded banks.
+    over equivalent airspeed. On the circle, the sign is that of the commanded banks; before, that of WP_LOITER_RAD.
     """
     target, entry, newest = twin.onboard.target, twin.onboard.entry, twin.telemetry.history.newest
     if twin.mode not in TARGET_MODES or twin.autopilot != "ardupilot" or target is None or entry is None:
@@ -178,7 +182,10 @@ def identified_radius(twin: "Twin") -> float:
     if middle < _MIN_RADIUS or np.median(np.abs(radius - middle)) > _RADIUS_SPREAD * middle:  # no circle about it
         return float("nan")
     widened = eas2tas(target[2] * 1e-3) ** 2
-    return float(np.copysign(middle / widened, np.median(commands[:, 0])))
+    sign = twin.received_params.get("WP_LOITER_RAD", 1.0)
+    if np.median(np.abs(commands[:, 2])) < _CIRCLING * middle:  # on the way to the circle its banks are not yet known
+        sign = float(np.median(commands[:, 0]))
+    return float(np.copysign(middle / widened, sign))
 
 
 def _course_hold(twin: "Twin", situation: ModeSituation) -> ModeSituation | None:
@@ -218,7 +225,7 @@ def failsafe_plan(twin: "Twin") -> FailsafePlan | None:
             return _mission_from_here(twin)
         return mode_route(law, mode, _situation(twin, p, course, None), params, failsafe=True)
 
-    return FailsafePlan(steps, route_of, "(assumes that every radio link is lost)")
+    return FailsafePlan(steps, route_of, "(assumes that every radio link is lost)", twin.telemetry.history.newest)
 
 
 def _no_route(mode: str, p: np.ndarray, course: float) -> None:
@@ -260,15 +267,50 @@ def _ned(origin: Origin, position: Sequence[float] | np.ndarray) -> np.ndarray:
     return to_ned(origin, *(np.array([x], float) for x in position))[0]
 
 
+def mode_change_time(twin: "Twin", t: float) -> float:
+    """Return when a mode began that a heartbeat reports at `t` [s since 1970].
+
+    The reported crosstrack and height errors jump with the route, by more than the aircraft can have flown between two
+    reports. Without them, the commanded bank first moves by more than between any two reports of the seconds before.
+    Without either the time is that of the report.
+    """
+    since = t - HEARTBEAT_S
+    t_c, command = twin.telemetry.history.rows_since("command", since - _BANK_S)
+    velocity = _newest(twin, "velocity")
+    if len(t_c) < 2 or velocity is None:
+        return t
+    if not np.isfinite(command[:, 2:4]).any():
+        return _first_unusual_bank(t_c, command[:, 0], since, t)
+    jump = np.nan_to_num(np.abs(np.diff(command[:, 2:4], axis=0))).max(axis=1)
+    reach = 2.0 * float(np.linalg.norm(velocity)) * np.diff(t_c)  # errors to both sides of a line
+    candidates = np.where((t_c[1:] >= since) & (t_c[1:] <= t) & (jump > reach + _ERROR_ROUNDING_M), jump - reach, 0.0)
+    k = int(candidates.argmax())
+    return float(t_c[k : k + 2].mean()) if candidates[k] > 0.0 else t
+
+
+def _first_unusual_bank(t_c: np.ndarray, banks: np.ndarray, since: float, t: float) -> float:
+    """Return when the commanded bank first moves faster than ever before `since`; `t` if it does not [s since 1970]."""
+    rates = np.abs(np.diff(np.nan_to_num(banks))) / np.maximum(np.diff(t_c), 1e-3)
+    before = rates[t_c[1:] < since]
+    unusual = np.flatnonzero((t_c[1:] >= since) & (t_c[1:] <= t) & (rates > (before.max() if len(before) else np.inf)))
+    return float(t_c[unusual[0] : unusual[0] + 2].mean()) if len(unusual) else t
+
+
 def mode_entry(twin: "Twin", t: float) -> ModeEntry | None:
-    """Return the newest position and course as the entry of a mode at `t`; None without either."""
+    """Return position and course at `t`, from the rows next before it, as the entry of a mode; None without either."""
     t_p, positions = twin.telemetry.history.rows_since("position", t - _MAX_ENTRY_AGE_S)
-    _, velocities = twin.telemetry.history.rows_since("velocity", t - _MAX_ENTRY_AGE_S)
+    t_v, velocities = twin.telemetry.history.rows_since("velocity", t - _MAX_ENTRY_AGE_S)
     if not len(t_p) or not len(velocities) or twin.telemetry.origin is None:
         return None
-    v, since = velocities[-1], min(max(t - float(t_p[-1]), 0.0), _MAX_ENTRY_AGE_S)
-    lat, lon, alt = to_geodetic(Origin(*(int(x) for x in positions[-1])), v * since)
+    row, v = _row_before(t_p, t), velocities[_row_before(t_v, t)]
+    since = min(t - float(t_p[row]), _MAX_ENTRY_AGE_S)
+    lat, lon, alt = to_geodetic(Origin(*(int(x) for x in positions[row])), v * since)
     return ModeEntry(t, (float(lat), float(lon), float(alt)), atan2(v[1], v[0]))
+
+
+def _row_before(times: np.ndarray, t: float) -> int:
+    """Return the number of the last row until `t`, else of the first."""
+    return max(int(np.searchsorted(times, t, side="right")) - 1, 0)
 
 
 def lock_course(twin: "Twin") -> None:
@@ -292,21 +334,51 @@ def lock_course(twin: "Twin") -> None:
 
 
 def update_target(twin: "Twin") -> None:
-    """Store the newest guidance target of the present mode; one that moved invalidates the prediction."""
+    """Store the newest guidance target of the present mode.
+
+    The first one tells where the aircraft flies since the mode change; one that moved is a new route from now on.
+    """
     t, targets = twin.telemetry.history.rows("target")
     if twin.mode not in TARGET_MODES or twin.telemetry.origin is None or not len(t):
         return
     t_target, target = float(t[-1]), targets[-1].astype(float)
     if twin.onboard.entry is None:  # the first status arrived in this mode
         twin.onboard.enter_mode(mode_entry(twin, t_target))
+        invalidate_prediction(twin, None, t_target)
     elif not t_target > twin.onboard.entry.t:
         return
     previous, new = twin.onboard.target, (float(target[0]), float(target[1]), float(target[2]))
-    if previous is not None and not _has_moved(previous, new):
+    if previous is None:
+        if not _is_of_mode_before(t, targets, twin.onboard.entry):
+            twin.onboard.set_target(new)
+            discard_prediction(twin)
+    elif _has_moved(previous, new):
+        twin.onboard.set_target(new)
+        invalidate_prediction(twin, Event.TARGET if twin.mode == "GUIDED" else None, t_target)
+
+
+def _is_of_mode_before(t: np.ndarray, targets: np.ndarray, entry: ModeEntry | None) -> bool:
+    """Return whether the only target since the mode change repeats that of the mode before.
+
+    It may have been sent before the change, whose time is known to the period of the commands.
+    """
+    if entry is None or not 1 < int(np.searchsorted(t, entry.t, side="right")) == len(t) - 1:
+        return False
+    *older, new = ((float(x[0]), float(x[1]), float(x[2])) for x in targets[-3:])
+    return not any(_has_moved(one, new) for one in older)
+
+
+def update_home(twin: "Twin", previous: Origin | None, t: float) -> None:
+    """Make a prediction due whose route depends on home, which became known or moved at `t` [s since 1970].
+
+    A home that becomes known was there before: the route is flown since the mode change. One that moves is a new route.
+    """
+    if twin.mode != "RTL" or twin.home is None:
         return
-    twin.onboard.set_target(new)
-    commanded = previous is not None and twin.mode == "GUIDED"
-    invalidate_prediction(twin, Event.TARGET if commanded else None, t_target)
+    if previous is None:
+        twin.prediction.expire()
+    elif _has_moved(previous, twin.home):
+        invalidate_prediction(twin, None, t)
 
 
 def _has_moved(previous: tuple[float, float, float], new: tuple[float, float, float]) -> bool:

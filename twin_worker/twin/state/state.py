@@ -32,11 +32,14 @@ from twin_worker.twin.state.inputs import Environment, OnboardState, Telemetry
 from twin_worker.twin.state.models import Identification, ModelBank
 from twin_worker.twin.state.outputs import AlertingState, ConfidenceState, PredictionState
 from twin_worker.twin.state.routes import (
+    HEARTBEAT_S,
     ROUTE_MODES,
     failsafe_plan,
     lock_course,
+    mode_change_time,
     mode_entry,
     present_route,
+    update_home,
     update_target,
 )
 from twin_worker.validation.verify import FIT_THRESHOLD
@@ -194,6 +197,7 @@ class Twin(msgspec.Struct):
             self.onboard.entry,
             present_route(self),
             failsafe_plan(self),
+            self.onboard.controller_memory,
             tuple(self.onboard.jumps),
         )
         return PredictionContext(
@@ -207,13 +211,14 @@ class Twin(msgspec.Struct):
 
     @property
     def home(self) -> Origin | None:
-        """Return home: item 0 of an ArduPilot mission, else the last disarmed position; None if unknown."""
+        """Return home: item 0 of an ArduPilot mission, as reported, or the last disarmed position; None if unknown."""
         items = self.onboard.mission.items if self.onboard.mission is not None else ()
         first = next((item for item in items if item.seq == 0), None)
         ardupilot = self.onboard.status is not None and self.onboard.status.autopilot == "ardupilot"
-        if first is None or not ardupilot or not (first.lat_e7 or first.lon_e7) or not abs(first.alt_m) < 1e5:
-            return self.alerts.home_fallback
-        return Origin(first.lat_e7, first.lon_e7, round(first.alt_m * 1e3))
+        if first is not None and ardupilot and (first.lat_e7 or first.lon_e7) and abs(first.alt_m) < 1e5:
+            return Origin(first.lat_e7, first.lon_e7, round(first.alt_m * 1e3))
+        reported = self.onboard.status.home if self.onboard.status is not None else None
+        return self.alerts.home_fallback if reported is None else Origin(*reported)
 
     def no_route_reason(self) -> str:
         """Return why the aircraft follows no known route; empty if it does."""
@@ -277,10 +282,16 @@ def _ingest_status(twin: Twin, status: Status) -> None:
         return
     if 0 < (step := status.clock_advance_s - previous.clock_advance_s) < np.inf:
         _shift_clock(twin, step)
+    if status.home != previous.home and status.mode == previous.mode:
+        update_home(twin, None if previous.home is None else Origin(*previous.home), status.t)
     if status.mode != previous.mode:
-        twin.onboard.enter_mode(mode_entry(twin, status.t))
+        changed_t = mode_change_time(twin, status.t)
+        twin.onboard.enter_mode(mode_entry(twin, changed_t))
         details = f"{status.mode[:20]}, previously {previous.mode[:20]}"
-        invalidate_prediction(twin, Event.MODE if previous.mode else None, status.t, details)
+        event = Event.MODE if previous.mode else None
+        known_t = changed_t if changed_t < status.t else status.t - HEARTBEAT_S
+        invalidate_prediction(twin, event, changed_t, details, known_t=known_t)
+        update_target(twin)
 
 
 def _shift_clock(twin: Twin, step: float) -> None:

@@ -35,9 +35,9 @@ _RETURN_COMMAND, _LAST_NAV_COMMAND = 20, 95  # MAV_CMD
 _LANDING_LOOKAHEAD = 3  # navigation items, the active one included, in which a landing suppresses ground alerts [-]
 
 
-def link_alerts(twin: Twin, now: float, silence_s: float) -> list[Alert]:
-    """Raise or clear the link alert; `silence_s` since the newest sample [s]."""
-    sentence = f"no sample for {silence_s:.1f} s; the twin predicts without telemetry"
+def link_alerts(twin: Twin, now: float) -> list[Alert]:
+    """Raise or clear the link alert; its text has no age, as it is shown while the age grows."""
+    sentence = "no samples; the twin predicts without telemetry"
     return twin.alerts.alarms.update(
         twin.config.uav,
         now,

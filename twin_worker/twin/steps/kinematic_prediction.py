@@ -39,6 +39,7 @@ class PathForecast:
         seq: mission item at the start, -1 none
         sentence: basis of the prediction, or the reason why there is none
         control: controller model used
+        known_s: look-ahead at which a failsafe begins whose route is not known [s]
     """
 
     path: np.ndarray | None
@@ -47,6 +48,7 @@ class PathForecast:
     seq: int
     sentence: str
     control: ControllerTwin | None = None
+    known_s: float = np.inf
 
 
 def no_prediction(sentence: str, seq: int = -1) -> PathForecast:
@@ -188,7 +190,8 @@ def predict_without_model(twin: Twin, recent: Track, ahead: np.ndarray) -> PathF
         return no_prediction(forecast.sentence, forecast.seq)
     text = f"{kinematic.describe(twin.models.kinematic)}. {forecast.sentence}".strip(". ")
     path = forecast.path if reported_path(twin) is None else _turn_after(forecast.path, ahead)
-    return PathForecast(path, "greybox", greybox.LAW, forecast.seq, text, forecast.controller)
+    control, known_s = forecast.controller, forecast.known_s
+    return PathForecast(path, "greybox", greybox.LAW, forecast.seq, text, control, known_s)
 
 
 def _turn_after(path: np.ndarray, ahead: np.ndarray) -> np.ndarray:

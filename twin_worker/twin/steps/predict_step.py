@@ -65,6 +65,8 @@ def predict(twin: Twin, now: float) -> list[Message]:
         ensemble_spread(twin, path_forecast.method, ahead[:n]),
     )
     confidence = twin.confidence.tracker.confidence_of(forecast)
+    if path_forecast.known_s < confidence.horizon_s:
+        confidence = replace(confidence, horizon_s=path_forecast.known_s, horizon_open=False)
     prediction = _to_message(twin, forecast, confidence)
     prediction = msgspec.structs.replace(
         prediction,
@@ -110,7 +112,7 @@ def _publish_expiry(twin: Twin, coast_s: float, now: float) -> list[Message]:
     if twin.prediction.coasting_expired or twin.prediction.latest is None:
         return []
     twin.prediction.set_coasting_expired(True)
-    record_event(twin, Event.COASTING_EXPIRED, now, f"{_coast_text(twin, coast_s)}")
+    record_event(twin, Event.COASTING_EXPIRED, now, f"{_coast_text(twin, coast_s)} for {coast_s:.0f} s")
     _set_state(twin, twin.prediction.state)
     twin.prediction.predict_timer.restart(now)
     prediction = msgspec.structs.replace(
@@ -127,11 +129,10 @@ def _publish_expiry(twin: Twin, coast_s: float, now: float) -> list[Message]:
 
 
 def _coast_text(twin: Twin, coast_s: float) -> str:
-    return (
-        f"{'link lost' if twin.telemetry.link_lost else 'positions stopped'} {coast_s:.0f} s ago"
-        if coast_s or twin.telemetry.link_lost
-        else ""
-    )
+    """Describe the missing telemetry; its age is `coast_s`, as the last text is shown while the age grows."""
+    if not (coast_s or twin.telemetry.link_lost):
+        return ""
+    return "link lost" if twin.telemetry.link_lost else "positions stopped"
 
 
 def _effects_text(twin: Twin, path_forecast: PathForecast) -> str:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from fleet.autopilots.laws import remember
 from fleet.window import Window
 from twin_worker.confidence.calibration_table import error_growth
 from twin_worker.confidence.tube_and_horizon import AHEAD
@@ -37,7 +38,8 @@ def predict_route(twin: Twin, window: Window, recent: Track, ahead: np.ndarray) 
     initial = synchronise_controller(situation)
     if isinstance(initial, Rollout):
         return no_prediction(initial.sentence, initial.seq)
-    initial, failsafe_text = _with_failsafe(twin, situation, initial)
+    _store_controller_state(twin, situation.onboard.law, initial)
+    initial, failsafe_text, known_s = _with_failsafe(twin, situation, initial)
     t = float(window.t[-1])
     due = twin.prediction.selector.is_due(t)
     candidates, reason = method_paths(twin, (situation, initial), ahead, due)
@@ -46,7 +48,8 @@ def predict_route(twin: Twin, window: Window, recent: Track, ahead: np.ndarray) 
     _update_ensemble(twin, (situation, initial))
     sentence, control = " ".join(filter(None, (failsafe_text, initial.sentence))), initial.controller
     forecasts = {
-        name: PathForecast(path, name, control.law, initial.seq, sentence, control) for name, path in candidates.items()
+        name: PathForecast(path, name, control.law, initial.seq, sentence, control, known_s)
+        for name, path in candidates.items()
     }
     if twin.config.method != PAPER and (due or twin.prediction.selector.best((*forecasts, GREYBOX)) == GREYBOX):
         kinematic = predict_without_model(
@@ -55,6 +58,15 @@ def predict_route(twin: Twin, window: Window, recent: Track, ahead: np.ndarray) 
         if kinematic.path is not None and not twin.telemetry.link_lost:
             forecasts[GREYBOX] = kinematic
     return select_method(twin, t, forecasts, recent, ahead)
+
+
+def _store_controller_state(twin: Twin, law: str, initial: InitialCondition) -> None:
+    """Store the synchronised state of the controller, from which it continues when its route changes."""
+    if twin.telemetry.link_lost or twin.prediction.override is not None:
+        return
+    ctl, par, _ = initial.synchronised
+    state = remember(ctl, par, -float(initial.window.p[-1, 2]))
+    twin.prediction.store_controller_state(float(initial.window.t[-1]), law, state)
 
 
 def select_method(
@@ -85,11 +97,13 @@ def select_method(
     return replace(chosen, sentence=" ".join(filter(None, (selector.describe(chosen.method), chosen.sentence))))
 
 
-def _with_failsafe(twin: Twin, situation: PredictionContext, initial: InitialCondition) -> tuple[InitialCondition, str]:
-    """Return the start with the failsafe after a link loss, and its description."""
+def _with_failsafe(
+    twin: Twin, situation: PredictionContext, initial: InitialCondition
+) -> tuple[InitialCondition, str, float]:
+    """Return the start with the failsafe after a link loss, its description, and how far its route is known [s]."""
     plan = situation.onboard.failsafe
     if plan is None:
-        return initial, ""
+        return initial, "", np.inf
     ctl, par, legs = initial.synchronised
 
     def position_at(ctl: np.ndarray, legs: np.ndarray, times: np.ndarray) -> np.ndarray | None:
@@ -97,8 +111,8 @@ def _with_failsafe(twin: Twin, situation: PredictionContext, initial: InitialCon
         paths, _ = method_paths(twin, (situation, start), times, False)
         return next(iter(paths.values()), None)
 
-    ctl, legs, text = with_failsafe(ctl, legs, plan, position_at)
-    return replace(initial, synchronised=(ctl, par, legs)), text
+    ctl, legs, text, known_s = with_failsafe(ctl, legs, plan, position_at, float(initial.window.t[-1]))
+    return replace(initial, synchronised=(ctl, par, legs)), text, known_s
 
 
 def method_paths(

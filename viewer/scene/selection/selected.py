@@ -6,19 +6,28 @@ from typing import Any
 import numpy as np
 
 from fleet.contract import DiagnosisOutcome, Mismatch, TwinState
-from viewer.scene.labels import CameraView, Tag
+from viewer.scene.labels import CameraView, Tag, overlap
 from viewer.scene.routes import NOTHING, RouteLines
 from viewer.scene.selection.pins import EventMarkers, curtain, marked_look_aheads, rings, sample_paths, tube_faces
 from viewer.scene.strokes import Strokes, chain, circle, closed_loops, dash_lines, dashed
 from viewer.store.forecast import PastPrediction, ScenePrediction
 from viewer.store.store import FleetStore
 from viewer.store.track import positions_at
-from viewer.store.vehicle import Vehicle
-from viewer.text.words import MIN_HORIZON_S, fit, is_located, located_spans, short_text
+from viewer.store.vehicle import StatusRecord, Vehicle
+from viewer.text.words import (
+    fit_text,
+    horizon_text,
+    is_located,
+    lag_text,
+    located_spans,
+    lost_text,
+    short_text,
+)
 from viewer.theme.palette import Palette, mix, rgb, triple
 from viewer.theme.shapes import digit_strokes, face_camera
 
 MAX_NUMBERS = 60  # items up to which numbers are drawn
+NUMBER_SIZE, NUMBER_SHIFT = 0.36, 0.34  # height of a number and its offset from the item [drawn spans of an aircraft]
 Parts = list[tuple[np.ndarray, np.ndarray]]  # segments (n, 2, 3) [10 m] and their colour (3,)
 
 
@@ -55,6 +64,7 @@ def hindcast(past: list[PastPrediction], trail: np.ndarray, clock: float) -> tup
 
 BANDS, BAND_STEPS = 5, 12  # fading bands of the tube, slices per band
 BEYOND_S = 20.0  # look-ahead of the grey dashes beyond the horizon [s]
+SHORTEST_S = 0.2  # shortest stretch of tube drawn before the horizon [s]
 SAMPLES, SAMPLE_STEPS = 6, 40  # sample paths, points per path
 
 
@@ -80,6 +90,9 @@ class Selection:
         self._event_markers = EventMarkers(scene, palette)
         self._trail_start = np.inf  # start of the bright newest stretch of the path [s since 1970]
         self._track_colour = mix(palette.actual, palette.ground, 0.5)
+        self._label_boxes: list[np.ndarray] = []  # labels shown last
+        self._hidden_numbers = np.zeros(0, bool)  # items whose number a label covers
+        self._drawn_route: tuple[Vehicle, RouteLines, CameraView, float] | None = None
         self.tube = True
         self.tags: list[Tag] = []  # moving labels
         self.marks: list[Tag] = []  # labels at fixed positions
@@ -102,7 +115,7 @@ class Selection:
         for strokes in (self._thin, self._track, self._bold, self._horizon, self._mismatch):
             strokes.draw(NOTHING.legs)
         self._hide_tube()
-        self.tags, self.marks = [], []
+        self.tags, self.marks, self._drawn_route = [], [], None
 
     def draw(self, vehicle: Vehicle, store: FleetStore, now: float, *, ground: float, unit: float) -> None:
         """Draw the moving content of the UAV; `unit` is the drawn span of an aircraft [10 m]."""
@@ -121,22 +134,24 @@ class Selection:
             path = np.vstack([trail[::2], trail[-1:]])
             normal = ~is_located(path[:, 0], vehicle.mismatch)[1:]
             bold.append((chain(path[:, 1:4])[normal], rgb(p.actual)))
-        self._draw_forecast(vehicle, clock, ground, thin, bold)
+        self._draw_forecast(vehicle, vehicle.record(now), clock, ground, (thin, bold))
         lines, label = hindcast(store.past(vehicle), trail, clock)
         thin.append((lines, mix(p.horizon, p.ground, 0.85)))
         self.tags += [label] if label is not None else []
         self._thin.draw_parts(thin)
         self._bold.draw_parts(bold)
 
-    def _draw_forecast(self, vehicle: Vehicle, clock: float, ground: float, thin: Parts, bold: Parts) -> None:
-        forecast, p = vehicle.forecast, self._palette
+    def _draw_forecast(
+        self, vehicle: Vehicle, record: StatusRecord, clock: float, ground: float, strokes: tuple[Parts, Parts]
+    ) -> None:
+        (thin, bold), forecast, p = strokes, vehicle.forecast, self._palette
         if forecast is None:
             return self._hide_tube()
-        start = max(clock - forecast.t, 0.0)
-        if start >= forecast.horizon_s - 0.2:
+        start, horizon_s = max(clock - forecast.t, 0.0), record.horizon_s
+        if not horizon_s:
             self._hide_tube()
             return thin.append((_beyond_horizon(forecast, start), rgb(p.muted)))
-        horizon_s = forecast.horizon_s
+        start = min(start, horizon_s - SHORTEST_S)
         at = np.linspace(start, horizon_s, BANDS * BAND_STEPS + 1)
         path, axes = forecast.position_at(at), forecast.half_axes_at(at)
         sections = rings(path, axes)
@@ -152,20 +167,20 @@ class Selection:
             at = np.linspace(start, horizon_s, SAMPLE_STEPS)
             paths = sample_paths(forecast.position_at(at), forecast.half_axes_at(at), SAMPLES, vehicle.uav)
             thin.append((chain(paths), mix(p.tube, p.ground, 0.6)))
-        self._draw_marks(forecast, start, thin)
+        self._draw_marks(forecast, record, start, thin)
         thin.append((_beyond_horizon(forecast, horizon_s), rgb(p.muted)))
 
-    def _draw_marks(self, forecast: ScenePrediction, start: float, thin: Parts) -> None:
+    def _draw_marks(self, forecast: ScenePrediction, record: StatusRecord, start: float, thin: Parts) -> None:
         """Draw rings of the tube at marked look-aheads and at the horizon."""
-        p, horizon_s = self._palette, forecast.horizon_s
+        p, horizon_s = self._palette, record.horizon_s
         steps = [s for s in marked_look_aheads(horizon_s) if s > start + 1.0][-4:]
         at = np.array([0.0, *steps, horizon_s])
         sections = rings(forecast.position_at(at), forecast.half_axes_at(at))[1:]
         thin.append((closed_loops(sections[:-1]), mix(p.tube, p.ink, 0.7)))
         self._horizon.draw(closed_loops(sections[-1]), rgb(p.horizon))
-        claim = "below 10 % to the end" if forecast.message.horizon_open else "error reaches 10 %"
+        claim = "below 10 % to the end" if record.horizon_open else "error reaches 10 %"
         top = sections[-1][np.argmax(sections[-1][:, 2])]
-        self.tags.append(Tag("horizon", f"horizon {horizon_s:.0f} s: {claim}", top, "bottom-left"))
+        self.tags.append(Tag("horizon", f"horizon {horizon_text(record)}: {claim}", top, "bottom-left"))
         lows = [ring[np.argmin(ring[:, 2])] for ring in sections[:-1]]
         self.tags += [Tag(f"+{s:g}", f"+{s:g} s", low) for s, low in zip(steps, lows, strict=True)]
 
@@ -185,11 +200,33 @@ class Selection:
         if mismatch is not None and onset is not None:
             self.marks.insert(0, Tag("mismatch", f"▲ {short_text(mismatch)} from here", onset))
 
+    def move_numbers(self, boxes: list[np.ndarray], camera_view: CameraView) -> None:
+        """Draw the route again when labels, (2, 2) [image heights], cover other numbers than before."""
+        self._label_boxes = boxes
+        if self._drawn_route is not None:
+            _, route, _, unit = self._drawn_route
+            if not np.array_equal(self._hidden_numbers, self._covered(route, camera_view, unit)):
+                self.draw_route(*self._drawn_route[:2], camera_view, unit)
+
+    def _covered(self, route: RouteLines, camera_view: CameraView, unit: float) -> np.ndarray:
+        """Return a mask (n,) of the items whose number lies in the box of a label."""
+        right, up = camera_view.axes()
+        size = NUMBER_SIZE * unit
+        corners = [np.zeros(3), 2 * size * right + size * up] + NUMBER_SHIFT * unit * (right + up)
+        covered = np.zeros(len(route.points), bool)
+        for k, point in enumerate(route.points if self._label_boxes else ()):
+            number, depth = camera_view.project(point + corners)
+            covered[k] = (depth > 0).all() and any(overlap(number, box) for box in self._label_boxes)
+        return covered
+
     def draw_route(self, vehicle: Vehicle, route: RouteLines, camera_view: CameraView, unit: float) -> None:
         """Draw its mission: legs and loiters solid, jumps and returns dashed, a ring and a number at each item.
 
-        The numbers face the camera. The active item and its leg are highlighted. `unit` is as for `draw`.
+        The numbers face the camera and give way to labels. The active item and its leg are highlighted. `unit` is as
+        for `draw`.
         """
+        self._drawn_route = vehicle, route, camera_view, unit
+        self._hidden_numbers = self._covered(route, camera_view, unit)
         p, seq = self._palette, active_seq(vehicle)
         right, up = camera_view.axes()
         lines = [
@@ -197,16 +234,16 @@ class Selection:
             (dash_lines(route.returns, 1.2 * unit), mix(p.route, p.ground, 0.5)),
         ]
         leg = []
-        for point, item in zip(route.points, route.items.tolist(), strict=True):
+        for point, item, hidden in zip(route.points, route.items.tolist(), self._hidden_numbers, strict=True):
             ring = circle(point, 0.22 * unit, 14)
             if item == seq:
                 leg.append((ring, rgb(p.ink)))
             else:
                 lines.append((ring, rgb(p.route)))
-            if len(route.items) <= MAX_NUMBERS:
-                number = face_camera(digit_strokes(str(item), 0.42 * unit), right, up)
+            if len(route.items) <= MAX_NUMBERS and not hidden:
+                number = face_camera(digit_strokes(str(item), NUMBER_SIZE * unit), right, up)
                 colour = rgb(p.ink) if item == seq else mix(p.ink, p.route, 0.35)
-                lines.append((number + point + 0.34 * unit * (right + up), colour))
+                lines.append((number + point + NUMBER_SHIFT * unit * (right + up), colour))
         leg.append((route.legs[route.ends == seq], rgb(p.route)))
         self._route.draw_parts(lines)
         self._leg.draw_parts(leg)
@@ -220,18 +257,14 @@ def _beyond_horizon(forecast: ScenePrediction, start: float) -> np.ndarray:
 
 def selection_text(vehicle: Vehicle, now: float) -> str:
     """Describe the selected UAV and its status in one line."""
-    forecast = vehicle.forecast
-    if forecast is None:
-        horizon = "  no prediction yet"
-    else:
-        horizon = f"  horizon {forecast.horizon_s:.0f} s" if forecast.horizon_s >= MIN_HORIZON_S else "  no horizon"
-    if lag_s := vehicle.prediction_lag_s(now):
-        horizon = f"  prediction {lag_s:.0f} s old"
     if vehicle.ended:
         return f"{vehicle.name}  end of the recording"
-    lost = f"  link lost {vehicle.sample_age_s(now):.0f} s" if vehicle.state(now) is TwinState.LINK_LOST else ""
-    mean = fit(vehicle)
-    return vehicle.name + (lost or (f"  fit {mean:.0f} %" if mean is not None else "") + horizon)
+    record = vehicle.record(now)
+    lag = f"  {lag_text(record)}" if record.prediction_lag_s else ""
+    if record.state is TwinState.LINK_LOST:
+        return f"{vehicle.name}  {lost_text(record)}{lag}"
+    horizon = f"  horizon {horizon_text(record)}" if record.horizon_s else "  no horizon"
+    return f"{vehicle.name}  fit {fit_text(record)}{horizon if record.prediction_age_s is not None else ''}{lag}"
 
 
 MAX_POINTS = 200  # points of a segment

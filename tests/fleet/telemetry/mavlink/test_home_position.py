@@ -1,10 +1,15 @@
 """Home of an ArduPilot mission: item 0 as downloaded, HOME_POSITION, and what changes when home moves."""
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from fleet.contract import Mission
+from fleet.contract import Mission, Status
+from fleet.telemetry.mavlink.aircraft_link import AircraftLink
+from fleet.telemetry.mavlink.arrays.fleet_arrays import AircraftArrays
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
+from fleet.telemetry.onboard_logs.px4_missions import read_missions
+from fleet.telemetry.onboard_logs.topic import Topic
 from gateway.onboard import RequestSender
 from tests.support.talker import T0, Ears, Talker, of
 
@@ -52,8 +57,12 @@ def test_a_home_without_position_and_that_of_px4_replace_nothing():
     assert px4[-1].items[1].alt_m == pytest.approx(50.0 + 400.1)  # its altitudes are relative to home
 
 
-def test_home_is_requested_where_the_mission_came_before_it():
-    _, intake = heard(mission)
+@pytest.mark.parametrize(
+    ("autopilot", "first"),
+    [(mav.MAV_AUTOPILOT_ARDUPILOTMEGA, mission), (PX4, lambda talker: mission(talker, 465_000_000, 70_000_000, 50.0))],
+)
+def test_home_is_requested_where_the_mission_came_before_it_or_never_contains_it(autopilot, first):
+    _, intake = heard(first, autopilot=autopilot)
     onboard = RequestSender()
 
     def requested(t):
@@ -70,3 +79,30 @@ def test_home_is_requested_where_the_mission_came_before_it():
     intake.receive(T0 + 3.5, home(Talker()), "air")
     intake.flush(T0 + 4)
     assert not requested(T0 + 6)
+
+
+def test_every_status_carries_the_newest_home_and_none_before_the_autopilot_has_one():
+    intake, talker, news = MavlinkReceiver(), Talker(), []
+    for k, part in enumerate([b"", home(talker, 0, 0, 0), home(talker), home(talker, lat=465_000_500, alt_mm=399_000)]):
+        intake.receive(T0 + k, talker.heartbeat(autopilot=PX4) + part, "air")
+        news += intake.flush(T0 + k + 0.5)
+    assert [status.home for status in of(Status, news)[-3:]] == [
+        None,
+        (465_000_000, 70_000_000, 400_100),
+        (465_000_500, 70_000_000, 399_000),
+    ]
+
+
+def test_a_ulog_reports_home_with_its_altitude_and_its_place_where_that_is_valid():
+    t = np.arange(3.0)
+    columns = {"lat": [46.5, 46.5, 46.6], "lon": [7.0, 7.0, 7.1], "alt": [400.0, 401.0, 402.0]}
+    flags = {"valid_hpos": [0, 1, 1], "valid_alt": [1, 1, 0]}
+    data = {name: np.array(values, float) for name, values in (columns | flags).items()}
+    events = read_missions({"home_position": Topic(t, data, {})}, None).events
+    assert [(event.t, event.kind) for event in events] == [(0.0, "home"), (1.0, "home")]
+    aircraft = AircraftLink(AircraftArrays(), 1, 1, 1)
+    homes = []
+    for event in events:
+        aircraft.process_log_event(event, T0)
+        homes.append(aircraft.home)
+    assert homes == [None, (465_000_000, 70_000_000, 401_000)]

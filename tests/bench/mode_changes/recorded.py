@@ -1,16 +1,7 @@
-"""Predictions after a change of flight mode, beside those of undisturbed flight, on recordings.
+"""Changes of flight mode in recordings: the first prediction along the route of the new mode, and its error."""
 
-    python -m tests.bench.mode_changes s03_nominal_modes.tlog.xz
-
-For each change to a mode that the autopilot flies by itself: the delay until the first prediction along the route of
-the new mode, and its error 10 s later over the median error of predictions in undisturbed flight (no change within
-40 s).
-"""
-
-import argparse
-import json
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -110,29 +101,18 @@ def _error(flight: ReferenceFlight, p: Prediction) -> float | None:
     return float(np.linalg.norm(flight.positions_at(p.ned_origin(), instant)[0] - predicted))
 
 
-def main() -> None:
-    """Print the table."""
-    form = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("python -m tests.bench.mode_changes", description=__doc__, formatter_class=form)
-    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="recordings")
-    parser.add_argument("--json", type=Path, help="write the changes to FILE")
-    args = parser.parse_args()
-    changes = []
-    print("| recording | at [s] | change | follows after [s] | method | error at 10 s [m] | undisturbed [m] | met |")
-    print("|---|---|---|---|---|---|---|---|", flush=True)
-    for path in args.files:
+def report(paths: Iterable[Path]) -> Iterable[tuple[str, ModeChange | None]]:
+    """Yield the lines of a table, each with its change."""
+    yield (
+        "| recording | at [s] | change | follows after [s] | method | error at 10 s [m] | undisturbed [m] | met |",
+        None,
+    )
+    yield "|---|---|---|---|---|---|---|---|", None
+    for path in paths:
         for c in measure(path.name, replay_messages(path)):
-            changes.append(c)
             delay, error = ("—" if x is None else f"{x:.1f}" for x in (c.delay_s, c.error_m))
-            print(
+            line = (
                 f"| {c.recording}:uav-{c.uav} | {c.t:.0f} | {c.before} to {c.after} | {delay} | {c.method} | {error} "
-                f"| {c.usual_m:.1f} | {'yes' if c.is_met else 'no'} |",
-                flush=True,
+                f"| {c.usual_m:.1f} | {'yes' if c.is_met else 'no'} |"
             )
-    print(f"{sum(c.is_met for c in changes)} of {len(changes)} met", flush=True)
-    if args.json:
-        args.json.write_text(json.dumps([asdict(c) for c in changes], indent=1) + "\n")
-
-
-if __name__ == "__main__":
-    main()
+            yield line, c

@@ -1,0 +1,150 @@
+"""Wrong inputs: each is answered in one last line with what was found and expected, and ends with exit code 2."""
+
+import json
+import logging
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+
+from fleet import cli
+from fleet.commands.offline.completion import SCRIPTS, verb_parsers
+from fleet.process import logs
+from gateway import __main__ as gateway
+from twin_worker import __main__ as twin_worker
+from viewer import __main__ as viewer
+
+MAINS = {"fleet": cli.main, "gateway": gateway.main, "twin_worker": twin_worker.main, "viewer": viewer.main}
+ANSWERS = {  # command line -> part of the last line
+    "fleet": "found no verb, expected assess, calibrate",
+    "fleet statsu": "found no verb 'statsu', expected assess, calibrate",
+    "fleet STATUS": "did you mean status?",
+    "fleet --verison": "found no option '--verison', expected one of the usage above; did you mean --version?",
+    "fleet status --routr x": "found no option '--routr', expected one of the usage above; did you mean --router?",
+    "fleet status --router": "--router: found no value, expected one; write it after --router",
+    "fleet status --json=yes": "--json: found value 'yes', expected none; leave it out",
+    "fleet status extra": "found 'extra' behind all arguments, expected nothing more; leave it out",
+    "fleet status --router nonsense": "--router: found 'nonsense', expected e.g. tcp/127.0.0.1:7447",
+    "fleet status --router tcp/127.0.0.1:1": "router tcp/127.0.0.1:1: no response; start `zenohd` or `fleet up`",
+    "fleet status --config nosuch.toml": "found no file 'nosuch.toml', expected one; check the path",
+    "fleet status --config folder": "found a folder 'folder', expected a file; name a file in it",
+    "fleet status --config bad.toml": "--config: found invalid TOML in bad.toml",
+    "fleet up --uavs x": "--uavs: found 'x', expected a whole number; correct it",
+    "fleet up --uavs 0": "--uavs: found 0, expected 1 to 250 aircraft",
+    "fleet up --re x": "--re: found an abbreviation of --replay, --results; write one in full",
+    "fleet up --autopilot ardu": "--autopilot: found 'ardu', expected ardupilot, px4; did you mean ardupilot?",
+    "fleet up --replay nosuch.tlog": "--replay: found no file 'nosuch.tlog', expected a recording; check the path",
+    "fleet up --replay folder": "--replay: found a folder 'folder', expected a recording; name a file in it",
+    "fleet up --for nan": "--for: found 'nan', expected a number; correct it",
+    "fleet up --for inf": "--for: found 'inf', expected a number; correct it",
+    "fleet up --port 99999": "--port: found 99999, expected 1 to 65535; choose another port",
+    "fleet up --mavlink 127.0.0.1": "--mavlink: found '127.0.0.1', expected HOST:PORT such as 127.0.0.1:14550",
+    "fleet up --terrain nosuch.tif": "--terrain: found no file 'nosuch.tif', expected a raster file; check the path",
+    "fleet up --imagery folder": "--imagery: found a folder 'folder', expected a raster file; name a file in it",
+    "fleet up --fault nosuch": "fault: found 'nosuch', expected one of actuator_lag",
+    "fleet inspect": "FILE: found none, expected at least one recording; name one",
+    "fleet inspect nosuch.tlog": "FILE: found no file 'nosuch.tlog', expected a recording; check the path",
+    "fleet inspect folder": "FILE: found a folder 'folder', expected a recording; name a file in it",
+    "fleet assess folder": "FILE: found a folder 'folder', expected a recording; name a file in it",
+    "fleet calibrate text.txt": "--out: found none, expected one; add it",
+    "fleet whatif seven": "uav: found 'seven', expected a whole number; correct it",
+    "fleet whatif 7 --wind 3": "--wind: found 1 numbers, expected north and east; write e.g. --wind=6,-2",
+    "fleet schema predictoin": "did you mean prediction?",
+    "fleet effects nosuch": "found 'nosuch', expected an effect such as actuator_stuck",
+    "fleet completion tcsh": "shell: found 'tcsh', expected bash, zsh, fish",
+    "gateway --link udp:": "--link: found 'udp:', expected udpin, udpout, udpbcast, tcpin, tcp, serial, replay",
+    "gateway --link upd:127.0.0.1:14550": "each with an address behind a :; did you mean udpin?",
+    "gateway --link udpin:127.0.0.1": "expected udpin:HOST:PORT; write e.g. udpin:127.0.0.1:14550",
+    "gateway --link serial:/dev/ttyUSB0:x7:0": "expected serial:PATH:BAUD; write e.g. serial:/dev/ttyUSB0:57600",
+    "gateway --record text.txt": "--record: 'text.txt' cannot be created (File exists); name another folder",
+    "gateway --record-budget lots --record r": "--record-budget: found 'lots', expected a size such as 500M or 10G",
+    "gateway --keys folder": "found a folder 'folder', expected a file; name a file in it",
+    "gateway --most-uavs 0": "--most-uavs: found 0, expected at least 1; write e.g. 250",
+    "twin_worker --uavs 9-3": "--uavs: found '9-3', expected a range of ids such as 0-49; write the lower one first",
+    "twin_worker --separation 5": "--separation: found '5', expected two distances in m, e.g. 50,20; correct it",
+    "twin_worker --omega nan": "--omega: found 'nan', expected a number; correct it",
+    "twin_worker --processes 0": "--processes: found 0, expected 1 to 256; set one per core",
+    "viewer --terrain nosuch.tif": "--terrain: found no file 'nosuch.tif', expected a raster file; check the path",
+    "viewer --imagery folder": "--imagery: found a folder 'folder', expected a raster file; name a file in it",
+    "viewer --terrain text.txt": "text.txt: found no readable raster",
+    "viewer --port 0": "--port: found 0, expected 1 to 65535; choose another port",
+    "viewer --ligth": "found no option '--ligth', expected one of the usage above; did you mean --light?",
+}
+ARGPARSE = re.compile(
+    r"invalid choice|invalid \w+ value|unrecognized|the following arguments|\bargument -|error:|Errno"
+)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A folder to work in; the commands set up logging, which is undone."""
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "text.txt").write_text("no recording\n")
+    (tmp_path / "bad.toml").write_text("[router\n")
+    monkeypatch.chdir(tmp_path)
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+    yield
+    root.handlers[:] = handlers
+    root.setLevel(level)
+
+
+@pytest.mark.parametrize("line", ANSWERS)
+def test_a_wrong_input_is_answered_in_one_line(line: str, folder: None, capsys: pytest.CaptureFixture[str]) -> None:
+    program, *words = line.split()
+    try:
+        code = MAINS[program](words)
+    except SystemExit as left:
+        code = left.code
+    said = capsys.readouterr().err
+    last = logs.strip_time(said.splitlines()[-1])
+    verb = f"fleet {words[0]}" if program == "fleet" and words and words[0] in cli.command_modules() else program
+    assert code == 2 and last.startswith(f"{verb}: ") and ANSWERS[line] in last
+    assert not ARGPARSE.search(said) and "Traceback" not in said and len(last) < 1000
+    if "usage" in said.partition("\n")[0]:  # that of the verb
+        assert said.startswith(f"usage: {verb} ")
+
+
+def test_version_and_help_of_all_commands_compile_and_import_nothing_heavy() -> None:
+    """What takes time is imported when a command runs; the modules are counted, as seconds are the machine's."""
+    code = """
+import json, sys
+from importlib import import_module
+found = {}
+for name in ("fleet.cli", "gateway.__main__", "twin_worker.__main__", "viewer.__main__"):
+    main = import_module(name).main
+    for option in ("--version", "--help"):
+        try:
+            main([option])
+        except SystemExit as left:
+            found[name + option] = left.code
+heavy = [name for name in ("numba", "scipy", "zenoh", "viser", "pymavlink", "jsbsim") if name in sys.modules]
+print(json.dumps([found, heavy]), file=sys.stderr)
+"""
+    line = [sys.executable, "-W", "error", "-c", code]
+    done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
+    found, heavy = json.loads(done.stderr)
+    assert set(found.values()) == {0} and len(found) == 8 and heavy == []
+    assert done.stdout.count("parauav ") == 4 and "examples:" in done.stdout
+
+
+def test_completion_offers_all_verbs_and_their_options() -> None:
+    verbs = verb_parsers()
+    assert set(verbs) == set(cli.command_modules())
+    for script in SCRIPTS.values():
+        text = script(verbs)
+        assert all(name in text for name in verbs) and "autopilot" in text
+    ask = 'source /dev/stdin; COMP_WORDS=(fleet {}); COMP_CWORD={}; _fleet; echo "${{COMPREPLY[@]}}"'
+    for words, n, expected in (("st", 1, "status"), ("status --r", 2, "--router"), ("completion z", 2, "zsh")):
+        done = subprocess.run(
+            ["bash", "-c", ask.format(words, n)],
+            input=SCRIPTS["bash"](verbs),
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert done.stdout.strip() == expected and done.stderr == ""

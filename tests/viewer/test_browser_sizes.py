@@ -1,0 +1,213 @@
+"""The page in a browser on a phone, a laptop and a large screen, dark and light: boxes, contrast, keys, one truth."""
+
+import threading
+import time
+from collections.abc import Iterator
+from itertools import combinations
+from types import SimpleNamespace
+
+import msgspec
+import numpy as np
+import pytest
+from conftest import unused_port
+
+from fleet.contract import Prediction, TwinState
+from tests.bench.viewing.page import PLACES, differing
+from tests.support.memory_bus import MemoryBus
+from tests.support.pretend_feed import PretendFleet
+from tests.viewer.test_browser import ARGS, IN_SCENE, PATIENCE_MS, SCHEME
+from viewer.browser.http_server import serve, without_stdout
+from viewer.scene.labels import EM_PX, overlap
+from viewer.server.app import App
+
+pytestmark = pytest.mark.browser
+UAVS, LOST = 10, 5
+SIZES = {"1280x720": (1280, 720), "1920x1080": (1920, 1080), "390x844": (390, 844)}
+FONT = 'system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif'
+CUT = """() => {
+  const bad = [], seen = e => e.getClientRects().length && getComputedStyle(e).visibility !== 'hidden';
+  const boxes = [...document.querySelectorAll('.uav h1, .uav td, .uav th, .uav .card b, .uav .chip, .legend span, ' +
+    '.uav.buttons button, .uav .say')].filter(seen);
+  for (const e of boxes) {
+    const r = e.getBoundingClientRect();
+    const block = getComputedStyle(e).display !== 'inline';
+    if (block && e.scrollWidth > e.clientWidth + 1) bad.push('cut: ' + e.textContent);
+    if (r.right > innerWidth + 1 || r.left < -1) bad.push('outside: ' + e.textContent);
+  }
+  for (const group of ['.legend', '.uav .cards', '.uav.buttons', 'tr.on']) {
+    const parts = [...(document.querySelector(group) || {children: []}).children].filter(seen);
+    parts.forEach((a, i) => parts.slice(i + 1).forEach(b => {
+      const p = a.getBoundingClientRect(), q = b.getBoundingClientRect();
+      if (p.left < q.right - 1 && q.left < p.right - 1 && p.top < q.bottom - 1 && q.top < p.bottom - 1)
+        bad.push('overlap: ' + a.textContent + ' | ' + b.textContent);
+    }));
+  }
+  return bad;
+}"""
+CONTRAST = """() => {
+  const parse = text => (text.match(/[\\d.]+/g) || [0, 0, 0, 0]).map(Number);
+  const light = c => c.slice(0, 3).map(v => v / 255).map(v => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
+    .reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
+  const behind = e => { for (; e; e = e.parentElement) {
+    const c = parse(getComputedStyle(e).backgroundColor);
+    if (c.length < 4 || c[3] > 0.99) return c; } return [0, 0, 0]; };
+  const bad = [];
+  for (const e of document.querySelectorAll('.uav *')) {
+    const own = [...e.childNodes].some(n => n.nodeType === 3 && n.textContent.trim());
+    if (!own || !e.getClientRects().length || e.closest('svg, tr.on')) continue;
+    const [a, b] = [light(parse(getComputedStyle(e).color)), light(behind(e))];
+    const ratio = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
+    const sign = e.textContent.trim().length === 1 && !/\\w/.test(e.textContent);  // graphics need less
+    if (ratio < (sign ? 3 : 4.5)) bad.push(ratio.toFixed(2) + ' ' + e.textContent.slice(0, 40));
+  }
+  return bad;
+}"""
+WIDTHS = """([texts, font]) => { const pen = document.createElement('canvas').getContext('2d'); pen.font = font;
+  return texts.map(text => pen.measureText(text).width); }"""
+SHARE = "window.__viserMutable.canvas.getBoundingClientRect().width / innerWidth"
+AT_ZERO_SCROLL = "document.documentElement.scrollWidth <= innerWidth"
+
+
+class Wild(PretendFleet):
+    """A fleet whose horizons and fits change with each message, and one of which falls silent."""
+
+    def __init__(self, bus: MemoryBus) -> None:
+        super().__init__(bus, UAVS)
+        publish, start = bus.publish, time.time()
+
+        def changed(message, *more):
+            if isinstance(message, Prediction):
+                message = msgspec.structs.replace(message, horizon_s=6.0 + (message.t * 7.0) % 20.0)
+            publish(message, *more)
+
+        bus.publish, self._silent_from = changed, start + 1.0
+        self.uavs[LOST].state = TwinState.LINK_LOST
+
+    def advance(self, t: float) -> None:  # type: ignore[override]
+        super().advance(t, lost_since=self._silent_from)
+
+
+@pytest.fixture(scope="module")
+def live(chromium: str) -> Iterator[SimpleNamespace]:
+    """A viewer in this process with a fleet that flies, and a browser with its page."""
+    from playwright.sync_api import sync_playwright
+
+    port, bus, stop = unused_port(), MemoryBus(), threading.Event()
+    server = serve("127.0.0.1", port)
+    app, fleet = App(bus, server), Wild(bus)
+
+    def fly() -> None:
+        while not stop.wait(0.1):
+            fleet.advance(time.time())
+
+    threads = [threading.Thread(target=fly), threading.Thread(target=app.run, args=(stop,))]
+    for thread in threads:
+        thread.start()
+    errors: list[str] = []
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=ARGS)
+        page = browser.new_page(viewport={"width": 1280, "height": 720})
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(f"http://127.0.0.1:{port}/?fixedDpr=0.5")
+        page.wait_for_function(IN_SCENE, timeout=PATIENCE_MS)
+        yield SimpleNamespace(page=page, app=app, errors=errors)
+        browser.close()
+    stop.set()
+    for thread in threads:
+        thread.join()
+    with without_stdout():
+        server.stop()
+
+
+def until(page, true) -> None:
+    """Let the page go on until something is true of the server."""
+    for _ in range(600):
+        if true():
+            return
+        page.evaluate("new Promise(done => setTimeout(done, 100))")
+    pytest.fail("it never was")
+
+
+def view_of(live: SimpleNamespace):
+    return next(iter(live.app.views.values()))
+
+
+def drawn_since(view, live: SimpleNamespace) -> bool:
+    """Let the labels be drawn once more."""
+    before = view._labels.boxes
+    until(live.page, lambda: view._labels.boxes is not before)
+    return True
+
+
+def test_keys_select_the_next_and_the_previous_row(live: SimpleNamespace) -> None:
+    page = live.page
+    rows = "[...document.querySelectorAll('.uav.list tr.pick')].findIndex(row => row.classList.contains('on'))"
+    page.locator("tr.pick").first.dispatch_event("pointerdown")
+    page.wait_for_function(f"{rows} === 0", timeout=PATIENCE_MS)
+    uav = page.evaluate("document.querySelectorAll('tr.pick')[1].dataset.uav")
+    page.keyboard.press("j")
+    page.wait_for_function("uav => document.querySelector('tr.on').dataset.uav === uav", arg=uav, timeout=PATIENCE_MS)
+    page.keyboard.press("k")
+    page.wait_for_function("uav => document.querySelector('tr.on').dataset.uav !== uav", arg=uav, timeout=PATIENCE_MS)
+    assert live.errors == []
+
+
+@pytest.mark.parametrize("uav", [0, LOST])
+def test_list_and_tiles_always_tell_the_same(live: SimpleNamespace, uav: int) -> None:
+    """Three seconds of each, twenty looks a second; `python -m tests.bench.viewing --consistency 60` looks longer."""
+    page = live.page
+    page.locator(f'tr[data-uav="{uav}"]').dispatch_event("pointerdown")
+    page.wait_for_function(
+        "uav => document.querySelector('tr.on').dataset.uav === uav", arg=str(uav), timeout=PATIENCE_MS
+    )
+    samples = page.evaluate(PLACES, 3.0)
+    assert len(samples) > 10 and len({tuple(one["row"]) for one in samples}) > 2
+    assert differing(samples) == []
+
+
+@pytest.mark.parametrize("light", [False, True], ids=["dark", "light"])
+@pytest.mark.parametrize("size", SIZES)
+def test_nothing_is_cut_or_covered_at_this_size(live: SimpleNamespace, size: str, *, light: bool) -> None:
+    page, (width, height) = live.page, SIZES[size]
+    page.set_viewport_size({"width": width, "height": height})
+    view_of(live).browser.set_theme(light=light)
+    page.wait_for_function(SCHEME, arg="light" if light else "dark", timeout=PATIENCE_MS)
+    until(page, lambda: view_of(live).browser.layout[:2] == (width, height) and view_of(live).palette.dark != light)
+    view = view_of(live)
+    until(page, lambda: view.selection.tags and view.panels._table.content and view._labels.boxes)
+    page.locator("tr.on").first.wait_for(state="attached", timeout=PATIENCE_MS)
+    if width > 600:
+        page.wait_for_function(f"{SHARE} >= 0.6", timeout=PATIENCE_MS)
+    page.wait_for_function(f"({CUT})().length === 0", timeout=5_000)
+    assert page.evaluate(CUT) == [] and page.evaluate(CONTRAST) == [] and page.evaluate(AT_ZERO_SCROLL)
+    until(page, lambda: (view.browser.layout.bottom > 0.4 * height) == (width < 600))  # the sheet, or the timeline
+    layout = view.browser.layout
+    until(page, lambda: view.camera.view().bottom_px == layout.bottom and drawn_since(view, live))
+    assert 0 < layout.top < 80
+    nodes = [node for node in view._labels._nodes if node.visible]
+    texts = [node.text for node in nodes]
+    widths = page.evaluate(WIDTHS, [texts, f"{EM_PX}px {FONT}"])
+    boxes = list(view._labels.boxes)
+    assert not any(overlap(a, b) for a, b in combinations(boxes, 2))
+    assert all(box[0, 1] >= -0.5 + layout.bottom / height and box[1, 1] <= 0.5 - layout.top / height for box in boxes)
+    room = sorted(float(box[1, 0] - box[0, 0]) * height for box in boxes)
+    assert (
+        len(widths) != len(room) or (np.array(room) > np.sort(widths)).all()
+    )  # else a label has come or gone meanwhile
+    assert live.errors == []
+
+
+def test_a_phone_has_list_detail_and_timeline_as_sheets(live: SimpleNamespace) -> None:
+    page = live.page
+    page.set_viewport_size({"width": 390, "height": 844})
+    page.locator('tr[data-uav="3"]').click(timeout=PATIENCE_MS)
+    page.wait_for_function("document.querySelector('tr.on').dataset.uav === '3'", timeout=PATIENCE_MS)
+    for name, shown in (("Selected", ".uav .cards"), ("Timeline", ".uav.buttons")):
+        bar = page.get_by_role("button", name=f"Expand panel {name}")
+        assert bar.bounding_box()["height"] >= 44  # for a thumb
+        bar.press("Enter")
+        page.locator(shown).wait_for(state="visible", timeout=PATIENCE_MS)
+        assert not page.locator(".uav.list").is_visible()
+        page.get_by_role("button", name=f"Collapse panel {name}").dispatch_event("click")
+        page.locator(".uav.list").wait_for(state="visible", timeout=PATIENCE_MS)
+    assert page.evaluate("document.elementFromPoint(195, 200).tagName") == "CANVAS" and live.errors == []
