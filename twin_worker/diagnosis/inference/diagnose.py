@@ -31,7 +31,7 @@ from twin_worker.diagnosis.model.weather import own_weather
 
 # least probability that effects of the catalogue, and nothing else, act; and of each from held-out data alone [-]
 NAMED_PROBABILITY = 0.5
-SUSPECTED_PROBABILITY = 0.2  # the same, for a suspicion [-]
+SUSPECTED_PROBABILITY = 0.1  # the same, for a suspicion of separable effects [-]
 MAX_CLASS = 4  # largest number of effects that a name may stand for
 MAX_RATIO = 3.0  # largest mean square of a channel over its usual without a better explanation [-]
 _MAX_SPEED_RATIO = 1.7  # a larger speed ratio means another aircraft
@@ -280,4 +280,5 @@ def _outcome(decision: Decision, confirmed: bool, fits: bool) -> ReportOutcome:
     separable = all(1 + len(member.rivals) <= MAX_CLASS for member in members)
     if confirmed and separable and decision.effects > NAMED_PROBABILITY:
         return ReportOutcome.NAMED
-    return ReportOutcome.SUSPECTED if decision.effects > SUSPECTED_PROBABILITY else ReportOutcome.NONE
+    least = SUSPECTED_PROBABILITY if separable else NAMED_PROBABILITY
+    return ReportOutcome.SUSPECTED if decision.effects > least else ReportOutcome.NONE

@@ -27,6 +27,7 @@ _N_REFINED = {1: 12, 2: 6, 3: 4}  # hypotheses refined per scan, by size of the 
 _BEAM = {1: 3, 2: 2}  # sets of each size that are extended
 _MIN_SCAN_GAIN = 40.0  # gain of the scan below which a hypothesis is not refined
 _REFINE_SHARE = 0.6  # share of the best score from which the onset is refined
+BESIDE_SHARE = 0.5  # share of the gain of effects above which a change beside them is more than their model error [-]
 _PRUNED_NATS = 6.0  # a set this far below the best one is not extended
 
 ReportProgress = Callable[[str], None]
@@ -201,7 +202,8 @@ class Search:
         if (best := self.best()) is not None:
             given = self.whitened.conditioned(tuple(member.hypothesis for member in best.members))
             for anomaly in find_anomalies(given):
-                self._add_anomaly(best, anomaly)
+                if anomaly.net_gain > BESIDE_SHARE * best.gain:
+                    self._add_anomaly(best, anomaly)
         gain, _ = turbulence_evidence(self.whitened)
         if gain.any():
             self._explanations[(TURBULENCE,)] = Explanation((), gain, change=TURBULENCE)
