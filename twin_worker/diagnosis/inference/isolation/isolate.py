@@ -102,7 +102,7 @@ class Scanner:
                         i = steps.gates + offset
                         b = b - np.einsum("mci,mc->mi", new[i] - slopes.J[i], profiled[i])
                 x = (steps.inverse @ b[..., None])[..., 0]
-                gain = (b * x).sum(axis=1)
+                gain = np.nan_to_num((b * x).sum(axis=1))  # an effect that the flight does not excite has no gain
                 best = int(np.argmax(gain))
                 fitted = slopes.zero.with_parameters(x[best] / slopes.scale, steps.onsets[best])
                 out.append(ScoredHypothesis(float(gain[best]), fitted))

@@ -140,7 +140,7 @@ class Search:
 
     def _nominal_nats(self, gain: float) -> float:
         """Return the cost of a difference to the nominal flights with a gain [nat]."""
-        return 0.5 * (len(self.whitened.base.flights) + 1) * float(np.log1p(gain / self._nominal_constant))
+        return 0.5 * (len(self.whitened.base.flights) + 1) * float(np.log1p(max(gain, 0.0) / self._nominal_constant))
 
     def _constant_gain(self, member: ScoredHypothesis, members: Sequence[ScoredHypothesis]) -> float:
         """Return the gain of an effect without its onset, the larger of alone and given the other members."""
