@@ -126,6 +126,7 @@ MESSAGES = (
         latency_worst_s=0.3,
         round_trip_s=0.1,
         gps_offset_s=0.06,
+        home=(470_000_000, 80_000_000, 400_100),
         sentence="link lost 3 s ago",
     ),
     Mission(uav=UAV, t=T, items=(ITEM,), seq=1, complete=True, sentence="fine"),

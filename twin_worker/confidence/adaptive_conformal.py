@@ -1,14 +1,16 @@
 """Adapt tube and horizon to one aircraft by the scores of its own past predictions.
 
-The factor on a table's half-axes is a quantile of the aircraft's own scores; the table counts as a few more scores.
-The quantile level rises at each miss and falls a little at each hit, within bounds. Short look-aheads are scored
-first; their common factor also scales the longer ones.
+The factor on a table's half-axes is the product of two: of each axis, by the mean logarithm of the aircraft's own
+errors, which says how calm its air and how exact its model is; and of each look-ahead, a quantile of its own scores
+after that. In both, the table counts as a few more scores. The quantile level rises at each miss and falls a little at
+each hit, within bounds. Short look-aheads are scored first; the factor of an axis also scales the longer ones.
 
 Coverage is not guaranteed. The long-run coverage of the source requires unbounded levels and an infinite region from
 level 1 on, but a published region must be finite. An aircraft whose errors exceed all errors in the table is therefore
 covered less. `Confidence.sentence` reports a bound that is met; the measured coverage is published too.
 
-Source: Gibbs & Candes 2021, "Adaptive conformal inference under distribution shift", proposition 4.1.
+Source: Gibbs & Candes 2021, "Adaptive conformal inference under distribution shift", proposition 4.1; Gelman et al.
+2013, "Bayesian data analysis", 2.5 (normal mean with a normal prior, here of log errors).
 """
 
 from dataclasses import dataclass, field
@@ -16,10 +18,11 @@ from dataclasses import dataclass, field
 import numba as nb
 import numpy as np
 
-from twin_worker.confidence.calibration_table import ATOMS, COLUMN, KNOTS, CalibrationTable
-from twin_worker.confidence.prediction_log import EVERY_S, PredictionLog
+from twin_worker.confidence.calibration_table import ATOMS, KNOTS, CalibrationTable
+from twin_worker.confidence.prediction_log import EVERY_S, KNOT_OF, PredictionLog
 from twin_worker.confidence.weighted_quantile import censored_quantile, critical_factor, weighted_quantile
-from twin_worker.numerics.prediction_errors import AHEAD, NOMINAL_COVERAGE
+from twin_worker.numerics.interpolation import interpolate_rows
+from twin_worker.numerics.prediction_errors import NOMINAL_COVERAGE
 
 _TABLE_WEIGHT = 10.0  # independent predictions that the table counts as [-]
 _DECAY_S = 400.0  # time constant of the weight of a score [s]
@@ -27,8 +30,8 @@ _WEIGHT = np.minimum(1.0, EVERY_S / (0.5 * KNOTS))  # weight of a score; scores 
 _HORIZON_WEIGHT = EVERY_S / 30.0  # weight of a first passage [-]
 _TUBE_STEP, _HORIZON_STEP = 0.05, 0.02  # of the level, per independent miss [-]
 _MIN_LEVEL, _MAX_LEVEL = 0.5, 0.99
-_COLUMN_OF = np.full(len(AHEAD), -1)
-_COLUMN_OF[COLUMN] = np.arange(len(KNOTS))
+_MEAN_LOG_ERROR = -0.500  # expected log |error / sigma| of Student's t with 4 degrees of freedom, as tables assume [-]
+_MIN_SCORE = 0.01  # smaller errors are as small as this [-]
 _MIN_FACTOR, _MAX_FACTOR = 0.1, 20.0
 _exact = nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath: results equal numpy's
 
@@ -55,7 +58,7 @@ def _update_tube_levels(
 ) -> None:
     """Update the levels at the knots, (13,), with new scores of this group."""
     for k in range(len(rows)):
-        knot, value = _COLUMN_OF[columns[k]], score[rows[k], columns[k]]
+        knot, value = KNOT_OF[columns[k]], score[rows[k], columns[k]]
         if in_group[rows[k]] and knot >= 0 and np.isfinite(value):
             level[knot] += _TUBE_STEP * _WEIGHT[knot] * ((1.0 if value > 1.0 else 0.0) - (1.0 - NOMINAL_COVERAGE))
     for knot in range(len(level)):
@@ -81,7 +84,7 @@ class ScaleFactors:
     """Present scale factors of one group.
 
     Attributes:
-        tube: on the table's half-axes, by knot, (13,) [-]
+        tube: on the table's half-axes, by knot and axis, (13, 3) [-]
         horizon: on the error ratio that determines the horizon [-]
         own_count: number of this aircraft's predictions behind them [-]
         bounded: a level or factor of the tube is at its upper bound, so further misses cannot widen the tube
@@ -93,23 +96,37 @@ class ScaleFactors:
     bounded: bool = False
 
     def at(self, ahead: np.ndarray) -> np.ndarray:
-        """Return the factor on half-axes by look-ahead, (n,) [-]."""
-        return np.interp(ahead, KNOTS, self.tube)
+        """Return the factor on half-axes by look-ahead, (n, 3) [-]."""
+        return interpolate_rows(ahead, KNOTS, self.tube)
 
 
 def scale_factors(log: PredictionLog, group: str, table: CalibrationTable, levels: AdaptiveLevels) -> ScaleFactors:
     """Compute scale factors from the table and the scores of the aircraft's own predictions of this group."""
     rows = np.flatnonzero(log.group == group)
-    scores = log.score[np.ix_(rows, COLUMN)] * log.factor[rows]
+    ratios = log.axis_score[rows] * log.factor[rows]
     age = log.evaluated_until - log.t0[rows]
-    weight = np.exp(-np.clip(age, 0.0, None) / _DECAY_S)[:, None] * np.where(np.isfinite(scores), _WEIGHT, 0.0)
-    level = np.array([levels.tube.mean()])
-    pooled = _joint_quantiles(table.scores, scores.reshape(1, -1), weight.reshape(1, -1) / len(KNOTS), level)[0]
-    tube = _joint_quantiles(table.scores * pooled, scores.T, weight.T, levels.tube)
-    horizon = _horizon_factor(log, rows, table.risks * pooled, levels.horizon)
+    weight = np.exp(-np.clip(age, 0.0, None) / _DECAY_S)[:, None] * np.where(np.isfinite(ratios[..., 0]), _WEIGHT, 0.0)
+    axis = _axis_factors(ratios, weight, table)
+    scores = (ratios / axis).max(axis=2)
+    tube = _joint_quantiles(table.scores, scores.T, weight.T, levels.tube)[:, None] * axis
+    horizon = _horizon_factor(log, rows, table.risks * axis.max(), levels.horizon)
     own_count = int((weight > 0).any(axis=1).sum())
     bounded = bool((levels.tube >= _MAX_LEVEL).any() or (tube >= _MAX_FACTOR).any())
     return ScaleFactors(np.clip(tube, _MIN_FACTOR, _MAX_FACTOR), horizon, own_count, bounded)
+
+
+def _axis_factors(ratios: np.ndarray, weight: np.ndarray, table: CalibrationTable) -> np.ndarray:
+    """Return the factor of each axis, (3,): geometric mean of errors over expected ones, shrunk to 1 by the table.
+
+    Args:
+        ratios: errors over half-axes of the table, nan where unknown, (s, 13, 3) [-]
+        weight: of each, 0 where unknown, (s, 13)
+        table: its half-axes are `table.factor` standard deviations
+    """
+    expected = _MEAN_LOG_ERROR - np.log(table.factor)
+    excess = np.log(np.maximum(np.where(weight[..., None] > 0, ratios, 1.0), _MIN_SCORE)) - expected
+    total = np.einsum("rk,rka->a", weight, excess) / len(KNOTS)
+    return np.exp(total / (weight.sum() / len(KNOTS) + _TABLE_WEIGHT))
 
 
 def _joint_quantiles(atoms: np.ndarray, scores: np.ndarray, weight: np.ndarray, level: np.ndarray) -> np.ndarray:

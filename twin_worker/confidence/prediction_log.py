@@ -11,10 +11,13 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from twin_worker.confidence.calibration_table import KNOTS
+from twin_worker.confidence.calibration_table import COLUMN, KNOTS
 from twin_worker.numerics.interpolation import interpolate_rows
 from twin_worker.numerics.prediction_errors import AHEAD, ERROR_LIMIT, min_path_length, track_frame
 
+KNOT_OF = np.full(len(AHEAD), -1)
+KNOT_OF[COLUMN] = np.arange(len(KNOTS))
+"""Number of the knot at each look-ahead, -1 elsewhere."""
 _GAP_S = 2.5  # positions farther apart than this are a telemetry gap [s]
 _exact = nb.njit(cache=True, error_model="numpy", nogil=True)  # no fastmath: as numpy does it
 
@@ -29,6 +32,7 @@ class LogArrays(NamedTuple):
     tube: np.ndarray
     min_length: np.ndarray
     score: np.ndarray
+    axis_score: np.ndarray
     next_column: np.ndarray
     live: np.ndarray
     followed: np.ndarray
@@ -109,9 +113,12 @@ def evaluate_all(log: LogArrays, flight: tuple, evaluated: np.ndarray) -> int:
                 )
             c, s = log.direction[row, column, 0], log.direction[row, column, 1]
             axes[0], axes[1], axes[2] = error[0] * c + error[1] * s, error[1] * c - error[0] * s, error[2]
-            max_ratio = 0.0
+            max_ratio, knot = 0.0, KNOT_OF[column]
             for i in range(3):
-                max_ratio = max(max_ratio, abs(axes[i]) / log.tube[row, column, i])
+                ratio = abs(axes[i]) / log.tube[row, column, i]
+                max_ratio = max(max_ratio, ratio)
+                if knot >= 0:
+                    log.axis_score[row, knot, i] = ratio
             log.score[row, column] = max_ratio
             if log.uncensored[row]:
                 length = max(_length_until(instant, odometer) - log.start_length[row], log.min_length[row])
@@ -162,10 +169,11 @@ class PredictionLog:
     path: np.ndarray  # NED [m]
     direction: np.ndarray  # unit vector along the path
     tube: np.ndarray  # half-axes as published [m]
-    factor: np.ndarray  # published half-axes over those of the table [-]
+    factor: np.ndarray  # published half-axes over those of the table, by knot and axis [-]
     ratio: np.ndarray  # running maximum of table half-axes over path length [-]
     horizon: np.ndarray  # as published [s]
     score: np.ndarray  # largest error over its half-axis [-]
+    axis_score: np.ndarray  # error over each half-axis, at the knots [-]
     next_column: np.ndarray  # first look-ahead not yet flown
     live: np.ndarray  # look-aheads remain to be scored
     followed: np.ndarray  # follow-up time: first passage of 10 %, or censoring time [s]
@@ -188,10 +196,11 @@ class PredictionLog:
         self.path = np.zeros((rows, n, 3))
         self.direction = np.zeros((rows, n, 2), np.float32)
         self.tube = np.ones((rows, n, 3), np.float32)
-        self.factor = np.ones((rows, len(KNOTS)))
+        self.factor = np.ones((rows, len(KNOTS), 3))
         self.ratio = np.zeros((rows, n), np.float32)
         self.horizon = np.zeros(rows)
         self.score = np.full((rows, n), np.nan, np.float32)
+        self.axis_score = np.full((rows, len(KNOTS), 3), np.nan, np.float32)
         self.next_column = np.zeros(rows, int)
         self.live = np.zeros(rows, bool)
         self.followed = np.zeros(rows)
@@ -217,7 +226,7 @@ class PredictionLog:
         n = len(path)
         self.t0[row], self.method[row], self.group[row], self.size[row] = t0, method, group, n
         self.path[row, :n], self.direction[row, :n] = path, track_frame(path, AHEAD[:n])
-        self.score[row], self.next_column[row], self.live[row] = np.nan, 0, True
+        self.score[row], self.axis_score[row], self.next_column[row], self.live[row] = np.nan, np.nan, 0, True
         self.followed[row], self.exceeded[row], self.uncensored[row], self.horizon_pending[row] = 0.0, False, True, True
         self.min_length[row], self.start_length[row], self.last_error[row] = min_path_length(speed), np.nan, 0.0
         return row

@@ -120,7 +120,7 @@ class Confidence:
         horizon_s: confidence horizon, from look-ahead 0 [s]
         horizon_open: the horizon is not reached at the last look-ahead
         sentence: calibration table used, and number of own predictions behind the adaptation
-        factor: half-axes of the tube over those of the table, by knot, (13,) [-]
+        factor: half-axes of the tube over those of the table, by knot and axis, (13, 3) [-]
         ratio: running maximum of half-axes over predicted path length, (n,) [-]
         axis_quantile: coverage of each half-axis by itself [-]
     """
@@ -163,7 +163,7 @@ class ConfidenceTracker:
         horizon, horizon_open = first_passage(scale.horizon * ratio, forecast.ahead)
         adaptation = f", adapted to {scale.own_count} own predictions" if scale.own_count else ""
         adaptation += "; adaptation is at its bound: coverage may be below the target" if scale.bounded else ""
-        tube = scale.at(forecast.ahead)[:, None] * half_axes
+        tube = scale.at(forecast.ahead) * half_axes
         return Confidence(tube, horizon, horizon_open, description + adaptation, scale.tube, ratio, table.alone)
 
     def _factors(self, group: str, table: CalibrationTable) -> ScaleFactors:

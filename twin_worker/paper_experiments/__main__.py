@@ -1,13 +1,15 @@
 """`python -m twin_worker.paper_experiments identify FILE…`: the paper's identification experiment on recorded flights.
 
-Every few seconds of flight, the two linear models (4 longitudinal, 5 lateral states) are identified on the preceding
-window, by a first step and by its prediction-error refinement without prior. Both then run free over the following
-unseen seconds. The flight mode of those seconds (climb, level, turn, descent) groups the results.
+In every flight mode (climb, level, turn, descent) of the unseen seconds, up to `--each` experiments spread over all
+flights: the two linear models (4 longitudinal, 5 lateral states) are identified on the preceding window, by a first
+step and by its prediction-error refinement, and the coupled model of the twin beside them. All then run free over the
+unseen seconds, and over the end of the identification data.
 
 Source: Huang 2021, section 4.2, figures 7 and 8.
 """
 
 import argparse
+import functools
 import json
 import sys
 from collections import Counter
@@ -24,10 +26,13 @@ from fleet.process.logs import report_progress
 from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
 from twin_worker.paper_experiments.experiment import (
     FIRST_STEPS,
+    MODELS,
+    SEEN_RUN_S,
     STATE_NAMES,
     Experiment,
     ExperimentPlan,
     RecordedFlight,
+    choose_starts,
     read_flights,
     run_experiments,
 )
@@ -43,77 +48,93 @@ EXAMPLES = """
 
 
 def summary(results: list[Experiment]) -> dict[str, dict[str, Any]]:
-    """Summarise each mode: count, median of the mean fit over states, paired gain, quartiles per state, verdicts.
+    """Summarise each mode: count, medians of the mean fit over states, quartiles per state, gain, verdicts.
 
-    `p` is the one-sided signed-rank p-value of the gain; it is too small, because adjacent experiments share data.
+    `unseen` and `seen` are of the unseen seconds and of the end of the identification data. The gain is that of the
+    refined model over the first step, paired. `p` is its one-sided signed-rank p-value; it is too small, because
+    adjacent experiments share data.
     """
     table = {}
     for mode in PHASES:
-        if mode_results := [result for result in results if result.mode == mode]:
-            table[mode] = _row(mode_results, [result.fit_seen for result in results if result.mode_seen == mode])
+        if group := [result for result in results if result.mode == mode]:
+            table[mode] = _row(group, [result for result in results if result.mode_seen == mode])
     return table
 
 
-def _row(mode_results: list[Experiment], seen_fits: list[np.ndarray]) -> dict[str, Any]:
-    fit = np.array([result.fit for result in mode_results])
+def _row(group: list[Experiment], seen_group: list[Experiment]) -> dict[str, Any]:
+    fit = np.array([result.fit for result in group])
     gain = np.diff(fit.mean(axis=2), axis=1)[:, 0]
-    verdicts = Counter(str(result.outcome) for result in mode_results)
+    verdicts = Counter(str(result.outcome) for result in group)
     common_verdict = verdicts.most_common(1)[0][0]
     return {
-        "n": len(mode_results),
-        "fit": _steps(np.median(fit.mean(axis=2), axis=0)),
-        "fit_seen": _steps(np.median(np.mean(seen_fits, axis=2), axis=0)) if seen_fits else None,
+        "n": len(group),
+        "flights": len({result.uav for result in group}),
+        "unseen": _fits(fit),
+        "seen": _fits(np.array([result.fit_seen for result in seen_group])) if seen_group else None,
         "paired_gain": round(float(np.median(gain)), 1),
         "share_better": round(float((gain > 0).mean()), 3),
         "p": float(scipy.stats.wilcoxon(gain, alternative="greater").pvalue) if gain.any() else 1.0,
-        "states": {
-            name: _steps(np.percentile(fit[:, :, k], (25, 50, 75), axis=0).T) for k, name in enumerate(STATE_NAMES)
-        },
         "verdicts": dict(verdicts),
-        "sentence": next(result.sentence for result in mode_results if str(result.outcome) == common_verdict),
+        "sentence": next(result.sentence for result in group if str(result.outcome) == common_verdict),
     }
 
 
-def _steps(pair: np.ndarray) -> dict[str, Any]:
-    """Return the values of both steps by name."""
-    return dict(zip(("first", "refined"), np.round(pair, 1).tolist(), strict=True))
+def _fits(fit: np.ndarray) -> dict[str, Any]:
+    """Return count, median of the mean over states, and quartiles per state of every model: fit (N, 3, 9) [%]."""
+    quartiles = np.percentile(fit, (25, 50, 75), axis=0)
+    return {
+        "n": len(fit),
+        "mean": dict(zip(MODELS, np.round(np.median(fit.mean(axis=2), axis=0), 1).tolist(), strict=True)),
+        "states": {
+            name: dict(zip(MODELS, np.round(quartiles[:, :, k].T, 1).tolist(), strict=True))
+            for k, name in enumerate(STATE_NAMES)
+        },
+    }
 
 
-def format_summary(first: str, table: dict[str, dict[str, Any]]) -> str:
+def format_summary(first: str, table: dict[str, dict[str, Any]], plan: ExperimentPlan, air: str) -> str:
     """Format the summary as text."""
-    lines = [f"first step: {first}; fit over unseen seconds, median [%]"]
+    lines = [
+        f"first step: {first}; {air}; identified on {plan.seen_s:.0f} s, free run over {plan.unseen_s:.0f} s unseen "
+        f"and over the last {SEEN_RUN_S:.0f} s of the identification data",
+        f"  fit, median [%]                 mean  {' '.join(f'{name:>5}' for name in STATE_NAMES)}",
+    ]
     for mode, row in table.items():
-        step = row["fit"]
-        lines.append(
-            f"  {mode:8} n {row['n']:4}   first {step['first']:6.1f}   refined {step['refined']:6.1f}   "
-            f"paired {row['paired_gain']:+5.1f}, better in {row['share_better']:.0%} (p {row['p']:.1g})"
-        )
-        if seen := row["fit_seen"]:
-            values = f"first {seen['first']:.1f}, refined {seen['refined']:.1f}"
-            lines.append(f"           over identification data: {values}")
+        for part in ("unseen", "seen"):
+            for model in MODELS if row[part] else ():
+                states = " ".join(f"{row[part]['states'][name][model][1]:5.0f}" for name in STATE_NAMES)
+                label = f"{mode:8}n {row[part]['n']:4} {part:6} {model:8}"
+                lines.append(f"  {label} {row[part]['mean'][model]:5.0f}  {states}")
         verdict_text = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in sorted(row["verdicts"].items()))
-        lines.append(f"           {verdict_text}; e.g. {row['sentence']}")
+        lines.append(
+            f"    {row['flights']} flights; refined better than first in {row['share_better']:.0%}, "
+            f"paired {row['paired_gain']:+.0f} (p {row['p']:.1g})"
+        )
+        lines.append(f"    {verdict_text}; e.g. {row['sentence']}")
     return "\n".join(lines)
 
 
 def _run(args: argparse.Namespace) -> int:
+    if args.each < 1:
+        raise ValueError(f"--each: found {args.each}, expected 1 or more; write e.g. 100")
     flights: list[RecordedFlight] = []
     for path in args.files:
         report_progress("paper", f"reading {path.name}")
         flights += read_flights(path, options=RecordingOptions.of(args))
     if not flights:
         raise ValueError("paper: found no flight with attitude, velocity, position and servo rows; use another FILE")
-    plan = ExperimentPlan(args.seen, args.unseen, args.every)
-    total = sum(len(list(flight.starts(plan.seen_s, plan.unseen_s, plan.every_s))) for flight in flights)
-    if not total:
+    plan = ExperimentPlan(args.seen, args.unseen, args.every, args.each)
+    starts = choose_starts(flights, plan)
+    if not starts:
         raise ValueError(f"paper: found no {plan.seen_s + plan.unseen_s:.0f} s of data without gaps; record longer")
-    result: dict[str, Any] = {"plan": asdict(plan), "first_step": {}}
+    result: dict[str, Any] = {"plan": asdict(plan), "air": args.air, "first_step": {}}
     for first in FIRST_STEPS if args.first == "both" else (args.first,):
-        results = _collect(run_experiments(flights, first, plan), total, first)
+        results = _collect(run_experiments(starts, first, plan), len(starts), first)
         result["first_step"][first] = table = summary(results)
-        print(format_summary(first, table), flush=True)
+        print(format_summary(first, table, plan, args.air), flush=True)
         if args.out:
-            print(f"  figures: {', '.join(path.name for path in draw(args.out, first, results))} in {args.out}")
+            figures = draw(args.out, first, results, f"{args.air}, identified on {plan.seen_s:.0f} s")
+            print(f"  figures: {', '.join(path.name for path in figures)} in {args.out}")
     if args.json:
         args.json.write_text(json.dumps(result, indent=1) + "\n")
     return 0
@@ -144,26 +165,33 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--first", choices=(*FIRST_STEPS, "both"), default="both", help="first step: projection (paper), PBSID, or both"
     )
-    durations = {"seen": "identification window", "unseen": "free run", "every": "interval of experiments"}
-    for name, text in durations.items():
-        default = getattr(ExperimentPlan(), f"{name}_s")
-        parser.add_argument(f"--{name}", type=_seconds, default=default, metavar="S", help=f"{text} ({default:.0f} s)")
+    plan = ExperimentPlan()
+    for name, least, text in (
+        ("seen", 20, "identification window"),
+        ("unseen", 4, "free run"),
+        ("every", 1, "interval of possible starts"),
+    ):
+        default = getattr(plan, f"{name}_s")
+        kind = functools.partial(_seconds, least)
+        parser.add_argument(f"--{name}", type=kind, default=default, metavar="S", help=f"{text} ({default:.0f} s)")
+    parser.add_argument("--each", type=int, default=plan.each, metavar="N", help=f"most of one mode ({plan.each})")
+    parser.add_argument("--air", default="as recorded", metavar="TEXT", help="description of the air, for the figures")
     parser.add_argument("--out", type=Path, metavar="DIR", help="draw the figures into DIR")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the numbers to FILE")
     add_recording_arguments(parser)
     return run_command("twin_worker.paper_experiments", _run, parser.parse_args(argv))
 
 
-def _seconds(argument: str) -> float:
-    """Parse a duration of 5 s or more; shorter free runs are never verified.
+def _seconds(least: float, argument: str) -> float:
+    """Parse a duration.
 
     Raises:
         ArgumentTypeError: if the value is out of range.
         ValueError: if it is no number.
     """
     value = float(argument)
-    if not 5 <= value <= 600:
-        raise argparse.ArgumentTypeError(f"found {argument}, expected 5..600 s; write e.g. 40")
+    if not least <= value <= 600:
+        raise argparse.ArgumentTypeError(f"found {argument}, expected {least:.0f}..600 s; write e.g. 40")
     return value
 
 

@@ -1,32 +1,41 @@
-"""One experiment of the paper: identify two linear models on a window, and run them free over the seconds after it.
+"""One experiment of the paper: identify on a window of flight, run free over the seconds after it.
 
-First step: projection (as in the paper) or PBSID; then prediction-error refinement without prior. The models have
-4 longitudinal and 5 lateral states.  Source: Huang 2021, sections 3.1 and 4.2.
+Three models of the same window:
+
+- first step: projection (as in the paper) or PBSID, 4 longitudinal and 5 lateral states, with bias;
+- refined: the same model after prediction-error refinement, start states and output biases estimated, with a ridge
+  towards the first step;
+- coupled: the derivatives model of the twin, both axes in one model with exact kinematics.
+
+Source: Huang 2021, sections 3.1 and 4.2.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from fleet.airframes import GENERIC, load
 from fleet.airframes.airframe import servo_map
 from fleet.contract import Outcome, Params, Sample
 from fleet.frames import Origin, ned_to_body
+from fleet.physics.simulate import TAU, lagged
 from fleet.telemetry.recording.options import NO_OPTIONS, RecordingOptions
 from fleet.telemetry.recording.recordings import replay_messages
 from fleet.window import STATES as ALL
 from fleet.window import Window
 from twin_worker.estimation.wind_filter import WindFilter
+from twin_worker.identification.fixed_wing.derivatives_model import identify
 from twin_worker.identification.linear.linear_model import AXES, INPUTS, STATES, AxisModel
-from twin_worker.identification.linear.prediction_error_method import refine
+from twin_worker.identification.linear.multiple_shooting import refine_with_starts
 from twin_worker.identification.linear.state_space import StateSpace
 from twin_worker.identification.linear.subspace import pbsid, projection
-from twin_worker.telemetry.flight_phase import phase_of
+from twin_worker.paper_experiments.free_run import coupled_free_run, linear_free_run, sensor_errors
+from twin_worker.telemetry.flight_phase import PHASES, phase_of
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.resample import preprocess
-from twin_worker.validation.held_out import HeldOut
-from twin_worker.validation.verify import fit_percent, verify
+from twin_worker.validation.verify import fit_percent, verify_free_run
 
 _WIND_S = 0.2  # sampling interval of the wind filter [s]
 _WIND_TRANSIENT_S = 20.0  # convergence time of the wind filter [s]
@@ -106,7 +115,12 @@ def _wind(history: TelemetryHistory, recording: Window) -> np.ndarray:
 
 FIRST_STEPS: dict[str, Callable[..., StateSpace]] = {"projection": projection, "pbsid": pbsid}
 STATE_NAMES = tuple(name for axis in AXES for name in STATES[axis])
-_WEAK_PRECISION = 1e-3  # prior precision that only regularises the normal equations [-]
+MODELS = ("first", "refined", "coupled")
+_ORDER = [ALL.index(name) for name in STATE_NAMES]
+_RIDGE = 1e3  # precision of an entry of [A B c] about the first step, scaled units [-]
+_RUN_S = (2.0, 4.0)  # free-run lengths of the refinement, one after the other [s]
+SEEN_RUN_S = 8.0  # free run over the end of the identification data [s]
+START_S = 1.0  # data before the free run that determine its start [s]
 
 
 @dataclass(frozen=True)
@@ -116,27 +130,28 @@ class ExperimentPlan:
     Attributes:
         seen_s: length of the identification window [s]
         unseen_s: length of the free run [s]
-        every_s: interval between the starts of two experiments [s]
-        segment_s: free-run length of the refinement [s]
+        every_s: interval between two possible starts [s]
+        each: maximum number of experiments of one mode, spread evenly over all flights
     """
 
     seen_s: float = 40.0
-    unseen_s: float = 8.0
-    every_s: float = 5.0
-    segment_s: float = 8.0
+    unseen_s: float = 4.0
+    every_s: float = 1.0
+    each: int = 200
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """One pair of models with its free run over unseen data.
+    """Three models with their free runs over unseen data.
 
     Attributes:
         uav, t: UAV id, and start of the unseen window [s since 1970]
-        mode, mode_seen: flight mode of the unseen window, and of the window of equal length before it
+        mode, mode_seen: flight mode of the unseen window, and of the end of the identification data
         seconds: since the start of the unseen window, (n,) [s]
-        actual, first, refined: states in the order of `STATE_NAMES`, (n, 9) [m/s, rad/s, rad]
-        fit: both steps over the unseen window, (2, 9) [%]
-        fit_seen: both steps over the last part of the identification window, (2, 9) [%]
+        actual: states in the order of `STATE_NAMES`, (n, 9) [m/s, rad/s, rad]
+        runs: free run of each of `MODELS`, (3, n, 9)
+        fit: of each model over the unseen window, (3, 9) [%]
+        fit_seen: of each model over the end of the identification data, (3, 9) [%]
         outcome, sentence: verdict on the refined model
     """
 
@@ -146,22 +161,20 @@ class Experiment:
     mode_seen: str
     seconds: np.ndarray
     actual: np.ndarray
-    first: np.ndarray
-    refined: np.ndarray
+    runs: np.ndarray
     fit: np.ndarray
     fit_seen: np.ndarray
     outcome: Outcome
     sentence: str
 
 
-def both_steps(axis: str, seen: Window, first: str, segment_s: float) -> tuple[AxisModel, AxisModel]:
-    """Identify one axis by the first step, and refine it by the prediction error of free runs, without prior.
+def both_steps(axis: str, seen: Window, first: str) -> tuple[AxisModel, AxisModel]:
+    """Identify one axis by the first step, and refine it by the prediction error of free runs.
 
     Args:
         axis: `longitudinal` or `lateral`
         seen: identification window
         first: name of the first step, `projection` or `pbsid`
-        segment_s: free-run length of the refinement [s]
     Raises:
         ValueError: if the data are too short or not informative; the message names the reason.
     """
@@ -174,17 +187,14 @@ def both_steps(axis: str, seen: Window, first: str, segment_s: float) -> tuple[A
     y, u = axis_model.scaled(seen)
     model = FIRST_STEPS[first](y, u, len(states), ok=ok).outputs_as_states().stabilised()
     start = np.hstack([model.A, model.B, np.zeros((len(states), 1))])
-    precision = np.full(start.shape, _WEAK_PRECISION)
-    refined = refine(
+    refined = refine_with_starts(
         start,
         y,
         u,
         ok,
-        prior=start,
-        precision=precision,
-        length=int(segment_s / seen.dt),
-        effective_fraction=1.0,
-        steps=20,
+        lengths=tuple(round(run_s / seen.dt) for run_s in _RUN_S),
+        ridge=_RIDGE,
+        errors=sensor_errors(states, scale[0]),
     )
     return replace(axis_model, D=start), replace(axis_model, D=refined)
 
@@ -196,39 +206,60 @@ def run_experiment(flight: RecordedFlight, start: int, first: str, plan: Experim
         ValueError: if the data are too short or not informative; the message names the reason.
     """
     window = flight.window(start, plan.seen_s, plan.unseen_s)
-    n_seen, n_unseen = round(plan.seen_s / window.dt), round(plan.unseen_s / window.dt)
-    axes = [both_steps(axis, window.part(0, n_seen), first, plan.segment_s) for axis in AXES]
-    steps = [(axes[0][k], axes[1][k]) for k in (0, 1)]
-    runs, seen_runs = ([_free_run(pair, window, at, n_unseen) for pair in steps] for at in (n_seen, n_seen - n_unseen))
-    actual, seen_actual = (window.columns(STATE_NAMES)[at : at + n_unseen] for at in (n_seen, n_seen - n_unseen))
-    verdict = verify(steps[1], window, n_seen)
+    dt = window.dt
+    n, before, tail = round(plan.seen_s / dt), round(START_S / dt), round(min(SEEN_RUN_S, plan.seen_s) / dt)
+    training, wind = window.part(0, n), flight.wind[start]
+    lagged_inputs = replace(window, u=lagged(window.u, dt, TAU))
+    axes = [both_steps(axis, lagged_inputs.part(0, n), first) for axis in AXES]
+    coupled = identify(training, wind, load(GENERIC))
+    states = window.columns(STATE_NAMES)
+    runs, actual = {}, {}
+    for name, fitted, shown in (
+        ("unseen", slice(n - before, n), slice(n, len(window))),
+        ("seen", slice(n - tail, n), slice(n - tail, n)),
+    ):
+        steps = [np.hstack([linear_free_run(axis[k], lagged_inputs, fitted, shown) for axis in axes]) for k in (0, 1)]
+        runs[name] = np.array([*steps, coupled_free_run(coupled, window, fitted, shown, wind)[:, _ORDER]])
+        actual[name] = states[shown]
+    refined = np.empty_like(runs["unseen"][1])
+    refined[:, _ORDER] = runs["unseen"][1]
+    outcome, reason = verify_free_run(window.x[n:], refined, training)
+    fit, fit_seen = (np.array([fit_percent(actual[k], run) for run in runs[k]]) for k in ("unseen", "seen"))
     return Experiment(
         uav=flight.uav,
-        t=float(window.t[n_seen]),
-        mode=phase_of(window.part(n_seen, n_seen + n_unseen)),
-        mode_seen=phase_of(window.part(n_seen - n_unseen, n_seen)),
-        seconds=window.t[n_seen : n_seen + n_unseen] - window.t[n_seen],
-        actual=actual,
-        first=runs[0],
-        refined=runs[1],
-        fit=np.array([fit_percent(actual, run) for run in runs]),
-        fit_seen=np.array([fit_percent(seen_actual, run) for run in seen_runs]),
-        outcome=verdict.outcome,
-        sentence=verdict.sentence,
+        t=float(window.t[n]),
+        mode=phase_of(window.part(n, len(window))),
+        mode_seen=phase_of(window.part(n - tail, n)),
+        seconds=window.t[n:] - window.t[n],
+        actual=actual["unseen"],
+        runs=runs["unseen"],
+        fit=fit,
+        fit_seen=fit_seen,
+        outcome=outcome,
+        sentence=f"mean fit {fit[1].mean():.0f} %, {reason}",
     )
 
 
-def _free_run(pair: tuple[AxisModel, AxisModel], window: Window, start: int, length: int) -> np.ndarray:
-    """Run both axes free from the measured states of a row, (length, 9)."""
-    order = [ALL.index(name) for name in STATE_NAMES]
-    return HeldOut(pair, window.part(start, start + length), 0).runs(length)[:, order]
-
-
-def run_experiments(flights: Iterable[RecordedFlight], first: str, plan: ExperimentPlan) -> Iterator[Experiment | str]:
-    """Run all possible experiments; yield the reason as text where one fails."""
+def choose_starts(flights: Sequence[RecordedFlight], plan: ExperimentPlan) -> list[tuple[RecordedFlight, int]]:
+    """Return flight and start row of every experiment: of each mode at most `plan.each`, spread evenly."""
+    by_mode: dict[str, list[tuple[RecordedFlight, int]]] = {mode: [] for mode in PHASES}
     for flight in flights:
+        unseen = round(plan.unseen_s / flight.recording.dt)
         for start in flight.starts(plan.seen_s, plan.unseen_s, plan.every_s):
-            try:
-                yield run_experiment(flight, start, first, plan)
-            except ValueError as error:
-                yield f"uav-{flight.uav}: {error}"
+            by_mode[phase_of(flight.recording.part(start, start + unseen))].append((flight, start))
+    chosen = []
+    for starts in by_mode.values():
+        count = min(plan.each, len(starts))
+        chosen += [starts[k * len(starts) // count] for k in range(count)]
+    return chosen
+
+
+def run_experiments(
+    starts: Iterable[tuple[RecordedFlight, int]], first: str, plan: ExperimentPlan
+) -> Iterator[Experiment | str]:
+    """Run experiments; yield the reason as text where one fails."""
+    for flight, start in starts:
+        try:
+            yield run_experiment(flight, start, first, plan)
+        except ValueError as error:
+            yield f"uav-{flight.uav}: {error}"

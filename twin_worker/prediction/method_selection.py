@@ -219,17 +219,38 @@ def imm(p: np.ndarray, v: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     Returns:
         mean path, NED, (k, 3) [m]
     """
+    return _mean_path(_estimate(p, v), p[-1, 2], v[-4:, 2].mean(), ahead)
+
+
+def imm_with_variance(p: np.ndarray, v: np.ndarray, ahead: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the path of `imm` and the variance of its horizontal position, north plus east, (k,) [m2].
+
+    Source: Bar-Shalom 2001, 11.6.6 (moments of the mixture).
+    """
+    estimator = _estimate(p, v)
+    variance = _mixture_variance(estimator, int(np.ceil(ahead[-1] / STEP)))
+    path = _mean_path(estimator, p[-1, 2], v[-4:, 2].mean(), ahead)
+    return path, np.interp(ahead, STEP * np.arange(len(variance)), variance)
+
+
+def _estimate(p: np.ndarray, v: np.ndarray) -> IMMEstimator:
+    """Return the estimator after all rows."""
     rows = np.column_stack([p[:, 0], v[:, 0], p[:, 1], v[:, 1]])
     filters = [_filter(rate, noise, rows[0]) for rate, noise in ((0.0, 0.5), (_TURN_RATE, 1.0), (-_TURN_RATE, 1.0))]
     estimator = IMMEstimator(filters, np.array([0.8, 0.1, 0.1]), _MODEL_TRANSITION)
     for row in rows[1:]:
         estimator.predict()
         estimator.update(row)
+    return estimator
+
+
+def _mean_path(estimator: IMMEstimator, p_d: float, v_d: float, ahead: np.ndarray) -> np.ndarray:
+    """Return the mean path from height `p_d` [m] and sink rate `v_d` [m/s] on, NED, (k, 3) [m]."""
     steps = int(np.ceil(ahead[-1] / STEP))
     track = _run_forward(estimator, steps)
     t = STEP * np.arange(steps + 1)
-    climb = np.clip(v[-4:, 2].mean(), -8.0, 8.0) * 6.0 * (1 - np.exp(-ahead / 6.0))  # the climb decays
-    return np.column_stack([np.interp(ahead, t, track[:, 0]), np.interp(ahead, t, track[:, 1]), p[-1, 2] + climb])
+    climb = np.clip(v_d, -8.0, 8.0) * 6.0 * (1 - np.exp(-ahead / 6.0))  # the climb decays
+    return np.column_stack([np.interp(ahead, t, track[:, 0]), np.interp(ahead, t, track[:, 1]), p_d + climb])
 
 
 def _run_forward(estimator: IMMEstimator, steps: int) -> np.ndarray:
@@ -244,3 +265,20 @@ def _run_forward(estimator: IMMEstimator, steps: int) -> np.ndarray:
         mu = mixed
         track.append(mu @ x)
     return np.array(track)[:, [0, 2]]
+
+
+def _mixture_variance(estimator: IMMEstimator, steps: int) -> np.ndarray:
+    """Return the variance of p_n plus that of p_e of the mixed models without measurements, (steps + 1,) [m2]."""
+    mu = estimator.mu.copy()
+    x, P, F, Q = (np.stack([getattr(filt, name) for filt in estimator.filters]) for name in ("x", "P", "F", "Q"))
+    FT, out = F.transpose(0, 2, 1), np.empty(steps + 1)
+    for k in range(steps + 1):
+        out[k] = mu @ ((x - mu @ x)[:, [0, 2]] ** 2 + P[:, [0, 2], [0, 2]]).sum(axis=1)
+        mixed = mu @ _MODEL_TRANSITION
+        share = (_MODEL_TRANSITION * mu[:, None]).T / mixed[:, None]  # of each model in each mixed start
+        start = share @ x
+        offset = x[None] - start[:, None]
+        spread = np.einsum("ji,jia,jib->jab", share, offset, offset)
+        P = F @ (np.einsum("ji,iab->jab", share, P) + spread) @ FT + Q
+        x, mu = np.einsum("jab,jb->ja", F, start), mixed
+    return out

@@ -104,6 +104,21 @@ def fit_by_axis(fit: dict[str, float], horizon_s: float) -> dict[str, float]:
     return {f"{axis}{horizon_s:.0f}": mean_fit(fit, states) for axis, states in AXES.items()}
 
 
+def verify_free_run(
+    y: np.ndarray, y_hat: np.ndarray, training: Window, threshold: float = FIT_THRESHOLD
+) -> tuple[Outcome, str]:
+    """Return the verdict on one free run and its reason: above the threshold, and better than persistence.
+
+    Args:
+        y, y_hat: measured and predicted states in the order of `fleet.window.STATES`, (n, 9)
+        training: identification window
+        threshold: minimum mean fit [%]
+    """
+    ok = np.ones(len(y), bool)
+    fit, persistence = _by_state(fit_percent(y, y_hat)), _by_state(fit_percent(y, persistence_forecast(y, ok, len(y))))
+    return _classify(fit, _shortfall(fit, persistence, threshold), training)
+
+
 def verify(
     plant: Plant, window: Window, start: int, threshold: float = FIT_THRESHOLD, active: Plant | None = None
 ) -> Verdict:

@@ -121,6 +121,43 @@ def draw_mission(
     return (tuple(_renumber_from_zero(items[1:])), start._replace(seq=start.seq - 1)) if px4 else (tuple(items), start)
 
 
+_PAPER_LEGS = (1, 1, 1, 0, 0, -1, -1, -1, 0)  # height change of the paper's legs: climb, level, descent [-]
+_PAPER_LEG_M, _PAPER_HEIGHT_M = (250.0, 350.0), 95.0  # length of a leg; height of the low level legs above home
+
+
+def paper_mission(
+    seed: int, origin: Origin = HOME, geometry: MissionGeometry = SMALL_GEOMETRY
+) -> tuple[tuple[Item, ...], StartState]:
+    """Draw the mission of the paper's figure 6: climb, level flight, turns and descent in one endless lap.
+
+    Three legs climb, two are level, three descend and one is level, at constant airspeed; a turn joins any two.
+
+    Args:
+        seed: seed of all random draws
+        origin: home
+        geometry: mission geometry of the aircraft type
+    """
+    rng = np.random.default_rng((seed, 12))
+    side, course = float(rng.choice([-1, 1])), rng.uniform(-pi, pi)
+    turns = rng.dirichlet(np.full(len(_PAPER_LEGS), 12.0)) * 2 * pi  # sum up to one lap
+    lengths = rng.uniform(*_PAPER_LEG_M, len(_PAPER_LEGS)) * geometry.scale
+    courses = course + side * np.cumsum(turns)
+    steps = lengths * np.array([np.cos(courses), np.sin(courses)])
+    steps -= steps.mean(axis=1, keepdims=True)  # the lap is closed
+    corners = np.cumsum(steps, axis=1) + np.array([[rng.uniform(-300, 300)], [rng.uniform(-300, 300)]]) * geometry.scale
+    slope = rng.uniform(0.8, 1.0) * min(geometry.climb, geometry.sink)
+    climbs = slope * np.hypot(*steps) * np.array(_PAPER_LEGS)
+    climbs[climbs < 0] *= -climbs[climbs > 0].sum() / climbs[climbs < 0].sum()  # and level with its start
+    heights = _PAPER_HEIGHT_M * geometry.height + np.cumsum(climbs)
+    items = [mission_item(0, WAYPOINT, origin, (0.0, 0.0, 0.0), frame=ABSOLUTE)]
+    for (north, east), height in zip(corners.T, heights, strict=True):
+        corner = float(north), float(east), -float(height)
+        items.append(mission_item(len(items), WAYPOINT, origin, corner))
+    items.append(mission_item(len(items), DO_JUMP, origin, params=(1.0, -1.0)))
+    start = np.array([corners[0, -1], corners[1, -1], -float(heights[-1])])
+    return tuple(items), StartState(1, start, float(courses[0]))
+
+
 def _renumber_from_zero(items: list[Item]) -> Iterator[Item]:
     """Renumber items from zero, including the jump target."""
     for entry in items:

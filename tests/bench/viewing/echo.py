@@ -24,7 +24,7 @@ class Echoing(View):
         asked.on_update(lambda _: self._answer())
         self._answer()
 
-    def _result(self) -> None:
+    def _answer(self) -> None:
         self._pressed += 1
         self._echo.content = f'<i class="echo" onpointerdown="{self._send}">{self._pressed}</i>'
         self.client.flush()

@@ -113,7 +113,7 @@ class Page:
         """Wait until a node is in the scene."""
         self.page.wait_for_function(IN_SCENE.format(name), timeout=1e3 * timeout_s, polling=10)
 
-    def state(self, name: str, began: float) -> None:
+    def watch(self, name: str, began: float) -> None:
         """Begin to note how old the probe's place is whenever it changes on the screen."""
         self.page.evaluate(WATCH, [name, began, PROBE_M_S])
 

@@ -7,7 +7,7 @@ from fleet.autopilots import laws
 from fleet.contract import Mission
 from fleet.frames import Origin, _radii, to_ned
 from twin_worker.confidence import adaptive_conformal
-from twin_worker.confidence.prediction_log import CAPACITY, PredictionLog, accumulate_length
+from twin_worker.confidence.prediction_log import CAPACITY, KNOT_OF, PredictionLog, accumulate_length
 from twin_worker.estimation.airspeed_setpoint import _median
 from twin_worker.numerics.interpolation import interpolate_rows
 from twin_worker.numerics.prediction_errors import AHEAD, track_frame
@@ -90,7 +90,7 @@ def test_levels_learn_what_numpy_would_have_learnt(seed: int) -> None:
         made, n = book(rng), int(rng.integers(0, 60))
         r, j = rng.integers(CAPACITY, size=n), rng.integers(len(AHEAD), size=n)
         mine, claimed = made.group == "a", made.horizon_pending.copy()
-        knot, score = adaptive_conformal._COLUMN_OF[j], made.score[r, j]
+        knot, score = KNOT_OF[j], made.score[r, j]
         new = mine[r] & (knot >= 0) & np.isfinite(score)
         step = (
             adaptive_conformal._TUBE_STEP

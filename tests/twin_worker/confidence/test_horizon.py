@@ -216,6 +216,17 @@ def test_it_recovers_when_errors_change(tables, times, alone):
     assert record.coverage[0] == pytest.approx(0.9, abs=0.05) and record.coverage[1] > 60
 
 
+def test_calm_air_narrows_the_region_along_the_path_only(tables):
+    """A wind that does not drift: errors along are a fifth of those of the tables' flights, the others as usual."""
+    record = ConfidenceTracker(tables)
+    inside, _, _ = flight(record, np.tile([0.2, 1.0, 1.0], (150, 1)), seed=14)
+    made = PointForecast(750.0, "hybrid", GROUP, AHEAD, moved(750), V, made_up.GROWTH)
+    ratio = record.confidence_of(made).tube / ConfidenceTracker(tables).confidence_of(made).tube
+    columns = np.searchsorted(AHEAD, [5, 16, 30, 60])
+    assert (ratio[columns, 0] < 0.5).all() and (ratio[columns, 1:] > 0.75).all() and (ratio[columns, 1:] < 1.4).all()
+    assert inside[75:].mean() == pytest.approx(0.9, abs=0.05)
+
+
 @pytest.mark.parametrize("times", [0.3, 1.0, 5.0])
 def test_untaught_it_learns_in_flight(times):
     inside, _, _ = flight(ConfidenceTracker(TableSet({})), np.full(240, times), seed=10)

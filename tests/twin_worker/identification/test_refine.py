@@ -4,6 +4,12 @@ import numpy as np
 import pytest
 from test_subspace import closed_loop, system
 
+from twin_worker.identification.linear.multiple_shooting import (
+    SensorErrors,
+    refine_with_starts,
+    residuals_and_jacobian,
+    segments_of,
+)
 from twin_worker.identification.linear.prediction_error_method import free_run, normal_equations, refine
 
 
@@ -158,3 +164,51 @@ def test_without_data_the_start_stays():
     y, u = flight(400)
     start = biased()
     assert np.allclose(refined(start, y, u, np.zeros(len(y), bool)), start)
+
+
+def test_sensitivities_of_multiple_shots_are_derivatives():
+    y, u = flight(60)
+    D, segments = biased(), np.array([[0, 20], [25, 55]])
+    starts = np.hstack([y[segments[:, 0]], 0.1 * np.ones((2, 4))])
+    weight, none = np.array([1.0, 2.0, 0.5, 1.0]), np.empty((0, 4, D.size + 8))
+    e, J = np.empty((50, 4)), np.zeros((50, 4, D.size + 8))
+    cost = residuals_and_jacobian(D, starts, segments, y, u, weight, e, J)
+    assert cost == pytest.approx(float((e**2).sum()))
+    moved, h = [np.empty_like(e), np.empty_like(e)], 1e-5
+    for column in range(D.size + 8):
+        for side, out in zip((-h, h), moved, strict=True):
+            par, z = D.ravel().copy(), starts.copy()
+            if column < D.size:
+                par[column] += side
+            else:
+                z[:, column - D.size] += side
+            residuals_and_jacobian(par.reshape(D.shape), z, segments, y, u, weight, out, none)
+        assert np.allclose((moved[0] - moved[1]) / (2 * h), J[..., column], rtol=1e-4, atol=1e-4)
+
+
+def test_multiple_shots_find_a_biased_model_despite_sensor_errors_that_drift():
+    """A constant error of every 100 rows: the biases take it up; a ridge that is strong enough keeps the first step."""
+    y, u = flight()
+    drift = np.repeat(np.random.default_rng(8).standard_normal((15, 4)), 100, axis=0)
+    y += 0.2 * drift
+    ok, errors = np.ones(len(y), bool), SensorErrors(np.full(4, 0.02), np.full(4, 0.2))
+
+    def distance(D: np.ndarray) -> float:
+        return float(np.linalg.norm(D[:, :-1] - truth()[:, :-1]))
+
+    options = {"lengths": (50, 100), "errors": errors}
+    found = refine_with_starts(biased(), y, u, ok, ridge=1.0, **options)
+    no_bias = refined(biased(), y, u, length=100, effective_fraction=1.0)
+    assert distance(found) < 0.3 * distance(biased()) and distance(found) < 0.5 * distance(no_bias)
+    kept = refine_with_starts(biased(), y, u, ok, ridge=1e12, **options)
+    assert np.allclose(kept, biased(), atol=1e-4)
+
+
+def test_segments_avoid_gaps_and_none_is_an_error():
+    ok = np.ones(100, bool)
+    ok[40:45] = False
+    assert segments_of(ok, 20).tolist() == [[0, 20], [20, 40], [45, 63], [63, 81], [81, 99]]
+    y, u = flight(100)
+    errors = SensorErrors(np.full(4, 0.02), np.full(4, 0.2))
+    with pytest.raises(ValueError, match="wait for more"):
+        refine_with_starts(biased(), y, u, np.zeros(100, bool), lengths=(50,), ridge=1.0, errors=errors)

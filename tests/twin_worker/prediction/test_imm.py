@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twin_worker.prediction.method_selection import STEP, constant_turn_prediction, imm
+from twin_worker.prediction.method_selection import STEP, constant_turn_prediction, imm, imm_with_variance
 from twin_worker.telemetry.track import STEP as TRACK_STEP
 from twin_worker.telemetry.track import Track
 
@@ -43,6 +43,22 @@ def test_a_circle_goes_on_round(rate):
     off, off_line = (np.linalg.norm(x - want, axis=1) for x in (path, line))
     assert off[3] < 0.3 * off_line[3] and off[5] < 0.5 * off_line[5]
     assert np.sign(path[5, 1]) == np.sign(rate)
+
+
+def test_the_variance_grows_to_that_of_a_random_turn():
+    """Independent simulation: models drawn by the transition probabilities, each flown exactly."""
+    p, v = straight()
+    path, variance = imm_with_variance(p, v, AHEAD)
+    assert np.allclose(path, imm(p, v, AHEAD)) and (np.diff(variance) > 0).all()
+    rng = np.random.default_rng(7)
+    transition = np.array([[0.97, 0.015, 0.015], [0.06, 0.93, 0.01], [0.06, 0.01, 0.93]])
+    model, at, velocity = np.zeros(4000, int), np.zeros(4000, complex), np.full(4000, complex(*v[-1, :2]))
+    for _ in range(60):  # to 30 s
+        model = (rng.random(4000)[:, None] > transition.cumsum(axis=1)[model]).sum(axis=1)
+        rate = np.array([1e-9, 0.3, -0.3])[model]
+        at += velocity * (np.exp(1j * rate * STEP) - 1) / (1j * rate)
+        velocity *= np.exp(1j * rate * STEP)
+    assert np.sqrt(variance[30]) == pytest.approx(np.sqrt(np.var(at.real) + np.var(at.imag)), rel=0.15)
 
 
 def test_left_mirrors_right():

@@ -1,8 +1,8 @@
 """Routes that no mission describes: of the present mode, and of the failsafe after a link loss."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from math import atan2, copysign, isfinite, pi, radians
+from dataclasses import replace
+from math import atan2, isfinite
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -18,12 +18,11 @@ from fleet.autopilots.modes import (
     ModeSituation,
     after_steering,
     hold_bank,
-    make_leg,
     mode_route,
 )
 from fleet.contract import Event
-from fleet.frames import G, Origin, to_geodetic, to_ned, wrap
-from fleet.mission import FIRST_ITEM, KIND, LOITER_UNLIMITED, RADIUS, WAYPOINT, Route, unroll_route
+from fleet.frames import Origin, to_geodetic, to_ned
+from fleet.mission import FIRST_ITEM, KIND, LOITER_UNLIMITED, RADIUS, Route, unroll_route
 from twin_worker.prediction.autopilot_identification import LAW_OF_AUTOPILOT
 from twin_worker.prediction.failsafe_route import FailsafePlan
 from twin_worker.prediction.multirotor.rollout import item_in_force
@@ -41,13 +40,6 @@ _TARGET_MOVED_M = 2.0  # a guidance target that moves further is a new one [m]
 _CIRCLING = 0.3  # largest median crosstrack error on a circle, in radii [-]
 _RADIUS_S, _MIN_RADIUS_ROWS = 20.0, 10  # newest flight, and reports in it, that tell the radius of a circle [s]
 _MIN_RADIUS, _RADIUS_SPREAD = 10.0, 0.1  # smallest radius [m], and largest median deviation from it [-]
-_PATH_S, _PATH_FIT_S = 0.6, 20.0  # newest reports that give curvature and course of a path, and of its law [s]
-_PATH_LAG_S = 2.0  # flight on the reported path in the replay of the law [s]
-_MIN_OFF_TARGET = radians(15.0)  # a bearing that differs more from that of the target belongs to another path [rad]
-_MIN_TURN_RATE = radians(3.0)  # slower turns of the reported course are rounding to degrees [rad/s]
-_ARC_STEP, _ARC_STEPS, _PATH_M = radians(15.0), 12, 1e5  # of a curved path; length of its straight end [m]
-_MAX_PATH_BANK_ERROR = radians(6.0)  # largest median error of the law to the commanded banks [rad]
-_PATH_PERIODS, _PATH_DAMPINGS = np.arange(8.0, 31.0, 2.0), np.arange(0.6, 1.05, 0.1)  # tried values of L1 [s, -]
 _FAILSAFE_PARAMETERS = {"arduplane": ("FS_LONG_ACTN", "FS_GCS_ENABL"), "px4": ("NAV_DLL_ACT",)}
 
 
@@ -69,88 +61,6 @@ def present_route(twin: "Twin") -> Route | None:
         if route is not None:
             return _with_radius(route, identified_radius(twin))
     return _manual_until_failsafe(twin, law)
-
-
-@dataclass(frozen=True)
-class ReportedPath:
-    """Path that an autopilot reports to follow, without any list of points.
-
-    Attributes:
-        route: from the point abeam the aircraft on
-        since: time from which the flight is on it, as far as known [s since 1970]
-        law: period and damping of L1 that match the commanded banks, by their names with ArduPlane
-    """
-
-    route: Route
-    since: float
-    law: dict[str, float]
-
-
-def reported_path(twin: "Twin") -> ReportedPath | None:
-    """Return the path that NAV_CONTROLLER_OUTPUT describes in GUIDED; None where it flies to the reported target.
-
-    An onboard computer may command a path point by point. Its course is the reported bearing, the aircraft is left of
-    it by the crosstrack error. A course that turns continues as an arc; what follows is not known.
-    """
-    history, origin, newest = twin.telemetry.history, twin.telemetry.origin, twin.telemetry.history.newest
-    if twin.mode != "GUIDED" or twin.autopilot != "ardupilot" or origin is None or twin.prediction.override is not None:
-        return None
-    t, bearings = history.rows_since("bearing", max(newest - _PATH_FIT_S, twin.onboard.plan_changed_t))
-    (t_c, commands), (t_p, positions) = (
-        history.rows_since(name, t[0] - 2.0 if len(t) else 0.0) for name in ("command", "position")
-    )
-    t_v, velocities = history.rows_since("velocity", t[0] - 2.0 if len(t) else 0.0)
-    if len(t) < _MIN_RADIUS_ROWS or newest - t[-1] > _MAX_ENTRY_AGE_S or min(len(t_p), len(t_v), len(t_c)) < 2:
-        return None
-    p = _at(t, t_p, to_ned(origin, *positions.T))
-    bearing, crosstrack = np.unwrap(bearings[:, 0]), np.interp(t, t_c, commands[:, 2])
-    if twin.onboard.target is not None:
-        offset = _ned(origin, twin.onboard.target)[:2] - p[:, :2]
-        off_target = np.abs(wrap(bearing - np.arctan2(offset[:, 1], offset[:, 0])))
-        if np.median(off_target) < _MIN_OFF_TARGET:
-            return None
-    v = _at(t, t_v, velocities)
-    law = _path_law(bearing, crosstrack, v, np.interp(t, t_c, commands[:, 0]))
-    if law is None or not np.isfinite(crosstrack[-1]):
-        return None
-    recent = t > t[-1] - _PATH_S
-    rate = float(np.polyfit(t[recent] - t[-1], bearing[recent], 1)[0]) if recent.sum() > 3 else 0.0
-    course, speed = float(bearing[-1]), max(float(np.hypot(*v[-1, :2])), 1.0)
-    start = p[-1] + crosstrack[-1] * np.array([-np.sin(course), np.cos(course), 0.0])
-    points = [start]
-    if abs(rate) > _MIN_TURN_RATE:
-        step = copysign(_ARC_STEP, rate)
-        for _ in range(_ARC_STEPS):
-            chord, course = 2.0 * speed / rate * np.sin(0.5 * step), course + step
-            points.append(
-                points[-1] + chord * np.array([np.cos(course - 0.5 * step), np.sin(course - 0.5 * step), 0.0])
-            )
-    points.append(points[-1] + _PATH_M * np.array([np.cos(course), np.sin(course), 0.0]))
-    legs = np.array([make_leg(WAYPOINT, point) for point in points[1:]])
-    remark = ("the path beyond the reported course is not known",)
-    return ReportedPath(Route(origin, legs, start, remark), float(t[-1]) - _PATH_LAG_S, law)
-
-
-def _at(t: np.ndarray, sample_t: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    return np.column_stack([np.interp(t, sample_t, column) for column in rows.T])
-
-
-def _path_law(bearing: np.ndarray, crosstrack: np.ndarray, v: np.ndarray, banks: np.ndarray) -> dict[str, float] | None:
-    """Return period and damping of L1 that match the commanded banks; None where L1 does not.
-
-    phi = atan(4 zeta pi v sin(nu) / (T g)),  nu = asin(e / L1) + bearing - course,  L1 = zeta T v / pi
-    """
-    speed = np.maximum(np.hypot(v[:, 0], v[:, 1]), 1.0)
-    nu2 = wrap(bearing - np.arctan2(v[:, 1], v[:, 0]))
-    best, law = _MAX_PATH_BANK_ERROR, None
-    for T in _PATH_PERIODS:
-        for zeta in _PATH_DAMPINGS:
-            nu = nu2 + np.arcsin(np.clip(crosstrack * pi / (zeta * T * speed), -0.7071, 0.7071))
-            phi = np.arctan(4.0 * zeta * pi * speed / (T * G) * np.sin(np.clip(nu, -pi / 2, pi / 2)))
-            error = float(np.median(np.abs(np.clip(phi, banks.min(), banks.max()) - banks)))
-            if error < best:
-                best, law = error, {"NAVL1_PERIOD": float(T), "NAVL1_DAMPING": float(zeta)}
-    return law
 
 
 def _with_radius(route: Route, radius: float) -> Route:

@@ -10,15 +10,16 @@ from fleet.contract import Mission
 from fleet.mission import route_items
 from twin_worker.prediction import kinematic
 from twin_worker.prediction.autopilot_parameters import ControllerTwin, RouteOverride, multirotor_controller
-from twin_worker.prediction.method_selection import STEP, imm
+from twin_worker.prediction.method_selection import STEP, imm_with_variance
 from twin_worker.prediction.multirotor import fit, rollout
 from twin_worker.telemetry.track import SETTLING_S, Track, hovering_mask, resample_track
-from twin_worker.twin.state.routes import ROUTE_MODES, failsafe_plan, present_route, reported_path
+from twin_worker.twin.state.reported_path import ReportedPath, reported_path
+from twin_worker.twin.state.routes import ROUTE_MODES, failsafe_plan, present_route
 from twin_worker.twin.state.state import Twin
 
 _FIT_WINDOW_S = 130.0  # flight time used to fit the kinematic models [s]
 _VTOL_COMMANDS = (84, 85)  # MAV_CMD: NAV_VTOL_TAKEOFF, NAV_VTOL_LAND
-_KNOWN_PATH_S = 10.0  # part of a path that is commanded point by point which is predicted by its course [s]
+_KNOWN_PATH_S = 5.0  # part of a path that is commanded point by point which its course tells: the distance of L1 [s]
 _WIND_MAX_AGE_S = 10.0  # maximum age of the autopilot's wind estimate [s]
 _TURN_NAMES = {  # parameters of L1 with other autopilots, by their names with ArduPlane
     "NAVL1_PERIOD": ("NAVL1_PERIOD", "FW_L1_PERIOD"),
@@ -112,7 +113,8 @@ def _multirotor_config(twin: Twin, recent: Track, override: RouteOverride | None
     return rollout.with_wing_limits(config) if twin.vehicle_class.rotor_prefix else config
 
 
-def _fixed_wing_config(twin: Twin) -> kinematic.KinematicConfig:
+def fixed_wing_config(twin: Twin) -> kinematic.KinematicConfig:
+    """Return the configuration of the kinematic fixed-wing model from the present state of a twin."""
     assert twin.telemetry.origin is not None
     items = route_items(twin.onboard.mission)
     wind = twin.environment.wind.wind if np.isfinite(twin.environment.wind.t) else _reported_wind(twin)
@@ -164,7 +166,7 @@ def fit_kinematic_models(twin: Twin) -> None:
         config = _multirotor_config(twin, recent)
         twin.models.store_multirotor(fit.fit_model(recent, seq, config, twin.models.multirotor))
     elif not is_hovering(twin):
-        model = kinematic.fit_model(recent, seq, _fixed_wing_config(twin), twin.models.kinematic)
+        model = kinematic.fit_model(recent, seq, fixed_wing_config(twin), twin.models.kinematic)
         twin.models.store_kinematic(model)
 
 
@@ -185,19 +187,22 @@ def predict_without_model(twin: Twin, recent: Track, ahead: np.ndarray) -> PathF
         )
         unbroken = unbroken.part(int(hover_rows[-1]) + 1 if len(hover_rows) else 0, len(unbroken))
     seq = rollout.items_in_force(unbroken.t, twin.telemetry.history.rows_since("leg"), twin.onboard.mission)
-    forecast = kinematic.fly(unbroken, seq, _fixed_wing_config(twin), twin.models.kinematic, ahead)
+    forecast = kinematic.fly(unbroken, seq, fixed_wing_config(twin), twin.models.kinematic, ahead)
     if forecast.path is None:
         return no_prediction(forecast.sentence, forecast.seq)
     text = f"{kinematic.describe(twin.models.kinematic)}. {forecast.sentence}".strip(". ")
-    path = forecast.path if reported_path(twin) is None else _turn_after(forecast.path, ahead)
+    reported = reported_path(twin)
+    path = forecast.path if reported is None or reported.repeats else _turn_after(forecast.path, ahead, reported)
     control, known_s = forecast.controller, forecast.known_s
     return PathForecast(path, "greybox", greybox.LAW, forecast.seq, text, control, known_s)
 
 
-def _turn_after(path: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """Return the path with the mean of straight flight and turns after the known part of a commanded path, (k, 3) [m].
+def _turn_after(path: np.ndarray, ahead: np.ndarray, reported: ReportedPath) -> np.ndarray:
+    """Return the path with its expectation after the known part of a commanded path, (k, 3) [m].
 
-    Where nothing tells whether the aircraft turns, the expected distance from here grows ever more slowly.
+    Nothing tells whether the aircraft turns. Two estimates are combined by their variances: straight flight and turns
+    from the end of the known part on, and the positions of the flight so far, in whose area it stays.
+    Source: Bar-Shalom 2001, 3.4.2 (linear minimum mean square error estimation).
     """
     times = ahead[0] + STEP * np.arange(int(_KNOWN_PATH_S / STEP) + 1)
     known = np.column_stack([np.interp(times, ahead, column) for column in path.T])
@@ -205,7 +210,10 @@ def _turn_after(path: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     if len(known) < 4 or not after.any() or not np.isfinite(known).all():
         return path
     out = path.copy()
-    out[after] = imm(known, np.gradient(known, STEP, axis=0), ahead[after] - times[-1])
+    turns, variance = imm_with_variance(known, np.gradient(known, STEP, axis=0), ahead[after] - times[-1])
+    weight = reported.spread**2 / (reported.spread**2 + variance)
+    turns[:, :2] = reported.centre + weight[:, None] * (turns[:, :2] - reported.centre)
+    out[after] = turns
     return out
 
 

@@ -15,7 +15,7 @@ from twin_worker.prediction.closed_loop import MIN_ROLLOUT_S
 from twin_worker.prediction.method_selection import constant_turn_prediction
 from twin_worker.telemetry.track import Track
 from twin_worker.twin.state.events import record_event
-from twin_worker.twin.state.routes import reported_path
+from twin_worker.twin.state.reported_path import reported_path
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.kinematic_prediction import (
     PathForecast,

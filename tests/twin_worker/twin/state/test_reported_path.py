@@ -8,7 +8,7 @@ from fleet.frames import G, to_geodetic
 from fleet.mission import P_N
 from tests.support.flights import HERE, T0, messages, predictions, turn
 from twin_worker.prediction.autopilot_parameters import fixed_wing_controller
-from twin_worker.twin.state.routes import reported_path
+from twin_worker.twin.state.reported_path import reported_path
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.step import advance
 
@@ -63,6 +63,34 @@ def test_a_course_that_turns_continues_as_an_arc():
     assert chord == pytest.approx(2 * (VA / 0.2) * np.sin(np.radians(7.5)), rel=0.05)
 
 
+def test_a_path_that_returned_to_where_it_was_repeats_its_circuit():
+    twin = flown(0.2, seconds=45.0)
+    path = reported_path(twin)
+    assert path is not None and path.repeats
+    points = path.route.legs[:-1, P_N : P_N + 2]
+    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    assert np.linalg.norm(points - centre, axis=1) == pytest.approx(VA / 0.2 - LEFT, rel=0.06)  # right of a right turn
+    latest = predictions(advance(twin, (), twin.telemetry.history.newest + 1.0))[-1:] or [twin.prediction.latest]
+    ahead, positions = latest[0].ahead.numpy(), latest[0].path.numpy().astype(float)[:, :2]
+    one_lap = int(np.searchsorted(ahead, 2 * np.pi / 0.2))
+    assert np.linalg.norm(positions[one_lap] - positions[0]) < 40.0
+    assert np.linalg.norm(positions[one_lap // 2] - positions[0]) > 150.0  # the other side of the circle
+
+
+def test_a_path_that_crosses_itself_in_another_direction_does_not_repeat():
+    assert not reported_path(flown(0.0)).repeats
+    assert not reported_path(flown(0.2, seconds=25.0)).repeats
+
+
+def test_a_path_that_is_not_known_ends_in_the_area_flown_so_far():
+    twin = flown(0.2, seconds=25.0)
+    path = reported_path(twin)
+    assert path is not None
+    latest = predictions(advance(twin, (), twin.telemetry.history.newest + 1.0))[-1:] or [twin.prediction.latest]
+    positions = latest[0].path.numpy().astype(float)[:, :2]
+    assert np.linalg.norm(positions[-1] - path.centre) < 0.5 * path.spread
+
+
 def test_flight_to_the_reported_target_and_other_modes_have_no_such_path():
     assert reported_path(flown(0.0, at_target=True)) is None
     assert reported_path(flown(0.0, mode="AUTO")) is None
@@ -74,7 +102,7 @@ def test_the_prediction_follows_the_path_instead_of_the_turn_rate():
     latest = made[-1] if made else twin.prediction.latest
     assert latest is not None and latest.method == "greybox" and "reported course" in latest.sentence
     ahead, path = latest.ahead.numpy(), latest.path.numpy().astype(float)
-    k = int(np.searchsorted(ahead, 9.0))
+    k = int(np.searchsorted(ahead, 5.0))
     right = (path[k] - path[0])[:2] @ np.array([-np.sin(1.0), np.cos(1.0)])
     assert right == pytest.approx(LEFT, abs=2.0)  # onto the path
     travelled = np.linalg.norm(path[[k, int(np.searchsorted(ahead, 60.0))], :2] - path[0, :2], axis=1)
