@@ -56,7 +56,6 @@ def made(
         free_run_error_before=6.1,
         free_run_error_after=2.2,
         where=("pitch", ((ONSET, 118.0), (130.0, LENGTH))) if outcome is ReportOutcome.UNKNOWN else ("", ()),
-        anomaly_ratio={"pitch": 3.0},
         terms={"q·V": -0.42, "sin(0.9 t)": 1.3e-5} if outcome is ReportOutcome.UNKNOWN else {},
         ranking=() if outcome is ReportOutcome.NONE else _tried(),
         limitations=("the accelerometer comes at 5 Hz: gusts and small changes of lift are seen less well",),

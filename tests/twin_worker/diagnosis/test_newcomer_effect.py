@@ -12,8 +12,9 @@ from fleet.effects import FOLDERS_ENV, Onset, catalogue
 from tests.support.effect_flights import CARD, Plan, flown
 from twin_worker.diagnosis.baseline.calibrate import calibrate
 from twin_worker.diagnosis.data.card import FaultHypothesis, OnsetProfile
-from twin_worker.diagnosis.inference.diagnose import MIN_RMS_DROP, diagnose
+from twin_worker.diagnosis.inference.diagnose import diagnose
 from twin_worker.diagnosis.inference.report import ReportOutcome
+from twin_worker.diagnosis.inference.validation.cross_validate import MIN_RMS_DROP
 
 PAGE = (ROOT / "docs" / "extending.md").read_text()
 (DOOR,) = re.findall(r'^```python title="door_jammed.py"\n(.*?)^```', PAGE, re.M | re.S)

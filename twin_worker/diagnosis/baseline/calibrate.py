@@ -8,14 +8,16 @@ import numpy as np
 from twin_worker.diagnosis.baseline.fit import drag_uncertainty, fit, fit_timing, terms_in_wind
 from twin_worker.diagnosis.data.card import AircraftCard, FaultHypothesis
 from twin_worker.diagnosis.data.flight import FlightData
+from twin_worker.diagnosis.inference.isolation.block_means import BLOCK_ROWS, BlockMeans, block_sigma
+from twin_worker.diagnosis.inference.isolation.isolate import scan
 from twin_worker.diagnosis.inference.isolation.nuisance import (
     MAX_SPREAD_RATIO,
     drift_modes,
     drift_slopes,
     list_nuisances,
 )
-from twin_worker.diagnosis.inference.isolation.select_hypotheses import best_hypotheses
-from twin_worker.diagnosis.inference.isolation.unmodelled import find_anomalies
+from twin_worker.diagnosis.inference.isolation.search import best_hypotheses, has_size
+from twin_worker.diagnosis.inference.isolation.unmodelled import find_anomalies, find_changed_coefficients
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline, Noise, wind_is_nominal
 from twin_worker.diagnosis.model.envelope import nominal_envelope
@@ -84,17 +86,36 @@ def with_statistics(
     base = _with_noise(base, modelled_flights, winds, remove_mean)
     progress("computing the chance gains of nominal flights")
     chance: dict[str, float] = {}
-    usual = []
+    block_chance: dict[str, float] = {}
+    flights = []
     for modelled, w in zip(modelled_flights, winds, strict=True):
         own = replace(modelled.base, noise=base.noise, spread=base.spread, usual=base.usual, others=base.others)
         with_noise = ModelledFlight(modelled.flight, own, template=modelled)
-        whitened = WhitenedResiduals(with_noise, weather_hypotheses(w) if wind_is_nominal(base) else ())
-        usual.append(whitened.mean_square())
-        for scored in best_hypotheses(whitened, ()):
+        flights.append(WhitenedResiduals(with_noise, weather_hypotheses(w) if wind_is_nominal(base) else ()))
+    usual = np.median([whitened.mean_square() for whitened in flights], axis=0)
+    floor = base.noise.sigma / np.sqrt(BLOCK_ROWS)  # of white noise
+    sigma = np.maximum(np.sqrt(np.mean([block_sigma(whitened) ** 2 for whitened in flights], axis=0)), floor)
+    for whitened in flights:
+        scanned = scan(whitened)
+        reached = [
+            scored for scored in scanned if has_size(scored.hypothesis)
+        ]  # the gain of a wrong sign is not reached
+        for scored in (*reached, *best_hypotheses(whitened, scanned)):
             chance[scored.kind] = max(chance.get(scored.kind, 0.0), scored.gain)
-        for anomaly in find_anomalies(whitened, whitened):
+        means = BlockMeans(whitened, sigma)
+        without = means.cost(())
+        for scored in reached:
+            gain = without - means.cost((scored.hypothesis,))
+            block_chance[scored.kind] = max(block_chance.get(scored.kind, 0.0), gain)
+        for anomaly in (*find_anomalies(whitened), *find_changed_coefficients(whitened)):
             chance[anomaly.kind] = max(chance.get(anomaly.kind, 0.0), anomaly.net_gain)
-    return replace(base, chance=chance, usual=np.maximum(np.median(usual, axis=0), _MIN_USUAL))
+    return replace(
+        base,
+        chance=chance,
+        block_chance=block_chance,
+        usual=np.maximum(usual, _MIN_USUAL),
+        block_sigma=sigma,
+    )
 
 
 def _check_plausible(base: Baseline) -> None:

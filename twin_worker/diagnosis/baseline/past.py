@@ -94,6 +94,7 @@ def calibrate_past(
     return replace(
         base,
         noise=Noise(base.noise.ar, np.where(is_baro, IGNORED_SIGMA, base.noise.sigma)),
+        block_sigma=np.where(is_baro, IGNORED_SIGMA, base.block_sigma),
         spread=base.spread | _bias_spreads(modelled_past, weather) | _weather_spreads(modelled_past, weather),
         chance=_chance_gains(base, max(later_s, past.seconds) * len(pieces) / past.seconds),
     )

@@ -1,19 +1,16 @@
 """Diagnose one flight with the calibrated simulation: locate, isolate, estimate and validate effects."""
 
 import time
-from collections.abc import Callable
-from copy import copy
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from fleet.effects import Onset, Stage, catalogue
 from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.data.flight import FlightData, decimated
+from twin_worker.diagnosis.inference.isolation.decision import TURBULENCE, Decision, decide
 from twin_worker.diagnosis.inference.isolation.isolate import MIN_R2, ScoredHypothesis
-from twin_worker.diagnosis.inference.isolation.refine import refine
-from twin_worker.diagnosis.inference.isolation.select_hypotheses import select_hypotheses, turbulence_evidence
-from twin_worker.diagnosis.inference.isolation.unmodelled import find_anomalies, first_unexplained
+from twin_worker.diagnosis.inference.isolation.search import Search, turbulence_evidence
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 from twin_worker.diagnosis.inference.report import (
     DiagnosisFinding,
@@ -25,29 +22,21 @@ from twin_worker.diagnosis.inference.report import (
     with_sentence,
 )
 from twin_worker.diagnosis.inference.validation import cross_validate, force_prediction
-from twin_worker.diagnosis.inference.validation.cross_validate import (
-    MIN_RMS_DROP,
-    CrossValidation,
-    free_form,
-    high_segments,
-)
+from twin_worker.diagnosis.inference.validation.cross_validate import CrossValidation, free_form, high_segments
 from twin_worker.diagnosis.inference.validation.force_prediction import free_run_errors
 from twin_worker.diagnosis.inference.validation.spread import covariances, recommend_manoeuvre, reported_sigma
 from twin_worker.diagnosis.model.baseline import CHANNEL_OF, CHANNELS, Baseline
 from twin_worker.diagnosis.model.residual import ModelledFlight
 from twin_worker.diagnosis.model.weather import own_weather
 
-_MIN_FORCE_DROP = 0.10  # or of the error of predicted forces
-_MIN_HELD_OUT_SHARE = 0.15  # least share of an effect's gain on held-out data
-_STRONG_SHARE, _STRONG_GAIN = 0.4, 450.0  # or a strong gain: least share of it on held-out data, and least gain
-_CHANCE_FACTOR, _MIN_STRONG_GAIN = 5.0, 150.0  # least strong gain: multiple of the chance gain, lower limit
-_MAX_RATIO = 3.0  # largest ratio of mean square to usual without an explanation
-_MAX_RATIO_NAMED = 2.6  # the same limit with the named effects included
-_MIN_EXPLAINED = 0.6  # least share of the excess that named effects explain
-_MIN_SIGMAS = 2.0  # a parameter below this many standard deviations is not significant
+# least probability that effects of the catalogue, and nothing else, act; and of each from held-out data alone [-]
+NAMED_PROBABILITY = 0.5
+SUSPECTED_PROBABILITY = 0.1  # the same, for a suspicion of separable effects [-]
+MAX_CLASS = 4  # largest number of effects that a name may stand for
+MAX_RATIO = 3.0  # largest mean square of a channel over its usual without a better explanation [-]
 _MAX_SPEED_RATIO = 1.7  # a larger speed ratio means another aircraft
+_N_STATED = 5  # sets of effects whose probability a report states
 _INTENSITY_SIGMA = 0.2  # relative standard deviation of a turbulence intensity
-_MIN_GUST_GAIN = 450.0  # least gain of turbulence
 _JUDGED_CHANNELS = [
     CHANNELS.index(name) for name in ("force_x", "side", "lift", "roll", "pitch", "yaw", "airspeed", "baro")
 ]
@@ -71,38 +60,30 @@ def diagnose(flight: FlightData, base: Baseline, progress: ReportProgress = lamb
     weather = own_weather(modelled)
     whitened = WhitenedResiduals(modelled, weather)
     before, white_before = whitened.mean_square() / base.usual, _profiled_residuals(whitened)
-    gust_gain, _ = turbulence_evidence(whitened)
-    progress("selecting effects")
-    unconditioned = copy(whitened)
-    named, ranked = select_hypotheses(whitened, weather, progress)
-    if gust_gain > _MIN_GUST_GAIN and gust_gain > sum(selected.gain for selected in named):
-        named = []
+    progress("searching for explanations")
+    search = Search(whitened)
+    search.run(progress)
+    decision = decide(search.explanations, search.weights)
     progress("validating on held-out data")
-    named, validation, findings = _cross_validated(unconditioned, named, before)
-    whitened.condition_on((*weather, *(selected.hypothesis for selected in named)))
+    named, validation, confirmed = _validated(search, decision, before)
+    whitened.condition_on((*weather, *decision.nominal, *(member.hypothesis for member in named)))
     after, white_after = whitened.mean_square() / base.usual, _profiled_residuals(whitened)
-    if not any(map(_is_significant, findings)):
-        findings = ()
-    if not named and (turbulence := _turbulence_finding(whitened)) is not None:
-        findings = (turbulence,)
+    if decision.best is not None and decision.best.change == TURBULENCE:
+        findings: tuple[DiagnosisFinding, ...] = (_turbulence_finding(whitened, decision),)
+        outcome = _outcome(decision, confirmed=True, fits=True)
+    else:
+        findings = _findings(whitened, weather, named, validation, decision)
+        outcome = _outcome(decision, confirmed, _fits(before, after))
     measured, simulated, with_effects = force_prediction.predict_forces(modelled, weather, validation.fitted)
     errors = [force_prediction.rms(modelled, measured - x) for x in (simulated, with_effects)]
-    strong_gain = sum(_strong_gain(base, finding) for finding in findings)
-    outcome = _outcome(findings, validation, (1.0 - errors[1] / errors[0], strong_gain), before, after)
-    accepted = findings if outcome is ReportOutcome.NAMED else ()
-    if not accepted:
+    if outcome is not ReportOutcome.NAMED:
         whitened.condition_on(weather)
-    turbulent = any(finding.hypothesis.effect.variance for finding in findings)
-    anomalies = [] if turbulent else find_anomalies(whitened, unconditioned)
-    accepted_gain = sum(finding.gain for finding in accepted)
-    anomaly = first_unexplained(anomalies, base, accepted_gain, still_high=after.max() > _MAX_RATIO_NAMED)
-    if anomaly is not None:
-        outcome = ReportOutcome.UNKNOWN
     where: tuple[str, tuple[tuple[float, float], ...]] = ("", ())
     terms: dict[str, float] = {}
     if outcome is ReportOutcome.UNKNOWN:
+        anomaly = decision.anomaly
         judged = _JUDGED_CHANNELS[int(np.argmax(after[_JUDGED_CHANNELS]))]
-        channel = CHANNELS.index(anomaly.channel) if anomaly else judged
+        channel = CHANNELS.index(anomaly.channel) if anomaly and decision.unmodelled > decision.none else judged
         where = (CHANNELS[channel], high_segments(modelled.t, white_after[:, channel], whitened.ok))
         terms = free_form(modelled, weather, channel)
     free_runs = free_run_errors(modelled, [weather, *([(*weather, *validation.fitted)] if validation.fitted else [])])
@@ -110,7 +91,7 @@ def diagnose(flight: FlightData, base: Baseline, progress: ReportProgress = lamb
         flight=flight.name,
         outcome=outcome,
         sentence="",
-        findings=findings,
+        findings=() if outcome is ReportOutcome.NONE else findings,
         ratio_before=dict(zip(CHANNELS, before.tolist(), strict=True)),
         ratio_after=dict(zip(CHANNELS, after.tolist(), strict=True)),
         fit_before=validation.before,
@@ -120,9 +101,8 @@ def diagnose(flight: FlightData, base: Baseline, progress: ReportProgress = lamb
         free_run_error_before=float(np.degrees(free_runs[0])),
         free_run_error_after=float(np.degrees(free_runs[-1])),
         where=where,
-        anomaly_ratio={entry.kind: entry.net_gain / entry.limit(base) for entry in anomalies},
         terms=terms,
-        ranking=_ranking(ranked, named),
+        ranking=_ranking(search.ranking, decision.best.members if decision.best else ()),
         limitations=(*flight.limitations, *uncovered_axes(base)),
         series=FigureSeries(
             t=modelled.t,
@@ -136,6 +116,7 @@ def diagnose(flight: FlightData, base: Baseline, progress: ReportProgress = lamb
             held_out=force_prediction.blocks(modelled.t, odd=True),
         ),
         seconds=time.perf_counter() - started,
+        posterior=_stated(decision),
     )
     return with_sentence(report)
 
@@ -166,7 +147,7 @@ def uncovered_axes(base: Baseline) -> tuple[str, ...]:
     )
 
 
-def _ranking(ranked: list[ScoredHypothesis], named: list[ScoredHypothesis]) -> tuple[RankedCandidate, ...]:
+def _ranking(ranked: Sequence[ScoredHypothesis], named: Sequence[ScoredHypothesis]) -> tuple[RankedCandidate, ...]:
     """List every hypothesis tested, named and rival ones included, once per label with its best onset."""
     best: dict[str, RankedCandidate] = {}
     for scored in (*ranked, *(alternative for n in named for alternative in (n, *n.rivals))):
@@ -181,38 +162,46 @@ def _profiled_residuals(whitened: WhitenedResiduals) -> np.ndarray:
     return np.where(whitened.ok[:, None], e, np.nan)
 
 
-def _cross_validated(
-    unconditioned: WhitenedResiduals, named: list[ScoredHypothesis], before: np.ndarray
-) -> tuple[list[ScoredHypothesis], CrossValidation, tuple[DiagnosisFinding, ...]]:
-    """Cross-validate the selected effects; remove those after the first that held-out data do not confirm."""
-    whitened, weather = copy(unconditioned), unconditioned.conditions
+def _stated(decision: Decision) -> dict[str, float]:
+    """Return the probability of the most probable sets of effects, of `none`, and of `unknown`."""
+    ranked = [(names, p) for names, p in decision.sets.items() if names][:_N_STATED]
+    out = {" + ".join(sorted(names)): p for names, p in ranked}
+    return out | {"none": decision.none, "unknown": decision.unmodelled}
+
+
+def _validated(
+    search: Search, decision: Decision, before: np.ndarray
+) -> tuple[tuple[ScoredHypothesis, ...], CrossValidation, bool]:
+    """Return the effects of the best explanation that held-out data confirm, their cross-validation, and True.
+
+    Where held-out data confirm none of them, the last one and False.
+    """
+    named = decision.best.members if decision.best and decision.effects > SUSPECTED_PROBABILITY else ()
     while named:
-        hypotheses = tuple(selected.hypothesis for selected in named)
-        proof = cross_validate.fit_and_validate(unconditioned, hypotheses, before)
-        findings = _findings(whitened, weather, named, proof)
-        order = sorted(range(len(named)), key=lambda k: -named[k].gain)
-        weak = [
-            k for k in order[1:] if findings[k].held_out_share < _MIN_HELD_OUT_SHARE or not _is_significant(findings[k])
-        ]
-        if not weak:
-            return named, proof, findings
-        named = [selected for k, selected in enumerate(named) if k != weak[-1]]
-        for i, selected in enumerate(named):
-            whitened.condition_on((*weather, *(other.hypothesis for k, other in enumerate(named) if k != i)))
-            named[i] = replace(refine(whitened, selected.hypothesis), rivals=selected.rivals)
-    return [], CrossValidation(np.nan, np.nan, (), ()), ()
+        named = search.estimated(named)
+        hypotheses = tuple(member.hypothesis for member in named)
+        proof = cross_validate.fit_and_validate(search.whitened, hypotheses, before, search.blocks, search.weights)
+        probability = [proof.probability(k) for k in range(len(named))]
+        weakest = int(np.argmin(probability))
+        if probability[weakest] > NAMED_PROBABILITY or len(named) == 1:
+            return named, proof, probability[weakest] > NAMED_PROBABILITY
+        named = (*named[:weakest], *named[weakest + 1 :])
+    return (), CrossValidation(np.nan, np.nan, (), ()), False
 
 
 def _findings(
     whitened: WhitenedResiduals,
     weather: tuple[FaultHypothesis, ...],
-    named: list[ScoredHypothesis],
+    named: tuple[ScoredHypothesis, ...],
     validation: CrossValidation,
+    decision: Decision,
 ) -> tuple[DiagnosisFinding, ...]:
+    if not named:
+        return ()
     body = whitened.base.card.body
     findings = []
     all_covariances = covariances(whitened, weather, [selected.hypothesis for selected in named])
-    for selected, covariance, held_out_gain in zip(named, all_covariances, validation.held_out_gains, strict=True):
+    for k, (selected, covariance) in enumerate(zip(named, all_covariances, strict=True)):
         hypothesis = selected.hypothesis
         rivals = [rival.hypothesis for rival in selected.rivals]
         findings.append(
@@ -227,7 +216,8 @@ def _findings(
                 channel=hypothesis.effect.channel,
                 surface=hypothesis.target if hypothesis.effect.stage is Stage.DELTA else "",
                 segments=(_segment(hypothesis, float(whitened.modelled.t[0]), float(whitened.modelled.t[-1])),),
-                held_out_share=held_out_gain / max(selected.gain, 1e-9),
+                held_out_share=validation.held_out_gains[k] / max(selected.gain, 1e-9),
+                probability=decision.names.get(hypothesis.effect.name, 0.0),
             )
         )
     return tuple(findings)
@@ -241,11 +231,9 @@ def _segment(hypothesis: FaultHypothesis, first: float, last: float) -> tuple[fl
     return max(hypothesis.onset.t0, first), last
 
 
-def _turbulence_finding(whitened: WhitenedResiduals) -> DiagnosisFinding | None:
-    """Return turbulence as a finding if the residuals scatter as gusts do."""
+def _turbulence_finding(whitened: WhitenedResiduals, decision: Decision) -> DiagnosisFinding:
+    """Return turbulence as a finding; its intensity follows from the scatter of sideslip."""
     gain, variance_ratio = turbulence_evidence(whitened)
-    if gain < _MIN_GUST_GAIN:
-        return None
     effect = catalogue()["turbulence"]
     eq_terms = whitened.modelled.equation_terms(whitened.conditions)
     beta = np.radians(whitened.modelled.residuals(whitened.conditions)[whitened.ok][:, CHANNELS.index("side")])
@@ -253,7 +241,7 @@ def _turbulence_finding(whitened: WhitenedResiduals) -> DiagnosisFinding | None:
     reported = effect.reported(effect, np.array([intensity]), whitened.base.card.body)
     return DiagnosisFinding(
         hypothesis=FaultHypothesis(effect, "", (intensity,)),
-        gain=gain,
+        gain=float(gain.sum()),
         reported=reported,
         sigma={name: _INTENSITY_SIGMA * x for name, x in reported.items()},
         parameter_sigma=(_INTENSITY_SIGMA * intensity,),
@@ -263,56 +251,34 @@ def _turbulence_finding(whitened: WhitenedResiduals) -> DiagnosisFinding | None:
         surface="",
         segments=((float(whitened.modelled.t[0]), float(whitened.modelled.t[-1])),),
         held_out_share=1.0,
+        probability=decision.names[TURBULENCE],
     )
 
 
-def _outcome(
-    findings: tuple[DiagnosisFinding, ...],
-    validation: CrossValidation,
-    force_evidence: tuple[float, float],
-    before: np.ndarray,
-    after: np.ndarray,
-) -> ReportOutcome:
-    """Decide the outcome; `force_evidence`: relative drop of the held-out force error, and least strong gain."""
-    force_drop, strong_gain = force_evidence
-    turbulent = any(finding.hypothesis.effect.variance for finding in findings)
-    strong = (
-        all(finding.held_out_share >= _STRONG_SHARE for finding in findings)
-        and sum(finding.gain for finding in findings) > strong_gain
-    )
-    gained = validation.rms_drop >= MIN_RMS_DROP or (
-        validation.rms_drop > 0.0 and (force_drop >= _MIN_FORCE_DROP or strong)
-    )
-    significant = all(
-        finding.held_out_share >= _MIN_HELD_OUT_SHARE and _is_significant(finding) and not _at_bound(finding)
-        for finding in findings
-    )
-    proven = turbulent or (gained and significant)
+def _fits(before: np.ndarray, after: np.ndarray) -> bool:
+    """Return whether every channel is as usual with the effects, or they explain the greater part of what was not.
+
+    Args:
+        before, after: mean square of each channel over its usual, without and with the effects, (c,)
+    """
     excess = [np.maximum(x[_JUDGED_CHANNELS] - 1.0, 0.0).sum() for x in (before, after)]
-    explained = 1.0 - excess[1] / max(excess[0], 1e-9)
-    if findings and proven:
-        unexplained = after[_JUDGED_CHANNELS].max() > _MAX_RATIO_NAMED and explained < _MIN_EXPLAINED and not turbulent
-        return ReportOutcome.UNKNOWN if unexplained else ReportOutcome.NAMED
-    if before[_JUDGED_CHANNELS].max() > _MAX_RATIO:
+    least = np.minimum(before, after)[_JUDGED_CHANNELS]  # what is as usual needs no explanation
+    return bool(least.max() < MAX_RATIO or excess[1] < 0.5 * excess[0])
+
+
+def _outcome(decision: Decision, confirmed: bool, fits: bool) -> ReportOutcome:
+    """Decide the outcome.
+
+    Args:
+        decision: posterior of the explanations
+        confirmed: held-out data confirm an effect of the best set
+        fits: the residuals with these effects are as usual
+    """
+    if decision.unmodelled > max(decision.effects, decision.none) or not fits:
         return ReportOutcome.UNKNOWN
-    return ReportOutcome.SUSPECTED if findings else ReportOutcome.NONE
-
-
-def _strong_gain(base: Baseline, finding: DiagnosisFinding) -> float:
-    """Return the gain that counts as strong for an effect, from the gain that nominal flights reach by chance."""
-    if not base.vane:
-        return _STRONG_GAIN
-    chance = max((x for kind, x in base.chance.items() if kind.startswith(f"{finding.hypothesis.label}|")), default=0.0)
-    return min(max(_CHANCE_FACTOR * chance, _MIN_STRONG_GAIN), _STRONG_GAIN)
-
-
-def _is_significant(finding: DiagnosisFinding) -> bool:
-    """Return whether any parameter except nuisances is significantly different from zero."""
-    counted = zip(finding.hypothesis.effect.parameters, finding.hypothesis.par, finding.parameter_sigma, strict=True)
-    return any(abs(x) > _MIN_SIGMAS * sigma and not p.nuisance for p, x, sigma in counted)
-
-
-def _at_bound(finding: DiagnosisFinding) -> bool:
-    """Return whether a parameter except nuisances is at its physical bound; a share of 1 is allowed there."""
-    counted = zip(finding.hypothesis.effect.parameters, finding.hypothesis.par, strict=True)
-    return any(x and x in (p.low, p.high) and x != 1.0 and not p.nuisance for p, x in counted)
+    members = decision.best.members if decision.best else ()
+    separable = all(1 + len(member.rivals) <= MAX_CLASS for member in members)
+    if confirmed and separable and decision.effects > NAMED_PROBABILITY:
+        return ReportOutcome.NAMED
+    least = SUSPECTED_PROBABILITY if separable else NAMED_PROBABILITY
+    return ReportOutcome.SUSPECTED if decision.effects > least else ReportOutcome.NONE

@@ -35,6 +35,7 @@ class DiagnosisFinding:
         channel, surface: location; surface may be empty
         segments: start and end times since the start of the flight [s]
         held_out_share: share of the gain that is present on held-out data
+        probability: posterior probability that this effect acts; nan where none is computed
     """
 
     hypothesis: FaultHypothesis
@@ -48,6 +49,7 @@ class DiagnosisFinding:
     surface: str
     segments: tuple[tuple[float, float], ...]
     held_out_share: float = 0.0
+    probability: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,7 @@ class Report:
         force_before, force_after: rms error of simulated specific force on held-out blocks [m/s2]
         free_run_error_before, free_run_error_after: rms attitude error of 5 s free runs on held-out blocks [deg]
         where: for unknown: channel and segments
-        anomaly_ratio: anomaly kind -> gain over its chance limit
+        posterior: probability of the most probable sets of effects, of `none`, and of `unknown`
         terms: for unknown: sparse free-form fit without physical meaning, `term -> coefficient`
         ranking: candidates, best first
         limitations: detection power lost because of missing data, in sentences
@@ -115,13 +117,13 @@ class Report:
     free_run_error_before: float
     free_run_error_after: float
     where: tuple[str, tuple[tuple[float, float], ...]]
-    anomaly_ratio: dict[str, float]
     terms: dict[str, float]
     ranking: tuple[RankedCandidate, ...]
     limitations: tuple[str, ...]
     series: FigureSeries = field(compare=False)
     seconds: float = 0.0
     detection_limits: tuple[str, ...] = ()
+    posterior: dict[str, float] = field(default_factory=dict)
 
 
 def with_sentence(report: Report) -> Report:

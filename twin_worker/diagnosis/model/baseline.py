@@ -13,6 +13,7 @@ CHANNELS = (
 )
 """Residuals: fx [m/s2]; beta, alpha [deg]; p', q', r' [rad/s2]; airspeed [m/s]; dV/dt against the accelerometer
 [m/s2]; Euler rates against the gyros [rad/s]; barometric height [m]."""
+IGNORED_SIGMA = 1e6  # noise sigma of an ignored channel
 WEATHER_MPS = 1.0  # larger wind spread between nominal flights: a mean wind is then nominal
 
 
@@ -76,8 +77,10 @@ class Baseline:
         noise: of the residuals
         spread: nuisance -> standard deviation between flights, in its own unit
         chance: hypothesis and kind of onset -> largest gain on left-out nominal flights
+        block_chance: the same with the largest gain in the means over 10 s
         others: coefficients with each nominal flight left out, less those of all flights: their uncertainty
         usual: mean square of each whitened residual on nominal flights, (c,)
+        block_sigma: standard deviation of the raw residual's mean over 10 s on left-out nominal flights, (c,)
         flights: names of the nominal flights
         envelope: conditions of the nominal flights; None where the flight itself is its baseline
     """
@@ -92,8 +95,10 @@ class Baseline:
     noise: Noise = field(default_factory=unit_noise)
     spread: dict[str, float] = field(default_factory=dict)
     chance: dict[str, float] = field(default_factory=dict)
+    block_chance: dict[str, float] = field(default_factory=dict)
     others: tuple[dict[str, np.ndarray], ...] = ()
     usual: np.ndarray = field(default_factory=lambda: np.ones(len(CHANNELS)))
+    block_sigma: np.ndarray = field(default_factory=lambda: np.full(len(CHANNELS), IGNORED_SIGMA))
     flights: tuple[str, ...] = ()
     envelope: Envelope | None = None
 
@@ -106,16 +111,15 @@ class Baseline:
 CHANNEL_OF = {"X": "force_x", "beta": "side", "alpha": "lift", "L": "roll", "M": "pitch", "N": "yaw"}
 """Equation -> channel of its residual."""
 
-IGNORED_SIGMA = 1e6  # noise sigma of an ignored channel
-
 
 def exclude_equations(base: Baseline, equations: Iterable[str]) -> Baseline:
     """Return a baseline that ignores the residuals of some equations."""
-    sigma, r2 = base.noise.sigma.copy(), dict(base.r2)
+    sigma, block_sigma, r2 = base.noise.sigma.copy(), base.block_sigma.copy(), dict(base.r2)
     for name in equations:
-        sigma[CHANNELS.index(CHANNEL_OF[name])] = IGNORED_SIGMA
+        channel = CHANNELS.index(CHANNEL_OF[name])
+        sigma[channel] = block_sigma[channel] = IGNORED_SIGMA
         r2[name] = min(r2.get(name, 0.0), 0.0)
-    return replace(base, noise=Noise(base.noise.ar, sigma), r2=r2)
+    return replace(base, noise=Noise(base.noise.ar, sigma), block_sigma=block_sigma, r2=r2)
 
 
 def wind_is_nominal(base: Baseline) -> bool:

@@ -17,7 +17,7 @@ from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline
 from twin_worker.diagnosis.model.equations import TERMS
 
 FORMAT = "parauav.simulation.1"
-_OPTIONAL = ("envelope",)  # fields that earlier models lack
+_OPTIONAL = ("envelope", "block_sigma", "block_chance")  # fields that earlier models lack
 
 
 def save(path: Path, base: Baseline, findings: Sequence[DiagnosisFinding] = ()) -> None:
@@ -72,7 +72,10 @@ def _check_shapes(base: Baseline) -> None:
     for coef in (base.coef, *base.others):
         for name, terms in TERMS.items():
             _check_array(coef[name], (len(terms),))
-    for array, shape in ((base.noise.ar, (n, 2)), (base.noise.sigma, (n,)), (base.usual, (n,))):
+    for array, shape in (
+        *((base.noise.ar, (n, 2)), (base.noise.sigma, (n,))),
+        *((base.usual, (n,)), (base.block_sigma, (n,))),
+    ):
         _check_array(array, shape)
     for value in (base.speed, base.airspeed):
         if not isfinite(value) or value <= 0:
@@ -115,6 +118,7 @@ def as_json(report: Report, predictions: Path | None = None) -> dict[str, Any]:
             "name": finding.hypothesis.effect.name,
             "parameters": _finite(finding.reported),
             "sigma": _finite(finding.sigma),
+            "posterior": _or_none(finding.probability),
         }
         for finding in report.findings
     ]
@@ -129,6 +133,8 @@ def as_json(report: Report, predictions: Path | None = None) -> dict[str, Any]:
         "located": located,
         "parameters": [_finite(finding.reported) for finding in named],
         "sigma": [_finite(finding.sigma) for finding in named],
+        "posterior": [_or_none(finding.probability) for finding in named],
+        "explanations": report.posterior,
         "suspects": suspects if not named else [],
         "fit_before": _or_none(report.fit_before),
         "fit_after": _or_none(report.fit_after),
@@ -139,7 +145,6 @@ def as_json(report: Report, predictions: Path | None = None) -> dict[str, Any]:
         "predictions": str(predictions) if predictions else None,
         "channels_before": _finite(report.ratio_before),
         "channels_after": _finite(report.ratio_after),
-        "odd": report.anomaly_ratio,
         "free_form": report.terms,
         "lacks": list(report.limitations),
         "detection_limits": list(report.detection_limits),

@@ -1,7 +1,8 @@
 """Scan all effects, targets and onsets; one whitened Jacobian per effect and target serves all onsets."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,11 +42,73 @@ class ScoredHypothesis:
 
 def scan(whitened: WhitenedResiduals) -> list[ScoredHypothesis]:
     """Return the best hypothesis of every effect, target and kind of onset, best first."""
-    out = []
-    for effect, target in candidates(whitened):
-        scan_effect = _scan_by_start if effect.initial_guesses else _scan_by_slope
-        out += scan_effect(whitened, effect, target)
-    return sorted(out, key=lambda scored: -scored.net_gain)
+    return Scanner(whitened).scan(whitened)
+
+
+class _StepsOf(NamedTuple):
+    """One kind of onset of one effect: gates and profiles of the tested onsets, and inverse normal matrices."""
+
+    kind: Onset
+    gates: np.ndarray
+    onsets: list[OnsetProfile]
+    inverse: np.ndarray
+
+
+class _Slopes(NamedTuple):
+    """Whitened slopes of one effect, (n, c, k), scaled; those of the first rows of a step, and the kinds of onset."""
+
+    zero: FaultHypothesis
+    scale: np.ndarray
+    J: np.ndarray
+    onset_slopes: np.ndarray | None
+    kinds: list[_StepsOf]
+
+
+class _Starts(NamedTuple):
+    """Whitened change of the residuals, (n, c), under each start value of an effect without a slope at zero."""
+
+    hypotheses: list[FaultHypothesis]
+    changes: list[np.ndarray]
+
+
+class Scanner:
+    """Scan of all effects, targets and onsets, with slopes computed once and used for every set of conditions.
+
+    Args:
+        whitened: residuals without any effect
+    """
+
+    def __init__(self, whitened: WhitenedResiduals) -> None:
+        self._slopes: list[_Slopes] = []
+        self._starts: list[_Starts] = []
+        for effect, target in candidates(whitened):
+            if effect.initial_guesses:
+                starts = [FaultHypothesis(effect, target, start) for start in effect.initial_guesses]
+                reference = whitened.residuals(())
+                self._starts.append(_Starts(starts, [whitened.residuals((one,)) - reference for one in starts]))
+            elif (slopes := _prepare_slopes(whitened, effect, target)) is not None:
+                self._slopes.append(slopes)
+
+    def scan(self, whitened: WhitenedResiduals) -> list[ScoredHypothesis]:
+        """Return the best hypothesis of every effect, target and kind of onset, best first."""
+        profiled = whitened.e + whitened.Jn @ whitened.xn
+        out = []
+        for slopes in self._slopes:
+            score = -(np.swapaxes(slopes.J, 1, 2) @ profiled[..., None])[..., 0]
+            for steps in slopes.kinds:
+                b = _onset_sums(score, steps.gates, steps.kind)
+                if steps.kind is Onset.STEP and slopes.onset_slopes is not None:
+                    for offset, new in enumerate(slopes.onset_slopes):
+                        i = steps.gates + offset
+                        b = b - np.einsum("mci,mc->mi", new[i] - slopes.J[i], profiled[i])
+                x = (steps.inverse @ b[..., None])[..., 0]
+                gain = np.nan_to_num((b * x).sum(axis=1))  # an effect that the flight does not excite has no gain
+                best = int(np.argmax(gain))
+                fitted = slopes.zero.with_parameters(x[best] / slopes.scale, steps.onsets[best])
+                out.append(ScoredHypothesis(float(gain[best]), fitted))
+        for starts in self._starts:
+            out += _scan_starts(whitened, starts)
+        return sorted(out, key=lambda scored: -scored.net_gain)
 
 
 def candidates(whitened: WhitenedResiduals) -> Iterator[tuple[Effect, str]]:
@@ -65,19 +128,20 @@ def covered(base: Baseline, effect: Effect, target: str) -> bool:
     return equation is None or base.r2.get(equation, 1.0) > MIN_R2
 
 
-def _scan_by_slope(whitened: WhitenedResiduals, effect: Effect, target: str) -> list[ScoredHypothesis]:
+def _prepare_slopes(whitened: WhitenedResiduals, effect: Effect, target: str) -> _Slopes | None:
+    """Return the slopes of an effect at zero, or None if the flight does not show it."""
     step = np.array([p.step for p in effect.parameters])
     zero = FaultHypothesis(effect, target, (0.0,) * effect.n_parameters)
     raw_slopes = whitened.residual_slopes(zero, step)
     J = whitened.whiten_slopes(raw_slopes)
     scale = np.sqrt((J**2).sum(axis=(0, 1)))
     if not (scale > 1e-9).all():
-        return []
+        return None
     J = J / scale
     # a force derived from the velocity does not resolve the first rows
     by_row = whitened.base.vane and Onset.STEP in effect.onsets
     onset_slopes = whitened.whiten_onset_slopes(raw_slopes) / scale if by_row else None
-    out = []
+    kinds = []
     for kind in effect.onsets:
         gates, onsets = onset_gates(whitened.modelled.t, kind, 1 if by_row else _ONSET_STRIDE)
         if not len(gates):
@@ -85,10 +149,8 @@ def _scan_by_slope(whitened: WhitenedResiduals, effect: Effect, target: str) -> 
         sums = normal_equations(whitened, J, gates, kind)
         if kind is Onset.STEP and onset_slopes is not None:
             sums = _with_onset_slopes(whitened, J, onset_slopes, gates, sums)
-        gain, x = solve_onsets(whitened, *sums)
-        best = int(np.argmax(gain))
-        out.append(ScoredHypothesis(float(gain[best]), zero.with_parameters(x[best] / scale, onsets[best])))
-    return out
+        kinds.append(_StepsOf(kind, gates, onsets, np.linalg.inv(_profiled_matrix(whitened, sums[0], sums[2]))))
+    return _Slopes(zero, scale, J, onset_slopes, kinds)
 
 
 def onset_gates(t: np.ndarray, kind: Onset, stride: int = _ONSET_STRIDE) -> tuple[np.ndarray, list[OnsetProfile]]:
@@ -114,11 +176,15 @@ def normal_equations(
     """Sum the normal equations of slopes J, (n, c, k), per onset: (m, k, k), (m, k), (m, k, nuisances)."""
     rows = np.swapaxes(J, 1, 2)
     A, b, C = rows @ J, -(rows @ whitened.e[..., None])[..., 0], rows @ whitened.Jn
+    squares = gates if kind is Onset.STEP else gates**2
+    return _onset_sums(A, squares, kind), _onset_sums(b, gates, kind), _onset_sums(C, gates, kind)
+
+
+def _onset_sums(x: np.ndarray, gates: np.ndarray, kind: Onset) -> np.ndarray:
+    """Sum the rows of x, (n, …), under each gate, (m, …)."""
     if kind is Onset.STEP:
-        return tuple(np.cumsum(x[::-1], axis=0)[::-1][gates] for x in (A, b, C))  # type: ignore[return-value]
-    flat = [x.reshape(len(x), -1) for x in (A, b, C)]
-    sums = (gates**2 @ flat[0], gates @ flat[1], gates @ flat[2])
-    return tuple(s.reshape(len(gates), *x.shape[1:]) for s, x in zip(sums, (A, b, C), strict=True))  # type: ignore[return-value]
+        return np.cumsum(x[::-1], axis=0)[::-1][gates]  # type: ignore[no-any-return]
+    return (gates @ x.reshape(len(x), -1)).reshape(len(gates), *x.shape[1:])  # type: ignore[no-any-return]
 
 
 def _with_onset_slopes(
@@ -143,17 +209,19 @@ def solve_onsets(
     whitened: WhitenedResiduals, A: np.ndarray, b: np.ndarray, C: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve for the gain (m,) and the parameters (m, k) of each onset, the nuisances free within their spread."""
-    inverse = np.linalg.inv(whitened.Ann)
-    A = A - C @ inverse @ np.swapaxes(C, 1, 2)
-    b = b - C @ (inverse @ whitened.bn)
-    k = A.shape[1]
-    trace = np.einsum("mii->m", A)
-    A = A + (1e-9 * trace + 1e-12)[:, None, None] * np.eye(k)
-    x = np.linalg.solve(A, b[..., None])[..., 0]
+    b = b - C @ np.linalg.solve(whitened.Ann, whitened.bn)
+    x = np.linalg.solve(_profiled_matrix(whitened, A, C), b[..., None])[..., 0]
     return (b * x).sum(axis=1), x
 
 
-def _scan_by_start(whitened: WhitenedResiduals, effect: Effect, target: str) -> list[ScoredHypothesis]:
+def _profiled_matrix(whitened: WhitenedResiduals, A: np.ndarray, C: np.ndarray) -> np.ndarray:
+    """Return the normal matrices, (m, k, k), with the nuisances free within their spread."""
+    A = A - C @ np.linalg.inv(whitened.Ann) @ np.swapaxes(C, 1, 2)
+    trace = np.einsum("mii->m", A)
+    return A + (1e-9 * trace + 1e-12)[:, None, None] * np.eye(A.shape[1])  # type: ignore[no-any-return]
+
+
+def _scan_starts(whitened: WhitenedResiduals, starts: _Starts) -> list[ScoredHypothesis]:
     """Scan the start values of an effect without a slope at zero; a step gains the sum over the rows after it."""
     out: dict[Onset, ScoredHypothesis] = {}
     before = (whitened.e**2).sum(axis=1)
@@ -161,17 +229,17 @@ def _scan_by_start(whitened: WhitenedResiduals, effect: Effect, target: str) -> 
     onset_rows = np.flatnonzero((t > t[0] + _EDGE_S[0]) & (t < t[-1] - _EDGE_S[1]))
     if not len(onset_rows):  # a short flight has no onset inside
         onset_rows = np.array([0])
-    for start in effect.initial_guesses:
-        hypothesis = FaultHypothesis(effect, target, start)
-        gain = before - (whitened.clipped((hypothesis,)) ** 2).sum(axis=1)
+    for hypothesis, change in zip(starts.hypotheses, starts.changes, strict=True):
+        e = np.clip(whitened.raw + change, -whitened.clip, whitened.clip)
+        gain = before - (e**2).sum(axis=1)
         tail_gain = np.cumsum(gain[::-1])[::-1][onset_rows]
         i = int(np.argmax(tail_gain))
         step = OnsetProfile(Onset.STEP, float(t[onset_rows[i]]))
         options = {
             Onset.ALWAYS: ScoredHypothesis(float(gain.sum()), hypothesis),
-            Onset.STEP: ScoredHypothesis(float(tail_gain[i]), hypothesis.with_parameters(np.array(start), step)),
+            Onset.STEP: ScoredHypothesis(float(tail_gain[i]), replace(hypothesis, onset=step)),
         }
         for kind, scored in options.items():
-            if kind in effect.onsets and (kind not in out or scored.gain > out[kind].gain):
+            if kind in hypothesis.effect.onsets and (kind not in out or scored.gain > out[kind].gain):
                 out[kind] = scored
     return list(out.values())

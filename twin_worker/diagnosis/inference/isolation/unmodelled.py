@@ -2,10 +2,10 @@
 
 For each channel all coefficients of its equation are freed, from any onset on, and from any onset relative to the time
 before it. A correctly named effect leaves no gain; a wrong one that only resembles the cause leaves much. Single
-coefficients without an effect in the catalogue compete with the named effects directly.
+coefficients without an effect in the catalogue compete with the named effects directly (`decision`).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from copy import copy
 from typing import NamedTuple
 
@@ -23,7 +23,7 @@ from twin_worker.diagnosis.inference.isolation.isolate import (
 )
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 from twin_worker.diagnosis.model import equations as eq
-from twin_worker.diagnosis.model.baseline import CHANNEL_OF, CHANNELS, Baseline
+from twin_worker.diagnosis.model.baseline import CHANNEL_OF, CHANNELS
 
 _AIR_LAG_S = 4.0  # time constant of a partly blocked pressure line
 _MIN_SIDE_S = 25.0  # least length of data before and after the onset
@@ -142,81 +142,45 @@ def _tail_sums(x: np.ndarray, starts: np.ndarray) -> np.ndarray:
     return np.cumsum(np.add.reduceat(x, starts, axis=0)[::-1], axis=0)[::-1]
 
 
-class EvidenceRule(NamedTuple):
-    """Thresholds of one kind of evidence.
-
-    Attributes:
-        min_gain: least gain
-        chance_factor: multiple of the gain that nominal flights reach by chance
-        limit_factor: multiple of the limit if effects are named
-        gain_share, gain_share_high: least share of the gain of the named effects; the latter if a channel stays high
-    """
-
-    min_gain: float
-    chance_factor: float
-    limit_factor: float
-    gain_share: float
-    gain_share_high: float
-
-
-RULES = {
-    "odd": EvidenceRule(450.0, 3.0, 2.0, 0.5, 0.25),  # the whole equation changed, given the named effects
-    "shift": EvidenceRule(240.0, 2.4, 1.5, 0.05, 0.05),  # the equation changed in flight, given the named effects
-    "one": EvidenceRule(165.0, 3.0, 1.0, 0.9, 0.9),  # one coefficient changed, without the named effects
-    "tone": EvidenceRule(200.0, 2.0, 1.0, 0.0, 0.0),  # a tone, given the named effects
-}
-
-
 class Anomaly(NamedTuple):
-    """Gain of a changed equation less its cost, or power ratio of a tone, with channel, onset [s], rule and term."""
+    """Gain of a changed equation less its cost, or power ratio of a tone, with channel, onset [s], kind and term."""
 
     net_gain: float
     channel: str
     t0: float
-    rule: str = "odd"
+    change: str = "odd"
     term: str = ""
 
     @property
     def kind(self) -> str:
-        """Return `rule:channel:term`, the key of `Baseline.chance`."""
-        return ":".join(filter(None, (self.rule, self.channel, self.term)))
-
-    def limit(self, base: Baseline) -> float:
-        """Return the least gain that exceeds chance."""
-        rule = RULES[self.rule]
-        return max(rule.min_gain, rule.chance_factor * base.chance.get(self.kind, 0.0))
-
-    def is_unexplained(self, base: Baseline, named_gain: float, still_high: bool) -> bool:
-        """Return whether the named effects, with total gain `named_gain` (0: none), do not explain the anomaly."""
-        rule = RULES[self.rule]
-        least = (rule.gain_share_high if still_high else rule.gain_share) * named_gain
-        return self.net_gain > max((rule.limit_factor if named_gain else 1.0) * self.limit(base), least)
+        """Return `change:channel:term`, the key of `Baseline.chance`."""
+        return ":".join(filter(None, (self.change, self.channel, self.term)))
 
 
-def find_anomalies(whitened: WhitenedResiduals, unconditioned: WhitenedResiduals) -> list[Anomaly]:
-    """Return the gain of a changed equation and the tone of every channel, best first.
+def find_anomalies(whitened: WhitenedResiduals) -> list[Anomaly]:
+    """Return a tone, the change of the whole equation (`odd`) and its change in flight (`shift`) of every channel.
 
     Without a fast accelerometer the equations are too uncertain: the list is empty.
 
     Args:
-        whitened: residuals conditioned on the named effects
-        unconditioned: residuals without the named effects
+        whitened: residuals conditioned on the effects that act beside the anomaly
     """
     if not whitened.base.vane:
         return []
     bounded = whitened.with_nuisance_priors()  # no nuisance released
     out = list(find_tones(bounded))
     for equation in channel_equations(bounded):
-        for rule, (net_gain, t0) in (("odd", equation.gain_of_all()), ("shift", equation.gain_in_flight())):
-            out.append(Anomaly(net_gain, equation.channel, t0, rule))
-    for equation in channel_equations(unconditioned):
-        for name, (net_gain, t0) in equation.gain_per_term():
-            out.append(Anomaly(net_gain, equation.channel, t0, "one", name))
-    return sorted(out, key=lambda anomaly: -anomaly.net_gain)
+        for change, (net_gain, t0) in (("odd", equation.gain_of_all()), ("shift", equation.gain_in_flight())):
+            out.append(Anomaly(net_gain, equation.channel, t0, change))
+    return out
 
 
-def first_unexplained(
-    anomalies: Sequence[Anomaly], base: Baseline, named_gain: float, still_high: bool
-) -> Anomaly | None:
-    """Return the first anomaly that the named effects do not explain; `still_high`: a channel stays above its limit."""
-    return next((anomaly for anomaly in anomalies if anomaly.is_unexplained(base, named_gain, still_high)), None)
+def find_changed_coefficients(whitened: WhitenedResiduals) -> list[Anomaly]:
+    """Return the change of each single coefficient without an effect in the catalogue (`one`); empty as above."""
+    if not whitened.base.vane:
+        return []
+    return [
+        Anomaly(net_gain, equation.channel, t0, "one", name)
+        for equation in channel_equations(whitened)
+        for name, (net_gain, t0) in equation.gain_per_term()
+    ]

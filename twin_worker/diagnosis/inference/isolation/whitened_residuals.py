@@ -104,6 +104,16 @@ class WhitenedResiduals:
             self.conditions = conditions
             self._update()
 
+    def conditioned(self, conditions: tuple[FaultHypothesis, ...]) -> "WhitenedResiduals":
+        """Return a copy with further conditions, with the slopes and the precision of the nuisances as they are."""
+        out = copy(self)
+        out.conditions = (*self.conditions, *conditions)
+        out.raw = out.residuals(())
+        out.e = np.clip(out.raw, -out.clip, out.clip)
+        out.bn = -project(out.Jn, out.e)
+        out.xn = np.linalg.solve(out.Ann, out.bn)
+        return out
+
     def _update(self) -> None:
         """Compute residuals and nuisance slopes under the current conditions."""
         self.raw = self.residuals(())

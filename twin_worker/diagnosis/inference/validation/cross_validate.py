@@ -1,14 +1,18 @@
 """Cross-validation: fit effects on even blocks of 10 s, evaluate them on odd blocks; and the part left unexplained."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import expit
 
 from fleet.effects import Onset, Stage
 from twin_worker.diagnosis.data.card import FaultHypothesis
+from twin_worker.diagnosis.inference.isolation.block_means import BlockMeans
+from twin_worker.diagnosis.inference.isolation.decision import Weights
 from twin_worker.diagnosis.inference.isolation.refine import refine
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
-from twin_worker.diagnosis.inference.validation.force_prediction import blocks
+from twin_worker.diagnosis.inference.validation.force_prediction import BLOCK_S, blocks
 from twin_worker.diagnosis.model.residual import ModelledFlight
 
 MIN_RMS_DROP = 0.03  # least relative drop of the held-out rms residual for a named effect
@@ -26,12 +30,18 @@ class CrossValidation:
         before, after: whitened rms on odd blocks without and with the effects, in the affected channels
         fitted: the effects as fitted on even blocks
         held_out_gains: gain of each effect on odd blocks given the others, doubled to compare with the whole flight
+        evidence: log evidence of each effect given the others in each odd block in which it acts [nat]
     """
 
     before: float
     after: float
     fitted: tuple[FaultHypothesis, ...]
     held_out_gains: tuple[float, ...]
+    evidence: tuple[tuple[float, ...], ...] = ()
+
+    def probability(self, index: int) -> float:
+        """Return the probability of an effect against none from the held-out blocks alone, at equal prior odds."""
+        return float(expit(sum(self.evidence[index])))
 
     @property
     def rms_drop(self) -> float:
@@ -40,7 +50,11 @@ class CrossValidation:
 
 
 def fit_and_validate(
-    whitened: WhitenedResiduals, hypotheses: tuple[FaultHypothesis, ...], channel_ratio: np.ndarray
+    whitened: WhitenedResiduals,
+    hypotheses: tuple[FaultHypothesis, ...],
+    channel_ratio: np.ndarray,
+    means: BlockMeans,
+    weights: Weights,
 ) -> CrossValidation:
     """Fit the effects on even blocks and evaluate them on odd blocks.
 
@@ -48,6 +62,8 @@ def fit_and_validate(
         whitened: residuals conditioned on the weather alone; not modified
         hypotheses: as fitted on the whole flight
         channel_ratio: mean square of each channel over its usual, (c,)
+        means: block means of the flight
+        weights: of the evidence
     """
     weather = whitened.conditions
     even, odd = (whitened.part(_half_rows(whitened, hypotheses, odd=side)) for side in (False, True))
@@ -66,8 +82,31 @@ def fit_and_validate(
         2.0 * (odd.cost([g for k, g in enumerate(fitted) if k != i]) - cost) for i in range(len(fitted))
     )
     before = _rms(odd, used)
+    transient = _is_transient(hypotheses)
+    labels = np.floor(whitened.modelled.t / (_SHORT_S if transient else BLOCK_S)).astype(int)
+
+    def block_costs(acting: Sequence[FaultHypothesis]) -> np.ndarray:
+        """Return the negative log likelihood of each block of odd rows, with nuisances of the even rows, (b,)."""
+        even.condition_on((*weather, *acting))
+        odd.condition_on((*weather, *acting))
+        e = (odd.e + odd.Jn @ even.xn) * odd.ok[:, None]
+        out = np.bincount(labels - labels[0], (e * e).sum(axis=1)) / (2.0 * weights.rows_per_sample)
+        return out if transient else out + 0.5 * weights.block_weight * means.squares(acting, even.xn)
+
+    with_all = block_costs(fitted)
+    evidence = []
+    for i, hypothesis in enumerate(fitted):
+        others = [g for k, g in enumerate(fitted) if k != i]
+        acts = odd.ok & (hypothesis.onset.gate(whitened.modelled.t) > _MIN_GATE)
+        gain = block_costs(others) - with_all
+        evidence.append(tuple(gain[np.unique(labels[acts]) - labels[0]].tolist()))
+    even.condition_on((*weather, *fitted))
     odd.condition_on((*weather, *fitted))
-    return CrossValidation(before, _rms(odd, used), tuple(fitted), held_out_gains)
+    return CrossValidation(before, _rms(odd, used), tuple(fitted), held_out_gains, tuple(evidence))
+
+
+def _is_transient(hypotheses: Sequence[FaultHypothesis]) -> bool:
+    return all(hypothesis.onset.kind is Onset.BUMP for hypothesis in hypotheses)
 
 
 def _half_rows(whitened: WhitenedResiduals, hypotheses: tuple[FaultHypothesis, ...], odd: bool) -> np.ndarray:
@@ -77,7 +116,7 @@ def _half_rows(whitened: WhitenedResiduals, hypotheses: tuple[FaultHypothesis, .
     slow noise hides them elsewhere.
     """
     t = whitened.modelled.t
-    if all(hypothesis.onset.kind is Onset.BUMP for hypothesis in hypotheses):
+    if _is_transient(hypotheses):
         passing = np.any([hypothesis.onset.gate(t) > _MIN_GATE for hypothesis in hypotheses], axis=0)
         return passing & ((np.floor(t / _SHORT_S) % 2 == 1) == odd)
     jumps = [g.onset.t0 for g in hypotheses if g.effect.stage is Stage.SENSOR and g.onset.kind is Onset.STEP]
