@@ -53,7 +53,8 @@ class Statement(NamedTuple):
     true: bool
 
 
-class ReliabilityBin(NamedTuple):
+@dataclass(frozen=True)
+class ReliabilityBin:
     """One bin of the reliability diagram: mean stated probability, share of true candidates with interval, number."""
 
     stated: float

@@ -5,6 +5,7 @@ import numpy as np
 from fleet.airframes import GENERIC, load
 from fleet.airframes.airframe import servo_map
 from fleet.autopilots import arduplane, copter, greybox
+from fleet.autopilots.laws import remember
 from fleet.autopilots.shadow import NO_MEMORY, replay_controller
 from fleet.contract import Array, Item, Prediction, TwinState
 from fleet.frames import Origin, to_geodetic, wrap
@@ -21,7 +22,7 @@ from twin_worker.identification.fixed_wing.energy_balance import fit_attitude_la
 from twin_worker.identification.fixed_wing.plant import bias_corrected
 from twin_worker.identification.linear.linear_model import AXES, identify_axis
 from twin_worker.numerics.interpolation import zero_order_hold
-from twin_worker.numerics.prediction_errors import AHEAD
+from twin_worker.numerics.prediction_errors import AHEAD, displacement_along_path
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.resample import Resampler
 from twin_worker.twin.state.flight_phase import speed_extremes
@@ -47,6 +48,7 @@ def warm_up() -> None:
     inputs = [np.full(n, _SPEED), np.zeros(n), np.zeros(n), window.u, np.ones(n, np.int64)]
     rows = [window.t - window.t[0], window.p, window.v, euler, rates, *inputs]
     ctl, _ = replay_controller(par, legs, window.p[0], *rows, NO_MEMORY)  # type: ignore
+    remember(ctl, par, 0.0)
     state = np.concatenate([window.p[-1], window.x[-1]])
     linear = linear_plant(*(part for axis in axes for part in (axis.physical(), axis.means)))
     coupled = coupled_plant(identify(window, np.zeros(2), load(GENERIC)).par, np.array([_SPEED, 0.0]))
@@ -102,6 +104,7 @@ def _run_traffic() -> None:
 def _run_propagation() -> None:
     """Propagate a prediction, update the wind filter, and detect flight."""
     ahead, path = (Array.of(values).numpy() for values in (np.arange(5.0), np.zeros((5, 3))))
+    displacement_along_path(np.outer(AHEAD, [_SPEED, 0.0, 0.0]), AHEAD)
     shift_to_position(ahead, path, 1.0, np.zeros(3), np.empty((4, 3), np.float32))  # type: ignore[call-arg]
     widen_tube(ahead, path, 1.0, np.empty((4, 3), np.float32))  # type: ignore[call-arg]
     speed_extremes(np.zeros((3, 3)))  # type: ignore[call-arg]

@@ -23,7 +23,7 @@ from tests.bench.security.site import SCRIPT, expired, make_papers, make_passwor
 from twin_worker import __main__ as twin_worker
 from viewer import __main__ as viewer
 
-OFF_THE_BUS = {"assess", "calibrate", "diagnose", "effects", "fly", "inspect", "paper", "prove", "schema"}
+OFF_THE_BUS = {"assess", "calibrate", "completion", "diagnose", "effects", "fly", "inspect", "paper", "prove", "schema"}
 
 
 @pytest.fixture(scope="module")
