@@ -82,9 +82,8 @@ def simulate_route(
     rest_std = air[REST] * sqrt(1.0 - exp(-2.0 / air[REST_S]))
     gamma_gain, steps_per_s, shear = 1.0 - exp(-dt / GAMMA_S), round(1.0 / dt), 1.0
     Va, rate = speed / air[SCALE], 0.0
+    v_before = np.zeros(3)
     for k in range(len(out)):
-        for j in range(3):
-            out[k, j] = p[j]
         if not (3.0 < speed < 3.0 * parameters[V_0] and abs(phi) < _MAX_BANK):
             return k
         c, s, cos_gamma = cos(psi + air[D_PSI]), sin(psi + air[D_PSI]), cos(gamma)
@@ -109,12 +108,15 @@ def simulate_route(
         v[0] = speed * cos_gamma * c + air[W_N] * shear + wind[0] + wind[2]
         v[1] = speed * cos_gamma * s + air[W_E] * shear + wind[1] + wind[3]
         v[2] = -speed * sin(gamma)
+        for j in range(3):
+            p[j] += 0.5 * dt * (v_before[j] + v[j]) if k > 0 else 0.0  # trapezoidal rule: no lag in turns
+            out[k, j], v_before[j] = p[j], v[j]
         euler[0], euler[1], euler[2] = phi, theta, psi
         rate += min(5.0 * dt, 1.0) * ((speed / air[SCALE] - Va) / dt - rate) if k > 0 else 0.0
         Va = speed / air[SCALE]
         phi_c, theta_c, delta_t = guide(ctl, par, legs, p, v, euler, Va, rate, dt)
         thr += min(max(delta_t - thr, -dt / _THROTTLE_S), dt / _THROTTLE_S)
-        n = 1.0 / cos(phi)
+        n, phi_before = 1.0 / cos(phi), phi
         theta, q_rate = _lag(theta, q_rate, theta_c, parameters[WN_THETA : B_THETA + 1], dt)
         phi, p_rate = _lag(phi, p_rate, phi_c, parameters[WN_PHI : B_PHI + 1], dt)
         alpha = parameters[A_0] + parameters[A_N] * (n * (parameters[V_0] / speed) ** 2 - 1.0)
@@ -125,10 +127,9 @@ def simulate_route(
             + parameters[C_V] * (speed - parameters[V_0])
             + parameters[C_N] * (n * n - 1.0)
         )
-        psi = wrap(psi + dt * (parameters[K_PSI] * G * tan(phi) / speed + parameters[B_PSI]))
+        mean_tan = 0.5 * (tan(phi_before) + tan(phi))
+        psi = wrap(psi + dt * (parameters[K_PSI] * G * mean_tan / speed + parameters[B_PSI]))
         speed += dt * (accel + G * v[2] / speed)
-        for j in range(3):
-            p[j] += dt * v[j]
     return len(out)
 
 
