@@ -4,7 +4,8 @@
     gamma' = (theta - alpha - gamma) / 0.6 s,      alpha = a_0 + a_n (n (V_0 / V)^2 - 1),      n = 1 / cos phi
     V' + g sin gamma = c_0 + c_t (delta_t - t_0) + c_v (V - V_0) + c_n (n^2 - 1)
     psi' = k g tan phi / V + b_psi
-    p' = V e(gamma, psi + d_psi) + w (h / h_0)^(1/7) + drift + rest,      both first-order Gauss-Markov
+    chi_a = psi + d_psi - (theta - gamma) tan phi
+    p' = V e(gamma, chi_a) + w (h / h_0)^(1/7) + drift + rest,      both first-order Gauss-Markov
 
 Guidance and TECS are the autopilot's own laws; the loops below them are replaced by identified lags.
 Source: Beard & McLain 2012, chapter 9 (guidance models); Stengel 2004, section 2.6 (energy height).
@@ -15,7 +16,7 @@ from math import cos, exp, nan, sin, sqrt, tan
 import numpy as np
 
 from fleet.autopilots.laws import guide
-from fleet.frames import G, wrap
+from fleet.frames import G, air_direction, wrap
 from fleet.physics.kernel import inlined_kernel, kernel
 
 STEP = 0.1  # of guidance and integration [s]
@@ -39,7 +40,7 @@ N_PARAMETERS = 16
 # columns of `air`
 W_N, W_E = 0, 1  # mean wind at height H_0 [m/s]
 DRIFT_N, DRIFT_E, REST_N, REST_E = 2, 3, 4, 5  # slow drift of the wind, and the rest: gusts [m/s]
-SCALE, D_PSI = 6, 7  # true over reported airspeed, direction through the air minus heading [-, rad]
+SCALE, D_PSI = 6, 7  # true over reported airspeed; direction through the air minus heading, wings level [-, rad]
 H_0, GROUND = 8, 9  # height above ground of the mean wind, 0: no shear; p_d of the ground [m]
 DRIFT, DRIFT_S, REST, REST_S = 10, 11, 12, 13  # standard deviation and time constant of drift and rest [m/s, s]
 N_AIR = 14
@@ -86,7 +87,8 @@ def simulate_route(
     for k in range(len(out)):
         if not (3.0 < speed < 3.0 * parameters[V_0] and abs(phi) < _MAX_BANK):
             return k
-        c, s, cos_gamma = cos(psi + air[D_PSI]), sin(psi + air[D_PSI]), cos(gamma)
+        chi = air_direction(phi, theta, psi + air[D_PSI], gamma)
+        c, s, cos_gamma = cos(chi), sin(chi), cos(gamma)
         tailwind_before = (wind[0] + wind[2]) * c + (wind[1] + wind[3]) * s
         if k > 0:
             wind[0], wind[1], wind[2], wind[3] = (

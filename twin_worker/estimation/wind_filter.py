@@ -3,10 +3,11 @@
 from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass
-from math import atan2, cos, exp, hypot, inf, isfinite, log, sin, sqrt
+from math import asin, atan2, cos, exp, hypot, inf, isfinite, log, sin, sqrt
 
 import numpy as np
 
+from fleet.frames import air_direction, wrap
 from fleet.physics.kernel import kernel
 from twin_worker.telemetry.history import TelemetryHistory
 
@@ -158,7 +159,14 @@ class WindFilter:
         return self._P[self._selected]
 
     def update(self, t: float, ground: Iterable[float], Va: float, psi: float) -> None:
-        """Update with one row: ground velocity NED (3,) [m/s], reported airspeed [m/s], heading [rad]."""
+        """Update with one row.
+
+        Args:
+            t: time [s since 1970]
+            ground: ground velocity NED, (3,) [m/s]
+            Va: reported airspeed [m/s]
+            psi: direction of the velocity through the air by the reported attitude [rad]
+        """
         dt = min(t - self.t, 5.0) if isfinite(self.t) else 0.2
         north, east, down = map(float, ground)
         if dt <= 0 or not 3.0 <= Va < _MAX_SPEED or not hypot(north, east, down) < _MAX_SPEED:
@@ -263,6 +271,13 @@ class WindFilter:
 
 _ROW_INTERVAL_S = 0.199  # interval of the rows used [s]
 _STALE_S = 0.5  # older airspeed and heading are not combined with a velocity [s]
+_MIN_AIRSPEED, _MAX_PATH_SINE, _MAX_BANK = 3.0, 0.5, 1.2  # bounds of the direction by attitude [m/s, -, rad]
+
+
+def reported_direction(phi: float, theta: float, psi: float, down: float, Va: float) -> float:
+    """Return the direction through the air by reported attitude [rad], sink rate and airspeed [m/s], [rad]."""
+    gamma = -asin(min(max(down / max(Va, _MIN_AIRSPEED), -_MAX_PATH_SINE), _MAX_PATH_SINE))
+    return float(air_direction(min(max(phi, -_MAX_BANK), _MAX_BANK), theta, psi, gamma))
 
 
 def update_from_history(
@@ -280,13 +295,22 @@ def update_from_history(
     air_times, air = history.rows_since("air", since - 1.0)
     att_times, attitude = history.rows_since("attitude", since - 1.0)
     t_air, t_att = air_times.tolist(), att_times.tolist()  # bisect on a short list is faster than on an array
-    if not (t_air and t_att):
-        return last_t
     for t, ground in zip(times.tolist(), velocity.tolist(), strict=True):
         if t - last_t < _ROW_INTERVAL_S or t >= until:
             continue
-        i, j = bisect_left(t_air, t) - 1, bisect_left(t_att, t) - 1
-        if i >= 0 and j >= 0 and t - t_air[i] < _STALE_S and t - t_att[j] < _STALE_S:
+        i, j = bisect_left(t_air, t), bisect_left(t_att, t)
+        if i == len(t_air) or j == len(t_att):
+            break  # not received yet
+        if i and j and t - t_air[i - 1] < _STALE_S and t - t_att[j - 1] < _STALE_S:
             last_t = t
-            wind_filter.update(t, ground, float(air[i, 0]), float(attitude[j, 2]))
+            Va = _between(air_times, air[:, 0], i, t)
+            phi, theta = _between(att_times, attitude[:, 0], j, t), _between(att_times, attitude[:, 1], j, t)
+            turned = wrap(attitude[j, 2] - attitude[j - 1, 2])
+            psi = attitude[j - 1, 2] + (t - t_att[j - 1]) / (t_att[j] - t_att[j - 1]) * turned
+            wind_filter.update(t, ground, Va, reported_direction(phi, theta, psi, ground[2], Va))
     return last_t
+
+
+def _between(times: np.ndarray, values: np.ndarray, k: int, t: float) -> float:
+    """Interpolate linearly between rows k - 1 and k."""
+    return float(values[k - 1] + (t - times[k - 1]) / (times[k] - times[k - 1]) * (values[k] - values[k - 1]))
