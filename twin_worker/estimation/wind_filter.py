@@ -67,10 +67,11 @@ def _predict_and_correct(
         heading_walk: random walk of the heading bias [rad per sqrt(s)]
     Returns:
         the normalised innovation squared (NIS); the log-likelihood of the row without its constant
-    A gust changes the readings of airspeed and heading at once and the ground velocity late. Weighted with the readings,
-    it would reduce the scale by 1 to 3 %. The corrections are weighted with instruments that a gust does not change:
-    mean airspeed, and the direction of the previous ground velocity minus the wind.
-    Source: Bar-Shalom 2001, 5.2.4 (Joseph form); Soderstrom & Stoica 1983 (instrumental variables).
+
+    A gust changes the readings of airspeed and heading at once and the ground velocity late: corrections weighted with
+    these readings reduce the scale by 1 to 3 %. Instruments that a gust does not change weigh them: the mean airspeed,
+    and the direction of the previous ground velocity minus the wind.
+    Source: Bar-Shalom 2001, 5.2.4 (Joseph form); Söderström & Stoica 1983 (instrumental variables).
     """
     decay, H, HP, y = np.ones(8), np.zeros((2, 8)), np.zeros((2, 8)), np.empty(2)
     for i in range(2):
@@ -113,7 +114,13 @@ def _predict_and_correct(
 
 @kernel
 def _correct(
-    x: np.ndarray, P: np.ndarray, H: np.ndarray, HP: np.ndarray, weighted: np.ndarray, S_inv: np.ndarray, variance: float
+    x: np.ndarray,
+    P: np.ndarray,
+    H: np.ndarray,
+    HP: np.ndarray,
+    weighted: np.ndarray,
+    S_inv: np.ndarray,
+    variance: float,
 ) -> None:
     K, A, AP = np.empty((8, 2)), np.eye(8), np.zeros((8, 8))
     for i in range(8):
@@ -136,8 +143,9 @@ def _correct(
 class WindFilter:
     """Estimate a, b, mean, drift, gust of  v = Va cos(gamma) (a e(psi) + b e(psi + 90 deg)) + mean + drift + gust.
 
-    a, b are airspeed scale times cosine and sine of the heading bias. The mean is a random walk. Drift and gust are
-    first-order Gauss-Markov processes, which separates gusts from wind. The heading bias is constant, or drifts as that
+    psi is the direction by the attitude (`fleet.frames.air_direction`); a, b are airspeed scale times cosine and sine
+    of the heading bias. The mean is a random walk. Drift and gust are first-order Gauss-Markov processes, which
+    separates gusts from wind. The heading bias is constant, or drifts as that
     of an attitude estimate in a long turn does: both hypotheses are filtered, and the likelihood of the flight selects.
     How much the wind drifts depends on the weather: three standard deviations are filtered, and their posterior mean
     variance tells how much the wind may change in the next minutes. The state is that of the middle one.
@@ -223,7 +231,7 @@ class WindFilter:
     def expect_scale(self, altitude: float) -> None:
         """Begin with the scale of the standard atmosphere at an altitude [m]; ignored after the first row.
 
-        Autopilots report equivalent airspeed, some of them true airspeed: half of the difference is a standard deviation.
+        Most autopilots report equivalent, some true airspeed: half of the difference is a standard deviation.
         """
         if not self._row_count:
             self._scale = eas2tas(altitude)

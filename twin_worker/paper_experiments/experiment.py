@@ -108,7 +108,8 @@ def _wind(history: TelemetryHistory, recording: Window) -> np.ndarray:
     Va = np.interp(recording.t, t_air, air[:, 0])
     for k in range(0, len(recording), every):
         if recording.ok[k]:
-            direction = reported_direction(*recording.x[k, 6:].tolist(), float(recording.v[k, 2]), float(Va[k]))
+            phi, theta, psi = recording.x[k, 6:].tolist()
+            direction = reported_direction(phi, theta, psi, float(recording.v[k, 2]), float(Va[k]))
             filt.update(float(recording.t[k]), recording.v[k], float(Va[k]), direction)
         wind[k : k + every] = filt.wind
     return wind

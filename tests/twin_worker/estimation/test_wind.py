@@ -66,7 +66,9 @@ def test_the_flight_tells_how_much_the_wind_drifts(drift, least, most):
             slow = slow * np.exp(-0.2 / 60.0) + drift * np.sqrt(1 - np.exp(-0.4 / 60.0)) * rng.standard_normal(2)
             gust = gust * np.exp(-0.2 / 7.0) + 0.8 * np.sqrt(1 - np.exp(-0.4 / 7.0)) * rng.standard_normal(2)
             air = VA * np.array([cos(psi), sin(psi)])
-            read = air - gust + rng.standard_normal(2)  # a gust changes what is read at once, and the ground velocity late
+            read = (
+                air - gust + rng.standard_normal(2)
+            )  # a gust changes what is read at once, and the ground velocity late
             north, east = air + WIND + slow
             filt.update(k / 5, (north, east, 0.0), float(np.hypot(*read)), float(np.arctan2(read[1], read[0])))
         found.append(filt.drift_sigma)

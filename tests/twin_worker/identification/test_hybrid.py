@@ -204,7 +204,9 @@ def control() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return laws.init(par, way.legs, 0, p, p, v, np.zeros(3), SPEED, 0.0, 0.5), par, way.legs  # type: ignore
 
 
-def flown(air: np.ndarray, chance: np.ndarray, seconds: float = 60.0, dt: float = H.STEP, phi: float = 0.0) -> np.ndarray:
+def flown(
+    air: np.ndarray, chance: np.ndarray, seconds: float = 60.0, dt: float = H.STEP, phi: float = 0.0
+) -> np.ndarray:
     ctl, par, legs = control()
     start = np.zeros(H.N_START)
     start[2], start[H.V], start[H.THROTTLE], start[H.PHI] = -100.0, SPEED, 0.5, phi
