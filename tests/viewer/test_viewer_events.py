@@ -189,7 +189,7 @@ STORIES = {
             (0, EventKind.NO_MODEL, "no model yet: below threshold"),
             (4, EventKind.VERIFIED, "model verified: mean fit 88 %"),
             (20, EventKind.UNVERIFIED, "no verification for 12 s (diverged); an earlier model stays active"),
-            (28, EventKind.ACCEPTED, "model verified again"),
+            (28, EventKind.ACCEPTED, "model accepted again"),
         ],
     ),
     "verdicts that alternate are not told one by one": (
