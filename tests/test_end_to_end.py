@@ -25,7 +25,6 @@ from fleet.contract import (
     GatewayCounters,
     Mission,
     Model,
-    Outcome,
     Params,
     Prediction,
     Sample,

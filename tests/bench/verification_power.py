@@ -178,7 +178,9 @@ def _median(values: Iterable[float]) -> float | None:
 
 def main() -> None:
     form = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("python -m tests.bench.verification_power", description=__doc__, formatter_class=form)
+    parser = argparse.ArgumentParser(
+        "python -m tests.bench.verification_power", description=__doc__, formatter_class=form
+    )
     parser.add_argument("files", type=Path, nargs="*", metavar="FILE", help="recorded flights of fixed wings")
     parser.add_argument("--seed", type=int, default=2000, help="of the first simulated flight (2000)")
     parser.add_argument("--flights", type=int, default=16, help="simulated flights (16)")

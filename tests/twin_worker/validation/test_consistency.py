@@ -8,9 +8,8 @@ import pytest
 
 from fleet.contract import Outcome
 from fleet.physics.wrench import NAMES
-from tests.support.coupled_flights import SMALL, aircraft, fly, known
+from tests.support.coupled_flights import SMALL, aircraft, fly
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel, identify
-from twin_worker.validation import consistency
 from twin_worker.validation.consistency import GROUPS, MAX_DETECTABLE, TOLERANCE, error_text, estimate_errors, limits
 from twin_worker.validation.verify import verify, with_consistency
 
@@ -92,4 +91,6 @@ def test_limits_grow_with_the_spread_and_shrink_with_more_runs():
 
 def test_what_fails_is_described():
     text = error_text({"roll_damping": -22.4, "elevator_effectiveness": 31.0})
-    assert text == "on held-out data the aircraft has roll damping 22 % below, elevator effectiveness 31 % above the model"
+    assert (
+        text == "on held-out data the aircraft has roll damping 22 % below, elevator effectiveness 31 % above the model"
+    )
