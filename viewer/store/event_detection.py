@@ -191,7 +191,8 @@ def _model(state: DetectorState, model: Model) -> Detection:
         status, event = "none", TimelineEvent(model.t, EventKind.NO_MODEL, f"no model yet: {_outcome(newest)}")
     elif before in (None, "none"):
         summary = _without_uav_prefix(model.active_verdict.sentence, model.uav)
-        text = f"model {_outcome(model.active_verdict)}: {summary}"
+        word = "plausible" if model.active_verdict.outcome is Outcome.PLAUSIBLE else "verified"
+        text = f"model {word}: {summary}"
         status, event = "accepted", TimelineEvent(model.t, EventKind.VERIFIED, text)
     elif newest.outcome in ACCEPTED:
         status, event = "accepted", TimelineEvent(model.t, EventKind.ACCEPTED, "model accepted again")
