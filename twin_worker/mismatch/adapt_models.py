@@ -104,7 +104,7 @@ def _adapted_copy(twin: Twin, outputs: EffectOutputs, checkpoint: Checkpoint) ->
     after_onset = window.part(min(int(np.searchsorted(window.t, outputs.onset)), len(window) - 2), len(window))
     if checkpoint.derivatives_model is not None and twin.models.active_verdict is not None:
         plant = adapted_derivatives(checkpoint.derivatives_model, outputs, window)
-        verdict = msgspec.structs.replace(twin.models.active_verdict, outcome=Outcome.VERIFIED)
+        verdict = msgspec.structs.replace(twin.models.active_verdict, outcome=Outcome.PLAUSIBLE)
         adapted.identification.store_prior(plant)
         adapted.models.activate(VerifiedModel(plant, verdict, float(window.t[-1]), np.nan))
     if checkpoint.point_mass is not None:

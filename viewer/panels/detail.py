@@ -3,7 +3,7 @@
 from html import escape
 from math import isfinite
 
-from fleet.contract import AlertKind, Controller, Outcome, TwinState
+from fleet.contract import AlertKind, Controller, Outcome, TwinState, Verdict
 from viewer.store.inbox import rate_text, timestamp
 from viewer.store.vehicle import StatusRecord, Vehicle, mean_fit
 from viewer.text.words import (
@@ -92,7 +92,7 @@ def limitations(vehicle: Vehicle, now: float) -> list[str]:
     elif vehicle.forecast is None:
         rows = vehicle.track_rows()
         observed_s = record.t - float(rows[0, 0]) if len(rows) else 0.0
-        texts.append(f"No horizon yet after {age_text(observed_s)} of telemetry; it needs a verified model.")
+        texts.append(f"No horizon yet after {age_text(observed_s)} of telemetry; it needs a plausible model.")
     if record.prediction_lag_s:
         replay_advice = "play the recording more slowly, or " if vehicle.recorded else ""
         advice = f": its worker is overloaded; {replay_advice}assign fewer UAVs to each worker"
@@ -116,8 +116,11 @@ def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
     if vehicle.model is not None and verdict is not None:
         is_active = vehicle.model.active_verdict in (None, verdict) or record.fit is None
         active = "" if is_active else f"; predictions use an earlier model with fit {fit_text(record)}"
-        colour = fit_colour(mean_fit(verdict.fit), palette) if verdict.outcome is Outcome.VERIFIED else ""
-        colour = colour or palette.identifying
+        accepted = {
+            Outcome.VERIFIED: fit_colour(mean_fit(verdict.fit), palette),
+            Outcome.PLAUSIBLE: palette.plausible,
+        }
+        colour = accepted.get(verdict.outcome, palette.identifying)
         least = f", threshold {verdict.threshold:.0f} %" if verdict.threshold > 0 else ""
         cards.append(
             f'<div class="say" style="border-color:{colour}"><b>{escape(verdict.outcome.value.replace("_", " "))}</b> '
@@ -144,8 +147,15 @@ def _fits(vehicle: Vehicle) -> str:
     )
     return (
         f'<div class="soft">fit per state over {verdict.horizon_s:.1f} s, %</div><table><tr><th></th>{head}</tr>'
-        f"<tr><td>model</td>{fits}</tr><tr class=soft><td>persistence</td>{persistence}</tr></table>"
+        f"<tr><td>model</td>{fits}</tr><tr class=soft><td>persistence</td>{persistence}</tr></table>{_power(verdict)}"
     )
+
+
+def _power(verdict: Verdict) -> str:
+    """Describe the detectable error of each group of derivatives; empty without a stated power."""
+    pairs = list(verdict.detectable_error.items())[:12]
+    errors = ", ".join(f"{escape(name[:40].replace('_', ' '))} {value:.0f} %" for name, value in pairs)
+    return f'<div class="soft">the verification would have detected an error of: {errors}</div>' if errors else ""
 
 
 def coverage_text(vehicle: Vehicle) -> str:

@@ -9,6 +9,7 @@ import msgspec
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from fleet.bus.codec import is_plausible_epoch
 from fleet.bus.session import Bus, connect
@@ -17,6 +18,7 @@ from fleet.contract import Claim, FleetRow, FleetState, GatewayCounters, Status,
 from fleet.process.sanitise import printable
 from fleet.report.report_text import id_ranges
 
+STATE_COLOUR = {TwinState.VERIFIED: "green", TwinState.PLAUSIBLE: "yellow"}  # of the table; others: none
 LATE_S = 5.0  # an older prediction is shown in red; the viewer reports it as late from the same age on [s]
 EXAMPLES = """
   fleet status
@@ -111,7 +113,8 @@ def fleet_table(rows: list[FleetRow]) -> Table:
         details = "\n".join(
             (*(f"! {escape(printable(alert))}" for alert in row.alerts), *mismatch, escape(printable(row.verdict)))
         )
-        out.add_row(str(row.uav), row.state.value, fit, horizon, *ages, details)
+        state = Text(row.state.value, STATE_COLOUR.get(row.state, ""))
+        out.add_row(str(row.uav), state, fit, horizon, *ages, details)
     return out
 
 
