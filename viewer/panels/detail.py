@@ -143,7 +143,7 @@ def _fits(vehicle: Vehicle) -> str:
         for name in names
     )
     return (
-        f'<div class="soft">fit per state over {verdict.horizon_s:.1f} s, %</div><table><tr><th></th>{head}</tr>'
+        f'<div class="soft">fit per state over {verdict.horizon_s:.1f} s, %</div><table><tr><td></td>{head}</tr>'
         f"<tr><td>model</td>{fits}</tr><tr class=soft><td>persistence</td>{persistence}</tr></table>"
     )
 
