@@ -220,10 +220,10 @@ def table(fleet: list[Vehicle], palette: Palette, now: float, *, total: int, pic
     longest = max([FULL_BAR_S, *(vehicle.record(now).horizon_s for vehicle in worst)])
     rows = "".join(_row(vehicle, palette, now, pick, on=vehicle.uav == selected, longest=longest) for vehicle in worst)
     return (
-        '<div class="uav list" tabindex="0" role="region" aria-label="Aircraft"><table><tr><td></td><th>UAV</th><th>status</th><th class="num">fit %</th>'
-        f'<th class="num">horizon</th></tr>{rows}</table>'
+        '<div class="uav list" tabindex="0" role="region" aria-label="Aircraft"><table><tr><td></td><th>UAV</th>'
+        f'<th>status</th><th class="num">fit %</th><th class="num">horizon</th></tr>{rows}</table>'
         f'<div class="foot">{len(worst)} of {total} · alerts and worst state first, then shortest horizon '
-        "· keys J, K: next, previous</div></div>"
+        "· keys: tab Display</div></div>"
     )
 
 
