@@ -21,7 +21,7 @@ from fleet.access.knock import _remedy
 from fleet.bus.session import open_router
 from fleet.commands.live.status import machines, processes, watch
 from fleet.contract import Claim, FleetRow, FleetState, GatewayCounters, LinkCounters, Status, TwinState
-from fleet.health import claims, machine
+from fleet.health import claims, machine, ports
 from fleet.health import claims as door
 from fleet.health.machine import BAD, NOTE, OK
 from fleet.report.report_text import id_ranges
@@ -112,8 +112,8 @@ def test_the_port_our_own_gateway_has_is_no_finding() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held:
         with contextlib.suppress(OSError):  # some gateway of this machine may hold it just as well
             held.bind(("0.0.0.0", machine.MAVLINK_PORT))
-        assert machine.mavlink_port(["udpin:0.0.0.0:14550"]).grade == OK
-        taken = machine.mavlink_port(["udpin:0.0.0.0:14551"])
+        assert ports.mavlink_port(["udpin:0.0.0.0:14550"]).grade == OK
+        taken = ports.mavlink_port(["udpin:0.0.0.0:14551"])
         assert taken.grade == NOTE and "--link udpin" in taken.sentence
 
 
