@@ -52,7 +52,12 @@ def _cards(vehicle: Vehicle, record: StatusRecord, units: Units) -> str:
     return f'<div class="cards">{html}</div><div class="soft">{escape(fit_and_horizon(vehicle, record))}</div>'
 
 
-IDENTIFIED_METHODS = {"dynamics": "coupled", "paper": "linear"}  # methods that roll out the identified model, its kind
+IDENTIFIED_METHODS = {  # methods that roll out identified models, and their kind
+    "dynamics": "coupled",
+    "paper": "linear",
+    "hybrid": "point-mass",
+    "both": "mean of coupled and point-mass",
+}
 
 
 def fit_and_horizon(vehicle: Vehicle, record: StatusRecord) -> str:

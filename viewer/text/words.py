@@ -195,9 +195,10 @@ def summary_html(fleet: list[Vehicle], store: FleetStore, palette: Palette, now:
         for label, n in Counter(status_label(vehicle, palette, now) for vehicle in ordered).items()
     )
     horizons = sorted(h for vehicle in fleet if (h := vehicle.record(now).horizon_s))
-    median = f" · median horizon {horizons[len(horizons) // 2]:.0f} s" if horizons else ""
+    median = f'<span class="dot"> · </span>median horizon {horizons[len(horizons) // 2]:.0f} s' if horizons else ""
     n, coverage, quantile = fleet_coverage(fleet)
-    covered = f" · cov. {coverage * 100:.0f}/{quantile * 100:.0f} %" if n else ""
+    measured = f"cov. {coverage * 100:.0f}/{quantile * 100:.0f} %"
+    covered = f' · <span title="coverage of the region: measured, nominal">{measured}</span>' if n else ""
     notes = "".join(f'<div class="soft">{escape(text)}</div>' for text in store.worker_texts())
     plural = "UAV" if len(fleet) == 1 else "UAVs"
     head = f"<h1>{len(fleet)} {plural}<small>{median}{covered}</small></h1>"
