@@ -41,7 +41,7 @@ ORDER = (  # a folder, or a module in the root of a package, imports only from i
     ("fleet.simulator.faults",),
     ("fleet.simulator.flight",),
     ("fleet.simulator.conceal",),
-    ("fleet.blind_test", "fleet.health"),
+    ("fleet.blind_test", "fleet.health", "fleet.export"),
     ("fleet.commands.live", "fleet.commands.offline"),
     ("gateway",),
     ("gateway.link_spec",),

@@ -54,7 +54,7 @@ CONTRAST = """() => {
   const bad = [];
   for (const e of document.querySelectorAll('.uav *')) {
     const own = [...e.childNodes].some(n => n.nodeType === 3 && n.textContent.trim());
-    if (!own || !e.getClientRects().length || e.closest('svg, tr.on')) continue;
+    if (!own || !e.getClientRects().length || e.closest('svg')) continue;
     const [a, b] = [light(parse(getComputedStyle(e).color)), light(behind(e))];
     const ratio = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
     const sign = e.textContent.trim().length === 1 && !/\\w/.test(e.textContent);  // graphics need less

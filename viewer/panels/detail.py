@@ -6,6 +6,7 @@ from math import isfinite
 from fleet.contract import AlertKind, Controller, Outcome, TwinState, Verdict
 from viewer.store.inbox import rate_text, timestamp
 from viewer.store.vehicle import StatusRecord, Vehicle, mean_fit
+from viewer.text.units import METRIC, Units
 from viewer.text.words import (
     LOW_FIT,
     SHORT_HORIZON_S,
@@ -26,32 +27,37 @@ MAX_TEXT = 500  # characters of a received text
 REFUSED_S = 10.0  # how long a rejected message is reported [s]
 
 
-def status_html(vehicle: Vehicle, palette: Palette, now: float) -> str:
+def status_html(vehicle: Vehicle, palette: Palette, now: float, units: Units = METRIC) -> str:
     """Return the status of the UAV and its twin as HTML. Received texts are escaped here."""
     label = status_label(vehicle, palette, now)
-    cards = _cards(vehicle, vehicle.record(now)) + _sentences(vehicle, palette, now)
+    cards = _cards(vehicle, vehicle.record(now), units) + _sentences(vehicle, palette, now)
     return (
         f'<div class="uav"><div class="head"><h1>{vehicle.name}</h1><b style="color:{label.colour}">'
         f"{label.glyph} {label.text}</b></div>{cards}</div>"
     )
 
 
-def figures_html(vehicle: Vehicle, now: float) -> str:
+def figures_html(vehicle: Vehicle, now: float, units: Units = METRIC) -> str:
     """Return fits, figures and controller as HTML."""
-    return f'<div class="uav">{_fits(vehicle)}{_facts(vehicle, now)}{law_html(vehicle.controller)}</div>'
+    return f'<div class="uav">{_fits(vehicle)}{_facts(vehicle, now, units)}{law_html(vehicle.controller)}</div>'
 
 
-def _cards(vehicle: Vehicle, record: StatusRecord) -> str:
+def _cards(vehicle: Vehicle, record: StatusRecord, units: Units) -> str:
     cards = {
         "fit": fit_text(record),
         "horizon": horizon_text(record),
-        "airspeed": f"{vehicle.Va:.1f} m/s" if isfinite(vehicle.Va) else "–",
+        "airspeed": units.speed_text(vehicle.Va),
     }
     html = "".join(f'<div class="card"><span class="soft">{k}</span><b>{v}</b></div>' for k, v in cards.items())
     return f'<div class="cards">{html}</div><div class="soft">{escape(fit_and_horizon(vehicle, record))}</div>'
 
 
-IDENTIFIED_METHODS = {"dynamics": "coupled", "paper": "linear"}  # methods that roll out the identified model, its kind
+IDENTIFIED_METHODS = {  # methods that roll out identified models, and their kind
+    "dynamics": "coupled",
+    "paper": "linear",
+    "hybrid": "point-mass",
+    "both": "mean of coupled and point-mass",
+}
 
 
 def fit_and_horizon(vehicle: Vehicle, record: StatusRecord) -> str:
@@ -146,7 +152,7 @@ def _fits(vehicle: Vehicle) -> str:
         for name in names
     )
     return (
-        f'<div class="soft">fit per state over {verdict.horizon_s:.1f} s, %</div><table><tr><th></th>{head}</tr>'
+        f'<div class="soft">fit per state over {verdict.horizon_s:.1f} s, %</div><table><tr><td></td>{head}</tr>'
         f"<tr><td>model</td>{fits}</tr><tr class=soft><td>persistence</td>{persistence}</tr></table>{_power(verdict)}"
     )
 
@@ -188,13 +194,14 @@ def law_html(controller: Controller | None) -> str:
     return head + key_value_table(rows, ' class="law"')
 
 
-def _facts(vehicle: Vehicle, now: float) -> str:
+def _facts(vehicle: Vehicle, now: float, units: Units) -> str:
     prediction, status, row = vehicle.prediction, vehicle.status, vehicle.row
     record = vehicle.record(now)
     at, age_s, rate = record.t, record.sample_age_s, vehicle.time.rate
     time_name = "recorded" if vehicle.recorded else "data time"
     names = "calibration", "method", "mode", "link", time_name, "sample", "prediction", "within 10 %", "worker"
     figures = {"coverage": coverage_text(vehicle)} | dict.fromkeys(names, "–")
+    figures |= {"altitude": f"{units.height_text(vehicle.alt_m)} above mean sea level"}
     figures[time_name] = timestamp(at)
     if vehicle.recorded and rate and not vehicle.ended:
         figures[time_name] += f", played {rate_text(rate)}"
