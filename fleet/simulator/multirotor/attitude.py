@@ -1,14 +1,14 @@
 """Attitude and rate control of a simulated multirotor, with the mixer of a quadrotor in X.
 
     phi_ref' = clip((phi_c - phi_ref) / input_tc), slew limited          ArduCopter only; PX4 commands phi_c directly
-    p_c = phi_ref' + P (phi_ref - phi)
+    p_c = phi_ref' + P (phi_ref - phi)                                     about the body axes
     roll = P (p_c - p) + I int(p_c - p) - D p'                            and the same for pitch and yaw
     thrust_i = throttle +- roll / 2 +- pitch / 2 +- yaw / 2, then the inverse of the thrust curve
 
 Source: structure, parameter names and defaults of the ArduCopter and PX4 documentation of the attitude controllers.
 """
 
-from math import cos, radians, sin, sqrt
+from math import radians, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -93,9 +93,9 @@ class AttitudeController:
         g = self._gains
         slew = float(np.clip(wrap(command[2] - self.psi_ref) / max(dt, 1e-6), -g.max_yaw_rate, g.max_yaw_rate))
         self.psi_ref = float(wrap(self.psi_ref + slew * dt))
-        euler_rates = [*self._lean_rates(command, e, dt), slew + g.yaw_p * float(wrap(self.psi_ref - e.euler[2]))]
-        euler_rates[2] = min(max(euler_rates[2], -2 * g.max_yaw_rate), 2 * g.max_yaw_rate)
-        rates_c = _body_rates(euler_rates, e.euler)
+        yaw_rate = slew + g.yaw_p * float(wrap(self.psi_ref - e.euler[2]))
+        yaw_rate = min(max(yaw_rate, -2 * g.max_yaw_rate), 2 * g.max_yaw_rate)
+        rates_c = np.array([*self._lean_rates(command, e, dt), yaw_rate])
         previous = self._rates
         self._rates = previous + (e.rates - previous) * dt / (dt + _D_FILTER_S)
         error = rates_c - e.rates
@@ -109,8 +109,14 @@ class AttitudeController:
         return self._mix(torque, throttle)
 
     def _lean_rates(self, command: tuple[float, float, float], e: Estimate, dt: float) -> list[float]:
-        """Return the commanded roll and pitch rates [rad/s]."""
+        """Return the commanded roll and pitch rates [rad/s].
+
+        A rotation about the body's vertical axis keeps the direction of thrust and changes roll and pitch.
+        """
         g, rates = self._gains, []
+        phi, theta = self._ref
+        turned = float(e.rates[2]) * dt
+        self._ref = [phi + theta * turned, theta - phi * turned]
         for k in range(2):
             feed_forward = 0.0
             if g.input_tc > 0:
@@ -134,13 +140,6 @@ class AttitudeController:
         if expo <= 0:
             return thrust
         return (-(1 - expo) + np.sqrt((1 - expo) ** 2 + 4 * expo * thrust)) / (2 * expo)
-
-
-def _body_rates(euler_rates: list[float], euler: np.ndarray) -> np.ndarray:
-    """Convert Euler angle rates to body rates p q r; Beard & McLain, eq. 3.2."""
-    (sf, st), (cf, ct) = ((f(euler[0]), f(euler[1])) for f in (sin, cos))
-    a, b, c = euler_rates
-    return np.array([a - c * st, b * cf + c * sf * ct, -b * sf + c * cf * ct])
 
 
 def square_root_control(error: float, p: float, limit: float) -> float:

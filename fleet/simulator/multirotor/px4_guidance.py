@@ -63,22 +63,29 @@ class Px4Guidance:
             self._waited = min(self._waited + dt, 0.0)
             self._p = p.copy()
             return Reference(self._p, np.zeros(3), np.zeros(3))
+        get = self._params.__getitem__
         target = self._velocity_target(p, following)
-        jerk, get = self._params["MPC_JERK_AUTO"], self._params.__getitem__
-        for axis in range(3):
-            limit = get("MPC_ACC_HOR") if axis < 2 else (get("MPC_ACC_UP_MAX" if target[2] < 0 else "MPC_ACC_DOWN_MAX"))
-            error = target[axis] - self._v[axis]
-            a_c = min(sqrt(2 * jerk * abs(error)), limit) * (1 if error > 0 else -1)
-            self._a[axis] += min(max(a_c - self._a[axis], -jerk * dt), jerk * dt)
-            if abs(error) < 0.5 * jerk * dt * dt + abs(self._a[axis]) * dt and abs(self._a[axis]) < 2 * jerk * dt:
-                self._v[axis], self._a[axis] = target[axis], 0.0
-            else:
-                self._v[axis] += self._a[axis] * dt
         lag = hypot(*(self._p - p)[:2]) / get("MPC_XY_ERR_MAX")
-        self._p[:2] += self._v[:2] * dt * min(max(1.0 - lag, 0.0), 1.0)
-        self._p[2] += self._v[2] * dt * (abs(self._p[2] - p[2]) < 2.0)
+        stretch = min(max(1.0 - lag, 0.0), 1.0)  # trajectory time over time
+        for axis in range(3):
+            vertical = get("MPC_ACC_UP_MAX" if target[2] < 0 else "MPC_ACC_DOWN_MAX")
+            limit, step = (get("MPC_ACC_HOR"), dt * stretch) if axis < 2 else (vertical, dt)
+            self._step_axis(axis, float(target[axis]), limit, step)
+            self._p[axis] += self._v[axis] * step
         self._arrive(dt, p)
-        return Reference(self._p.copy(), self._v.copy(), self._a.copy())
+        v_ref = self._v * np.array([stretch, stretch, 1.0])
+        return Reference(self._p.copy(), v_ref, self._a.copy())
+
+    def _step_axis(self, axis: int, target: float, limit: float, dt: float) -> None:
+        """Advance acceleration and velocity of one axis towards a velocity, limited in jerk."""
+        jerk = self._params["MPC_JERK_AUTO"]
+        error = target - self._v[axis]
+        a_c = min(sqrt(2 * jerk * abs(error)), limit) * (1 if error > 0 else -1)
+        self._a[axis] += min(max(a_c - self._a[axis], -jerk * dt), jerk * dt)
+        if abs(error) <= abs(self._a[axis]) * dt and abs(self._a[axis]) <= 2 * jerk * dt:
+            self._v[axis], self._a[axis] = target, 0.0
+        else:
+            self._v[axis] += self._a[axis] * dt
 
     def _velocity_target(self, p: np.ndarray, following: Callable[[], Task | None]) -> np.ndarray:
         get, task = self._params.__getitem__, self._task

@@ -41,6 +41,10 @@ _PX4: dict[str, float] = {
     **{"MC_PITCHRATE_P": 0.12, "MC_PITCHRATE_I": 0.12, "MC_PITCHRATE_D": 0.003, "MC_PITCHRATE_MAX": 220.0},
     **{"MC_YAWRATE_P": 0.9, "MC_YAWRATE_I": 0.09},
 }
+_LARGE = {  # slower motors
+    "ardupilot": {"ATC_RAT_RLL_P": 0.09, "ATC_RAT_RLL_I": 0.09, "ATC_RAT_PIT_P": 0.09, "ATC_RAT_PIT_I": 0.09},
+    "px4": {"MC_ROLL_P": 4.5, "MC_ROLLRATE_P": 0.09, "MC_ROLLRATE_I": 0.09, "MC_PITCHRATE_P": 0.09},
+}
 _CHOICES: Mapping[str, Mapping[str, tuple[float, ...]]] = {
     "ardupilot": {
         **{"WPNAV_SPEED": (500.0, 700.0, 800.0, 1000.0), "WPNAV_ACCEL": (150.0, 200.0, 250.0, 300.0)},
@@ -64,7 +68,7 @@ def tuned_parameters(seed: int, autopilot: str, aircraft: str) -> dict[str, floa
         aircraft: name in `airframes.TYPES`
     """
     rng = np.random.default_rng((seed, 3))
-    values = dict(_PX4 if autopilot == "px4" else _ARDUCOPTER)
+    values = dict(_PX4 if autopilot == "px4" else _ARDUCOPTER) | (_LARGE[autopilot] if aircraft == "quad_large" else {})
     for name, choices in _CHOICES[autopilot].items():
         values[name] = float(rng.choice(choices))
     hover = round(hover_thrust(TYPES[aircraft]), 3)
