@@ -96,7 +96,6 @@ class CopterGuidance:
             self._tail, self._leg, self._lead = self._leg, self._lead, None
             return
         self._tail = self._lead = None
-        self._scale = 1.0
         acc = self._params["WPNAV_ACCEL"] * _CM
         origin = p + v * float(np.linalg.norm(v)) / (2 * acc)
         previous = getattr(self, "_leg", None)
@@ -176,7 +175,7 @@ class CopterGuidance:
             state[0] += self._tail.a - self._tail.b
         if self._lead is not None:
             state += self._lead.at(self._lead.t)
-        return state * np.array([[1.0], [self._scale], [self._scale]])
+        return state
 
     def _corner(self, leg: Leg, task: Task | None) -> Leg | None:
         """Return the next leg when it may begin now; None: not yet, or the aircraft stops here."""
@@ -198,12 +197,12 @@ class CopterGuidance:
         """Slow the profile down while the aircraft lags behind the reference."""
         speed = float(np.linalg.norm(state[1]))
         target = 1.0
-        if speed > 0.1 and self._scale > 0:
+        if speed > 0.1:
             direction = state[1] / speed
             behind, along = float((state[0] - p) @ direction), float(v @ direction)
-            target = 0.05 + (along - self._params["PSC_POSXY_P"] * behind) / (speed / self._scale)
+            target = 0.05 + (along - self._params["PSC_POSXY_P"] * behind) / speed
         time_constant = self._params["WPNAV_ACCEL"] * _CM / self._params["WPNAV_JERK"]
-        self._scale += (min(max(target, 0.05), 1.0) - self._scale) * dt / (dt + 0.3 * time_constant)
+        self._scale += (min(max(target, 0.0), 1.0) - self._scale) * dt / (dt + time_constant)
 
     def _arrive(self, dt: float, p: np.ndarray, v: np.ndarray) -> None:
         if self._lead is not None:

@@ -11,7 +11,6 @@ import numpy as np
 
 from fleet.frames import G
 from twin_worker.prediction.multirotor.rollout import MultirotorConfig, MultirotorModel, MultirotorTwin, fly_segments
-from twin_worker.prediction.multirotor.route import segments_from_mission
 from twin_worker.telemetry.track import STEP, Track
 
 _MIN_TRACK_S = 2.0  # minimum track before a rollout [s]
@@ -40,9 +39,7 @@ def fit_model(track: Track, seq: np.ndarray, config: MultirotorConfig, model: Mu
     segments_of = {}
     for k in starts:
         if seq[k] not in segments_of:
-            segments_of[seq[k]] = segments_from_mission(
-                config.items, int(seq[k]) + config.seq_offset, config.origin, track.p[k], config.params
-            )[0]
+            segments_of[seq[k]] = config.segments(int(seq[k]) + config.seq_offset, track.p[k])[0]
 
     def cost_of(candidate: MultirotorModel) -> float:
         errors = [

@@ -9,12 +9,13 @@ from math import isfinite
 
 import numpy as np
 
-from fleet.autopilots import copter
+from fleet.autopilots import copter, copter_legs
 from fleet.autopilots.copter import Limits
 from fleet.contract import Item, Mission
 from fleet.frames import Origin
 from fleet.mission import join_remarks, route_items
 from twin_worker.numerics.interpolation import zero_order_hold
+from twin_worker.prediction.multirotor import copter_rollout
 from twin_worker.prediction.multirotor.route import (
     limit_speeds,
     numbered_from_one,
@@ -30,6 +31,7 @@ _ZETA = 0.9
 _TRANSITION_ACCEL = 4.0  # acceleration of a quadplane in transition [m/s2]
 _ITEM_MAX_AGE_S = 15.0  # maximum age of a reported item [s]
 _STATIONARY_SPEED = 0.8  # stationary below this speed [m/s]
+_WAYPOINT, _LAST_NAV = 16, 95  # MAV_CMD
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,8 @@ class MultirotorConfig:
         limit: limits from the parameters
         absent: limits without a received parameter
         changed_t: last change of route, mode or parameters [s since 1970]
+        origin: of the twin's frame
+        plans_legs: flies jerk-limited legs as ArduCopter does; otherwise the general law of `copter`
     """
 
     items: tuple[Item, ...]
@@ -87,6 +91,26 @@ class MultirotorConfig:
     absent: tuple[str, ...]
     changed_t: float
     origin: Origin
+    plans_legs: bool = False
+
+    @property
+    def law(self) -> str:
+        """Return the name of the law."""
+        return copter_legs.LAW if self.plans_legs else copter.LAW
+
+    def segments(self, seq: int, p: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+        """Return the route from item `seq` on, for ArduCopter from the leg before it; and the mission's problems."""
+        options = {"arcs": self.plans_legs}
+        route, problems = segments_from_mission(self.items, seq, self.origin, p, self.params, **options)
+        if not self.plans_legs or not len(route):
+            return route, problems
+        before = max((i.seq for i in self.items if i.seq < seq and 0 < i.command < _LAST_NAV), default=-1)
+        item = next((i for i in self.items if i.seq == before), None)
+        if item is None or item.command != _WAYPOINT or item.param1 > 0 or before < 1:
+            return route, problems
+        longer, more = segments_from_mission(self.items, before, self.origin, p, self.params, **options)
+        k = np.flatnonzero(longer[:, copter.SEQ] == seq)
+        return (longer, more) if len(k) and k[0] <= 1 else (route, problems)
 
 
 def multirotor_config(
@@ -107,7 +131,8 @@ def multirotor_config(
     if "speed" in absent and track is not None:
         limit = limit._replace(speed=_cruise_speed(track, limit.speed))
     items = numbered_from_one(items, origin) if seq_offset else items
-    return MultirotorConfig(items, seq_offset, params, limit, absent, since, origin)
+    plans_legs = autopilot == "ardupilot" and not prefix
+    return MultirotorConfig(items, seq_offset, params, limit, absent, since, origin, plans_legs)
 
 
 def _cruise_speed(track: Track, default: float) -> float:
@@ -131,7 +156,7 @@ def fly_route(
     if not isfinite(seq[-1]):
         return None, "the current mission item is not reported (MISSION_CURRENT)"
     item_seq = int(seq[-1]) + config.seq_offset
-    segments, problems = segments_from_mission(config.items, item_seq, config.origin, track.p[-1], config.params)
+    segments, problems = config.segments(item_seq, track.p[-1])
     if not len(segments):
         return None, join_remarks(("the mission has nothing to fly", *problems))
     return fly_segments(track, segments, item_seq, MultirotorTwin(config, model), ahead), join_remarks(problems)
@@ -139,7 +164,7 @@ def fly_route(
 
 def fly_home(track: Track, config: MultirotorConfig, model: MultirotorModel, ahead: np.ndarray) -> np.ndarray | None:
     """Predict a return to launch from the end of the track; None if home is unknown."""
-    segments = return_segments(config.items, config.origin, track.p[-1], config.params)
+    segments = return_segments(config.items, config.origin, track.p[-1], config.params, arcs=config.plans_legs)
     return fly_segments(track, segments, -1, MultirotorTwin(config, model), ahead) if len(segments) else None
 
 
@@ -178,8 +203,12 @@ def fly_segments(track: Track, commanded: np.ndarray, seq: int, twin: Multirotor
     """Simulate route segments from the end of the track with current item `seq`; return the path, (k, 3) [m]."""
     segments = limit_speeds(commanded, twin.limit)
     stops = (segments[:, copter.HOLD] > 0) & np.isfinite(segments[:, copter.HOLD])
-    segments[stops, copter.HOLD] += twin.model.stop_delay_s
+    planned = twin.config.plans_legs and not twin.model.n_starts  # its stops are part of the law
+    segments[stops, copter.HOLD] += 0.0 if planned else twin.model.stop_delay_s
     segments[:, copter.SPEED] *= np.where(commanded[:, copter.SPEED] > 0, twin.model.speed_fraction, 1.0)
+    if segments.shape[1] == copter_legs.N_COLUMNS:
+        par = copter_rollout.parameters(twin.limit, twin.config.params)
+        return copter_rollout.fly(track, segments, seq, par, ahead)
     p, v = track.p[-1].copy(), track.v[-3:].mean(axis=0)
     ref = _initial_reference(track, segments, seq, twin.model.wn)
     out = np.empty((int(ahead[-1] / STEP) + 2, 3))
