@@ -20,6 +20,7 @@ _VELOCITY_S = 0.7  # weight of a velocity against a position [s]
 _MAX_OFFSET_M = 5.0  # from the leg; beyond it a new leg begins at the aircraft
 _ATTITUDE_LAG_S = 0.25
 _STATIONARY_SPEED = 0.8  # [m/s]
+_REPORT_DELAY_S = 0.5  # mean delay of MISSION_CURRENT at 1 Hz [s]
 _VELOCITY_ROWS, _ACCELERATION_ROWS = 3, 8
 _GAINS = (  # default and parameter names, horizontal and vertical
     (1.0, ("PSC_NE_POS_P", "PSC_POSXY_P")),
@@ -40,18 +41,20 @@ def parameters(limit: Limits, params: Mapping[str, float]) -> np.ndarray:
     )
 
 
-def fly(track: Track, segments: np.ndarray, seq: int, par: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """Simulate the flight from the end of the track with current item `seq`; return the path, (k, 3) [m].
+def fly(
+    track: Track, segments: np.ndarray, item: tuple[int, float], par: np.ndarray, ahead: np.ndarray
+) -> np.ndarray:
+    """Simulate the flight from the end of the track; return the path, (k, 3) [m].
 
     Args:
         track: newest flight
         segments: from the leg before the present one on, (n, copter_legs.N_COLUMNS)
-        seq: current mission item
+        item: current mission item, and the time since it was first reported, nan unknown [-, s]
         par: as of `parameters`
         ahead: look-ahead, (k,) [s]
     """
     v = track.v[-_VELOCITY_ROWS:].mean(axis=0)
-    state = _synchronise(track, segments, seq, par)
+    state = _synchronise(track, segments, item, par)
     rows = min(_ACCELERATION_ROWS, len(track) - 1)
     a = (track.v[-1] - track.v[-1 - rows]) / (STEP * rows) if rows else np.zeros(3)
     xva = np.array([track.p[-1], v, np.clip(a, -5.0, 5.0)])
@@ -60,49 +63,64 @@ def fly(track: Track, segments: np.ndarray, seq: int, par: np.ndarray, ahead: np
     return np.column_stack([np.interp(ahead, STEP * np.arange(len(out)), column) for column in out.T])
 
 
-def _synchronise(track: Track, segments: np.ndarray, seq: int, par: np.ndarray) -> np.ndarray:
+def _synchronise(track: Track, segments: np.ndarray, item: tuple[int, float], par: np.ndarray) -> np.ndarray:
     """Return the state of the navigation now, (copter_legs.N_STATE,)."""
+    seq, since = item
     own = np.flatnonzero(segments[:, copter.SEQ] == seq)
     first = int(own[0]) if len(own) else 0
-    if len(own):
-        circle = own[segments[own, copter_legs.TURN] != 0.0]
-        if len(circle) and (state := _on_circle(track, segments[circle[0]])) is not None:
-            state[copter_legs.SEGMENT] = circle[0]
-            return state
+    circle = own[segments[own, copter_legs.TURN] != 0.0]
+    if len(circle) and (state := _on_circle(track, segments[circle[0]])) is not None:
+        state[copter_legs.SEGMENT] = circle[0]
+        return state
+    if len(own) and _length(segments[first]) < 0.1 and isfinite(since):  # waits where it is
+        state = _new_leg(track, segments, first, par)
+        state[copter_legs.WAIT] = since + _REPORT_DELAY_S
+        return state
     states, refs = np.zeros((_MAX_RUN, copter_legs.N_STATE)), np.zeros((_MAX_RUN, 3, 3))
     n = copter_legs.reference_states(segments, par, STEP, states, refs)
-    straight = segments[states[:n, copter_legs.SEGMENT].astype(int), copter_legs.TURN] == 0.0
-    rows = np.flatnonzero((segments[states[:n, copter_legs.SEGMENT].astype(int), copter.SEQ] == seq) & straight)
+    segment = states[:n, copter_legs.SEGMENT].astype(int)
+    rows = np.flatnonzero((segments[segment, copter.SEQ] == seq) & (segments[segment, copter_legs.TURN] == 0.0))
     if not len(rows):
-        return _new_leg(track, first, par)
+        return _new_leg(track, segments, first, par)
+    stopped = int(_stationary_s(track) / STEP)
+    at_end = np.linalg.norm(track.p[-1] - segments[own[-1], copter.B_N : copter.B_N + 3]) < 3.0
+    back = min(stopped, len(track) - 2) if stopped and at_end else 0  # rows since it was moving
+    row = int(rows[np.argmin(_distance(track, refs, rows, back))])
+    if np.linalg.norm(refs[row, 0] - track.p[-1 - back]) > _MAX_OFFSET_M:
+        return _new_leg(track, segments, int(segment[row]), par)
+    return states[min(row + back, int(rows[-1]))].copy()
+
+
+def _distance(track: Track, refs: np.ndarray, rows: np.ndarray, back: int) -> np.ndarray:
+    """Return the squared distance of reference rows from the track until `back` rows ago, (n,) [m2]."""
     cost = np.zeros(len(rows))
-    for back in _MATCH_ROWS:
-        if back < len(track):
-            earlier = np.maximum(rows - back, 0)
-            cost += np.sum((refs[earlier, 0] - track.p[-1 - back]) ** 2, axis=1)
-            v = track.v[max(len(track) - back - 2, 0) : len(track) - back].mean(axis=0)
+    for lag in _MATCH_ROWS:
+        k = len(track) - 1 - back - lag
+        if k >= 0:
+            earlier = np.maximum(rows - lag, 0)
+            v = track.v[max(k - 1, 0) : k + 1].mean(axis=0)
+            cost += np.sum((refs[earlier, 0] - track.p[k]) ** 2, axis=1)
             cost += _VELOCITY_S**2 * np.sum((refs[earlier, 1] - v) ** 2, axis=1)
-    row = int(rows[np.argmin(cost)])
-    if np.linalg.norm(refs[row, 0] - track.p[-1]) > _MAX_OFFSET_M:
-        return _new_leg(track, int(states[row, copter_legs.SEGMENT]), par)
-    state = states[row].copy()
-    waited = _stationary_s(track)
-    k = int(state[copter_legs.SEGMENT])
-    if segments[k, copter.HOLD] > 0 and waited > 0:
-        end = segments[k, copter.B_N : copter.B_N + 3]
-        if np.linalg.norm(track.p[-1] - end) < max(par[copter_legs.WP_RADIUS], 3.0):
-            state[copter_legs.T], state[copter_legs.WAIT] = 1e4, waited
-    return state
+    return cost
 
 
-def _new_leg(track: Track, segment: int, par: np.ndarray) -> np.ndarray:
-    """Return the state at the begin of a leg that starts where the aircraft can stop."""
+def _length(segment: np.ndarray) -> float:
+    return float(np.linalg.norm(segment[copter.B_N : copter.B_N + 3] - segment[copter.A_N : copter.A_N + 3]))
+
+
+def _new_leg(track: Track, segments: np.ndarray, k: int, par: np.ndarray) -> np.ndarray:
+    """Return the state on a leg that leads from the aircraft to the end of segment `k`, at its present speed."""
     state = np.zeros(copter_legs.N_STATE)
-    v = track.v[-_VELOCITY_ROWS:].mean(axis=0)
-    state[copter_legs.SEGMENT], state[copter_legs.SCALE] = segment, 1.0
+    state[copter_legs.SEGMENT], state[copter_legs.SCALE] = k, 1.0
     state[copter_legs.TAIL] = state[copter_legs.LEAD] = -1.0
-    start = track.p[-1] + v * float(np.linalg.norm(v)) / (2 * par[copter_legs.ACC_XY])
-    state[copter_legs.START_N : copter_legs.START_D + 1] = start
+    p, v = track.p[-1], track.v[-_VELOCITY_ROWS:].mean(axis=0)
+    offset = segments[k, copter.B_N : copter.B_N + 3] - p
+    direction = offset / max(float(np.linalg.norm(offset)), 1e-6)
+    speed, acc, jerk = max(float(v @ direction), 0.0), segments[k, copter.ACC], par[copter_legs.JERK]
+    ramp = min(acc / jerk, float(np.sqrt(speed / jerk)))  # time of each jerk phase of an acceleration to this speed
+    time = 2 * ramp + max(speed / acc - ramp, 0.0) if speed > 0.3 else 0.0
+    state[copter_legs.T] = time
+    state[copter_legs.START_N : copter_legs.START_D + 1] = p - direction * speed * time / 2
     return state
 
 

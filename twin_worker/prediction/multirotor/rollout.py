@@ -21,6 +21,7 @@ from twin_worker.prediction.multirotor.route import (
     numbered_from_one,
     return_segments,
     segments_from_mission,
+    stop_position,
     stopping_segment,
 )
 from twin_worker.telemetry.track import STEP, Track
@@ -31,7 +32,7 @@ _ZETA = 0.9
 _TRANSITION_ACCEL = 4.0  # acceleration of a quadplane in transition [m/s2]
 _ITEM_MAX_AGE_S = 15.0  # maximum age of a reported item [s]
 _STATIONARY_SPEED = 0.8  # stationary below this speed [m/s]
-_WAYPOINT, _LAST_NAV = 16, 95  # MAV_CMD
+_WAYPOINT, _TURNS, _LAST_NAV = 16, 18, 95  # MAV_CMD
 
 
 @dataclass(frozen=True)
@@ -98,19 +99,43 @@ class MultirotorConfig:
         """Return the name of the law."""
         return copter_legs.LAW if self.plans_legs else copter.LAW
 
-    def segments(self, seq: int, p: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
-        """Return the route from item `seq` on, for ArduCopter from the leg before it; and the mission's problems."""
+    def segments(self, track: Track, seq: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+        """Return the route from the current item on, for ArduCopter from the leg before it; and the mission's problems.
+
+        Args:
+            track: newest flight
+            seq: reported mission item of each row
+        """
+        item = int(seq[-1]) + self.seq_offset
         options = {"arcs": self.plans_legs}
-        route, problems = segments_from_mission(self.items, seq, self.origin, p, self.params, **options)
+        route, problems = segments_from_mission(self.items, item, self.origin, track.p[-1], self.params, **options)
         if not self.plans_legs or not len(route):
             return route, problems
-        before = max((i.seq for i in self.items if i.seq < seq and 0 < i.command < _LAST_NAV), default=-1)
-        item = next((i for i in self.items if i.seq == before), None)
-        if item is None or item.command != _WAYPOINT or item.param1 > 0 or before < 1:
+        before = self._previous(item, seq)
+        if before is None:
             return route, problems
-        longer, more = segments_from_mission(self.items, before, self.origin, p, self.params, **options)
-        k = np.flatnonzero(longer[:, copter.SEQ] == seq)
-        return (longer, more) if len(k) and k[0] <= 1 else (route, problems)
+        if before.command == _WAYPOINT and not before.param1 > 0 and before.seq < item:
+            arguments = (self.items, before.seq, self.origin, track.p[-1], self.params)
+            longer, more = segments_from_mission(*arguments, **options)
+            k = np.flatnonzero(longer[:, copter.SEQ] == item)
+            return (longer, more) if len(k) and k[0] <= 1 else (route, problems)
+        changed = int(np.flatnonzero(seq != seq[-1])[-1]) if (seq != seq[-1]).any() else None
+        if before.command == _TURNS and changed is not None:
+            v = track.v[changed]
+            start = track.p[changed] + v * float(np.linalg.norm(v)) / (2 * self.limit.acc)
+        else:
+            start = stop_position(self.items, before.seq, self.origin)
+        if start is not None:
+            route[0, copter.A_N : copter.A_N + 3] = start
+        return route, problems
+
+    def _previous(self, item: int, seq: np.ndarray) -> Item | None:
+        """Return the navigation item before the current one: the one reported before, else the one listed before."""
+        other = np.flatnonzero(np.isfinite(seq) & (seq != seq[-1]))
+        number = int(seq[other[-1]]) + self.seq_offset if len(other) else item
+        listed = [i for i in self.items if 0 < i.seq < item and 0 < i.command < _LAST_NAV]
+        reported = [i for i in self.items if i.seq == number and 0 < i.command < _LAST_NAV]
+        return reported[0] if reported and number != item else (listed[-1] if listed else None)
 
 
 def multirotor_config(
@@ -156,10 +181,17 @@ def fly_route(
     if not isfinite(seq[-1]):
         return None, "the current mission item is not reported (MISSION_CURRENT)"
     item_seq = int(seq[-1]) + config.seq_offset
-    segments, problems = config.segments(item_seq, track.p[-1])
+    segments, problems = config.segments(track, seq)
     if not len(segments):
         return None, join_remarks(("the mission has nothing to fly", *problems))
-    return fly_segments(track, segments, item_seq, MultirotorTwin(config, model), ahead), join_remarks(problems)
+    twin = MultirotorTwin(config, model)
+    return fly_segments(track, segments, item_seq, twin, ahead, since=time_on_item(seq)), join_remarks(problems)
+
+
+def time_on_item(seq: np.ndarray) -> float:
+    """Return how long the current item has been reported [s]; nan if from the first row on."""
+    other = np.flatnonzero(seq != seq[-1])
+    return STEP * (len(seq) - 1 - int(other[-1])) if len(other) else float("nan")
 
 
 def fly_home(track: Track, config: MultirotorConfig, model: MultirotorModel, ahead: np.ndarray) -> np.ndarray | None:
@@ -199,8 +231,19 @@ class MultirotorTwin:
         return np.array([self.config.limit.jerk, self.model.wn, _ZETA, self.model.max_tilt_airspeed, *self.model.wind])
 
 
-def fly_segments(track: Track, commanded: np.ndarray, seq: int, twin: MultirotorTwin, ahead: np.ndarray) -> np.ndarray:
-    """Simulate route segments from the end of the track with current item `seq`; return the path, (k, 3) [m]."""
+def fly_segments(
+    track: Track,
+    commanded: np.ndarray,
+    seq: int,
+    twin: MultirotorTwin,
+    ahead: np.ndarray,
+    *,
+    since: float = float("nan"),
+) -> np.ndarray:
+    """Simulate route segments from the end of the track with current item `seq`; return the path, (k, 3) [m].
+
+    `since` is the time since this item was first reported [s].
+    """
     segments = limit_speeds(commanded, twin.limit)
     stops = (segments[:, copter.HOLD] > 0) & np.isfinite(segments[:, copter.HOLD])
     planned = twin.config.plans_legs and not twin.model.n_starts  # its stops are part of the law
@@ -208,7 +251,7 @@ def fly_segments(track: Track, commanded: np.ndarray, seq: int, twin: Multirotor
     segments[:, copter.SPEED] *= np.where(commanded[:, copter.SPEED] > 0, twin.model.speed_fraction, 1.0)
     if segments.shape[1] == copter_legs.N_COLUMNS:
         par = copter_rollout.parameters(twin.limit, twin.config.params)
-        return copter_rollout.fly(track, segments, seq, par, ahead)
+        return copter_rollout.fly(track, segments, (seq, since), par, ahead)
     p, v = track.p[-1].copy(), track.v[-3:].mean(axis=0)
     ref = _initial_reference(track, segments, seq, twin.model.wn)
     out = np.empty((int(ahead[-1] / STEP) + 2, 3))

@@ -11,7 +11,7 @@ from fleet import mission as m
 from fleet.autopilots import copter, copter_legs
 from fleet.autopilots.copter import Limits
 from fleet.contract import Item
-from fleet.frames import Origin
+from fleet.frames import Origin, to_ned
 
 STOP_WAIT_S = 1e-3  # minimal wait that marks a stop [s]
 _NUDGE_E7 = 108  # 1.2 m north [1e-7 deg]
@@ -209,6 +209,19 @@ def _add_arc(builder: _SegmentBuilder, leg: np.ndarray, radius: float, rate: flo
     row = builder.rows[-1]
     row[copter_legs.RADIUS], row[copter_legs.TURN] = abs(radius), 2 * pi * turns * (1 if radius >= 0 else -1)
     row[copter_legs.C_N], row[copter_legs.C_E] = centre[:2]
+
+
+def stop_position(items: Sequence[Item], seq: int, origin: Origin) -> np.ndarray | None:
+    """Return where an aircraft waits after item `seq`, NED, (3,) [m]; None if the mission does not tell."""
+    home, place = _home(items, origin), None
+    for item in sorted(items, key=lambda i: i.seq):
+        if 0 < item.seq <= seq and item.command in (16, 17, 19, 22, 82):
+            down = -item.alt_m - origin.alt_mm * -1e-3 if item.frame in m.ABSOLUTE else home[2] - item.alt_m
+            north_east = home[:2]
+            if item.lat_e7 or item.lon_e7:
+                north_east = to_ned(origin, *(np.array([x], float) for x in (item.lat_e7, item.lon_e7, 0.0)))[0, :2]
+            place = np.array([*north_east, down])
+    return place
 
 
 def return_segments(
