@@ -9,6 +9,7 @@ from fleet.process.logs import report_status
 
 if TYPE_CHECKING:
     from fleet.simulator.faults.physics import Fault
+    from fleet.simulator.multirotor.uav import SimulatedMultirotor
 
 EXAMPLES = """
   fleet fly --uavs 0-7
@@ -69,7 +70,6 @@ def run(args: argparse.Namespace) -> int:
     """
     from fleet.simulator.flight import drive  # loads JSBSim and the compiler: not for --help
     from fleet.simulator.flight.uav import SimulatedUav
-    from fleet.simulator.multirotor.uav import SimulatedMultirotor
     from fleet.simulator.vehicle.weather import turbulence_level
 
     _check(args)
@@ -78,10 +78,10 @@ def run(args: argparse.Namespace) -> int:
     host, port = host_and_port("--to", args.to)
     options = {"autopilot": args.autopilot, "wind": args.wind, "turbulence": level}
     faulty = faults_of(args, args.uavs)
-    uavs: list[SimulatedUav | SimulatedMultirotor] = []
+    uavs: list[drive.SimulatedAircraft] = []
     for uav, aircraft in zip(args.uavs, aircraft_types(args.aircraft, args.uavs), strict=True):
         if aircraft in MULTIROTORS:
-            uavs.append(SimulatedMultirotor(uav, args.seed, aircraft=aircraft, **options))
+            uavs.append(_multirotor_class()(uav, args.seed, aircraft=aircraft, **options))
         else:
             uavs.append(SimulatedUav(uav, args.seed, aircraft=aircraft, faults=faulty.get(uav, ()), **options))
     if args.aircraft not in MULTIROTORS:
@@ -97,6 +97,22 @@ def run(args: argparse.Namespace) -> int:
     max_delay = drive.to_udp(uavs, (host, port), seconds=args.seconds, loss=args.loss, seed=args.seed, stop=stop)
     report_status("fly", f"stopped; at most {max_delay * 1e3:.0f} ms behind real time")
     return 0
+
+
+def _multirotor_class() -> "type[SimulatedMultirotor]":
+    """Return the class of simulated multirotors.
+
+    Raises:
+        ValueError: when RotorPy is not installed.
+    """
+    try:
+        from fleet.simulator.multirotor.uav import SimulatedMultirotor
+    except ModuleNotFoundError as error:
+        if error.name is None or not error.name.startswith("rotorpy"):
+            raise
+        remedy = "pip install --no-deps rotorpy, or run make setup"
+        raise ValueError(f"--aircraft: found no package rotorpy, expected it for multirotors; {remedy}") from None
+    return SimulatedMultirotor
 
 
 def aircraft_types(name: str, uavs: range) -> list[str]:

@@ -20,6 +20,7 @@ _VELOCITY_S = 0.7  # weight of a velocity against a position [s]
 _MAX_OFFSET_M = 5.0  # from the leg; beyond it a new leg begins at the aircraft
 _ATTITUDE_LAG_S = 0.25
 _STATIONARY_SPEED = 0.8  # [m/s]
+_LONG_S = 1e4  # time after the end of any leg [s]
 _REPORT_DELAY_S = 0.5  # mean delay of MISSION_CURRENT at 1 Hz [s]
 _VELOCITY_ROWS, _ACCELERATION_ROWS = 3, 8
 _GAINS = (  # default and parameter names, horizontal and vertical
@@ -74,7 +75,7 @@ def _synchronise(track: Track, segments: np.ndarray, item: tuple[int, float], pa
         return state
     if len(own) and _length(segments[first]) < 0.1 and isfinite(since):  # waits where it is
         state = _new_leg(track, segments, first, par)
-        state[copter_legs.WAIT] = since + _REPORT_DELAY_S
+        state[copter_legs.T], state[copter_legs.WAIT] = _LONG_S, since + _REPORT_DELAY_S
         return state
     states, refs = np.zeros((_MAX_RUN, copter_legs.N_STATE)), np.zeros((_MAX_RUN, 3, 3))
     n = copter_legs.reference_states(segments, par, STEP, states, refs)
