@@ -2,7 +2,7 @@
 
     speed = speed from which braking to the corner speed is possible, at most MPC_XY_CRUISE or the commanded one
     velocity target = speed towards a point of the line ahead;   a, v, p by jerk-limited steps, each axis alone
-    p waits while it is ahead of the aircraft by up to MPC_XY_ERR_MAX
+    trajectory time runs slower while p is ahead of the aircraft, and stops at MPC_XY_ERR_MAX
 
 The waypoint is reached within NAV_ACC_RAD and NAV_MC_ALT_RAD. The time it takes to turn the nose is not waited for.
 Source: PX4 documentation of the multicopter trajectory and position control, parameter names and defaults.
@@ -65,16 +65,15 @@ class Px4Guidance:
             return Reference(self._p, np.zeros(3), np.zeros(3))
         get = self._params.__getitem__
         target = self._velocity_target(p, following)
-        lag = hypot(*(self._p - p)[:2]) / get("MPC_XY_ERR_MAX")
-        stretch = min(max(1.0 - lag, 0.0), 1.0)  # trajectory time over time
+        behind = float((self._p - p)[:2] @ self._v[:2]) / max(hypot(*self._v[:2]), 1e-3)
+        stretch = min(max(1.0 - behind / get("MPC_XY_ERR_MAX"), 0.0), 1.0)  # trajectory time over time
         for axis in range(3):
             vertical = get("MPC_ACC_UP_MAX" if target[2] < 0 else "MPC_ACC_DOWN_MAX")
             limit, step = (get("MPC_ACC_HOR"), dt * stretch) if axis < 2 else (vertical, dt)
             self._step_axis(axis, float(target[axis]), limit, step)
             self._p[axis] += self._v[axis] * step
         self._arrive(dt, p)
-        v_ref = self._v * np.array([stretch, stretch, 1.0])
-        return Reference(self._p.copy(), v_ref, self._a.copy())
+        return Reference(self._p.copy(), self._v.copy(), self._a.copy())
 
     def _step_axis(self, axis: int, target: float, limit: float, dt: float) -> None:
         """Advance acceleration and velocity of one axis towards a velocity, limited in jerk."""

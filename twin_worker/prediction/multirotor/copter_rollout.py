@@ -31,15 +31,30 @@ _GAINS = (  # default and parameter names, horizontal and vertical
 )
 
 
+GainTable = tuple[tuple[float, tuple[str, ...]], ...]
+"""Default and parameter names of each gain."""
+
+
 def parameters(limit: Limits, params: Mapping[str, float]) -> np.ndarray:
     """Return the parameters of the navigation, (copter_legs.N_PAR,)."""
-    gains = [
+    return gains(_GAINS, limit, params)
+
+
+def gains(table: GainTable, limit: Limits, params: Mapping[str, float]) -> np.ndarray:
+    """Return gains of the position loop and limits, (copter_legs.N_PAR,)."""
+    values = [
         next((params[name] for name in names if isfinite(params.get(name, np.nan)) and params[name] > 0), default)
-        for default, names in _GAINS
+        for default, names in table
     ]
-    return np.array(
-        [*gains, _ATTITUDE_LAG_S, limit.jerk, limit.radius, limit.acc_corner, G * tan(min(limit.tilt, 1.2)), limit.acc]
-    )
+    tilt = G * tan(min(limit.tilt, 1.2))
+    return np.array([*values, _ATTITUDE_LAG_S, limit.jerk, limit.radius, limit.acc_corner, tilt, limit.acc])
+
+
+def present_motion(track: Track) -> np.ndarray:
+    """Return the newest position, velocity and acceleration, (3, 3)."""
+    rows = min(_ACCELERATION_ROWS, len(track) - 1)
+    a = (track.v[-1] - track.v[-1 - rows]) / (STEP * rows) if rows else np.zeros(3)
+    return np.array([track.p[-1], track.v[-_VELOCITY_ROWS:].mean(axis=0), np.clip(a, -5.0, 5.0)])
 
 
 def fly(
@@ -54,11 +69,7 @@ def fly(
         par: as of `parameters`
         ahead: look-ahead, (k,) [s]
     """
-    v = track.v[-_VELOCITY_ROWS:].mean(axis=0)
-    state = _synchronise(track, segments, item, par)
-    rows = min(_ACCELERATION_ROWS, len(track) - 1)
-    a = (track.v[-1] - track.v[-1 - rows]) / (STEP * rows) if rows else np.zeros(3)
-    xva = np.array([track.p[-1], v, np.clip(a, -5.0, 5.0)])
+    state, xva = _synchronise(track, segments, item, par), present_motion(track)
     out = np.empty((int(ahead[-1] / STEP) + 2, 3))
     copter_legs.follow(state, segments, xva, par, STEP, out)
     return np.column_stack([np.interp(ahead, STEP * np.arange(len(out)), column) for column in out.T])

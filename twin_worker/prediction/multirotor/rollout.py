@@ -9,13 +9,13 @@ from math import isfinite
 
 import numpy as np
 
-from fleet.autopilots import copter, copter_legs
+from fleet.autopilots import copter, copter_legs, px4_multirotor
 from fleet.autopilots.copter import Limits
 from fleet.contract import Item, Mission
 from fleet.frames import Origin
 from fleet.mission import join_remarks, route_items
 from twin_worker.numerics.interpolation import zero_order_hold
-from twin_worker.prediction.multirotor import copter_rollout
+from twin_worker.prediction.multirotor import copter_rollout, px4_rollout
 from twin_worker.prediction.multirotor.route import (
     limit_speeds,
     numbered_from_one,
@@ -82,7 +82,8 @@ class MultirotorConfig:
         absent: limits without a received parameter
         changed_t: last change of route, mode or parameters [s since 1970]
         origin: of the twin's frame
-        plans_legs: flies jerk-limited legs as ArduCopter does; otherwise the general law of `copter`
+        plans_legs: flies jerk-limited legs as ArduCopter does
+        smooths_velocity: flies a jerk-limited velocity as PX4 does; with neither, the general law of `copter`
     """
 
     items: tuple[Item, ...]
@@ -93,11 +94,12 @@ class MultirotorConfig:
     changed_t: float
     origin: Origin
     plans_legs: bool = False
+    smooths_velocity: bool = False
 
     @property
     def law(self) -> str:
         """Return the name of the law."""
-        return copter_legs.LAW if self.plans_legs else copter.LAW
+        return copter_legs.LAW if self.plans_legs else px4_multirotor.LAW if self.smooths_velocity else copter.LAW
 
     def segments(self, track: Track, seq: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
         """Return the route from the current item on, for ArduCopter from the leg before it; and the mission's problems.
@@ -156,8 +158,8 @@ def multirotor_config(
     if "speed" in absent and track is not None:
         limit = limit._replace(speed=_cruise_speed(track, limit.speed))
     items = numbered_from_one(items, origin) if seq_offset else items
-    plans_legs = autopilot == "ardupilot" and not prefix
-    return MultirotorConfig(items, seq_offset, params, limit, absent, since, origin, plans_legs)
+    plans_legs, smooths_velocity = (autopilot == name and not prefix for name in ("ardupilot", "px4"))
+    return MultirotorConfig(items, seq_offset, params, limit, absent, since, origin, plans_legs, smooths_velocity)
 
 
 def _cruise_speed(track: Track, default: float) -> float:
@@ -246,12 +248,16 @@ def fly_segments(
     """
     segments = limit_speeds(commanded, twin.limit)
     stops = (segments[:, copter.HOLD] > 0) & np.isfinite(segments[:, copter.HOLD])
-    planned = twin.config.plans_legs and not twin.model.n_starts  # its stops are part of the law
+    planned = (twin.config.plans_legs or twin.config.smooths_velocity) and not twin.model.n_starts  # its stops are part of the law
     segments[stops, copter.HOLD] += 0.0 if planned else twin.model.stop_delay_s
     segments[:, copter.SPEED] *= np.where(commanded[:, copter.SPEED] > 0, twin.model.speed_fraction, 1.0)
     if segments.shape[1] == copter_legs.N_COLUMNS:
         par = copter_rollout.parameters(twin.limit, twin.config.params)
         return copter_rollout.fly(track, segments, (seq, since), par, ahead)
+    if twin.config.smooths_velocity:
+        segments = px4_rollout.limit_takeoff(segments, twin.config.items, twin.config.params)
+        par = px4_rollout.parameters(twin.limit, twin.config.params)
+        return px4_rollout.fly(track, segments, (seq, since), par, ahead)
     p, v = track.p[-1].copy(), track.v[-3:].mean(axis=0)
     ref = _initial_reference(track, segments, seq, twin.model.wn)
     out = np.empty((int(ahead[-1] / STEP) + 2, 3))

@@ -171,7 +171,7 @@ def _add_descent(builder: _SegmentBuilder, ground: float, seq: float) -> None:
 
 
 def _add_return(builder: _SegmentBuilder, home: np.ndarray, params: Mapping[str, float], seq: float) -> None:
-    height = params.get("RTL_ALT_M", params.get("RTL_ALT", 100.0 * _RTL_M) * 0.01)
+    height = params.get("RTL_ALT_M", params.get("RTL_RETURN_ALT", params.get("RTL_ALT", 100.0 * _RTL_M) * 0.01))
     height = min(height, 1e3) if height > 0 else 0.0
     top = min(home[2] - height, builder.end[2])
     builder.add(np.array([*builder.end[:2], top]), seq, STOP_WAIT_S if top < builder.end[2] - 0.3 else 0.0)
