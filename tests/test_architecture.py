@@ -40,8 +40,7 @@ ORDER = (  # a folder, or a module in the root of a package, imports only from i
     ("fleet.simulator.vehicle",),
     ("fleet.simulator.faults",),
     ("fleet.simulator.flight",),
-    ("fleet.simulator.multirotor",),
-    ("fleet.simulator.conceal",),
+    ("fleet.simulator.conceal", "fleet.simulator.multirotor"),
     ("fleet.blind_test", "fleet.health"),
     ("fleet.commands.live", "fleet.commands.offline"),
     ("gateway",),
@@ -117,10 +116,7 @@ APART = (  # who, and what it must never import
     ("gateway", ("twin_worker", "viewer")),
     ("twin_worker", ("gateway", "viewer", "fleet.simulator")),
     ("viewer", ("gateway", "twin_worker", "fleet.simulator")),
-    (
-        "fleet.simulator",
-        ("fleet.physics", "fleet.effects", "fleet.physics.simulate", "fleet.physics.point_mass"),
-    ),  # never our own physics
+    ("fleet.simulator", ("fleet.physics", "fleet.effects")),  # never our own physics
     ("fleet.simulator.multirotor", ("fleet.autopilots", "fleet.mission")),  # nor the law and route that predict it
     ("fleet.simulator", ("importlib", "runpy", "subprocess")),  # nor by the back door
     ("fleet.effects", ("fleet.simulator",)),  # one code must never both conceal and find

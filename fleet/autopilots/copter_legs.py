@@ -101,7 +101,9 @@ def _may_begin(plan: np.ndarray, t: float, following: np.ndarray, par: np.ndarra
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
-def navigate(state: np.ndarray, segments: np.ndarray, xv: np.ndarray, par: np.ndarray, dt: float, r: np.ndarray) -> None:
+def navigate(
+    state: np.ndarray, segments: np.ndarray, xv: np.ndarray, par: np.ndarray, dt: float, r: np.ndarray
+) -> None:
     """Advance the navigation by dt.
 
     Args:
@@ -175,9 +177,7 @@ def begin_circle(state: np.ndarray, segment: np.ndarray, x: np.ndarray, rate: fl
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
-def _circle(
-    state: np.ndarray, segments: np.ndarray, xv: np.ndarray, par: np.ndarray, dt: float, r: np.ndarray
-) -> None:
+def _circle(state: np.ndarray, segments: np.ndarray, xv: np.ndarray, par: np.ndarray, dt: float, r: np.ndarray) -> None:
     k = int(state[SEGMENT])
     segment = segments[k]
     radius, sense = segment[RADIUS], 1.0 if segment[TURN] > 0.0 else -1.0

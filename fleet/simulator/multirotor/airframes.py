@@ -1,4 +1,4 @@
-"""Airframes of simulated multirotors: mass, inertia, rotors and drag in the parameters of RotorPy, and their variations.
+"""Airframes of simulated multirotors: mass, inertia, rotors and drag in the parameters of RotorPy, with variations.
 
 Source: parameter names and orders of magnitude of RotorPy (Folk, Paulos & Kumar 2023), scaled to a 10-inch and an
 18-inch quadrotor; thrust to weight 2.3 and 2.1.
@@ -64,11 +64,28 @@ def rotorpy_parameters(kind: MultirotorType) -> dict:
     Ixx, Iyy, Izz = kind.inertia
     c_Dx, c_Dy, c_Dz = kind.drag
     return {
-        **{"mass": kind.mass, "Ixx": Ixx, "Iyy": Iyy, "Izz": Izz, "Ixy": 0.0, "Ixz": 0.0, "Iyz": 0.0},
-        **{"num_rotors": 4, "rotor_directions": np.array(SPINS), "rotor_speed_min": 0.0},
+        "mass": kind.mass,
+        "Ixx": Ixx,
+        "Iyy": Iyy,
+        "Izz": Izz,
+        "Ixy": 0.0,
+        "Ixz": 0.0,
+        "Iyz": 0.0,
+        "num_rotors": 4,
+        "rotor_directions": np.array(SPINS),
+        "rotor_speed_min": 0.0,
         "rotor_pos": {f"r{k + 1}": kind.arm * np.array([*arm, 0.0]) for k, arm in enumerate(ARMS)},
-        **{"rotor_speed_max": kind.top_speed, "k_eta": kind.k_eta, "k_m": kind.k_m, "k_d": kind.k_d, "k_z": kind.k_z},
-        **{"k_h": kind.k_h, "k_flap": 0.0, "tau_m": kind.tau_m, "c_Dx": c_Dx, "c_Dy": c_Dy, "c_Dz": c_Dz},
+        "rotor_speed_max": kind.top_speed,
+        "k_eta": kind.k_eta,
+        "k_m": kind.k_m,
+        "k_d": kind.k_d,
+        "k_z": kind.k_z,
+        "k_h": kind.k_h,
+        "k_flap": 0.0,
+        "tau_m": kind.tau_m,
+        "c_Dx": c_Dx,
+        "c_Dy": c_Dy,
+        "c_Dz": c_Dz,
     }
 
 

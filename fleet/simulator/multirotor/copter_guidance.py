@@ -243,7 +243,7 @@ class CopterGuidance:
         centre = self._task.target
         p = np.array([*(centre[:2] + radius * out), centre[2]])
         v = np.array([*(c["rate"] * radius * ahead), 0.0])
-        return Reference(p, v, np.array([*(-c["rate"] ** 2 * radius * out), 0.0]))
+        return Reference(p, v, np.array([*(-(c["rate"] ** 2) * radius * out), 0.0]))
 
     def _descend(self, dt: float, p: np.ndarray) -> Reference:
         """Descend at WPNAV_SPEED_DN, then at LAND_SPEED below LAND_ALT_LOW."""

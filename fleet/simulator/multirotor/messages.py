@@ -1,6 +1,6 @@
 """MAVLink interface of a simulated multirotor: telemetry messages and their rates, for ArduCopter and PX4.
 
-Source: MAVLink common and ardupilotmega dialects; streams of ArduCopter 4.7 as recorded, and of PX4 src/modules/mavlink.
+Source: MAVLink common and ardupilotmega dialects; streams of ArduCopter 4.7 as recorded; PX4 MAVLink documentation.
 """
 
 from math import atan2, cos, degrees, hypot, nan, sin
@@ -14,7 +14,9 @@ from fleet.simulator.vehicle.sensors import Estimate
 
 COPTER_MODES = {"STABILIZE": 0, "AUTO": 3, "GUIDED": 4, "LOITER": 5, "RTL": 6, "LAND": 9, "BRAKE": 17}
 _CELLS_MV = 12_600  # of a full battery [mV]
-_ENABLED = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mav.MAV_MODE_FLAG_STABILIZE_ENABLED | mav.MAV_MODE_FLAG_GUIDED_ENABLED
+_ENABLED = (
+    mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mav.MAV_MODE_FLAG_STABILIZE_ENABLED | mav.MAV_MODE_FLAG_GUIDED_ENABLED
+)
 
 
 class TelemetryState(NamedTuple):
@@ -93,7 +95,12 @@ def _landed(f: TelemetryState) -> Any:
 
 def _attitude_target(f: TelemetryState) -> Any:
     (cf, ct, cp), (sf, st, sp) = ([wave(a / 2) for a in f.command] for wave in (cos, sin))
-    q = [cf * ct * cp + sf * st * sp, sf * ct * cp - cf * st * sp, cf * st * cp + sf * ct * sp, cf * ct * sp - sf * st * cp]
+    q = [
+        cf * ct * cp + sf * st * sp,
+        sf * ct * cp - cf * st * sp,
+        cf * st * cp + sf * ct * sp,
+        cf * ct * sp - sf * st * cp,
+    ]
     return mav.MAVLink_attitude_target_message(_ms(f.t), 0, q, 0.0, 0.0, 0.0, f.delta_t)
 
 

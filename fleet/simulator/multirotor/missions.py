@@ -56,7 +56,7 @@ def draw_mission(seed: int, autopilot: str, cruise: float, origin: Origin) -> Mu
         if leg == circle_at and not px4:
             radius = float(rng.choice([-1, 1]) * rng.choice([10, 15, 25]))
             items.append(item(seq, LOITER_TURNS, home, point, params=(float(rng.integers(1, 3)), 0.0, radius)))
-        elif leg == loiter_at or leg == circle_at:
+        elif leg in (loiter_at, circle_at):
             items.append(item(seq, LOITER_TIME, home, point, params=(float(rng.integers(8, 20)), 0.0, 1.0)))
         else:
             hold = float(rng.integers(3, 9)) if leg == wait_at else 0.0

@@ -1,8 +1,9 @@
 """Position control of a simulated multirotor: reference to roll, pitch and throttle.
 
     v_c = v_ref + square root control of the position error;   a_c = a_ref + P (v_c - v) + I int(v_c - v) - D v'
-    horizontal a_c at most g tan(tilt limit);   theta_c = atan(-a_forward / g_z), phi_c = atan(a_right cos(theta_c) / g_z)
-    throttle = hover (1 - ff a_down_c / g) - P_a (a_down_c - a_down) - I_a int(a_down_c - a_down), over cos(phi) cos(theta)
+    horizontal a_c at most g tan(tilt limit)
+    theta_c = atan(-a_forward / g_z), phi_c = atan(a_right cos(theta_c) / g_z)
+    throttle = (hover (1 - ff a_down_c / g) - P_a e - I_a int(e)) / (cos(phi) cos(theta)),   e = a_down_c - a_down
 
 ArduCopter closes the vertical acceleration (ff = 0) and leans by g_z = g; PX4 commands the thrust vector (ff = 1,
 g_z = g - a_down_c) and integrates the vertical velocity.

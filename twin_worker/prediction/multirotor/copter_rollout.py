@@ -57,9 +57,7 @@ def present_motion(track: Track) -> np.ndarray:
     return np.array([track.p[-1], track.v[-_VELOCITY_ROWS:].mean(axis=0), np.clip(a, -5.0, 5.0)])
 
 
-def fly(
-    track: Track, segments: np.ndarray, item: tuple[int, float], par: np.ndarray, ahead: np.ndarray
-) -> np.ndarray:
+def fly(track: Track, segments: np.ndarray, item: tuple[int, float], par: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     """Simulate the flight from the end of the track; return the path, (k, 3) [m].
 
     Args:

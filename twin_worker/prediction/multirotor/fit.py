@@ -43,7 +43,10 @@ def fit_model(track: Track, seq: np.ndarray, config: MultirotorConfig, model: Mu
     starts = _starts(track, seq, config)
     if len(starts) < 3:
         return model
-    segments_of = {k: config.segments(track.part(max(k - _HISTORY_ROWS, 0), k + 1), seq[max(k - _HISTORY_ROWS, 0) : k + 1])[0] for k in starts}
+    segments_of = {
+        k: config.segments(track.part(max(k - _HISTORY_ROWS, 0), k + 1), seq[max(k - _HISTORY_ROWS, 0) : k + 1])[0]
+        for k in starts
+    }
 
     def cost_of(candidate: MultirotorModel) -> float:
         errors = [

@@ -1,4 +1,4 @@
-"""Rollout of a PX4 multirotor's route: the trajectory starts at the position, velocity and acceleration of the aircraft."""
+"""Rollout of a PX4 multirotor's route: its trajectory starts with the motion of the aircraft."""
 
 from collections.abc import Mapping, Sequence
 from math import isfinite
@@ -18,8 +18,14 @@ _GAINS = (
     (4.0, ("MPC_Z_VEL_P_ACC",)),
 )
 _DEFAULTS = {
-    **{"NAV_ACC_RAD": 10.0, "NAV_MC_ALT_RAD": 0.8, "MPC_ACC_HOR": 3.0, "MPC_ACC_UP_MAX": 4.0, "MPC_ACC_DOWN_MAX": 3.0},
-    **{"MPC_Z_V_AUTO_UP": 3.0, "MPC_Z_V_AUTO_DN": 1.5, "MPC_XY_ERR_MAX": 2.0},
+    "NAV_ACC_RAD": 10.0,
+    "NAV_MC_ALT_RAD": 0.8,
+    "MPC_ACC_HOR": 3.0,
+    "MPC_ACC_UP_MAX": 4.0,
+    "MPC_ACC_DOWN_MAX": 3.0,
+    "MPC_Z_V_AUTO_UP": 3.0,
+    "MPC_Z_V_AUTO_DN": 1.5,
+    "MPC_XY_ERR_MAX": 2.0,
 }
 _TAKEOFF = 22  # MAV_CMD
 _REPORT_DELAY_S = 0.5  # mean delay of MISSION_CURRENT at 1 Hz [s]
@@ -43,9 +49,7 @@ def limit_takeoff(segments: np.ndarray, items: Sequence[Item], params: Mapping[s
     return segments
 
 
-def fly(
-    track: Track, segments: np.ndarray, item: tuple[int, float], par: np.ndarray, ahead: np.ndarray
-) -> np.ndarray:
+def fly(track: Track, segments: np.ndarray, item: tuple[int, float], par: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     """Simulate the flight from the end of the track; arguments as of `copter_rollout.fly`."""
     seq, since = item
     own = np.flatnonzero(segments[:, copter.SEQ] == seq)
