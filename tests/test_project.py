@@ -89,7 +89,7 @@ def test_what_is_imported_is_declared_and_what_is_declared_is_imported() -> None
     optional = {bare(line) for line in PROJECT["optional-dependencies"]["multirotor"]}
     assert third_party(*PACKAGES) == (run_time | optional) - OFFERED
     assert {bare(line) for line in PROJECT["optional-dependencies"]["bench"]} == PEERS <= third_party("tests/bench")
-    assert third_party("tests") <= run_time | development | PEERS
+    assert third_party("tests") <= run_time | optional | development | PEERS
     assert development <= third_party("tests") | TOOLS
 
 

@@ -175,8 +175,8 @@ def _gps_raw(f: TelemetryState) -> Any:
     return mav.MAVLink_gps_raw_int_message(round(f.t * 1e6), *fix, 80, 120, ground_speed, course, 14)
 
 
-MessageSchedule = tuple[tuple[float, int, Callable[[TelemetryState], Any]], ...]
-"""Rate [Hz], phase [ticks], message function."""
+MessageSchedule = tuple[tuple[float, int, Callable[[Any], Any]], ...]
+"""Rate [Hz], phase [ticks], message function of the telemetry state of the vehicle class."""
 
 COMMON: MessageSchedule = (
     (25, 0, _attitude),

@@ -31,8 +31,8 @@ class Profile:
         ramp = min(acc / jerk, sqrt(speed / jerk))  # time of one jerk phase [s]
         steady = max(speed / (ramp * jerk) - ramp, 0.0) if ramp > 0 else 0.0
         cruise = max(length - speed * (2 * ramp + steady), 0.0) / speed if speed > 0 else 0.0
-        self._phases = ((ramp, jerk), (steady, 0.0), (ramp, -jerk), (cruise, 0.0))
-        self._phases += ((ramp, -jerk), (steady, 0.0), (ramp, jerk))
+        faster, slower = (ramp, jerk), (ramp, -jerk)
+        self._phases = (faster, (steady, 0.0), slower, (cruise, 0.0), slower, (steady, 0.0), faster)
         self.duration = sum(time for time, _ in self._phases)
         self.speed = speed
 
@@ -84,6 +84,7 @@ class CopterGuidance:
         self._params = params
         self.finished = False
         self.touches_down = False  # the task ends on the ground
+        self._leg = Leg(np.zeros(3), np.full(3, 1e9), Profile(0.0, 1.0, 1.0, 1.0))
         self._tail: Leg | None = None
         self._lead: Leg | None = None
         self._scale = 1.0
@@ -98,8 +99,8 @@ class CopterGuidance:
         self._tail = self._lead = None
         acc = self._params["WPNAV_ACCEL"] * _CM
         origin = p + v * float(np.linalg.norm(v)) / (2 * acc)
-        previous = getattr(self, "_leg", None)
-        if previous is not None and np.linalg.norm(v) < 0.7 and np.linalg.norm(previous.b - p) < 2.0:
+        previous = self._leg
+        if np.linalg.norm(v) < 0.7 and np.linalg.norm(previous.b - p) < 2.0:
             origin = previous.b  # waits at its target
         self._begin(task, origin, p)
 

@@ -19,7 +19,7 @@ _ENABLED = (
 )
 
 
-class TelemetryState(NamedTuple):
+class MultirotorState(NamedTuple):
     """Telemetry values of one aircraft at one instant; the first ones as those of a fixed wing."""
 
     t: float  # since boot [s]
@@ -45,22 +45,22 @@ def _ms(t: float) -> int:
     return round(t * 1e3) & 0xFFFFFFFF
 
 
-def _heartbeat_of(autopilot: int, mode: int, base_mode: int, f: TelemetryState) -> Any:
+def _heartbeat_of(autopilot: int, mode: int, base_mode: int, f: MultirotorState) -> Any:
     base_mode |= mav.MAV_MODE_FLAG_SAFETY_ARMED if f.armed else 0
     status = mav.MAV_STATE_STANDBY if f.landed else mav.MAV_STATE_ACTIVE
     return mav.MAVLink_heartbeat_message(mav.MAV_TYPE_QUADROTOR, autopilot, base_mode, mode, status, 3)
 
 
-def _heartbeat(f: TelemetryState) -> Any:
+def _heartbeat(f: MultirotorState) -> Any:
     return _heartbeat_of(mav.MAV_AUTOPILOT_ARDUPILOTMEGA, COPTER_MODES[f.mode], _ENABLED, f)
 
 
-def _heartbeat_px4(f: TelemetryState) -> Any:
+def _heartbeat_px4(f: MultirotorState) -> Any:
     mode = PX4_MODES[f.mode] << 24 | PX4_AUTO << 16
     return _heartbeat_of(mav.MAV_AUTOPILOT_PX4, mode, _ENABLED | mav.MAV_MODE_FLAG_AUTO_ENABLED, f)
 
 
-def _nav(f: TelemetryState) -> Any:
+def _nav(f: MultirotorState) -> Any:
     bearing, alt_error = round(degrees(atan2(f.target[1], f.target[0]))), f.estimate.p[2] - f.reference[0][2]
     distance = min(round(hypot(*f.target)), 65_535)
     return mav.MAVLink_nav_controller_output_message(
@@ -68,32 +68,32 @@ def _nav(f: TelemetryState) -> Any:
     )
 
 
-def _local(f: TelemetryState) -> Any:
+def _local(f: MultirotorState) -> Any:
     return mav.MAVLink_local_position_ned_message(_ms(f.t), *map(float, f.estimate.p), *map(float, f.estimate.v))
 
 
-def _mission_current(f: TelemetryState) -> Any:
+def _mission_current(f: MultirotorState) -> Any:
     return mav.MAVLink_mission_current_message(f.seq, f.n_items, mav.MISSION_STATE_ACTIVE, 1)
 
 
-def _sys_status(f: TelemetryState) -> Any:
+def _sys_status(f: MultirotorState) -> Any:
     present = mav.MAV_SYS_STATUS_SENSOR_3D_GYRO | mav.MAV_SYS_STATUS_SENSOR_3D_ACCEL | mav.MAV_SYS_STATUS_AHRS
     volts = round(_CELLS_MV * (0.86 + 0.14 * f.charge - 0.08 * f.load))
     rest = (round(6_000 * f.load), round(100 * f.charge), 0, 0, 0, 0, 0, 0)
     return mav.MAVLink_sys_status_message(present, present, present, 250, volts, *rest)
 
 
-def _home(f: TelemetryState) -> Any:
+def _home(f: MultirotorState) -> Any:
     unset = [nan] * 4
     return mav.MAVLink_home_position_message(*f.home, 0.0, 0.0, 0.0, unset, nan, nan, nan, round(f.t * 1e6))
 
 
-def _landed(f: TelemetryState) -> Any:
+def _landed(f: MultirotorState) -> Any:
     state = mav.MAV_LANDED_STATE_ON_GROUND if f.landed else mav.MAV_LANDED_STATE_IN_AIR
     return mav.MAVLink_extended_sys_state_message(0, state)
 
 
-def _attitude_target(f: TelemetryState) -> Any:
+def _attitude_target(f: MultirotorState) -> Any:
     (cf, ct, cp), (sf, st, sp) = ([wave(a / 2) for a in f.command] for wave in (cos, sin))
     q = [
         cf * ct * cp + sf * st * sp,
@@ -104,7 +104,7 @@ def _attitude_target(f: TelemetryState) -> Any:
     return mav.MAVLink_attitude_target_message(_ms(f.t), 0, q, 0.0, 0.0, 0.0, f.delta_t)
 
 
-def _local_target(f: TelemetryState) -> Any:
+def _local_target(f: MultirotorState) -> Any:
     values = [float(x) for part in f.reference for x in part]
     frame = mav.MAV_FRAME_LOCAL_NED
     return mav.MAVLink_position_target_local_ned_message(_ms(f.t), frame, 0, *values, f.command[2], 0.0)

@@ -139,8 +139,8 @@ class PositionController:
             return a_c, g.hover * (1 - a_c / G)
         a_c = min(max(a_c, -_MAX_ACC_Z), _MAX_ACC_Z)
         phi, theta, _ = e.euler
-        down = np.array([-sin(theta), sin(phi) * cos(theta), cos(phi) * cos(theta)])  # in the body frame
-        measured = float(down @ e.force) + G
+        axis = np.array([-sin(theta), sin(phi) * cos(theta), cos(phi) * cos(theta)])  # in the body frame
+        measured = float(axis @ e.force) + G
         self._acc_down += (measured - self._acc_down) * dt / (dt + _ACC_FILTER_S)
         acc_error = a_c - self._acc_down
         self._integral_z = min(max(self._integral_z + g.acc_z[1] * acc_error * dt, -0.4), 0.4)

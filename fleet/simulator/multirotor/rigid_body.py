@@ -26,7 +26,7 @@ _MIN_GUST_SPEED, _MIN_GUST_HEIGHT, _MAX_GUST_HEIGHT = 3.0, 10.0, 300.0  # [m/s],
 _IDLE_THRUST = 0.01  # of an armed motor, as a fraction of the maximum [-]
 
 
-class Vehicle:
+class RotorBody:
     """One multirotor on the ground or in flight."""
 
     def __init__(self, kind: MultirotorType, motors: np.ndarray, rng: np.random.Generator, w20: float):

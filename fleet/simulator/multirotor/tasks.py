@@ -79,17 +79,17 @@ class TaskSequence:
 
     def advance(self) -> Task | None:
         """Move on to the next task; None: the mission is complete."""
-        found = self._find()
-        if found is None:
+        step = self._find()
+        if step is None:
             return None
-        task, self._seq, self._speed, self._jumps = found
+        task, self._seq, self._speed, self._jumps = step
         self._target = task.target
         return task
 
     def following(self) -> Task | None:
         """Return the task after the current one without moving on."""
-        found = self._find()
-        return None if found is None else found[0]
+        step = self._find()
+        return None if step is None else step[0]
 
     def _find(self) -> tuple[Task, int, float, dict[int, int]] | None:
         seq, speed, jumps = self._seq, self._speed, dict(self._jumps)

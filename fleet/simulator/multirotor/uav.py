@@ -3,9 +3,10 @@
 It arms a few seconds after the start, flies its mission, lands, disarms, and starts again.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from math import hypot, pi
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -15,11 +16,11 @@ from fleet.simulator.multirotor import tasks
 from fleet.simulator.multirotor.airframes import TYPES, draw_airframe
 from fleet.simulator.multirotor.attitude import AttitudeController, attitude_gains
 from fleet.simulator.multirotor.copter_guidance import CopterGuidance
-from fleet.simulator.multirotor.messages import DIALECTS, MultirotorEndpoint, TelemetryState
+from fleet.simulator.multirotor.messages import DIALECTS, MultirotorEndpoint, MultirotorState
 from fleet.simulator.multirotor.missions import MultirotorMission, draw_mission
 from fleet.simulator.multirotor.position import PositionController, Reference, position_gains
 from fleet.simulator.multirotor.px4_guidance import Px4Guidance
-from fleet.simulator.multirotor.rigid_body import Vehicle
+from fleet.simulator.multirotor.rigid_body import RotorBody
 from fleet.simulator.multirotor.tasks import Task, TaskSequence
 from fleet.simulator.multirotor.tuning import motor_inputs, motor_pulses, tuned_parameters
 from fleet.simulator.vehicle.missions import HOME
@@ -79,7 +80,7 @@ class SimulatedMultirotor:
         self.items, self.origin = mission or draw_mission(aircraft_seed, autopilot, cruise, origin)
         kind, motors = draw_airframe(TYPES[aircraft], np.random.default_rng((aircraft_seed, 1)))
         weather = Weather(wind, np.random.default_rng((seed, 5)).uniform(-pi, pi), turbulence)
-        self.vehicle = Vehicle(kind, motors, rng, weather.w20_fps * 0.3048)
+        self.vehicle = RotorBody(kind, motors, rng, weather.w20_fps * 0.3048)
         self._wind = weather.wind(rng, DT * 10)
         self._sensors = Sensors(rng, DT)
         self._endpoint = MultirotorEndpoint(uav_id + 1, self.items, self.params, DIALECTS[autopilot])
@@ -149,7 +150,8 @@ class SimulatedMultirotor:
         if self.tick % 10 == 0:
             self.vehicle.set_wind(*self._wind.step(-float(self.estimate.p[2])))
         self._control()
-        frames = [] if self.silent or self.link_lost else self._endpoint.telemetry(self.tick, self._telemetry_state)
+        state: Callable[[], Any] = self._telemetry_state  # of this vehicle class
+        frames = [] if self.silent or self.link_lost else self._endpoint.telemetry(self.tick, state)
         self.vehicle.step()
         self._charge = max(self._charge - DT * self.vehicle.power / 0.3 / _ENDURANCE_S, 0.0)
         self.tick += 1
@@ -206,11 +208,11 @@ class SimulatedMultirotor:
     def _following(self) -> Task | None:
         return self._sequence.following() if self.mode == self.mission_mode else None
 
-    def _telemetry_state(self) -> TelemetryState:
+    def _telemetry_state(self) -> MultirotorState:
         e = self.estimate
         lat, lon, alt = to_geodetic(self.origin, e.p)
         target = np.zeros(3) if self._task is None else self._task.target - e.p
-        return TelemetryState(
+        return MultirotorState(
             t=self.boot_s + self.tick * DT,
             estimate=e,
             position=(int(lat), int(lon), int(alt)),

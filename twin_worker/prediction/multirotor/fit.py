@@ -81,12 +81,12 @@ def _moves(track: Track, k: int, run_rows: int) -> bool:
 
 
 def _rollout_error(
-    flown: tuple[Track, np.ndarray], k: int, segments: np.ndarray, seq: int, twin: MultirotorTwin
+    history: tuple[Track, np.ndarray], k: int, segments: np.ndarray, seq: int, twin: MultirotorTwin
 ) -> float:
     if not len(segments):
         return 0.0
     ahead = np.arange(0.0, _RUN_S + 0.5)
-    track, items = flown
+    track, items = history
     past = track.part(max(k - _HISTORY_ROWS, 0), k + 1)
     path = fly_segments(past, segments, seq, twin, ahead, since=time_on_item(items[: k + 1]))
     actual = track.p[k + np.rint(ahead / STEP).astype(int)]

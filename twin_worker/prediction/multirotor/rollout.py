@@ -109,8 +109,8 @@ class MultirotorConfig:
             seq: reported mission item of each row
         """
         item = int(seq[-1]) + self.seq_offset
-        options = {"arcs": self.plans_legs}
-        route, problems = segments_from_mission(self.items, item, self.origin, track.p[-1], self.params, **options)
+        arcs = self.plans_legs
+        route, problems = segments_from_mission(self.items, item, self.origin, track.p[-1], self.params, arcs=arcs)
         if not self.plans_legs or not len(route):
             return route, problems
         before = self._previous(item, seq)
@@ -118,7 +118,7 @@ class MultirotorConfig:
             return route, problems
         if before.command == _WAYPOINT and not before.param1 > 0 and before.seq < item:
             arguments = (self.items, before.seq, self.origin, track.p[-1], self.params)
-            longer, more = segments_from_mission(*arguments, **options)
+            longer, more = segments_from_mission(*arguments, arcs=arcs)
             k = np.flatnonzero(longer[:, copter.SEQ] == item)
             return (longer, more) if len(k) and k[0] <= 1 else (route, problems)
         changed = int(np.flatnonzero(seq != seq[-1])[-1]) if (seq != seq[-1]).any() else None

@@ -13,7 +13,7 @@ from fleet.commands.live.fly import MULTIROTORS, aircraft_types
 from fleet.simulator.multirotor.airframes import TYPES, draw_airframe, hover_thrust
 from fleet.simulator.multirotor.copter_guidance import Profile
 from fleet.simulator.multirotor.missions import MultirotorMission, draw_mission
-from fleet.simulator.multirotor.rigid_body import Vehicle
+from fleet.simulator.multirotor.rigid_body import RotorBody
 from fleet.simulator.multirotor.tasks import TaskSequence
 from fleet.simulator.multirotor.uav import SimulatedMultirotor
 from fleet.simulator.vehicle.missions import HOME, mission_item
@@ -51,7 +51,7 @@ def test_a_mixed_fleet_alternates_and_refuses_a_fault_of_a_multirotor(capsys: py
 
 
 def test_the_midpoint_rule_agrees_with_rotorpys_own_solver() -> None:
-    vehicle = Vehicle(TYPES["quad"], np.ones(4), np.random.default_rng(3), 0.0)
+    vehicle = RotorBody(TYPES["quad"], np.ones(4), np.random.default_rng(3), 0.0)
     model = vehicle._model
     vehicle._s[2], vehicle._s[3:6] = 50.0, (3.0, -2.0, 1.0)
     vehicle._s[16:] = 640.0
