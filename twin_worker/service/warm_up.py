@@ -4,7 +4,7 @@ import numpy as np
 
 from fleet.airframes import GENERIC, load
 from fleet.airframes.airframe import servo_map
-from fleet.autopilots import arduplane, copter, greybox
+from fleet.autopilots import arduplane, copter, copter_legs, greybox, px4_multirotor
 from fleet.autopilots.laws import remember
 from fleet.autopilots.shadow import NO_MEMORY, replay_controller
 from fleet.contract import Array, Item, Prediction, TwinState
@@ -61,12 +61,11 @@ def warm_up() -> None:
     ahead, factors = np.empty((5, 3)), np.ones(greybox.N_PAR)
     start = np.array([*window.p[-1], _SPEED, 0.0, 0.0, 0.0])
     greybox.follow(kinematic_ctl, par, legs, factors, start, np.zeros(2), 0.1, ahead)  # type: ignore
-    segments, parameters = np.ones((2, copter.N_SEGMENT)), np.ones(copter.N_PAR)
+    _run_multirotors()
     _run_traffic()
     _run_propagation()
     _run_telemetry(window)
     _run_identification()
-    copter.follow(np.zeros(copter.N_FOLLOW), segments, np.zeros(3), np.zeros(3), parameters, 0.1, ahead)  # type: ignore
 
 
 def _run_point_mass(control: tuple[np.ndarray, np.ndarray, np.ndarray], window: Window) -> None:
@@ -80,6 +79,17 @@ def _run_point_mass(control: tuple[np.ndarray, np.ndarray, np.ndarray], window: 
     batch = [np.tile(row, (2, 1)) for row in (parameters, air, start)]
     point_mass.simulate_ensemble(control, *batch, noise, np.arange(0, 17, 4), np.empty((2, 5, 3)))  # type: ignore
     fit_attitude_lag(np.ascontiguousarray(window.x[:, 6]), window.x[:, 6])
+
+
+def _run_multirotors() -> None:
+    """Run the three multirotor laws along two segments."""
+    segments, out, motion = np.ones((2, copter.N_SEGMENT)), np.empty((5, 3)), np.zeros((3, 3))
+    copter.follow(np.zeros(copter.N_FOLLOW), segments, np.zeros(3), np.zeros(3), np.ones(copter.N_PAR), 0.1, out)
+    px4_multirotor.follow(np.zeros(px4_multirotor.N_STATE), segments, motion, np.ones(px4_multirotor.N_PAR), 0.1, out)
+    segments, par = np.ones((2, copter_legs.N_COLUMNS)), np.ones(copter_legs.N_PAR)
+    copter_legs.follow(np.zeros(copter_legs.N_STATE), segments, np.zeros((3, 3)), par, 0.1, out)
+    states, references = np.empty((5, copter_legs.N_STATE)), np.empty((5, 3, 3))
+    copter_legs.reference_states(segments, par, 0.1, states, references)
 
 
 def _run_traffic() -> None:
