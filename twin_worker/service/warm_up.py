@@ -16,13 +16,14 @@ from fleet.window import Window
 from twin_worker.alerts.traffic import TrafficMonitor
 from twin_worker.confidence.adaptive_conformal import AdaptiveLevels
 from twin_worker.confidence.prediction_log import PredictionLog
-from twin_worker.estimation.wind_filter import WindFilter
+from twin_worker.estimation.wind_filter import WindFilter, reported_direction
 from twin_worker.identification.fixed_wing.derivatives_model import identify, linearise
 from twin_worker.identification.fixed_wing.energy_balance import fit_attitude_lag
 from twin_worker.identification.fixed_wing.plant import bias_corrected
 from twin_worker.identification.linear.linear_model import AXES, identify_axis
 from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.numerics.prediction_errors import AHEAD, displacement_along_path
+from twin_worker.prediction.fixed_wing.point_mass_rollout import unexplained_velocity
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.resample import Resampler
 from twin_worker.twin.state.flight_phase import speed_extremes
@@ -118,7 +119,10 @@ def _run_propagation() -> None:
     shift_to_position(ahead, path, 1.0, np.zeros(3), np.empty((4, 3), np.float32))  # type: ignore[call-arg]
     widen_tube(ahead, path, 1.0, np.empty((4, 3), np.float32))  # type: ignore[call-arg]
     speed_extremes(np.zeros((3, 3)))  # type: ignore[call-arg]
-    WindFilter().update(1e9, np.array([_SPEED, 0.0, 0.0]), _SPEED, 0.0)
+    WindFilter().update(1e9, np.array([_SPEED, 0.0, 0.0]), _SPEED, reported_direction(0.0, 0.0, 0.0, 0.0, _SPEED))
+    for rows in ((), (2,)):
+        start, air = np.ones((*rows, point_mass.N_START)), np.ones((*rows, point_mass.N_AIR))
+        unexplained_velocity(start, air, np.zeros((*rows, 2)))
 
 
 def _run_telemetry(window: Window) -> None:
