@@ -86,7 +86,7 @@ ORDER = (  # a folder, or a module in the root of a package, imports only from i
     ("viewer",),
     ("viewer.theme",),
     ("viewer.store",),
-    ("viewer.text",),
+    ("viewer.text", "viewer.scene.map"),
     ("viewer.browser",),
     ("viewer.panels", "viewer.scene"),
     ("viewer.scene.selection", "viewer.scene.terrain"),

@@ -16,6 +16,7 @@ EXAMPLES = """
   viewer
   viewer --port 8081 --light
   viewer --terrain dem.tif --imagery aerial.png@47.30,8.40,47.45,8.60
+  viewer --terrain N47E008.hgt --map region.mbtiles
   viewer --router tcp/10.0.0.5:7447
 """
 
@@ -40,11 +41,14 @@ def main(argv: list[str] | None = None) -> int:
         help="host name of the page behind a reverse proxy; other remote host names are refused",
     )
     parser.add_argument(
-        "--terrain", metavar="FILE", help="ground elevation in metres: GeoTIFF, or FILE@south,west,north,east"
+        "--terrain",
+        metavar="FILE",
+        help="ground elevation in metres: GeoTIFF, SRTM (.hgt), or FILE@south,west,north,east",
     )
     parser.add_argument(
         "--imagery", metavar="FILE", help="ground imagery: GeoTIFF, PNG or JPEG, or FILE@south,west,north,east"
     )
+    parser.add_argument("--map", metavar="FILE", help="map tiles: MBTiles or PMTiles with PNG, JPEG or WebP images")
     parser.add_argument("--light", action="store_true", help="light theme, for bright surroundings")
     return run_command("viewer", run, parser.parse_args(argv))
 
@@ -59,15 +63,18 @@ def run(args: argparse.Namespace) -> int:
     check_port("--port", args.port)
     from fleet.bus.session import connect  # here, as --help and --version need none of these
     from viewer.browser.http_server import serve, without_stdout
-    from viewer.scene.terrain import TerrainLayer, read_raster
+    from viewer.scene.map.raster import read_raster
+    from viewer.scene.map.tiles import open_tiles
+    from viewer.scene.terrain import TerrainLayer
     from viewer.server.app import App
 
     terrain = read_raster(args.terrain, colours=False) if args.terrain else None
     imagery = read_raster(args.imagery, colours=True) if args.imagery else None
+    tiles = open_tiles(args.map) if args.map else None
     stop = stop_on_signal()
     gc.set_threshold(*GC_THRESHOLDS)
     enable_malloc_trim(LARGE_BLOCK_BYTES)
-    terrain_layer = TerrainLayer(terrain, imagery)
+    terrain_layer = TerrainLayer(terrain, imagery, tiles)
     with connect(bus_config_from(args, VIEWER), retry=True) as bus:  # the page shows a missing router
         server = serve(args.host, args.port, args.name)
         try:

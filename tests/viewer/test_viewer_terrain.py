@@ -8,18 +8,8 @@ import pytest
 from PIL import Image, TiffImagePlugin
 
 from tests.support.pretend_feed import HOME
-from viewer.scene.terrain import (
-    KEYS,
-    MAX_CONTOURS,
-    NO_DATA,
-    SCALE,
-    TIEPOINT,
-    HeightGrid,
-    TerrainLayer,
-    contours,
-    read_raster,
-    to_utm,
-)
+from viewer.scene.map.raster import KEYS, NO_DATA, SCALE, TIEPOINT, read_raster, to_utm
+from viewer.scene.terrain import MAX_CONTOURS, HeightGrid, TerrainLayer, contours
 from viewer.store.place import UNIT_M, SceneFrame
 from viewer.theme.palette import DARK
 

@@ -148,6 +148,7 @@ class App:
         """Draw the content due on one page."""
         if tick % TICKS_PER_S == view.offset or view.dirty:
             self._terrain_layer.show(view.client, self.store.scene_frame, view.palette, self._ground_height)
+            self._terrain_layer.show_world(view.client.client_id, view.panels.world.value)
             view.panels.ground_error = self._terrain_layer.sentence
             view.scene.ground.grid.show(not self._terrain_layer.available)
             view.draw_slow(self.fleet_arrays, now, self._ground_height)
@@ -168,6 +169,7 @@ class App:
         clients = self._server.get_clients()
         for departed in self.views.keys() - clients.keys():
             del self.views[departed]
+            self._terrain_layer.reset_client(departed)
         self._failed_clients &= clients.keys()
         for client_id in clients.keys() - self.views.keys() - self._failed_clients:
             self._open_view(client_id, Browser(clients[client_id], self._palette, self._wake.set))

@@ -23,6 +23,7 @@ from viewer.scene.camera import (
 )
 from viewer.scene.fleet_arrays import LOST, MISMATCH, FleetArrays, display_status
 from viewer.scene.labels import Labels, alert_labels
+from viewer.scene.map.world import overview_html
 from viewer.scene.routes import NOTHING, mission_lines
 from viewer.scene.scene import Scene
 from viewer.scene.selection.selected import BEYOND_S, Selection
@@ -78,6 +79,7 @@ class View:
         self._framed_box = np.zeros((2, 3))  # corners of the box last framed [10 m]
         self._followed: tuple[int, np.ndarray] | None = None
         self._shown: dict[int, Vehicle] = {}  # snapshots in the panels; the scene shows the same until the next ones
+        self._region: SceneFrame | None = None  # scene frame of the overview shown
         self._error, self._error_time = "", 0.0  # last drawing error and its time, monotonic [s]
 
     def restore(self, previous: "View") -> None:
@@ -228,6 +230,8 @@ class View:
 
     def _draw(self, fleet_arrays: FleetArrays, now: float, scene_frame: SceneFrame, ground: float) -> None:
         options, scene = self.panels, self.scene
+        if self._region is not scene_frame:
+            self._region, options.region.content = scene_frame, overview_html(scene_frame, self.palette)
         scene.ground.raise_to(ground)
         scene.draw_trails(fleet_arrays, self.selected)
         scene.draw_predicted(fleet_arrays, now, self.selected if options.tube.value else None)

@@ -47,6 +47,8 @@ class Palette:
     ring: str = "#3B4D63"
     tube: str = "#56B4E9"
     route: str = "#9A8FD0"
+    coast: str = "#5F93A8"
+    border: str = "#8A7F96"
     actual: str = "#DCE6F0"
     sky: tuple[str, str] = ("#0B0F17", "#1A2433")
 
@@ -76,6 +78,8 @@ LIGHT = Palette(
     ring="#94A3B8",
     tube="#0072B2",
     route="#7A6BB8",
+    coast="#3F7A94",
+    border="#857A93",
     actual="#334155",
     sky=("#DCE6F0", "#FFFFFF"),
 )

@@ -66,6 +66,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--port", type=int, default=8080, help="port of the web page (8080)")
     parser.add_argument("--terrain", metavar="FILE", help="terrain heights for the page, as in viewer --help")
     parser.add_argument("--imagery", metavar="FILE", help="ground imagery for the page, as in viewer --help")
+    parser.add_argument("--map", metavar="FILE", help="map tiles for the page, as in viewer --help")
     parser.add_argument("--seed", type=int, default=1, help="seed of the simulated aircraft (1)")
     router_arguments(parser)
     parser.add_argument(
@@ -110,6 +111,8 @@ def _check(args: argparse.Namespace) -> None:
     for option in ("terrain", "imagery"):
         if (file := getattr(args, option)) and not args.no_viewer:
             check_file(f"--{option}", file if Path(file).exists() else file.rpartition("@")[0] or file, "a raster file")
+    if args.map and not args.no_viewer:
+        check_file("--map", args.map, "an MBTiles or PMTiles file")
     check_port("--port", args.port)
     check_parent("--summary", args.summary)
     if not (args.link or args.replay):
@@ -146,7 +149,7 @@ def _start(children: Children, args: argparse.Namespace) -> None:
         aircraft += [] if args.fault_uav is None else [f"--fault-uav={args.fault_uav}"]
         children.start("aircraft", "fleet.cli", "fly", *aircraft)
     if not args.no_viewer:
-        map_options = [f"--{name}={file}" for name in ("terrain", "imagery") if (file := getattr(args, name))]
+        map_options = [f"--{name}={file}" for name in ("terrain", "imagery", "map") if (file := getattr(args, name))]
         children.start("viewer", "viewer", "--port", str(args.port), *map_options, *router)
 
 

@@ -1,0 +1,1 @@
+"""Maps from files: rasters, tile archives, coast and borders of the world."""
