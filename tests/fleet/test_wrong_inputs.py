@@ -77,7 +77,7 @@ ANSWERS = {  # command line -> part of the last line
     "twin_worker --separation 5": "--separation: found '5', expected two distances in m, e.g. 50,20; correct it",
     "twin_worker --omega nan": "--omega: found 'nan', expected a number; correct it",
     "twin_worker --processes 0": "--processes: found 0, expected 1 to 256; set one per core",
-    "viewer --map nosuch.mbtiles": "--map: found no file 'nosuch.mbtiles', expected an MBTiles or PMTiles file; check the path",
+    "viewer --map no.mbtiles": "--map: found no file 'no.mbtiles', expected an MBTiles or PMTiles file; check the path",
     "viewer --map text.txt": "text.txt: found no tile archive, expected raster tiles",
     "fleet up --map folder": "--map: found a folder 'folder', expected an MBTiles or PMTiles file; name a file in it",
     "viewer --terrain nosuch.tif": "--terrain: found no file 'nosuch.tif', expected a raster file; check the path",

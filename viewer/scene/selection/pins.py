@@ -88,7 +88,10 @@ def event_text(event: TimelineEvent) -> str:
     return f"{event.kind.glyph} {clip(text, MAX_TEXT)} {time_of_day(event.t)}"
 
 
-SIDES = 20  # corners of one ring
+SIDES = 28  # corners of one ring
+TURN_STEPS = 4  # slices before and after a point over which its turn is measured
+HOVER = 0.1  # shorter distance within these slices is no flight [10 m]
+INNER_SHARE = 0.9  # of the radius of a turn that the surface reaches inwards [-]
 BAND_SIGMA = 2.1  # half-axes of the simultaneous 90 % region in standard deviations
 
 
@@ -110,12 +113,64 @@ def path_frame(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return cross, np.cross(along, cross)
 
 
-def rings(path: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Return the cross-sections (n, SIDES, 3) of the tube around a path (n, 3) with half-axes (n, 3) [10 m]."""
+def rings(path: np.ndarray, axes: np.ndarray, sides: np.ndarray | None = None) -> np.ndarray:
+    """Return the cross-sections (n, SIDES, 3) of the tube around a path (n, 3) with half-axes (n, 3) [10 m].
+
+    `sides` are half-axes to the left and to the right, (n, 2) [10 m]; None: the half-axis across the path for both.
+    """
     cross, up = path_frame(path)
-    turn = np.linspace(0, 2 * np.pi, SIDES, endpoint=False)[None, :, None]
-    across = np.cos(turn) * (axes[:, 1, None, None] * cross[:, None])
-    return path[:, None] + across + np.sin(turn) * (axes[:, 2, None, None] * up[:, None])
+    left, right = (axes[:, 1], axes[:, 1]) if sides is None else sides.T
+    turn = np.linspace(0, 2 * np.pi, SIDES, endpoint=False)[None, :]
+    across = np.cos(turn) * np.where(np.cos(turn) > 0, left[:, None], right[:, None])
+    return (
+        path[:, None] + across[..., None] * cross[:, None] + np.sin(turn)[..., None] * (axes[:, 2, None] * up)[:, None]
+    )
+
+
+def surface_sides(path: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Return the half-axes left and right of a path (n, 3) at which its surface is drawn: (n, 2) [10 m].
+
+    Towards the inside of a turn cross-sections wider than its radius intersect, and their surface would fold: it ends
+    before the centre of the turn. Rings at single look-aheads are drawn in full.
+    """
+    cross, _ = path_frame(path)
+    direction = np.unwrap(np.arctan2(-cross[:, 0], cross[:, 1]))  # of the horizontal path, from east [rad]
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1))])
+    k = np.arange(len(path))
+    before, after = np.maximum(k - TURN_STEPS, 0), np.minimum(k + TURN_STEPS, len(path) - 1)
+    turned, moved = direction[after] - direction[before], length[after] - length[before]
+    radius = moved / np.maximum(np.abs(turned), 1e-6)
+    pace = length[-1] / max(len(path) - 1, 1)
+    moves = moved > np.maximum(0.1 * pace * (after - before), HOVER)  # a hovering aircraft makes no turn
+    limit = np.where(moves, INNER_SHARE * radius, np.inf)
+    inner = np.minimum(axes[:, 1], limit)
+    left, right = np.where(turned > 0, inner, axes[:, 1]), np.where(turned < 0, inner, axes[:, 1])
+    return np.stack([left, right], axis=-1)
+
+
+def pass_number(path: np.ndarray, index: int, clearance: float) -> int:
+    """Return how often a path (n, 3) has come within `clearance` [10 m] of its point `index`, itself included."""
+    near = np.linalg.norm(path[: index + 1] - path[index], axis=1) < clearance
+    return 1 + int((near[:-1] & ~near[1:]).sum())
+
+
+def mark_tags(steps: list[float], lows: np.ndarray, passes: list[int], clearance: float) -> list[Tag]:
+    """Return the labels of marked look-aheads, the earliest first; one label for marks at the same place.
+
+    Args:
+        steps: marked look-aheads, increasing, k [s]
+        lows: their positions, (k, 3) [10 m]
+        passes: number of each pass through its place, k
+        clearance: distance within which marks share a label [10 m]
+    """
+    groups: list[list[int]] = []
+    for k in range(len(steps)):
+        group = next((g for g in groups if np.linalg.norm(lows[g[0]] - lows[k]) < clearance), None)
+        groups = [*groups, [k]] if group is None else groups
+        if group is not None:
+            group.append(k)
+    texts = [f"+{step:g} s" + (f" pass {n}" if n > 1 else "") for step, n in zip(steps, passes, strict=True)]
+    return [Tag(f"+{steps[g[0]]:g}", ", ".join(texts[k] for k in g), lows[g[0]]) for g in groups]
 
 
 def tube_faces(n: int) -> np.ndarray:

@@ -8,7 +8,17 @@ import numpy as np
 from fleet.contract import DiagnosisOutcome, Mismatch, TwinState
 from viewer.scene.labels import CameraView, Tag, overlap
 from viewer.scene.routes import NOTHING, RouteLines
-from viewer.scene.selection.pins import EventMarkers, curtain, marked_look_aheads, rings, sample_paths, tube_faces
+from viewer.scene.selection.pins import (
+    EventMarkers,
+    curtain,
+    mark_tags,
+    marked_look_aheads,
+    pass_number,
+    rings,
+    sample_paths,
+    surface_sides,
+    tube_faces,
+)
 from viewer.scene.strokes import Strokes, chain, circle, closed_loops, dash_lines, dashed
 from viewer.store.forecast import PastPrediction, ScenePrediction
 from viewer.store.store import FleetStore
@@ -23,7 +33,7 @@ from viewer.text.words import (
     lost_text,
     short_text,
 )
-from viewer.theme.palette import Palette, mix, rgb, triple
+from viewer.theme.palette import Palette, mix, rgb
 from viewer.theme.shapes import digit_strokes, face_camera
 
 MAX_NUMBERS = 60  # items up to which numbers are drawn
@@ -62,7 +72,11 @@ def hindcast(past: list[PastPrediction], trail: np.ndarray, clock: float) -> tup
     return lines, Tag("then", f"predicted {clock - prediction.t:.0f} s ago", prediction.position_at(0.4 * reach))
 
 
-BANDS, BAND_STEPS = 5, 12  # fading bands of the tube, slices per band
+BANDS, BAND_STEPS = 6, 12  # fading bands of the tube, slices per band
+NEAR_OPACITY, FAR_OPACITY = 0.42, 0.05  # of the tube where it is narrow, and at least
+TUBE_SHADE = 0.7  # share of the tube colour in its surface, as the lights of the scene brighten it
+NARROW = 0.5  # half-axis up to which the tube has its full opacity; beyond it fades in proportion [drawn spans]
+MARK_STEP_S = 0.5  # step of the path in which passes through one place are counted [s]
 BEYOND_S = 20.0  # look-ahead of the grey dashes beyond the horizon [s]
 SHORTEST_S = 0.2  # shortest stretch of tube drawn before the horizon [s]
 SAMPLES, SAMPLE_STEPS = 6, 40  # sample paths, points per path
@@ -75,11 +89,9 @@ class Selection:
         self._scene, self._palette = scene, palette
         faces = tube_faces(BAND_STEPS + 1)
         flat = np.zeros((int(faces.max()) + 1, 3), np.float32)
-        self._bands = [
-            self._mesh(f"/selected/band{b}", flat, faces, 0.34 * (1.2 - 0.2 * b), palette.tube) for b in range(BANDS)
-        ]
+        self._bands = [self._mesh(f"/selected/band{b}", (flat, faces), NEAR_OPACITY, "front") for b in range(BANDS)]
         steps = BANDS * BAND_STEPS + 1
-        self._curtain = self._mesh("/selected/curtain", *curtain(np.zeros((steps, 3)), 0.0), 0.10, palette.tube)
+        self._curtain = self._mesh("/selected/curtain", curtain(np.zeros((steps, 3)), 0.0), 0.10, "double")
         self._thin = Strokes(scene, "/selected/thin", 1.3)
         self._track = Strokes(scene, "/selected/flown", 1.6)
         self._mismatch = Strokes(scene, "/selected/mismatch", 5.5)
@@ -90,6 +102,7 @@ class Selection:
         self._event_markers = EventMarkers(scene, palette)
         self._trail_start = np.inf  # start of the bright newest stretch of the path [s since 1970]
         self._track_colour = mix(palette.actual, palette.ground, 0.5)
+        self._ground, self._unit = 0.0, 1.0  # height of the ground, drawn span of an aircraft [10 m]
         self._label_boxes: list[np.ndarray] = []  # labels shown last
         self._hidden_numbers = np.zeros(0, bool)  # items whose number a label covers
         self._drawn_route: tuple[Vehicle, RouteLines, CameraView, float] | None = None
@@ -97,14 +110,17 @@ class Selection:
         self.tags: list[Tag] = []  # moving labels
         self.marks: list[Tag] = []  # labels at fixed positions
 
-    def _mesh(self, name: str, vertices: np.ndarray, faces: np.ndarray, opacity: float, colour: str) -> Any:
+    def _mesh(self, name: str, surface: tuple[np.ndarray, np.ndarray], opacity: float, side: str) -> Any:
+        """Add a translucent surface, corners (n, 3) and triangles (m, 3), in a shade below that of the aircraft."""
+        vertices, faces = surface
+        shade = mix(self._palette.tube, self._palette.ground, TUBE_SHADE).astype(int)
         return self._scene.add_mesh_simple(
             name,
             vertices,
             faces,
-            color=triple(colour),
+            color=tuple(shade.tolist()),
             opacity=opacity,
-            side="double",
+            side=side,
             cast_shadow=False,
             receive_shadow=False,
             visible=False,
@@ -134,7 +150,8 @@ class Selection:
             path = np.vstack([trail[::2], trail[-1:]])
             normal = ~is_located(path[:, 0], vehicle.mismatch)[1:]
             bold.append((chain(path[:, 1:4])[normal], rgb(p.actual)))
-        self._draw_forecast(vehicle, vehicle.record(now), clock, ground, (thin, bold))
+        self._ground, self._unit = ground, unit
+        self._draw_forecast(vehicle, vehicle.record(now), clock, (thin, bold))
         lines, label = hindcast(store.past(vehicle), trail, clock)
         thin.append((lines, mix(p.horizon, p.ground, 0.85)))
         self.tags += [label] if label is not None else []
@@ -142,9 +159,9 @@ class Selection:
         self._bold.draw_parts(bold)
 
     def _draw_forecast(
-        self, vehicle: Vehicle, record: StatusRecord, clock: float, ground: float, strokes: tuple[Parts, Parts]
+        self, vehicle: Vehicle, record: StatusRecord, clock: float, strokes: tuple[Parts, Parts]
     ) -> None:
-        (thin, bold), forecast, p = strokes, vehicle.forecast, self._palette
+        (thin, bold), forecast, p, ground = strokes, vehicle.forecast, self._palette, self._ground
         if forecast is None:
             return self._hide_tube()
         start, horizon_s = max(clock - forecast.t, 0.0), record.horizon_s
@@ -154,10 +171,13 @@ class Selection:
         start = min(start, horizon_s - SHORTEST_S)
         at = np.linspace(start, horizon_s, BANDS * BAND_STEPS + 1)
         path, axes = forecast.position_at(at), forecast.half_axes_at(at)
-        sections = rings(path, axes)
+        sections = rings(path, axes, surface_sides(path, axes))
+        opacities = band_opacities(axes, self._unit)
         for b, band in enumerate(self._bands):
             band.vertices = sections[b * BAND_STEPS : (b + 1) * BAND_STEPS + 1].reshape(-1, 3)
             band.visible = self.tube
+            if abs(band.opacity - opacities[b]) > 0.02:
+                band.opacity = float(opacities[b])
         self._curtain.vertices, self._curtain.visible = curtain(path, ground)[0], self.tube
         bold.append((chain(path), rgb(p.ink)))
         foot = path * [1, 1, 0] + [0, 0, ground + 0.05]
@@ -181,8 +201,10 @@ class Selection:
         claim = "below 10 % to the end" if record.horizon_open else "error reaches 10 %"
         top = sections[-1][np.argmax(sections[-1][:, 2])]
         self.tags.append(Tag("horizon", f"horizon {horizon_text(record)}: {claim}", top, "bottom-left"))
-        lows = [ring[np.argmin(ring[:, 2])] for ring in sections[:-1]]
-        self.tags += [Tag(f"+{s:g}", f"+{s:g} s", low) for s, low in zip(steps, lows, strict=True)]
+        lows = np.array([ring[np.argmin(ring[:, 2])] for ring in sections[:-1]]).reshape(-1, 3)
+        path = forecast.position_at(np.arange(start, horizon_s, MARK_STEP_S))
+        passes = [pass_number(path, int((step - start) / MARK_STEP_S), self._unit) for step in steps]
+        self.tags += mark_tags(steps, lows, passes, self._unit)
 
     def _hide_tube(self) -> None:
         for node in (*self._bands, self._curtain):
@@ -247,6 +269,15 @@ class Selection:
         leg.append((route.legs[route.ends == seq], rgb(p.route)))
         self._route.draw_parts(lines)
         self._leg.draw_parts(leg)
+
+
+def band_opacities(axes: np.ndarray, unit: float) -> np.ndarray:
+    """Return the opacity of each band of the tube, (BANDS,), from its half-axes (BANDS BAND_STEPS + 1, 3) [10 m].
+
+    The near, narrow part is the visible one; a wider part is fainter, so that it hides neither aircraft nor paths.
+    """
+    widths = axes[:-1, 1:].mean(axis=1).reshape(BANDS, BAND_STEPS).mean(axis=1)
+    return np.clip(NEAR_OPACITY * NARROW * unit / np.maximum(widths, 1e-6), FAR_OPACITY, NEAR_OPACITY)
 
 
 def _beyond_horizon(forecast: ScenePrediction, start: float) -> np.ndarray:
