@@ -39,6 +39,7 @@ ICONS = (  # icons of tabs, buttons and commands
     Icon.DRONE,
     Icon.FOCUS_2,
     Icon.MOVIE,
+    Icon.RULER_MEASURE,
     Icon.TABLE,
 )
 DEFAULT_PORTS = {"http": "80", "https": "443"}  # default ports, omitted by browsers

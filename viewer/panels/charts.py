@@ -1,4 +1,4 @@
-"""Charts of the selected UAV: errors, fit and altitude of the last minute, and the prediction."""
+"""Charts of the selected UAV: errors, fit and altitude of the last minute, the prediction, the profile ahead."""
 
 from typing import Any
 
@@ -7,6 +7,7 @@ from viser import uplot
 
 from viewer.store.forecast import LOOK_AHEADS_S, prediction_errors, rms_by_look_ahead
 from viewer.store.place import UNIT_M
+from viewer.store.profile import Profile
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.text.units import METRIC, Units
@@ -18,7 +19,7 @@ PAST_S = 60.0  # length of the histories [s]
 
 
 class Charts:
-    """Four charts of the selected UAV; created once, then updated."""
+    """Five charts of the selected UAV; created once, then updated."""
 
     def __init__(self, gui: Any, palette: Palette) -> None:
         self._gui, p = gui, palette
@@ -36,11 +37,23 @@ class Charts:
         self._fit = self._chart("Mean fit per verdict, %", (("fit", p.verified),), (placeholder, placeholder))
         self._alt_lines, self._units = (("flown", p.actual), ("predicted", p.predicting)), METRIC
         self._alt = self._chart("Altitude, m", self._alt_lines, (placeholder,) * 3)
+        self._profile_lines = (
+            *(("ground", p.verified), ("route", p.route)),
+            *(("low", p.tube), ("predicted", p.predicting), ("high", p.tube)),
+        )
+        self._profile = self._chart("Altitude along the route", self._profile_lines, (placeholder,) * 6, _BAND)
 
-    def _chart(self, title: str, lines: tuple, data: tuple) -> tuple[Any, Any]:
+    def _chart(self, title: str, lines: tuple, data: tuple, more: dict[str, Any] | None = None) -> tuple[Any, Any]:
         head = self._gui.add_html(_heading(title, lines))
         series = tuple(
-            uplot.Series(label=name, stroke=colour, width=2, points={"show": False}) for name, colour in lines
+            uplot.Series(
+                label=name,
+                stroke=colour,
+                width=2,
+                points={"show": False},
+                **({"dash": (6, 4)} if name == "route" else {"fill": f"{colour}30"} if name == "ground" else {}),
+            )
+            for name, colour in lines
         )
         plot = self._gui.add_uplot(
             data,
@@ -50,8 +63,18 @@ class Charts:
             legend={"show": False},
             padding=(10, 16, 0, 0),
             height=108,
+            **(more or {}),
         )
         return head, plot
+
+    def draw_profile(self, profile: Profile | None, units: Units = METRIC) -> None:
+        """Update the altitude profile; hide it without one."""
+        if profile is None:
+            return _show(self._profile, None)
+        if self._profile[0].content != (heading := profile_heading(profile, self._profile_lines, units)):
+            self._profile[0].content = heading
+        altitudes = (x * units.per_m for x in profile[1:6])
+        _show(self._profile, (profile.distance_m * units.per_m_far, *altitudes), step=0.5)
 
     def draw(self, vehicle: Vehicle | None, store: FleetStore, now: float, units: Units = METRIC) -> None:
         """Update the data; hide a chart without data."""
@@ -70,6 +93,21 @@ class Charts:
         _show(self._alt, altitude and (altitude[0], *(metres * units.per_m for metres in altitude[1:])))
 
 
+_BAND: dict[str, Any] = {"bands": (uplot.Band(series=(5, 3), fill="rgba(86, 180, 233, 0.25)"),)}  # high to low
+
+
+def profile_heading(profile: Profile, lines: tuple, units: Units) -> str:
+    """Return the heading of the altitude profile as HTML, with the least clearance of the prediction region."""
+    ground = "ground" if profile.is_terrain else "level of home (no terrain file)"
+    legend = tuple((ground if name == "ground" else name, c) for name, c in lines if name not in ("low", "high"))
+    title = f"Altitude along the route, {units.height} over {units.distance}"
+    least = profile.clearance_m
+    if least is None:
+        return _heading(title, legend)
+    text = f"Prediction region at least {units.height_text(least[0])} above it, {units.distance_text(least[1])} ahead."
+    return _heading(title, legend) + f'<div class="uav soft" style="padding-block:0">{text}</div>'
+
+
 def _heading(title: str, lines: tuple) -> str:
     legend = " ".join(
         f'<span class="soft" style="white-space:nowrap"><span style="color:{colour}">━</span> {name}</span>'
@@ -78,14 +116,16 @@ def _heading(title: str, lines: tuple) -> str:
     return f'<div class="uav" style="padding-bottom:0"><b>{title}</b> {legend}</div>'
 
 
-def _show(chart: tuple[Any, Any], data: tuple[np.ndarray, ...] | None, *, from_zero: bool = False) -> None:
-    """Show data, x first. The y range is explicit, as NaN gaps break automatic scaling."""
+def _show(
+    chart: tuple[Any, Any], data: tuple[np.ndarray, ...] | None, *, from_zero: bool = False, step: float = 10.0
+) -> None:
+    """Show data, x first, in multiples of `step`. The y range is explicit: NaN gaps break automatic scaling."""
     for part in chart:
         part.visible = data is not None
     if data is None:
         return
     zero = [np.zeros(1)] if from_zero else []
-    x0, x1 = np.floor(data[0][0] / 10) * 10, np.ceil(data[0][-1] / 10) * 10
+    x0, x1 = np.floor(data[0][0] / step) * step, np.ceil(data[0][-1] / step) * step
     scales = {
         "x": {"time": False, "range": (float(x0), float(x1))},
         "y": {"range": axis_range(np.concatenate([*data[1:], *zero]))},

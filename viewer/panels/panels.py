@@ -64,6 +64,7 @@ KEYS = {
     "T, V, C": "camera from above, from the side, behind the selected aircraft",
     "F, L": "fit all; follow the selected aircraft",
     "N": "next aircraft with an alert",
+    "M, X": "measure, or end it; point in the middle of the view",
     "P": "pause, or live again",
     ", and .": "1 s back, forward",
     "[ and ]": "previous, next event",
@@ -107,7 +108,8 @@ class Panels:
         layout_input.on_update(lambda _: self._set_layout(layout_input.value))
         report = f"window.reportLayout('{layout_input._impl.uuid}')"  # defined in first.html
         self._gui.add_html(f'<img src="data:," alt="" style="display:none" onerror="{report}">')
-        self._banner, self._error, self._legend, self._unit_style = (self._gui.add_html("") for _ in range(4))
+        self._banner, self._error, self._legend = (self._gui.add_html("") for _ in range(3))
+        self._unit_style, self._measure = (self._gui.add_html("") for _ in range(2))
         self._build_left()
         self._build_right()
 
@@ -134,6 +136,7 @@ class Panels:
             self.routes = gui.add_checkbox("Routes of all", False)
             self.world = gui.add_checkbox("Coast and borders", True)
             self.follow: Any = gui.add_checkbox("Follow selected", False)
+            self.measure_button = gui.add_button("Measure distance", icon=viser.Icon.RULER_MEASURE)
             light = gui.add_checkbox("Light colours", not self._palette.dark)
             aviation = gui.add_checkbox("Knots, feet, nautical miles", browser.aviation)
             self.glyph = gui.add_slider("Aircraft size", min=0.5, max=4.0, step=0.1, initial_value=1.0)
@@ -151,7 +154,7 @@ class Panels:
         panel = self._gui.add_panel()
         with panel.add_tab("Selected", viser.Icon.FOCUS_2):
             self._about = self._gui.add_html("")
-            self._charts = Charts(self._gui, self._palette)
+            self.charts = Charts(self._gui, self._palette)
             self._events = self._gui.add_html("")
             self._facts = self._gui.add_html("")
         panel.dock_right()
@@ -165,7 +168,8 @@ class Panels:
             self._fit_panels()
 
     @property
-    def _units(self) -> Units:
+    def units(self) -> Units:
+        """Return the units chosen on this page."""
         return AVIATION if self._browser.aviation else METRIC
 
     def _fit_panels(self) -> None:
@@ -186,6 +190,10 @@ class Panels:
         card = f'<div class="say" style="border-color:{self._palette.mismatch}">{escape(sentence)}</div>'
         _update(self._error, f'<div class="uav">{card}</div>' if sentence else "")
 
+    def show_measure(self, html: str) -> None:
+        """Show the state of the measure tool; empty while it is off."""
+        _update(self._measure, html)
+
     def draw(self, fleet: list[Vehicle], store: FleetStore, now: float, selected: int | None) -> None:
         """Update all panels; call it about once per second and when the selection changes."""
         self._pulse, palette, pick = not self._pulse, self._palette, self._handler()
@@ -203,7 +211,7 @@ class Panels:
             (self._legend, legend_html(fleet, palette)),
             (self._missed, missed),
             (self._alerts, alerts_html(fleet, palette, now, pick)),
-            (self._facts, figures_html(selected_vehicle, now, self._units) if selected_vehicle is not None else ""),
+            (self._facts, figures_html(selected_vehicle, now, self.units) if selected_vehicle is not None else ""),
         )
         with self._browser.client.atomic():  # contents first: the block delays all other messages
             for html, text in contents:
@@ -215,7 +223,7 @@ class Panels:
             self.show(selected_vehicle, now)
             events = selected_vehicle.events if selected_vehicle is not None else None
             _update(self._events, "" if events is None else event_list_html(events, palette, self.seek))
-        self._charts.draw(selected_vehicle, store, now, self._units)
+        self.charts.draw(selected_vehicle, store, now, self.units)
         self._offer(fleet)
 
     def _offer(self, fleet: list[Vehicle]) -> None:
@@ -230,7 +238,7 @@ class Panels:
         """Show the status of the selected UAV."""
         placeholder = '<div class="uav soft">No UAV selected: click a row or an aircraft, or press Ctrl+K.</div>'
         _update(
-            self._about, status_html(vehicle, self._palette, now, self._units) if vehicle is not None else placeholder
+            self._about, status_html(vehicle, self._palette, now, self.units) if vehicle is not None else placeholder
         )
 
     def _passes(self, vehicle: Vehicle, now: float, selected: int | None) -> bool:

@@ -87,6 +87,23 @@ def mission_lines(mission: Mission | None, scene_frame: SceneFrame, ground: floa
     )
 
 
+def route_ahead(route: RouteLines, seq: int, at: np.ndarray) -> np.ndarray:
+    """Return the way from a position (3,) along the route: (n, 3) [10 m], the position first.
+
+    It leads from the active item `seq` to the last one, and from there, along a jump or a return, once more up to the
+    active item. Loiter circles and earlier jumps are left out.
+    """
+    begin = next((k for k, item in enumerate(route.items.tolist()) if item == seq), None)
+    if begin is None:
+        return at[None]
+    points = [at, *route.points[begin:]]
+    back = [target for start, target in route.returns if np.linalg.norm(start - route.points[-1]) < 1e-6]
+    if back:
+        again = int(np.argmin(np.linalg.norm(route.points - back[-1], axis=1)))
+        points += [*route.points[again : begin + 1]]
+    return np.array(points)
+
+
 def _return_seq(item: Item) -> int | None:
     """Return the item to which a jump or a return leads; None for other items."""
     if item.command == mav.RTL:

@@ -191,6 +191,7 @@ class App:
             self.views.pop(client_id, None)
             _log.exception("page %d could not be opened; other pages continue; reload it", client_id)
             return
+        view.heights = self._terrain_layer.heights
         view.offset = client_id * 4 % TICKS_PER_S
         if previous is not None:
             view.restore(previous)

@@ -24,10 +24,12 @@ from viewer.scene.camera import (
 from viewer.scene.fleet_arrays import LOST, MISMATCH, FleetArrays, display_status
 from viewer.scene.labels import Labels, alert_labels
 from viewer.scene.map.world import overview_html
-from viewer.scene.routes import NOTHING, mission_lines
+from viewer.scene.measure import Anchor, Measure, pick
+from viewer.scene.routes import NOTHING, RouteLines, mission_lines, route_ahead
 from viewer.scene.scene import Scene
-from viewer.scene.selection.selected import BEYOND_S, Selection
+from viewer.scene.selection.selected import BEYOND_S, Selection, active_seq
 from viewer.store.place import UNIT_M, SceneFrame
+from viewer.store.profile import Surface, altitude_profile
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.theme.events import clip
@@ -54,7 +56,10 @@ class View:
     ) -> None:
         client = browser.client
         self.client, self.browser, self._store, self.palette, self._wake = client, browser, store, palette, wake
-        self.scene = Scene(client.scene, palette, self.select)
+        self.scene = Scene(client.scene, palette, self._on_aircraft)
+        self.measure, self._route = Measure(client.scene, palette), NOTHING
+        self.heights: Callable[[np.ndarray], np.ndarray] = unknown_heights  # terrain under scene points
+        self._positions: dict[int, np.ndarray] = {}  # drawn positions while measuring, by UAV
         self.selection, self._labels = Selection(client.scene, palette), Labels(client.scene)
         commands = {
             "Camera: show the whole fleet": ("F", self.show_all),
@@ -63,9 +68,12 @@ class View:
             "Camera: behind the selected aircraft": ("C", self.chase),
             "Next aircraft with an alert": ("N", self.next_exception),
             "Toggle following the selected aircraft": ("L", self.toggle_follow),
+            "Measure distance, bearing and altitude difference": ("M", self.toggle_measure),
+            "Measure: point in the middle of the view": ("X", self.measure_middle),
         }
         self.panels = Panels(browser, palette, self.focus_on, commands)
         self.timeline = Timeline(client, store, recordings, palette, self._redraw)
+        self.panels.measure_button.on_click(lambda _: self.toggle_measure())
         self.panels.seek = self.timeline.send_code()
         with self.timeline.tab("Export", viser.Icon.DOWNLOAD):
             Export(client, store, recordings, palette, lambda: self.selected)
@@ -147,6 +155,43 @@ class View:
         """Toggle following the selected UAV."""
         self.panels.follow.value = not self.panels.follow.value
 
+    def _on_aircraft(self, uav: int) -> None:
+        """Select a pressed aircraft; while measuring it is a point instead, see `_on_press`."""
+        if not self.measure.active:
+            self.select(uav)
+
+    def toggle_measure(self) -> None:
+        """Start or end measuring: presses in the scene pick points."""
+        self.measure.toggle()
+        if self.measure.active:
+            self.client.scene.on_click()(self._on_press)
+        else:
+            self.client.scene.remove_click_callback(self._on_press)
+        self._redraw_measure()
+
+    def _on_press(self, event: viser.SceneClickEvent) -> None:
+        self._pick(np.array(event.ray_origin), np.array(event.ray_direction))
+
+    def measure_middle(self) -> None:
+        """Pick the point in the middle of the view, for the keyboard; start measuring if it is off."""
+        if not self.measure.active:
+            self.toggle_measure()
+        view = self.camera.view()
+        self._pick(view.position, view.look_at - view.position)
+
+    def _pick(self, start: np.ndarray, direction: np.ndarray) -> None:
+        anchors = [Anchor(f"UAV-{uav:03d}", at, uav) for uav, at in self._positions.items()]
+        route = self._route
+        anchors += [Anchor(f"item {n}", at) for n, at in zip(route.items.tolist(), route.points, strict=True)]
+        view, level = self.camera.view(), self.scene.ground.height
+        self.measure.add(pick((start, direction), anchors, view, self.heights, level))
+        self._redraw_measure()
+
+    def _redraw_measure(self) -> None:
+        self.panels.show_measure(self.measure.html(self.panels.units))
+        self.dirty = True
+        self._wake()
+
     def selected_vehicle(self) -> Vehicle | None:
         """Return the selected UAV as the panels show it, at its newest pose; None when there is none."""
         newest = self.timeline.vehicle(self.selected) if self.selected is not None else None
@@ -209,7 +254,9 @@ class View:
             self.selection.clear()
         else:
             self.selection.draw(vehicle, self._store, now, ground=scene.ground.height, unit=scene.glyphs.unit)
-        tags, marks = self.selection.tags, self.selection.marks
+        self._positions = dict(zip(fleet_arrays.uavs, fleet_arrays.at, strict=True))
+        self.measure.draw(self._positions.get, scene.ground.height, scene.glyphs.unit, self.panels.units)
+        tags, marks = [*self.measure.tags, *self.selection.tags], self.selection.marks
         alerts = alert_labels(fleet_arrays, self._shown, self.selected, scene.glyphs.unit)
         self._labels.draw([*tags, *marks[:1], *alerts, *marks[1:]], camera_view)
         self.selection.move_numbers(self._labels.boxes, camera_view)
@@ -221,6 +268,7 @@ class View:
         self._restore_selection(fleet_arrays)
         self.timeline.draw(self.selected)
         self.panels.draw(fleet_arrays.fleet, self._store, fleet_arrays.now, self.selected)
+        self.panels.show_measure(self.measure.html(self.panels.units))
         if (scene_frame := self._store.scene_frame) is not None and fleet_arrays.uavs:
             with self.client.atomic():
                 self._draw(fleet_arrays, now, scene_frame, ground)
@@ -258,10 +306,22 @@ class View:
         """Draw the selected UAV's flown path and mission."""
         vehicle, scene_frame = self.selected_vehicle(), self._store.scene_frame
         if vehicle is None or scene_frame is None:
-            return
+            self._route = NOTHING
+            return self.panels.charts.draw_profile(None)
         self.selection.draw_flight(vehicle, self._store.track(vehicle), now, self.scene.glyphs.unit)
         lines = mission_lines(vehicle.mission, scene_frame, ground)
         self.selection.draw_route(vehicle, lines, self.camera.view(), self.scene.glyphs.unit)
+        self._route = lines
+        self._draw_profile(vehicle, lines, Surface(self.heights, ground, scene_frame.origin.alt_mm * 1e-3), now)
+
+    def _draw_profile(self, vehicle: Vehicle, route: RouteLines, surface: Surface, now: float) -> None:
+        """Draw the altitude profile ahead of the selected UAV."""
+        if (at := vehicle.position(now)) is None:
+            return self.panels.charts.draw_profile(None)
+        way, forecast = route_ahead(route, active_seq(vehicle), at), vehicle.forecast
+        begin = max(vehicle.data_time(now) - forecast.t, 0.0) if forecast is not None else 0.0
+        span = begin, vehicle.record(now).horizon_s
+        self.panels.charts.draw_profile(altitude_profile(way, forecast, span, surface), self.panels.units)
 
     def frame_fleet(self, points: np.ndarray, key: tuple, ground: float) -> None:
         """Frame the fleet when its content, its extent or the aspect ratio changes.
@@ -300,6 +360,11 @@ class View:
         if self._followed is not None and self._followed[0] == vehicle.uav:
             self.camera.follow(at - self._followed[1])
         self._followed = vehicle.uav, at
+
+
+def unknown_heights(points: np.ndarray) -> np.ndarray:
+    """Return the height of unknown terrain under points (n, 2 or 3): NaN, (n,)."""
+    return np.full(len(points), np.nan)
 
 
 def outgrown(points: np.ndarray, box: np.ndarray) -> bool:

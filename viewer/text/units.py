@@ -11,6 +11,8 @@ class Units(NamedTuple):
     per_m_s: float
     height: str
     per_m: float
+    distance: str
+    per_m_far: float
 
     def speed_text(self, m_s: float, digits: int = 1) -> str:
         """Format a speed [m/s]; a dash where there is none."""
@@ -20,6 +22,11 @@ class Units(NamedTuple):
         """Format a height [m]; a dash where there is none."""
         return f"{metres * self.per_m:,.0f} {self.height}" if isfinite(metres) else "–"
 
+    def distance_text(self, metres: float) -> str:
+        """Format a distance [m]: in km or NM, a short one in the unit of heights; a dash where there is none."""
+        far = metres * self.per_m_far
+        return f"{far:,.2f} {self.distance}" if isfinite(metres) and far >= 1 else self.height_text(metres)
 
-METRIC = Units("m/s", 1.0, "m", 1.0)
-AVIATION = Units("kn", 3600 / 1852, "ft", 1 / 0.3048)
+
+METRIC = Units("m/s", 1.0, "m", 1.0, "km", 1e-3)
+AVIATION = Units("kn", 3600 / 1852, "ft", 1 / 0.3048, "NM", 1 / 1852)
