@@ -69,6 +69,9 @@ class TerrainLayer:
             self._build(scene_frame, ground)
         if self._shown_frames.get(client.client_id) is scene_frame:
             return
+        if client.client_id in self._shown_frames:  # of another origin, which may have had a map
+            for name in ("/terrain", "/env/world"):
+                client.scene.remove_by_name(name)
         self._shown_frames[client.client_id] = scene_frame
         if self._grid is not None:
             if palette.dark not in self._meshes:
