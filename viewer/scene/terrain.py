@@ -70,7 +70,7 @@ class TerrainLayer:
         if self._shown_frames.get(client.client_id) is scene_frame:
             return
         if client.client_id in self._shown_frames:  # of another origin, which may have had a map
-            for name in ("/terrain", "/env/world"):
+            for name in ("/terrain/ground", "/terrain/contours", "/terrain/world", "/env/world"):
                 client.scene.remove_by_name(name)
         self._shown_frames[client.client_id] = scene_frame
         if self._grid is not None:
