@@ -64,7 +64,7 @@ def command(one: Any, words: str) -> None:
             search.wait_for(timeout=10_000)
             break
     search.fill(words)
-    one.locator(".mantine-Spotlight-action[data-selected]", has_text=words).wait_for(timeout=20_000)
+    one.locator(".mantine-Spotlight-action[data-selected]", has_text=words).wait_for(timeout=60_000)
     one.keyboard.press("Enter")
     search.wait_for(state="hidden", timeout=60_000)
 
@@ -72,7 +72,7 @@ def command(one: Any, words: str) -> None:
 def turn_to(one: Any, uav: int) -> None:
     """Select a UAV with the command palette, which turns the camera to it."""
     command(one, f"UAV-{uav:03d}")
-    one.locator(".uav .head h1", has_text=f"UAV-{uav:03d}").wait_for(timeout=20_000)
+    one.locator(".uav .head h1", has_text=f"UAV-{uav:03d}").wait_for(timeout=60_000)
 
 
 def shoot(one: Any, file: Path, frames: int = FRAMES) -> None:
