@@ -64,6 +64,12 @@ CONTRAST = """() => {
 WIDTHS = """([texts, font]) => { const pen = document.createElement('canvas').getContext('2d'); pen.font = font;
   return texts.map(text => pen.measureText(text).width); }"""
 SHARE = "window.__viserMutable.canvas.getBoundingClientRect().width / innerWidth"
+BARS_IN_REACH = """() => [...document.querySelectorAll('[role=button][aria-expanded]')].every(
+  e => e.getBoundingClientRect().bottom <= innerHeight + 1)"""
+WIDE = """[...document.querySelectorAll('.mantine-Paper-root .mantine-ScrollArea-content')].filter(
+  e => e.getBoundingClientRect().width > innerWidth + 1).length"""
+SMALL = """[...document.querySelectorAll('.mantine-Paper-root :is(button, input:not([type=checkbox]))')].filter(
+  e => e.getClientRects().length && e.getBoundingClientRect().height < 36).map(e => e.outerHTML.slice(0, 120))"""
 AT_ZERO_SCROLL = "document.documentElement.scrollWidth <= innerWidth"
 
 
@@ -203,12 +209,14 @@ def test_a_phone_has_list_detail_and_timeline_as_sheets(live: SimpleNamespace) -
     page.set_viewport_size({"width": 390, "height": 844})
     page.locator('tr[data-uav="3"]').click(timeout=PATIENCE_MS)
     page.wait_for_function("document.querySelector('tr.on').dataset.uav === '3'", timeout=PATIENCE_MS)
+    page.wait_for_function(BARS_IN_REACH, timeout=PATIENCE_MS)  # without scrolling
     for name, shown in (("Selected", ".uav .cards"), ("Timeline", ".uav.buttons")):
+        assert page.evaluate(SMALL) == []
         bar = page.get_by_role("button", name=f"Expand panel {name}")
         assert bar.bounding_box()["height"] >= 44  # for a thumb
         bar.press("Enter")
         page.locator(shown).wait_for(state="visible", timeout=PATIENCE_MS)
-        assert not page.locator(".uav.list").is_visible()
+        assert not page.locator(".uav.list").is_visible() and page.evaluate(WIDE) == 0
         page.get_by_role("button", name=f"Collapse panel {name}").dispatch_event("click")
         page.locator(".uav.list").wait_for(state="visible", timeout=PATIENCE_MS)
     assert page.evaluate("document.elementFromPoint(195, 200).tagName") == "CANVAS" and live.errors == []
