@@ -7,7 +7,7 @@ from viser import uplot
 
 from viewer.store.forecast import LOOK_AHEADS_S, prediction_errors, rms_by_look_ahead
 from viewer.store.place import UNIT_M
-from viewer.store.profile import Profile
+from viewer.store.profile import AltitudeProfile
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.text.units import METRIC, Units
@@ -67,7 +67,7 @@ class Charts:
         )
         return head, plot
 
-    def draw_profile(self, profile: Profile | None, units: Units = METRIC) -> None:
+    def draw_profile(self, profile: AltitudeProfile | None, units: Units = METRIC) -> None:
         """Update the altitude profile; hide it without one."""
         if profile is None:
             return _show(self._profile, None)
@@ -96,7 +96,7 @@ class Charts:
 _BAND: dict[str, Any] = {"bands": (uplot.Band(series=(5, 3), fill="rgba(86, 180, 233, 0.25)"),)}  # high to low
 
 
-def profile_heading(profile: Profile, lines: tuple, units: Units) -> str:
+def profile_heading(profile: AltitudeProfile, lines: tuple, units: Units) -> str:
     """Return the heading of the altitude profile as HTML, with the least clearance of the prediction region."""
     ground = "ground" if profile.is_terrain else "level of home (no terrain file)"
     legend = tuple((ground if name == "ground" else name, c) for name, c in lines if name not in ("low", "high"))

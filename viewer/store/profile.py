@@ -27,7 +27,7 @@ class Surface(NamedTuple):
         return up * UNIT_M + self.origin_m
 
 
-class Profile(NamedTuple):
+class AltitudeProfile(NamedTuple):
     """Altitudes above mean sea level over the horizontal distance from the aircraft; NaN where there is none."""
 
     distance_m: np.ndarray  # (n,) along the way, increasing
@@ -50,7 +50,7 @@ class Profile(NamedTuple):
 
 def altitude_profile(
     way: np.ndarray, forecast: ScenePrediction | None, span: tuple[float, float], surface: Surface
-) -> Profile | None:
+) -> AltitudeProfile | None:
     """Compute the altitude profile; None without a way ahead.
 
     Args:
@@ -83,7 +83,7 @@ def altitude_profile(
     if not is_terrain:
         ground[:] = surface.level
     edges = [_along(s, predicted_s, path[:, 2] + sign * axes[:, 2]) for sign in (-1, 0, 1)]
-    return Profile(distance_m, *(surface.altitude_m(x) for x in (ground, route, *edges)), is_terrain)
+    return AltitudeProfile(distance_m, *(surface.altitude_m(x) for x in (ground, route, *edges)), is_terrain)
 
 
 def _lengths(points: np.ndarray) -> np.ndarray:
