@@ -79,23 +79,28 @@ def played(said: Said, name: str) -> Said:
 def moment(said: Said, since: float = SETTLED_S, uav: int | None = None) -> tuple[int, float]:
     """Choose whom to show and when [s since 1970]: whose horizon is neither near nor far for a while.
 
+    Where nobody's is, as open horizons are far, it is the one with the best horizon of any kind.
+
     Args:
         said: all that was said
         since: of its time, from when on [s]
         uav: of whom alone; None: of anybody
     """
-    best, least = (0 if uav is None else uav, said[-1][0]), inf
+    best, least = None, inf
+    otherwise, otherwise_off = (0 if uav is None else uav, said[-1][0]), inf
     runs: dict[int, list[float]] = defaultdict(list)
     for t, message, _ in said:
         if isinstance(message, Prediction) and t > said[0][0] + since and uav in (None, message.uav):
             run = runs[message.uav]
+            if message.horizon_s >= NEAR_S and (off := abs(message.horizon_s - BEST_S)) < otherwise_off:
+                otherwise, otherwise_off = (message.uav, t), off
             if message.horizon_open or not NEAR_S <= message.horizon_s <= FAR_S:
                 run.clear()
                 continue
             run.append(t)
             if len(run) >= STEADY and (off := abs(message.horizon_s - BEST_S)) < least:
                 best, least = (message.uav, t), off
-    return best
+    return best or otherwise
 
 
 def named_s(said: Said) -> float:
