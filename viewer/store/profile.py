@@ -83,7 +83,9 @@ def altitude_profile(
     if not is_terrain:
         ground[:] = surface.level
     edges = [_along(s, predicted_s, path[:, 2] + sign * axes[:, 2]) for sign in (-1, 0, 1)]
-    return AltitudeProfile(distance_m, *(surface.altitude_m(x) for x in (ground, route, *edges)), is_terrain)
+    low, middle, high = (surface.altitude_m(edge) for edge in edges)
+    ground, route = surface.altitude_m(ground), surface.altitude_m(route)
+    return AltitudeProfile(distance_m, ground, route, low, middle, high, is_terrain)
 
 
 def _lengths(points: np.ndarray) -> np.ndarray:
