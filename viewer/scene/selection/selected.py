@@ -72,7 +72,7 @@ def hindcast(past: list[PastPrediction], trail: np.ndarray, clock: float) -> tup
     return lines, Tag("then", f"predicted {clock - prediction.t:.0f} s ago", prediction.position_at(0.4 * reach))
 
 
-BANDS, BAND_STEPS = 6, 12  # fading bands of the tube, slices per band
+BANDS, BAND_STEPS = 5, 14  # fading bands of the tube, slices per band
 NEAR_OPACITY, FAR_OPACITY = 0.42, 0.05  # of the tube where it is narrow, and at least
 TUBE_SHADE = 0.7  # share of the tube colour in its surface, as the lights of the scene brighten it
 NARROW = 0.5  # half-axis up to which the tube has its full opacity; beyond it fades in proportion [drawn spans]
