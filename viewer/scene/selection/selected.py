@@ -74,6 +74,7 @@ def hindcast(past: list[PastPrediction], trail: np.ndarray, clock: float) -> tup
 
 BANDS, BAND_STEPS = 5, 14  # fading bands of the tube, slices per band
 NEAR_OPACITY, FAR_OPACITY = 0.42, 0.05  # of the tube where it is narrow, and at least
+LATE_SHARE = 0.3  # of this opacity that remains at the horizon [-]
 TUBE_SHADE = 0.7  # share of the tube colour in its surface, as the lights of the scene brighten it
 NARROW = 0.5  # half-axis up to which the tube has its full opacity; beyond it fades in proportion [drawn spans]
 MARK_STEP_S = 0.5  # step of the path in which passes through one place are counted [s]
@@ -274,10 +275,11 @@ class Selection:
 def band_opacities(axes: np.ndarray, unit: float) -> np.ndarray:
     """Return the opacity of each band of the tube, (BANDS,), from its half-axes (BANDS BAND_STEPS + 1, 3) [10 m].
 
-    The near, narrow part is the visible one; a wider part is fainter, so that it hides neither aircraft nor paths.
+    The near, narrow part is the visible one; a later or wider part is fainter, so that it hides no aircraft or path.
     """
     widths = axes[:-1, 1:].mean(axis=1).reshape(BANDS, BAND_STEPS).mean(axis=1)
-    return np.clip(NEAR_OPACITY * NARROW * unit / np.maximum(widths, 1e-6), FAR_OPACITY, NEAR_OPACITY)
+    by_width = np.clip(NARROW * unit / np.maximum(widths, 1e-6), 0.0, 1.0)
+    return np.clip(NEAR_OPACITY * by_width * np.linspace(1.0, LATE_SHARE, BANDS), FAR_OPACITY, NEAR_OPACITY)
 
 
 def _beyond_horizon(forecast: ScenePrediction, start: float) -> np.ndarray:
