@@ -23,14 +23,13 @@ from tests.bench.mismatch.offline import Cache, cases, source_hash
 from twin_worker.diagnosis.baseline.calibrate import calibrate
 from twin_worker.diagnosis.data.card import read_card
 from twin_worker.diagnosis.data.flight import FlightData, read_flights
-from twin_worker.diagnosis.inference.isolation.decision import (
+from twin_worker.diagnosis.inference.isolation.decision import decide, posterior
+from twin_worker.diagnosis.inference.isolation.evidence import (
     TURBULENCE,
     DecisionTable,
     EvidenceTerms,
     Explanation,
     Weights,
-    decide,
-    posterior,
 )
 from twin_worker.diagnosis.inference.isolation.search import Search
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
@@ -48,6 +47,7 @@ START = {  # mean and standard deviation of the prior; rows and error as logarit
     "block_weight": (0.1, 0.3),
     "further": ((-3.0, -3.0, -3.0), 2.0),
     "changes": ((-5.0,) * len(CHANGES), 3.0),
+    "beside": (0.0, 3.0),
 }
 _FLOOR = 0.02  # probability of a wrong label: bounds the loss of one flight
 _FOLDS = 4
@@ -92,8 +92,9 @@ def right_explanations(label: dict[str, Any], explanations: Sequence[Explanation
 def weights(x: np.ndarray) -> Weights:
     """Return the weights at a point of the search."""
     rows, error, *rest = x.tolist()
-    changes = dict(zip(CHANGES, rest[7:], strict=True))
-    return Weights(float(np.exp(rows)), float(np.exp(error)), *rest[:4], (rest[4], rest[5], rest[6]), changes)
+    changes = dict(zip(CHANGES, rest[7:-1], strict=True))
+    further = rest[4], rest[5], rest[6]
+    return Weights(float(np.exp(rows)), float(np.exp(error)), *rest[:4], further, changes, rest[-1])
 
 
 def fit(flights: Sequence[LabelledFlight]) -> Weights:

@@ -4,21 +4,15 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
 from fleet.effects import Onset, catalogue
 from twin_worker.diagnosis.data.card import FaultHypothesis, OnsetProfile
 from twin_worker.diagnosis.inference.diagnose import _outcome
-from twin_worker.diagnosis.inference.isolation.decision import (
-    CLASS_PROBABILITY,
-    TURBULENCE,
-    Explanation,
-    Weights,
-    decide,
-    load_table,
-    smallest_set,
-)
+from twin_worker.diagnosis.inference.isolation.decision import CLASS_PROBABILITY, decide, smallest_set
+from twin_worker.diagnosis.inference.isolation.evidence import TURBULENCE, Explanation, Weights, load_table
 from twin_worker.diagnosis.inference.isolation.isolate import ScoredHypothesis
 from twin_worker.diagnosis.inference.isolation.unmodelled import Anomaly, ChannelEquation, find_tones
 from twin_worker.diagnosis.inference.report import ReportOutcome
@@ -65,7 +59,26 @@ def test_the_class_holds_what_is_close_and_leaves_out_what_is_not() -> None:
     (member,) = decision.best.members
     assert member.hypothesis.effect.name == "thrust_loss"
     assert [rival.hypothesis.effect.name for rival in member.rivals] == ["drag_increase"]
-    assert sum(decision.names.values()) == pytest.approx(1.0)
+    assert decision.probability(("thrust_loss", "drag_increase", "icing")) == pytest.approx(1.0 - decision.none)
+    assert 0.5 < decision.probability(("thrust_loss",)) < decision.probability(("thrust_loss", "drag_increase"))
+    both = explained({"force_x": 5000.0}, "thrust_loss", "drag_increase")
+    assert decide([both], WEIGHTS).probability(("thrust_loss", "drag_increase")) <= 1.0  # one set counts once
+
+
+def test_no_statement_is_more_certain_than_the_search() -> None:
+    found = [explained({"force_x": 5000.0}, "thrust_loss")]
+    decision = decide(found, msgspec.structs.replace(WEIGHTS, missed=0.06))
+    assert decision.probability(("thrust_loss",)) == pytest.approx(0.94, abs=1e-6)
+    assert decision.effects == pytest.approx(0.94, abs=1e-6) and decision.missed == 0.06
+
+
+def test_a_change_beside_effects_has_its_own_prior() -> None:
+    loss = explained({"roll": 3000.0}, "roll_damping")
+    rate = replace(loss, change="odd", anomaly=Anomaly(600.0, "gyro_roll", 60.0), channel_gain=loss.channel_gain.copy())
+    rate.channel_gain[CHANNELS.index("gyro_roll")] = 600.0
+    assert decide([loss, rate], WEIGHTS).unmodelled > 0.9
+    unlikely = msgspec.structs.replace(WEIGHTS, beside=-20.0)
+    assert decide([loss, rate], unlikely).unmodelled < 0.1
 
 
 def test_a_second_effect_is_judged_in_its_own_channel() -> None:

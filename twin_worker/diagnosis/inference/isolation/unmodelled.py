@@ -27,12 +27,13 @@ from twin_worker.diagnosis.model.baseline import CHANNEL_OF, CHANNELS
 
 _AIR_LAG_S = 4.0  # time constant of a partly blocked pressure line
 _MIN_SIDE_S = 25.0  # least length of data before and after the onset
-_UNCATALOGUED_TERMS = {  # terms without an effect: damping, stability, cross-coupled surface, moving loads
-    "L": ("beta", "p", "r", "delta_r"),
-    "M": ("q", "c_x"),
-    "N": ("beta", "p", "r", "delta_a"),
+_UNCATALOGUED_TERMS = {  # terms without an effect: stability, cross damping, cross-coupled surface, moving loads
+    "L": ("beta", "r", "delta_r"),
+    "M": ("c_x",),
+    "N": ("beta", "p", "delta_a"),
 }
-_SLOW, _RATE = "lagging", "rate"  # sensor terms: delayed airspeed, gyro scale error
+# sensor terms: lagging pressures, scale errors of gyros and accelerometers
+_SLOW, _RATE, _FORCE = "lagging", "rate", "force"
 Gain = tuple[float, float]
 """Gain less the parameter cost, and onset [s]."""
 
@@ -68,7 +69,7 @@ class ChannelEquation:
         """Yield the gain of freeing each single term that has no effect in the catalogue."""
         equation = next((name for name, channel in CHANNEL_OF.items() if channel == self.channel), "")
         for k, name in enumerate(self.names):
-            if name in (*_UNCATALOGUED_TERMS.get(equation, ()), _SLOW, _RATE):
+            if name in (*_UNCATALOGUED_TERMS.get(equation, ()), _SLOW, _RATE, _FORCE):
                 yield name, _step_gain(self._whitened, self._J[:, :, [k]])
 
 
@@ -86,11 +87,19 @@ def channel_equations(whitened: WhitenedResiduals) -> Iterator[ChannelEquation]:
     flow = eq_terms.flow
     constant = np.ones_like(flow.Va)
     if "Va" in whitened.modelled.flight.readings:
-        decay = np.exp(-STEP_S / _AIR_LAG_S)
-        late = lfilter([1.0 - decay], [1.0, -decay], flow.Va, zi=[decay * flow.Va[0]])[0] - flow.Va
-        yield ChannelEquation(whitened, "airspeed", {"1": constant, "Va": flow.Va, _SLOW: late})
+        yield ChannelEquation(whitened, "airspeed", {"1": constant, "Va": flow.Va, _SLOW: _lag(flow.Va)})
+    if "baro" in whitened.modelled.flight.readings:
+        yield ChannelEquation(whitened, "baro", {_SLOW: _lag(np.asarray(flow.h))})
+    for channel, force in zip(("gps_x", "gps_y", "gps_z"), eq_terms.intermediate["f"], strict=True):
+        yield ChannelEquation(whitened, channel, {"1": constant, _FORCE: force})
     for channel, rate in (("gyro_roll", flow.p), ("gyro_pitch", flow.q), ("gyro_yaw", flow.r)):
         yield ChannelEquation(whitened, channel, {"1": constant, _RATE: rate})
+
+
+def _lag(x: np.ndarray) -> np.ndarray:
+    """Return the difference that a first-order lag in a pressure line makes."""
+    decay = np.exp(-STEP_S / _AIR_LAG_S)
+    return np.asarray(lfilter([1.0 - decay], [1.0, -decay], x, zi=[decay * x[0]])[0] - x)
 
 
 def _step_gain(whitened: WhitenedResiduals, J: np.ndarray, margin_s: float = 0.0) -> Gain:
