@@ -14,9 +14,12 @@ from twin_worker.diagnosis.inference.diagnose import _outcome
 from twin_worker.diagnosis.inference.isolation.decision import CLASS_PROBABILITY, decide, smallest_set
 from twin_worker.diagnosis.inference.isolation.evidence import TURBULENCE, Explanation, Weights, load_table
 from twin_worker.diagnosis.inference.isolation.isolate import ScoredHypothesis
+from twin_worker.diagnosis.inference.isolation.onset import onset_posterior
+from twin_worker.diagnosis.inference.isolation.search import _variance_onset
 from twin_worker.diagnosis.inference.isolation.unmodelled import Anomaly, ChannelEquation, find_tones
 from twin_worker.diagnosis.inference.report import ReportOutcome
 from twin_worker.diagnosis.inference.validation.cross_validate import CrossValidation
+from twin_worker.diagnosis.inference.validation.force_prediction import held_out_gain, is_in_forces
 from twin_worker.diagnosis.model.baseline import CHANNELS, unit_noise
 
 STEP = OnsetProfile(Onset.STEP, 60.0)
@@ -168,6 +171,45 @@ def with_added(sight: Any, channel: str, x: np.ndarray) -> Any:
     """Add a course, (n,), to one channel's residual."""
     sight.e[:, CHANNELS.index(channel)] += x
     return sight
+
+
+@pytest.mark.parametrize("onset", [STEP, OnsetProfile(Onset.RAMP, 45.0, 60.0)], ids=["step", "ramp"])
+def test_the_onset_is_a_change_point_with_an_interval(onset: OnsetProfile) -> None:
+    sight = quiet(7)
+    shape = np.zeros((len(T), len(CHANNELS)))
+    shape[:, CHANNELS.index("force_x")] = 3.0 * np.random.default_rng(8).standard_normal(len(T))
+    sight.e -= onset.gate(T)[:, None] * shape
+    sight.raw = sight.e
+    sight.residuals = lambda hypotheses: sight.raw + shape
+    effect = catalogue()["icing"]
+    effect = replace(effect, onsets=(Onset.STEP, Onset.RAMP))
+    found = onset_posterior(sight, FaultHypothesis(effect, "", (0.1,) * 3, STEP), WEIGHTS)
+    assert found is not None and found.mode.kind is onset.kind
+    assert abs(found.mode.t0 - onset.t0) <= (1.0 if onset is STEP else 10.0)
+    assert found.interval[0] <= onset.t0 <= found.interval[1] + 1.0 and found.probability.sum() == pytest.approx(1.0)
+    assert onset_posterior(sight, FaultHypothesis(replace(effect, onsets=(Onset.ALWAYS,)), "", ()), WEIGHTS) is None
+
+
+def test_turbulence_begins_where_the_variance_changes() -> None:
+    square = np.random.default_rng(9).standard_normal((len(T), 3)) ** 2
+    assert _variance_onset(T, square, 28.0) is None
+    square[T >= ONSET_S] *= 5.0
+    found = _variance_onset(T, square, 28.0)
+    assert found is not None and abs(found - ONSET_S) < 3.0
+
+
+def test_the_interval_of_a_force_gain_holds_zero_where_the_effect_predicts_nothing() -> None:
+    noise = np.random.default_rng(10).standard_normal((2, len(T), 3))
+    sight: Any = SimpleNamespace(t=T, ok=np.ones(len(T), bool))
+    loss = FaultHypothesis(catalogue()["thrust_loss"], "", (0.2,), STEP)
+    offset = np.where(STEP.t0 < T, 2.0, 0.0)[:, None] * np.ones(3)
+    measured = noise[0] + offset
+    low, high = held_out_gain(sight, measured, (np.zeros_like(measured), offset), (loss,))
+    assert 0.3 < low < high < 0.9
+    low, high = held_out_gain(sight, measured, (offset, offset + 0.1 * noise[1]), (loss,))
+    assert low < 0.0
+    assert held_out_gain(sight, measured, (measured, measured), ())[0] == -np.inf
+    assert is_in_forces(loss) and not is_in_forces(FaultHypothesis(catalogue()["gyro_bias"], "p", (0.1,)))
 
 
 @pytest.mark.parametrize("hertz", [0.17, 0.93])

@@ -9,7 +9,7 @@ import numpy as np
 
 from fleet.effects import Onset, Stage
 from twin_worker.diagnosis.data.card import ALWAYS, FaultHypothesis
-from twin_worker.diagnosis.inference.isolation.block_means import BLOCK_ROWS, BLOCK_S, BlockMeans
+from twin_worker.diagnosis.inference.isolation.block_means import BLOCK_S, BlockMeans
 from twin_worker.diagnosis.inference.isolation.evidence import TURBULENCE, EvidenceTerms, Explanation, load_table
 from twin_worker.diagnosis.inference.isolation.isolate import Scanner, ScoredHypothesis
 from twin_worker.diagnosis.inference.isolation.onset import onset_posterior
@@ -324,8 +324,9 @@ def turbulence_evidence(whitened: WhitenedResiduals) -> tuple[np.ndarray, float,
     sensor_channels = [k for k, name in enumerate(CHANNELS) if name.startswith(("gps", "gyro"))]
     gain = np.zeros(len(CHANNELS) + 1)
     square = ((whitened.e + whitened.Jn @ whitened.xn) ** 2 / whitened.base.usual)[whitened.ok]
-    onset = _variance_onset(whitened.modelled.t[whitened.ok], square[:, air_channels])
-    after = square if onset is None else square[whitened.modelled.t[whitened.ok] >= onset]
+    t = whitened.modelled.t[whitened.ok]
+    onset = _variance_onset(t, square[:, air_channels], load_table().weights.rows_per_sample)
+    after = square if onset is None else square[t >= onset]
     ratio, sensor_ratio = after[:, air_channels].mean(axis=0), after[:, sensor_channels].mean()
     if ratio.min() < _GUST_RATIOS[0] or np.median(ratio) < _GUST_RATIOS[1] or sensor_ratio > _GUST_RATIOS[1]:
         return gain, 1.0, None
@@ -333,11 +334,8 @@ def turbulence_evidence(whitened: WhitenedResiduals) -> tuple[np.ndarray, float,
     return gain, float(np.median(ratio)), onset
 
 
-def _variance_onset(t: np.ndarray, square: np.ndarray) -> float | None:
-    """Return the change point of the variance of channels, (n, c); None if one variance throughout is as probable.
-
-    Blocks of 10 s count as one independent sample of each channel's variance.
-    """
+def _variance_onset(t: np.ndarray, square: np.ndarray, rows_per_sample: float) -> float | None:
+    """Return the change point of the variance of channels, (n, c); None if one variance throughout is as probable."""
     n = len(t)
     rows = np.arange(1, n)
     inside = rows[(t[rows] > t[0] + BLOCK_S) & (t[rows] < t[-1] - BLOCK_S)]
@@ -349,6 +347,6 @@ def _variance_onset(t: np.ndarray, square: np.ndarray) -> float | None:
     whole = np.log(np.maximum(total[-1] / n, 1e-6))
     gain = (n * whole - inside[:, None] * np.log(before) - (n - inside)[:, None] * np.log(after)).sum(axis=1)
     best = int(np.argmax(gain))
-    if gain[best] / (2.0 * BLOCK_ROWS) < np.log(len(inside)) or after[best].mean() < before[best].mean():
+    if gain[best] / (2.0 * rows_per_sample) < np.log(len(inside)) or after[best].mean() < before[best].mean():
         return None
     return float(t[inside[best]])
