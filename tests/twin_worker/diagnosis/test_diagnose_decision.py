@@ -224,7 +224,7 @@ def test_a_constant_term_does_not_drown_the_others() -> None:
     rate = np.random.default_rng(2).standard_normal(len(T))
     sight = with_added(quiet(3), "gyro_yaw", 0.8 * rate * (T > ONSET_S))
     equation = ChannelEquation(sight, "gyro_yaw", {"1": np.ones_like(T), "rate": rate})
-    (_, alone), (worth, t0) = next(equation.gain_per_term()), equation.gain_of_all()
+    (_, alone), (worth, t0, _) = next(equation.gain_per_term()), equation.gain_of_all()
     assert alone[0] > 250.0 and worth > alone[0] - 20.0 and abs(t0 - ONSET_S) < 3.0
     assert equation.gain_in_flight()[0] > 100.0
 

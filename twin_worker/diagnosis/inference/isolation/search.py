@@ -23,9 +23,6 @@ _N_REFINED = {1: 12, 2: 6, 3: 4}  # hypotheses refined per scan, by size of the 
 _BEAM = {1: 3, 2: 2}  # sets of each size that are extended
 _MIN_SCAN_GAIN = 40.0  # gain of the scan below which a hypothesis is not refined
 _REFINE_SHARE = 0.6  # share of the best score from which the onset is refined
-# share of the gain of effects in a channel, above which a change of it beside them is more than their model error [-]
-BESIDE_SHARE = 0.5
-_N_BESIDE = 2  # sets of effects that are tested for a change beside them
 _PRUNED_NATS = 6.0  # a set this far below the best one is not extended
 
 ReportProgress = Callable[[str], None]
@@ -213,12 +210,10 @@ class Search:
         """Add changes that no effect stands for, alone and beside the best set of effects, and turbulence."""
         for anomaly in (*find_anomalies(self.whitened), *find_changed_coefficients(self.whitened)):
             self._add_anomaly(Explanation((), np.zeros(len(CHANNELS) + 1)), anomaly)
-        sets = [one for one in self.explanations if one.members and not one.change]
-        for explanation in self._beam(sets, 1)[:_N_BESIDE]:
-            given = self.whitened.conditioned(tuple(member.hypothesis for member in explanation.members))
+        if (best := self.best()) is not None:
+            given = self.whitened.conditioned(tuple(member.hypothesis for member in best.members))
             for anomaly in find_anomalies(given):
-                if anomaly.net_gain > BESIDE_SHARE * explanation.channel_gain[CHANNELS.index(anomaly.channel)]:
-                    self._add_anomaly(explanation, anomaly)
+                self._add_anomaly(best, anomaly)
         gain, _, _ = turbulence_evidence(self.whitened)
         if gain.any():
             self._explanations[(TURBULENCE,)] = Explanation((), gain, change=TURBULENCE)
@@ -227,11 +222,22 @@ class Search:
                 self._explanations[("nominal", TURBULENCE)] = Explanation((), gain, nominal_nats=nats)
 
     def _add_anomaly(self, beside: Explanation, anomaly: Anomaly) -> None:
-        gain = beside.channel_gain.copy()
-        gain[CHANNELS.index(anomaly.channel)] += max(anomaly.net_gain, 0.0)
+        gain, channel = beside.channel_gain.copy(), CHANNELS.index(anomaly.channel)
+        gain[channel] += max(anomaly.net_gain, 0.0)
+        block_gain = beside.block_gain
+        if anomaly.series is not None:
+            hypotheses = [member.hypothesis for member in beside.members]
+            block_gain = self._no_effect_blocks - self.blocks.cost(hypotheses, (channel, anomaly.series))
         chance = beside.chance + self.whitened.base.chance.get(anomaly.kind, 0.0)
         key = (*sorted(member.kind for member in beside.members), anomaly.kind)
-        changed = replace(beside, channel_gain=gain, chance=chance, change=anomaly.change, anomaly=anomaly)
+        changed = replace(
+            beside,
+            channel_gain=gain,
+            block_gain=block_gain,
+            chance=chance,
+            change=anomaly.change,
+            anomaly=anomaly._replace(series=None),
+        )
         self._explanations[key] = changed
 
 

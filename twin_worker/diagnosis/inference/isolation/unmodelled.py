@@ -34,8 +34,14 @@ _UNCATALOGUED_TERMS = {  # terms without an effect: stability, cross damping, cr
 }
 # sensor terms: lagging pressures, scale errors of gyros and accelerometers
 _SLOW, _RATE, _FORCE = "lagging", "rate", "force"
-Gain = tuple[float, float]
-"""Gain less the parameter cost, and onset [s]."""
+
+
+class Gain(NamedTuple):
+    """Gain less the parameter cost, onset [s], and what is added to the raw residual, (n,)."""
+
+    net: float
+    t0: float
+    series: np.ndarray
 
 
 class ChannelEquation:
@@ -53,24 +59,25 @@ class ChannelEquation:
         slopes = np.zeros((len(whitened.modelled.t), len(CHANNELS), len(terms)))
         slopes[:, c] = np.transpose(list(terms.values()))
         white = whitened.noise.whiten(slopes)[:, c] * whitened.ok[:, None]
-        self._J = (white / (np.linalg.norm(white, axis=0) + 1e-12))[:, None, :]
+        norm = np.linalg.norm(white, axis=0) + 1e-12
+        self._J, self._raw = (white / norm)[:, None, :], slopes[:, c] / norm
         self._whitened = copy(whitened)  # this channel alone; the nuisance information of the other channels stays
         self._whitened.e, self._whitened.Jn = whitened.e[:, [c]], whitened.Jn[:, [c]]
 
     def gain_of_all(self) -> Gain:
         """Return the gain of freeing all terms from the best onset."""
-        return _step_gain(self._whitened, self._J)
+        return _step_gain(self._whitened, self._J, self._raw)
 
     def gain_in_flight(self) -> Gain:
         """Return the gain of a step at the best onset with all terms free throughout, whatever the calibration."""
-        return _step_gain(_with_free_terms(self._whitened, self._J), self._J, _MIN_SIDE_S)
+        return _step_gain(_with_free_terms(self._whitened, self._J), self._J, self._raw, _MIN_SIDE_S)
 
     def gain_per_term(self) -> Iterator[tuple[str, Gain]]:
         """Yield the gain of freeing each single term that has no effect in the catalogue."""
         equation = next((name for name, channel in CHANNEL_OF.items() if channel == self.channel), "")
         for k, name in enumerate(self.names):
             if name in (*_UNCATALOGUED_TERMS.get(equation, ()), _SLOW, _RATE, _FORCE):
-                yield name, _step_gain(self._whitened, self._J[:, :, [k]])
+                yield name, _step_gain(self._whitened, self._J[:, :, [k]], self._raw[:, [k]])
 
 
 def channel_equations(whitened: WhitenedResiduals) -> Iterator[ChannelEquation]:
@@ -102,14 +109,15 @@ def _lag(x: np.ndarray) -> np.ndarray:
     return np.asarray(lfilter([1.0 - decay], [1.0, -decay], x, zi=[decay * x[0]])[0] - x)
 
 
-def _step_gain(whitened: WhitenedResiduals, J: np.ndarray, margin_s: float = 0.0) -> Gain:
-    """Return gain and onset of a step in terms, (n, 1, k), at least `margin_s` from both ends [s]."""
+def _step_gain(whitened: WhitenedResiduals, J: np.ndarray, raw: np.ndarray, margin_s: float = 0.0) -> Gain:
+    """Return the gain of a step in terms, (n, 1, k), at least `margin_s` from both ends [s]; raw: before whitening."""
     t = whitened.modelled.t
     onset_rows, onsets = onset_gates(t, Onset.STEP)
-    gain, _ = solve_onsets(whitened, *normal_equations(whitened, J, onset_rows, Onset.STEP))
+    gain, x = solve_onsets(whitened, *normal_equations(whitened, J, onset_rows, Onset.STEP))
     gain = np.where((t[onset_rows] > t[0] + margin_s) & (t[onset_rows] < t[-1] - margin_s), gain, 0.0)
     best = int(np.argmax(gain))
-    return float(gain[best]) - PARAMETER_COST * J.shape[2], onsets[best].t0
+    series = raw @ x[best] * onsets[best].gate(t)
+    return Gain(float(gain[best]) - PARAMETER_COST * J.shape[2], onsets[best].t0, series)
 
 
 def _with_free_terms(whitened: WhitenedResiduals, J: np.ndarray) -> WhitenedResiduals:
@@ -131,9 +139,11 @@ _BLOCKS, _MIN_BLOCKS = 12, 4  # tested starts; least blocks after a start
 def find_tones(whitened: WhitenedResiduals) -> Iterator["Anomaly"]:
     """Yield the strongest tone of each calibrated channel, with the nuisances profiled out.
 
-    Its gain is the peak of the periodogram over the mean power; for a pure tone this is the row count.
+    Its gain is the peak of the periodogram, the drop of the sum of squares, less the peak that white noise of the
+    remaining variance would have: 2 sigma^2 ln(tested frequencies and starts).
     """
     t = whitened.modelled.t
+    ok = whitened.ok.astype(float)
     profiled = (whitened.e + np.einsum("tck,k->tc", whitened.Jn, whitened.xn)) * whitened.ok[:, None]
     frequencies = np.arange(*_BAND_HZ, 1.0 / (_OVERSAMPLING * (t[-1] - t[0])))
     starts = np.linspace(0, len(t), _BLOCKS, endpoint=False).astype(int)
@@ -141,9 +151,12 @@ def find_tones(whitened: WhitenedResiduals) -> Iterator["Anomaly"]:
     for equation, channel in CHANNEL_OF.items():
         if whitened.base.r2.get(equation, 1.0) > MIN_R2:
             x = profiled[:, CHANNELS.index(channel)]
-            power = np.abs(_tail_sums(waves * x[:, None], starts)) ** 2 / (_tail_sums(x * x, starts)[:, None] + 1e-9)
-            start, peak = np.unravel_index(int(np.argmax(power[:-_MIN_BLOCKS])), power[:-_MIN_BLOCKS].shape)
-            yield Anomaly(2.0 * float(power[start, peak]), channel, float(t[starts[start]]), "tone")
+            rows = np.maximum(_tail_sums(ok, starts), 1.0)[:, None]
+            drop = 2.0 * np.abs(_tail_sums(waves * x[:, None], starts)) ** 2 / rows
+            rest = np.maximum(_tail_sums(x * x, starts)[:, None] - drop, 0.0) / rows
+            gain = (drop - 2.0 * rest * np.log(drop.size))[:-_MIN_BLOCKS]
+            start, peak = np.unravel_index(int(np.argmax(gain)), gain.shape)
+            yield Anomaly(float(gain[start, peak]), channel, float(t[starts[start]]), "tone")
 
 
 def _tail_sums(x: np.ndarray, starts: np.ndarray) -> np.ndarray:
@@ -152,13 +165,14 @@ def _tail_sums(x: np.ndarray, starts: np.ndarray) -> np.ndarray:
 
 
 class Anomaly(NamedTuple):
-    """Gain of a changed equation less its cost, or power ratio of a tone, with channel, onset [s], kind and term."""
+    """Gain of a change less its cost, with channel, onset [s], kind, term, and its part of the residual, (n,)."""
 
     net_gain: float
     channel: str
     t0: float
     change: str = "odd"
     term: str = ""
+    series: np.ndarray | None = None
 
     @property
     def kind(self) -> str:
@@ -179,8 +193,8 @@ def find_anomalies(whitened: WhitenedResiduals) -> list[Anomaly]:
     bounded = whitened.with_nuisance_priors()  # no nuisance released
     out = list(find_tones(bounded))
     for equation in channel_equations(bounded):
-        for change, (net_gain, t0) in (("odd", equation.gain_of_all()), ("shift", equation.gain_in_flight())):
-            out.append(Anomaly(net_gain, equation.channel, t0, change))
+        for change, gain in (("odd", equation.gain_of_all()), ("shift", equation.gain_in_flight())):
+            out.append(Anomaly(gain.net, equation.channel, gain.t0, change, series=gain.series))
     return out
 
 
@@ -189,7 +203,7 @@ def find_changed_coefficients(whitened: WhitenedResiduals) -> list[Anomaly]:
     if not whitened.base.vane:
         return []
     return [
-        Anomaly(net_gain, equation.channel, t0, "one", name)
+        Anomaly(gain.net, equation.channel, gain.t0, "one", name, gain.series)
         for equation in channel_equations(whitened)
-        for name, (net_gain, t0) in equation.gain_per_term()
+        for name, gain in equation.gain_per_term()
     ]

@@ -23,7 +23,7 @@ PRESSURE = ("velocity", "airspeed")
 BLOCK_S = 10.0
 _ITERATIONS = 4  # of the pitching moment equation, whose drag depends on lift
 _SHORT_S, _MIN_GATE = 2.0, 0.01  # block length for transient effects; least gate value at which they act
-_MIN_BLOCKS, _RESAMPLES, _SEED = 3, 500, 17
+_MIN_BLOCKS, _RESAMPLES, _SEED = 2, 500, 17
 _LEVELS = 2.5, 97.5  # percentiles of the interval
 _MAX_SIDESLIP = 0.35  # limit of the predicted sideslip [rad]
 
@@ -85,7 +85,7 @@ def held_out_gain(
         measured, predicted: specific force, without and with the effects, (n, 3)
         fitted: the effects as fitted on the other blocks
     Returns:
-        limits; the lower one is minus infinity with fewer than three held-out blocks
+        limits; the lower one is minus infinity with fewer than two held-out blocks
     """
     t = modelled.t
     gates = [hypothesis.onset.gate(t) > _MIN_GATE for hypothesis in fitted]
