@@ -77,7 +77,7 @@ class Explanation:
         members: the effects, in the order in which they were found
         channel_gain: drop of the whitened sum of squares by channel, and by the prior of the nuisances, (c + 1,)
         block_gain: drop of the sum of squares of block means
-        parameters: number of parameters of the effects, without those of their onsets
+        parameters: number of parameters of the effects and of the change, without those of their onsets
         chance, block_chance: the same gains that these effects reach on left-out nominal flights
         nominal: differences to the nominal flights beside the effects; nominal_nats: their cost [nat]
         change: kind of the change, `turbulence`, or empty

@@ -59,5 +59,6 @@ def onset_posterior(
     probability /= probability.sum()
     t0 = np.array([onset.t0 for onset in onsets])
     order = np.argsort(t0)
-    low, high = (t0[order][min(np.searchsorted(np.cumsum(probability[order]), q), len(t0) - 1)] for q in _LEVELS)
-    return OnsetPosterior(onsets, probability, onsets[int(np.argmax(probability))], (float(low), float(high)))
+    rows = np.minimum(np.searchsorted(np.cumsum(probability[order]), _LEVELS), len(t0) - 1)
+    low, high = t0[order][rows].tolist()
+    return OnsetPosterior(onsets, probability, onsets[int(np.argmax(probability))], (low, high))

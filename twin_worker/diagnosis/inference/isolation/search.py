@@ -234,6 +234,7 @@ class Search:
             beside,
             channel_gain=gain,
             block_gain=block_gain,
+            parameters=beside.parameters + anomaly.parameters,
             chance=chance,
             change=anomaly.change,
             anomaly=anomaly._replace(series=None),

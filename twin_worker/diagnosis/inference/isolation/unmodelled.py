@@ -132,6 +132,7 @@ def _with_free_terms(whitened: WhitenedResiduals, J: np.ndarray) -> WhitenedResi
 
 
 _BAND_HZ = 0.1, 1.45  # the mission is slower, the filter removes what is faster
+_TONE_PARAMETERS = 3  # amplitude, phase, frequency
 _OVERSAMPLING = 2.0  # oversampling of the frequency resolution
 _BLOCKS, _MIN_BLOCKS = 12, 4  # tested starts; least blocks after a start
 
@@ -156,7 +157,9 @@ def find_tones(whitened: WhitenedResiduals) -> Iterator["Anomaly"]:
             rest = np.maximum(_tail_sums(x * x, starts)[:, None] - drop, 0.0) / rows
             gain = (drop - 2.0 * rest * np.log(drop.size))[:-_MIN_BLOCKS]
             start, peak = np.unravel_index(int(np.argmax(gain)), gain.shape)
-            yield Anomaly(float(gain[start, peak]), channel, float(t[starts[start]]), "tone")
+            yield Anomaly(
+                float(gain[start, peak]), channel, float(t[starts[start]]), "tone", parameters=_TONE_PARAMETERS
+            )
 
 
 def _tail_sums(x: np.ndarray, starts: np.ndarray) -> np.ndarray:
@@ -165,7 +168,7 @@ def _tail_sums(x: np.ndarray, starts: np.ndarray) -> np.ndarray:
 
 
 class Anomaly(NamedTuple):
-    """Gain of a change less its cost, with channel, onset [s], kind, term, and its part of the residual, (n,)."""
+    """Gain of a change less its cost, with channel, onset [s], kind, term, part of the residual, (n,), and parameters."""
 
     net_gain: float
     channel: str
@@ -173,6 +176,7 @@ class Anomaly(NamedTuple):
     change: str = "odd"
     term: str = ""
     series: np.ndarray | None = None
+    parameters: int = 1
 
     @property
     def kind(self) -> str:
@@ -194,7 +198,8 @@ def find_anomalies(whitened: WhitenedResiduals) -> list[Anomaly]:
     out = list(find_tones(bounded))
     for equation in channel_equations(bounded):
         for change, gain in (("odd", equation.gain_of_all()), ("shift", equation.gain_in_flight())):
-            out.append(Anomaly(gain.net, equation.channel, gain.t0, change, series=gain.series))
+            n = len(equation.names)
+            out.append(Anomaly(gain.net, equation.channel, gain.t0, change, series=gain.series, parameters=n))
     return out
 
 
