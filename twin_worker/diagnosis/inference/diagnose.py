@@ -82,8 +82,8 @@ def diagnose(flight: FlightData, base: Baseline, progress: ReportProgress = lamb
     measured, simulated, with_effects = force_prediction.predict_forces(modelled, weather, validation.fitted)
     errors = [force_prediction.rms(modelled, measured - x) for x in (simulated, with_effects)]
     if outcome is ReportOutcome.NAMED and any(is_in_forces(finding.hypothesis) for finding in findings):
-        low, _ = held_out_gain(modelled, measured, (simulated, with_effects), validation.fitted)
-        outcome = outcome if low > 0.0 else ReportOutcome.SUSPECTED
+        gain, _, _ = held_out_gain(modelled, measured, (simulated, with_effects))
+        outcome = ReportOutcome.SUSPECTED if gain <= 0.0 else outcome
     if outcome is not ReportOutcome.NAMED:
         whitened.condition_on(weather)
     where: tuple[str, tuple[tuple[float, float], ...]] = ("", ())
@@ -292,7 +292,7 @@ def _outcome(decision: Decision, confirmed: bool, fits: bool) -> ReportOutcome:
         return ReportOutcome.UNKNOWN
     members = decision.best.members if decision.best else ()
     separable = all(1 + len(member.rivals) <= MAX_CLASS for member in members)
-    if confirmed and separable and decision.effects > NAMED_PROBABILITY:
+    if confirmed and separable and decision.effects > NAMED_PROBABILITY * (1.0 - decision.missed):
         return ReportOutcome.NAMED
     least = SUSPECTED_PROBABILITY if separable else NAMED_PROBABILITY
     return ReportOutcome.SUSPECTED if decision.effects > least else ReportOutcome.NONE

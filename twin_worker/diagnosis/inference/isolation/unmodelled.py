@@ -168,7 +168,7 @@ def _tail_sums(x: np.ndarray, starts: np.ndarray) -> np.ndarray:
 
 
 class Anomaly(NamedTuple):
-    """Gain of a change less its cost, with channel, onset [s], kind, term, part of the residual, (n,), and parameters."""
+    """Gain of a change less its cost, with channel, onset [s], kind, term, part of the residual and parameters."""
 
     net_gain: float
     channel: str

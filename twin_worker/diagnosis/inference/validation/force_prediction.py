@@ -10,7 +10,7 @@ from itertools import product
 
 import numpy as np
 
-from fleet.effects import Onset, Stage
+from fleet.effects import Stage
 from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.data.flight import DECIMATION, DT
 from twin_worker.diagnosis.model import equations as eq
@@ -22,8 +22,8 @@ SIDE = ("velocity", "roll", "yaw")
 PRESSURE = ("velocity", "airspeed")
 BLOCK_S = 10.0
 _ITERATIONS = 4  # of the pitching moment equation, whose drag depends on lift
-_SHORT_S, _MIN_GATE = 2.0, 0.01  # block length for transient effects; least gate value at which they act
-_MIN_BLOCKS, _RESAMPLES, _SEED = 2, 500, 17
+_ACTING = 0.95  # share of the change of the prediction in the blocks resampled
+_MIN_BLOCKS, _RESAMPLES, _SEED = 3, 500, 17
 _LEVELS = 2.5, 97.5  # percentiles of the interval
 _MAX_SIDESLIP = 0.35  # limit of the predicted sideslip [rad]
 
@@ -73,36 +73,34 @@ def held_out_gain(
     modelled: ModelledFlight,
     measured: np.ndarray,
     predicted: tuple[np.ndarray, np.ndarray],
-    fitted: tuple[FaultHypothesis, ...],
-) -> tuple[float, float]:
-    """Return the 95 % interval of the gain 1 - rms(after) / rms(before) on held-out blocks, by resampling of blocks.
+) -> tuple[float, float, float]:
+    """Return the gain 1 - rms(after) / rms(before) on held-out blocks and its 95 % interval, by resampling of blocks.
 
-    Blocks last 10 s, those of transient effects 2 s, as in the cross-validation. Blocks in which no effect acts are the
-    same with and without it and not resampled.
+    Only blocks in which the effects act are resampled, those with 95 % of the squared change of the prediction.
 
     Args:
         modelled: the flight with its baseline
         measured, predicted: specific force, without and with the effects, (n, 3)
-        fitted: the effects as fitted on the other blocks
     Returns:
-        limits; the lower one is minus infinity with fewer than two held-out blocks
+        gain and limits; nan with fewer than three such blocks, from which no interval follows
     """
-    t = modelled.t
-    gates = [hypothesis.onset.gate(t) > _MIN_GATE for hypothesis in fitted]
-    acts = np.any(gates, axis=0) if gates else np.zeros(len(t), bool)
-    transient = all(hypothesis.onset.kind is Onset.BUMP for hypothesis in fitted)
-    labels = np.floor(t / (_SHORT_S if transient else BLOCK_S)).astype(int)
     finite = np.isfinite(predicted).all(axis=(0, 2)) & np.isfinite(measured).all(axis=1)
-    rows = modelled.ok & finite & acts & (labels % 2 == 1)
-    squares = np.array([((x - measured) ** 2).sum(axis=1) for x in predicted])
-    used = np.unique(labels[rows])
-    if len(used) < _MIN_BLOCKS:
-        return -np.inf, np.inf
-    sums = np.array([[row[rows & (labels == k)].sum() for row in squares] for k in used])
-    drawn = np.random.default_rng(_SEED).integers(len(used), size=(_RESAMPLES, len(used)))
-    before, after = sums[drawn].sum(axis=1).T
+    rows = modelled.ok & finite & blocks(modelled.t, odd=True)
+    pairs = (predicted[0], measured), (predicted[1], measured), predicted
+    squares = np.array([np.where(rows, np.nan_to_num(((x - y) ** 2).sum(axis=1)), 0.0) for x, y in pairs])
+    labels = np.floor(modelled.t / BLOCK_S).astype(int)
+    labels -= labels[0]
+    by_block = np.stack([np.bincount(labels, row) for row in squares], axis=1)
+    order = np.argsort(-by_block[:, 2])
+    change = np.cumsum(by_block[order, 2])
+    sums = by_block[order[: int(np.searchsorted(change, _ACTING * change[-1])) + 1]]
+    if len(sums) < _MIN_BLOCKS or change[-1] <= 0.0:
+        return np.nan, np.nan, np.nan
+    drawn = np.random.default_rng(_SEED).integers(len(sums), size=(_RESAMPLES, len(sums)))
+    before, after, _ = sums[drawn].sum(axis=1).T
     low, high = np.percentile(1.0 - np.sqrt(after / np.maximum(before, 1e-12)), _LEVELS)
-    return float(low), float(high)
+    total = sums.sum(axis=0)
+    return float(1.0 - np.sqrt(total[1] / max(total[0], 1e-12))), float(low), float(high)
 
 
 def predict_force(eq_terms: EquationTerms, source: tuple[str, str, str]) -> np.ndarray:
