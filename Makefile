@@ -73,6 +73,8 @@ lock:
 	@for pair in dev:$(LOCK) bench:$(BENCH_LOCK); do \
 	  $(COMPILE) pyproject.toml --extra $${pair%:*} --all-build-deps --output-file $${pair#*:} || exit 1; \
 	done
+	@echo rotorpy | $(COMPILE) - --output-file .venv-lock/rotorpy.lock  # its own dependencies stay out, see pyproject.toml
+	@sed -n '/^rotorpy==/,/[^\\]$$/p' .venv-lock/rotorpy.lock >> $(LOCK)
 	@.venv-lock/bin/python -c "import tomllib; extras = tomllib.load(open('pyproject.toml', 'rb'))['project']; \
 	  print(*extras['optional-dependencies']['docs'], sep='\n')" | $(COMPILE) - --output-file $(DOCS_LOCK)
 	@sed -i -e '/^#/d' -e '1i $(LOCK_HEAD)' $(LOCK) $(BENCH_LOCK) $(DOCS_LOCK)

@@ -20,8 +20,9 @@ report "1/3 create a virtual environment in .venv (Python $found)"
 "$python" -m venv --clear .venv
 
 total=$(grep -c '==' requirements.lock)
+# The lock is complete; --no-deps leaves out what rotorpy names but ParaUAV does not use (cvxopt, GPL).
 report "2/3 install $total packages, about 300 MB; a few minutes the first time"
-{ .venv/bin/python -m pip install --disable-pip-version-check --progress-bar off --require-hashes -r requirements.lock 2>&1 ||
+{ .venv/bin/python -m pip install --disable-pip-version-check --progress-bar off --no-deps --require-hashes -r requirements.lock 2>&1 ||
     echo 'SETUP-FAILED'; } | {
     count=0
     : >"$log"

@@ -251,15 +251,25 @@ class History(Message, frozen=True, kw_only=True):
 
 
 class Outcome(StrEnum):
-    """Outcome of an identification; an outcome other than VERIFIED is not an error."""
+    """Outcome of an identification; an outcome other than VERIFIED is not an error.
+
+    VERIFIED: fit above the threshold and above persistence, consistent with held-out data, and with a stated power.
+    PLAUSIBLE: fit above the threshold and above persistence only; the model predicts as a verified one does.
+    """
 
     VERIFIED = "verified"
+    PLAUSIBLE = "plausible"
     INSUFFICIENT_DATA = "insufficient_data"
     NOT_IDENTIFIABLE = "not_identifiable"
     BELOW_THRESHOLD = "below_threshold"
     WORSE_THAN_LAST = "worse_than_last"
     DRIFTING = "drifting"
     DIVERGED = "diverged"
+
+    @property
+    def is_accepted(self) -> bool:
+        """Return whether the model may predict."""
+        return self in (Outcome.VERIFIED, Outcome.PLAUSIBLE)
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
@@ -278,6 +288,14 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     horizon_s: Annotated[float, about("free-run length of the fit [s]")] = 0.0
     threshold: Annotated[float, about("omega: minimum mean fit [%]")] = 0.0
     attempts: Annotated[int, about("identification attempts for this verdict")] = 0
+    derivative_error: Annotated[
+        dict[str, float],
+        about("estimated error of each group of derivatives that is inconsistent with held-out data [%]"),
+    ] = {}
+    detectable_error: Annotated[
+        dict[str, float],
+        about("power: smallest error of a group of derivatives that is rejected with 95 % probability, up to 50 [%]"),
+    ] = {}
 
 
 class LinearModel(msgspec.Struct, frozen=True, kw_only=True):
@@ -317,14 +335,14 @@ class Derivatives(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Model(Message, frozen=True, kw_only=True):
-    """Active model (none before the first verified one), newest identification window and its verdict."""
+    """Active model (none before the first plausible or verified one), newest identification window and its verdict."""
 
     topic: ClassVar[str] = "model"
     version: ClassVar[int] = 2
 
     method: Annotated[str, about("dynamics (coupled derivatives) or paper (two linear axes)")]
     verdict: Annotated[Verdict, about("of the newest identification")]
-    active_verdict: Annotated[Verdict | None, about("of the model below; null before any was verified")] = None
+    active_verdict: Annotated[Verdict | None, about("of the model below; null before any was accepted")] = None
     longitudinal: LinearModel | None = None
     lateral: LinearModel | None = None
     derivatives: Annotated[Derivatives | None, about("of the coupled model; null for method paper")] = None
@@ -347,6 +365,7 @@ class TwinState(StrEnum):
     UNCLAIMED = "unclaimed"
     WAITING = "waiting"
     IDENTIFYING = "identifying"
+    PLAUSIBLE = "plausible"
     VERIFIED = "verified"
     PREDICTING = "predicting"
     LINK_LOST = "link_lost"

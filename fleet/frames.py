@@ -128,3 +128,14 @@ def wrap(angle: Any) -> Any:
     """Wrap an angle, or an array of them, to (-pi, pi] [rad]; a non-finite angle stays non-finite."""
     wrapped = (angle + pi) % (2 * pi) - pi
     return wrapped + 2 * pi * (wrapped <= -pi)
+
+
+@nb.njit(cache=True)
+def air_direction(phi: Any, theta: Any, psi: Any, gamma: Any) -> Any:
+    """Return the horizontal direction of the velocity through the air without sideslip, numbers or arrays [rad].
+
+    In a banked turn the angle of attack moves it out of the turn. The velocity is (cos(alpha), 0, sin(alpha)) in the
+    body; rotated by phi and theta, with theta - gamma = alpha cos(phi) for small alpha, it lies left of the nose by
+    alpha sin(phi) = (theta - gamma) tan(phi).  Source: Beard & McLain 2012, section 2.3.
+    """
+    return psi - (theta - gamma) * np.tan(phi)

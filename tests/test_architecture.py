@@ -40,8 +40,8 @@ ORDER = (  # a folder, or a module in the root of a package, imports only from i
     ("fleet.simulator.vehicle",),
     ("fleet.simulator.faults",),
     ("fleet.simulator.flight",),
-    ("fleet.simulator.conceal",),
-    ("fleet.blind_test", "fleet.health"),
+    ("fleet.simulator.conceal", "fleet.simulator.multirotor"),
+    ("fleet.blind_test", "fleet.health", "fleet.export"),
     ("fleet.commands.live", "fleet.commands.offline"),
     ("gateway",),
     ("gateway.link_spec",),
@@ -101,10 +101,12 @@ ALONE = {  # a foreign library, and the only places that may import it
     "zenoh": ("fleet/bus/session.py",),
     "viser": ("viewer/",),
     "jsbsim": ("fleet/simulator/vehicle/jsbsim.py",),
+    "rotorpy": ("fleet/simulator/multirotor/rigid_body.py",),
     "pymavlink": (
         "fleet/telemetry/",
         "fleet/simulator/flight/mavlink.py",
         "fleet/simulator/flight/mavlink_messages.py",
+        "fleet/simulator/multirotor/messages.py",
         "gateway/",
     ),
 }
@@ -114,10 +116,8 @@ APART = (  # who, and what it must never import
     ("gateway", ("twin_worker", "viewer")),
     ("twin_worker", ("gateway", "viewer", "fleet.simulator")),
     ("viewer", ("gateway", "twin_worker", "fleet.simulator")),
-    (
-        "fleet.simulator",
-        ("fleet.physics", "fleet.effects", "fleet.physics.simulate", "fleet.physics.point_mass"),
-    ),  # never our own physics
+    ("fleet.simulator", ("fleet.physics", "fleet.effects")),  # never our own physics
+    ("fleet.simulator.multirotor", ("fleet.autopilots", "fleet.mission")),  # nor the law and route that predict it
     ("fleet.simulator", ("importlib", "runpy", "subprocess")),  # nor by the back door
     ("fleet.effects", ("fleet.simulator",)),  # one code must never both conceal and find
     ("fleet.physics.simulate", ("fleet.simulator",)),

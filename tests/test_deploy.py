@@ -21,6 +21,7 @@ import zenoh
 from conftest import ROOT, unused_port
 from test_readme import MAINS, commands, understood
 
+from docs import generate
 from fleet.access.roles import ROLES, ROUTER_ROLE
 from fleet.bus.codec import decode, encode
 from fleet.bus.session import connect
@@ -318,3 +319,42 @@ def test_predictions_answer_over_http_and_what_it_is_asked_to_write_is_dropped(t
             return len(heard) > 3
 
         assert until(told) and set(heard) == {encode(EXAMPLES[Prediction])}
+
+
+# --- the Grafana dashboard -------------------------------------------------------------------------------------------
+
+DASHBOARD = json.loads((ROOT / "deploy" / "grafana.json").read_text())
+
+
+def served() -> dict[str, set[str]]:
+    """Every metric that gateway and worker serve, with its labels."""
+    families = [*generate.gateway_families(), *generate.worker_families()]
+    samples = [sample for family in families for sample in family.samples]
+    return {sample.name: set(sample.labels) for sample in samples}
+
+
+def test_every_metric_of_the_dashboard_is_served_with_the_labels_it_uses() -> None:
+    known = served()
+    targets = [target for panel in DASHBOARD["panels"] for target in panel["targets"]]
+    named = {name for target in targets for name in re.findall(r"\bparauav_\w+", target["expr"])}
+    assert named <= known.keys() and len(named) > 20
+    for target in targets:
+        (names, labels) = re.findall(r"\bparauav_\w+", target["expr"]), re.findall(r"{{(\w+)}}", target["legendFormat"])
+        labels += re.findall(r"by \((\w+)\)", target["expr"])
+        assert set(labels) <= set.union({"instance"}, *(known[name] for name in names)), target["expr"]
+        counters = [name for name in names if name.endswith("_total")]
+        assert all(re.search(rf"(rate|increase)\({name}\[", target["expr"]) for name in counters), target["expr"]
+
+
+def test_the_panels_of_the_dashboard_do_not_overlap_and_have_a_data_source() -> None:
+    taken: set[tuple[int, int]] = set()
+    for panel in DASHBOARD["panels"]:
+        place = panel["gridPos"]
+        cells = {
+            (place["x"] + i, place["y"] + j) for i in range(place["w"]) for j in range(place["h"])
+        }  # a grid of 24 columns
+        assert not cells & taken and max(x for x, _ in cells) < 24
+        taken |= cells
+        assert panel["datasource"]["uid"] == "${datasource}" and panel["title"]
+    assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(DASHBOARD["panels"])
+    assert [entry["type"] for entry in DASHBOARD["templating"]["list"]] == ["datasource"]

@@ -25,7 +25,6 @@ from fleet.contract import (
     GatewayCounters,
     Mission,
     Model,
-    Outcome,
     Params,
     Prediction,
     Sample,
@@ -215,7 +214,7 @@ def test_a_flight_of_another_autopilot_is_predicted_on_its_own_mission(router: s
         return p.state is TwinState.PREDICTING and p.method in ("dynamics", "hybrid", "both")
 
     def verified() -> list[Verdict]:
-        return [m.verdict for m in models if m.verdict.outcome is Outcome.VERIFIED]
+        return [m.verdict for m in models if m.verdict.outcome.is_accepted]
 
     with connect(router) as bus, process("twin_worker", "--uavs", f"{uav}-{uav + 99}", "--router", router) as worker:
         wait(lambda: "serves UAV ids" in worker.stdout.readline(), worker)

@@ -86,9 +86,10 @@ def third_party(*folders: str) -> set[str]:
 def test_what_is_imported_is_declared_and_what_is_declared_is_imported() -> None:
     run_time = {bare(line) for line in PROJECT["dependencies"]}
     development = {bare(line) for line in PROJECT["optional-dependencies"]["dev"]}
-    assert third_party(*PACKAGES) == run_time - OFFERED
+    optional = {bare(line) for line in PROJECT["optional-dependencies"]["multirotor"]}
+    assert third_party(*PACKAGES) == (run_time | optional) - OFFERED
     assert {bare(line) for line in PROJECT["optional-dependencies"]["bench"]} == PEERS <= third_party("tests/bench")
-    assert third_party("tests") <= run_time | development | PEERS
+    assert third_party("tests") <= run_time | optional | development | PEERS
     assert development <= third_party("tests") | TOOLS
 
 
@@ -106,6 +107,8 @@ def test_the_lock_holds_every_dependency_by_version_and_hash_and_no_address(lock
     if extra != "docs":  # the site is built without the packages themselves
         wanted |= {*PROJECT["dependencies"], "setuptools"}
     assert {bare(line) for line in wanted} <= locked
+    assert "cvxopt" not in locked  # GPL; named by rotorpy, whose flight dynamics do not need it
+    assert lock != "requirements.lock" or "rotorpy" in locked
 
 
 # --- commands --------------------------------------------------------------------------------------------------------

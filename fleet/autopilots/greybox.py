@@ -52,12 +52,16 @@ def follow(
     p, v, euler = start[:3].copy(), np.zeros(3), np.zeros(3)
     V, phi, psi, h_dot = start[3], start[4], start[5], start[6]
     landed = False
+    v_before = np.zeros(3)
     for k in range(len(out)):
-        out[k] = p
         if landed:
+            out[k] = p
             continue
         V_horizontal = sqrt(max(V * V - h_dot * h_dot, 1.0))
         v[0], v[1], v[2] = V_horizontal * cos(psi) + wind[0], V_horizontal * sin(psi) + wind[1], -h_dot
+        for j in range(3):
+            p[j] += 0.5 * dt * (v_before[j] + v[j]) if k > 0 else 0.0  # trapezoidal rule: no lag in turns
+            out[k, j], v_before[j] = p[j], v[j]
         euler[0], euler[2] = phi, psi
         if ctl[SWITCH_S] > 0.0:
             switch_when_due(ctl, par, legs, p, dt)
@@ -65,13 +69,13 @@ def follow(
         h_sp = leg_rules.height_demand(ctl, par, legs, p)
         i = leg_rules.current_leg(ctl, legs)
         Va_c = legs[i, VA_C] * lags[TAS_RATIO] if legs[i, VA_C] > 0.0 else lags[CRUISE]
+        phi_before = phi
         phi += (to_roll(par, a_lat, 0.0) - phi) * min(dt / lags[TAU_PHI], 1.0)
-        psi += G * tan(clip(phi + lags[B_PHI], -1.2, 1.2)) / max(V, 3.0) * dt
+        phi_mean = clip(0.5 * (phi_before + phi) + lags[B_PHI], -1.2, 1.2)
+        psi += G * tan(phi_mean) / max(V, 3.0) * dt
         V += (Va_c - V) * min(dt / lags[TAU_V], 1.0)
         h_dot_c = clip((h_sp + p[2]) / lags[TAU_H], -lags[SINK], lags[CLIMB])
         h_dot += (h_dot_c - h_dot) * min(dt / lags[TAU_CLIMB], 1.0)
-        for j in range(3):
-            p[j] += v[j] * dt
         if int(legs[i, KIND]) == LAND:
             along, length = leg_rules.along_line(ctl, legs[i], p)
             landed = along >= length

@@ -20,6 +20,7 @@ from fleet.bus.bus_protocol import parse_token
 from fleet.bus.session import Bus
 from fleet.contract import Claim, GatewayCounters, Status
 from fleet.health.machine import BAD, NOTE, OK, CheckResult, is_port_free
+from fleet.health.ports import port_user
 from fleet.report.report_text import id_ranges
 
 OFFSET_NOTE_S = 0.2  # a larger clock offset is a note [s]
@@ -220,7 +221,7 @@ def check_router(entry: BusConfig) -> Generator[CheckResult, None, bool]:
     try:
         reachable = probe_router(entry)
     except (ValueError, OSError) as error:
-        yield CheckResult(BAD, "router", str(error))
+        yield CheckResult(BAD, "router", f"{error}{at_router_port(entry)}")
         return False
     if reachable:
         yield CheckResult(OK, "router", f"{entry.endpoint} answers")
@@ -232,8 +233,16 @@ def check_router(entry: BusConfig) -> Generator[CheckResult, None, bool]:
         yield CheckResult(OK, "router", f"{entry.endpoint} is free; `fleet up` will open a router there")
     else:
         text = f"{entry.endpoint} is in use and does not answer; start `zenohd` there or choose another --router"
+        text += at_router_port(entry)
         yield CheckResult(BAD, "router", text)
     return False
+
+
+def at_router_port(entry: BusConfig) -> str:
+    """Return `; the port is used by …` with the program at the router's port on this machine; else nothing."""
+    host, port = parse_endpoint(entry.endpoint)
+    user = port_user(socket.SOCK_STREAM, port) if host in LOOPBACK else ""
+    return f"; the port is used by {user}" if user else ""
 
 
 def _router_certificate(entry: BusConfig, folder: Path) -> Iterator[CheckResult]:

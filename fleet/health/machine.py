@@ -5,7 +5,7 @@ import os
 import shutil
 import socket
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -95,16 +95,6 @@ def onboard_cache() -> Iterator[CheckResult]:
         yield CheckResult(BAD, "onboard cache", f"{folder}: found {problem}")
     else:
         yield CheckResult(OK, "onboard cache", f"{folder}: {sum(1 for _ in folder.glob('*.json'))} aircraft")
-
-
-def mavlink_port(links: Collection[str] = ()) -> CheckResult:
-    """Check that the default MAVLink UDP port is free; `links` are open links of local gateways."""
-    if any(f":{MAVLINK_PORT}" in link for link in links):
-        return CheckResult(OK, "mavlink", f"udp port {MAVLINK_PORT} is used by the gateway")
-    if is_port_free(socket.SOCK_DGRAM, "0.0.0.0", MAVLINK_PORT):
-        return CheckResult(OK, "mavlink", f"udp port {MAVLINK_PORT} is free")
-    remedy = "correct for a gateway container, else use another: --link udpin:0.0.0.0:14551"
-    return CheckResult(NOTE, "mavlink", f"udp port {MAVLINK_PORT} is in use; {remedy}")
 
 
 def is_port_free(kind: socket.SocketKind, host: str, port: int) -> bool:

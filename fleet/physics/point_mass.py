@@ -4,7 +4,8 @@
     gamma' = (theta - alpha - gamma) / 0.6 s,      alpha = a_0 + a_n (n (V_0 / V)^2 - 1),      n = 1 / cos phi
     V' + g sin gamma = c_0 + c_t (delta_t - t_0) + c_v (V - V_0) + c_n (n^2 - 1)
     psi' = k g tan phi / V + b_psi
-    p' = V e(gamma, psi + d_psi) + w (h / h_0)^(1/7) + drift + rest,      both first-order Gauss-Markov
+    chi_a = psi + d_psi - (theta - gamma) tan phi
+    p' = V e(gamma, chi_a) + w (h / h_0)^(1/7) + drift + rest,      both first-order Gauss-Markov
 
 Guidance and TECS are the autopilot's own laws; the loops below them are replaced by identified lags.
 Source: Beard & McLain 2012, chapter 9 (guidance models); Stengel 2004, section 2.6 (energy height).
@@ -15,7 +16,7 @@ from math import cos, exp, nan, sin, sqrt, tan
 import numpy as np
 
 from fleet.autopilots.laws import guide
-from fleet.frames import G, wrap
+from fleet.frames import G, air_direction, wrap
 from fleet.physics.kernel import inlined_kernel, kernel
 
 STEP = 0.1  # of guidance and integration [s]
@@ -39,7 +40,7 @@ N_PARAMETERS = 16
 # columns of `air`
 W_N, W_E = 0, 1  # mean wind at height H_0 [m/s]
 DRIFT_N, DRIFT_E, REST_N, REST_E = 2, 3, 4, 5  # slow drift of the wind, and the rest: gusts [m/s]
-SCALE, D_PSI = 6, 7  # true over reported airspeed, direction through the air minus heading [-, rad]
+SCALE, D_PSI = 6, 7  # true over reported airspeed; direction through the air minus heading, wings level [-, rad]
 H_0, GROUND = 8, 9  # height above ground of the mean wind, 0: no shear; p_d of the ground [m]
 DRIFT, DRIFT_S, REST, REST_S = 10, 11, 12, 13  # standard deviation and time constant of drift and rest [m/s, s]
 N_AIR = 14
@@ -82,12 +83,12 @@ def simulate_route(
     rest_std = air[REST] * sqrt(1.0 - exp(-2.0 / air[REST_S]))
     gamma_gain, steps_per_s, shear = 1.0 - exp(-dt / GAMMA_S), round(1.0 / dt), 1.0
     Va, rate = speed / air[SCALE], 0.0
+    v_before = np.zeros(3)
     for k in range(len(out)):
-        for j in range(3):
-            out[k, j] = p[j]
         if not (3.0 < speed < 3.0 * parameters[V_0] and abs(phi) < _MAX_BANK):
             return k
-        c, s, cos_gamma = cos(psi + air[D_PSI]), sin(psi + air[D_PSI]), cos(gamma)
+        chi = air_direction(phi, theta, psi + air[D_PSI], gamma)
+        c, s, cos_gamma = cos(chi), sin(chi), cos(gamma)
         tailwind_before = (wind[0] + wind[2]) * c + (wind[1] + wind[3]) * s
         if k > 0:
             wind[0], wind[1], wind[2], wind[3] = (
@@ -109,12 +110,15 @@ def simulate_route(
         v[0] = speed * cos_gamma * c + air[W_N] * shear + wind[0] + wind[2]
         v[1] = speed * cos_gamma * s + air[W_E] * shear + wind[1] + wind[3]
         v[2] = -speed * sin(gamma)
+        for j in range(3):
+            p[j] += 0.5 * dt * (v_before[j] + v[j]) if k > 0 else 0.0  # trapezoidal rule: no lag in turns
+            out[k, j], v_before[j] = p[j], v[j]
         euler[0], euler[1], euler[2] = phi, theta, psi
         rate += min(5.0 * dt, 1.0) * ((speed / air[SCALE] - Va) / dt - rate) if k > 0 else 0.0
         Va = speed / air[SCALE]
         phi_c, theta_c, delta_t = guide(ctl, par, legs, p, v, euler, Va, rate, dt)
         thr += min(max(delta_t - thr, -dt / _THROTTLE_S), dt / _THROTTLE_S)
-        n = 1.0 / cos(phi)
+        n, phi_before = 1.0 / cos(phi), phi
         theta, q_rate = _lag(theta, q_rate, theta_c, parameters[WN_THETA : B_THETA + 1], dt)
         phi, p_rate = _lag(phi, p_rate, phi_c, parameters[WN_PHI : B_PHI + 1], dt)
         alpha = parameters[A_0] + parameters[A_N] * (n * (parameters[V_0] / speed) ** 2 - 1.0)
@@ -125,10 +129,9 @@ def simulate_route(
             + parameters[C_V] * (speed - parameters[V_0])
             + parameters[C_N] * (n * n - 1.0)
         )
-        psi = wrap(psi + dt * (parameters[K_PSI] * G * tan(phi) / speed + parameters[B_PSI]))
+        mean_tan = 0.5 * (tan(phi_before) + tan(phi))
+        psi = wrap(psi + dt * (parameters[K_PSI] * G * mean_tan / speed + parameters[B_PSI]))
         speed += dt * (accel + G * v[2] / speed)
-        for j in range(3):
-            p[j] += dt * v[j]
     return len(out)
 
 

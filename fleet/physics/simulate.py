@@ -111,7 +111,7 @@ def simulate(
     phi_c, theta_c = command[0], command[1]
     delta, actuator_state, gain = command[2:].copy(), command[2:].copy(), 1.0 - np.exp(-dt / tau)
     change, delta_mean = np.empty(4), np.empty(4)  # the loop allocates no array
-    work, v, euler = np.empty((3, N_X)), np.empty(3), np.empty(3)
+    work, v, v_before, euler = np.empty((3, N_X)), np.empty(3), np.zeros(3), np.empty(3)
     Va_last, Va_dot = (sqrt(x[0] ** 2 + x[1] ** 2 + x[2] ** 2) + air[3]) / air[2], 0.0
     gust_decay, gust_fraction = exp(-dt / GUST_S), 1.0
     max_speed = 3.0 * max(trim[0], 5.0)
@@ -119,14 +119,15 @@ def simulate(
         V = sqrt(x[0] ** 2 + x[1] ** 2 + x[2] ** 2)
         if not (abs(x[6]) < 1.4 and abs(x[7]) < 1.2 and 3.0 < V < max_speed):
             return k
-        for i in range(3):
-            out[k, i] = p[i]
-        for i in range(N_X):
-            out[k, 3 + i] = x[i]
-        out[k, 11] = wrap(x[8])
         v[0], v[1], v[2] = _body_to_ned(x[0], x[1], x[2], x[6], x[7], x[8])
         v[0] += air[0]
         v[1] += air[1]
+        for i in range(3):
+            p[i] += 0.5 * dt * (v_before[i] + v[i]) if k > 0 else 0.0  # trapezoidal rule: no lag in turns
+            out[k, i], v_before[i] = p[i], v[i]
+        for i in range(N_X):
+            out[k, 3 + i] = x[i]
+        out[k, 11] = wrap(x[8])
         Va = (V + gust_fraction * air[3]) / air[2]
         euler[0], euler[1], euler[2] = x[6], x[7], out[k, 11]
         if k % GUIDE_EVERY == 0:
@@ -144,8 +145,6 @@ def simulate(
         else:
             _linear_step(lon, lon_mean, lat, lat_mean, x, delta)
         gust_fraction *= gust_decay
-        for i in range(3):
-            p[i] += v[i] * dt
     return len(out)
 
 

@@ -5,6 +5,7 @@ import io
 import json
 import re
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterable
 from datetime import timedelta
@@ -18,9 +19,9 @@ from fleet import SOURCES, cli
 from fleet.access.entry import BusConfig
 from fleet.access.knock import _remedy
 from fleet.bus.session import open_router
-from fleet.commands.live.status import machines, processes
+from fleet.commands.live.status import machines, processes, watch
 from fleet.contract import Claim, FleetRow, FleetState, GatewayCounters, LinkCounters, Status, TwinState
-from fleet.health import claims, machine
+from fleet.health import claims, machine, ports
 from fleet.health import claims as door
 from fleet.health.machine import BAD, NOTE, OK
 from fleet.report.report_text import id_ranges
@@ -111,8 +112,8 @@ def test_the_port_our_own_gateway_has_is_no_finding() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held:
         with contextlib.suppress(OSError):  # some gateway of this machine may hold it just as well
             held.bind(("0.0.0.0", machine.MAVLINK_PORT))
-        assert machine.mavlink_port(["udpin:0.0.0.0:14550"]).grade == OK
-        taken = machine.mavlink_port(["udpin:0.0.0.0:14551"])
+        assert ports.mavlink_port(["udpin:0.0.0.0:14550"]).grade == OK
+        taken = ports.mavlink_port(["udpin:0.0.0.0:14551"])
         assert taken.grade == NOTE and "--link udpin" in taken.sentence
 
 
@@ -226,6 +227,30 @@ def test_status_tells_which_machine_does_what() -> None:
     assert lines[1].split() == ["gs", "gateway", "0-3", "40", "messages/s"]
     assert lines[2].split()[:5] == ["m1", "worker", ONE, "0-2,", "5"] and "is leaving; busy" in lines[2]
     assert "\x1b" not in captured.get()
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_status_is_repeated_until_it_is_stopped_and_a_late_prediction_is_red(*, terminal: bool) -> None:
+    stop, out = threading.Event(), io.StringIO()
+
+    def rows(*_: object) -> list[tuple[FleetState, None]]:
+        age = next(ages)
+        if age > 60:
+            stop.set()
+        row = FleetRow(uav=7, state=TwinState.VERIFIED, verdict="", worker=ONE, prediction_age_s=age)
+        return [(FleetState(t=1.0, rows=(row,)), None)]
+
+    bus = of(claim(ONE, (7,)), uavs=(7,))
+    stop.wait = lambda _=None: stop.is_set()  # type: ignore[method-assign, assignment]
+    # `processes` asks for the same message, so each look takes two
+    ages = iter([0.4, 0.4, 5.1, 5.1, 61.0, 61.0])
+    bus.declare_queryable(FleetState, rows)
+    console = Console(file=out, width=120, force_terminal=terminal, color_system="standard" if terminal else None)
+    assert watch(bus, stop, console) == 0  # type: ignore[arg-type]
+    shown = out.getvalue()
+    assert 3 <= shown.count("until Ctrl-C") <= 4 and "gateway" in shown
+    red = [f"\x1b[31m{age}" in shown for age in ("0.4", "5.1", "61.0")]
+    assert red == ([False, True, True] if terminal else [False] * 3)
 
 
 def test_ids_are_written_as_spans() -> None:

@@ -72,6 +72,8 @@ VERDICT = Verdict(
     horizon_s=4.0,
     threshold=90.0,
     attempts=2,
+    derivative_error={"roll_damping": -22.0},
+    detectable_error={"aileron_effectiveness": 14.0},
 )
 DERIVATIVES = Derivatives(
     names=("X_0", "w_n"),

@@ -252,7 +252,7 @@ def test_what_comes_over_the_bus_is_escaped_everywhere(clock: Clock) -> None:
 
 def test_who_has_no_prediction_is_told_why(clock: Clock) -> None:
     feed, _, bus = feed_of(clock, 2)
-    assert "needs a verified model" in " ".join(limitations(feed.vehicles[1], clock.now))
+    assert "needs a plausible model" in " ".join(limitations(feed.vehicles[1], clock.now))
     assert "window has 41 samples" in status_html(feed.vehicles[1], DARK, clock.now)
     bus.publish(Status(uav=1, t=T, link=Link.LOST, sentence="no heartbeat for 6 s"))
     clock.now += 6

@@ -189,8 +189,12 @@ STORIES = {
             (0, EventKind.NO_MODEL, "no model yet: below threshold"),
             (4, EventKind.VERIFIED, "model verified: mean fit 88 %"),
             (20, EventKind.UNVERIFIED, "no verification for 12 s (diverged); an earlier model stays active"),
-            (28, EventKind.ACCEPTED, "model verified again"),
+            (28, EventKind.ACCEPTED, "model accepted again"),
         ],
+    ),
+    "a model that is only plausible is named so": (
+        [model(2, Outcome.PLAUSIBLE, in_force=True), model(6, Outcome.VERIFIED, in_force=True)],
+        [(2, EventKind.VERIFIED, "model plausible: mean fit 88 %")],
     ),
     "verdicts that alternate are not told one by one": (
         [model(t, Outcome.VERIFIED if t % 4 else Outcome.DIVERGED, in_force=True) for t in range(2, 90, 2)],

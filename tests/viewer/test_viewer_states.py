@@ -8,14 +8,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from fleet.contract import GatewayCounters, LinkCounters, Status
+from fleet.contract import GatewayCounters, LinkCounters, Outcome, Status, TwinState
 from gateway.link_spec import read_spec
 from gateway.links.recorded import ReplayLink
 from gateway.pipeline import Pipeline
 from tests.gateway.test_gateway import flight
 from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import HOSTILE, STAMP, Clock, PretendUav, T, feed_of
-from viewer.panels.detail import status_html
+from viewer.panels.detail import figures_html, status_html
 from viewer.scene.camera import set_initial_view
 from viewer.scene.fleet_arrays import display_status
 from viewer.scene.ground import RINGS_M
@@ -178,6 +178,30 @@ def test_a_verified_model_is_green_only_with_fit_and_horizon(
     page = status_html(vehicle, DARK, clock.now)
     assert told in page and "without the route" in page and f"{horizon_s:.0f} s" in page
     assert (f"border-color:{DARK.verified}" in page) == (fit > 50)
+
+
+def test_a_plausible_model_has_its_own_colour_and_a_verified_one_its_power(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 5)
+    one = PretendUav(4)
+    text = "uav-4: fit 88 %; consistent, would have detected an error of 14 % in aileron effectiveness"
+    verified = msgspec.structs.replace(
+        one.model(T).verdict,
+        outcome=Outcome.VERIFIED,
+        sentence=text,
+        detectable_error={"aileron_effectiveness": 14.2, "<b>": 20.0},
+    )
+    plausible = msgspec.structs.replace(verified, outcome=Outcome.PLAUSIBLE, detectable_error={})
+    for k, (verdict, state) in enumerate(((plausible, TwinState.PLAUSIBLE), (verified, TwinState.VERIFIED))):
+        bus.publish(msgspec.structs.replace(one.model(T + 1 + k), verdict=verdict, active_verdict=verdict), STAMP)
+        bus.publish(msgspec.structs.replace(one.prediction(T + 1 + k, 0.0), state=state, horizon_s=34.0), STAMP)
+        vehicle, colour = feed.get(4), DARK.plausible if k == 0 else DARK.verified
+        vehicle.row = msgspec.structs.replace(vehicle.row, state=state)
+        label, page = status_label(vehicle, DARK, clock.now), status_html(vehicle, DARK, clock.now)
+        assert (label.text, label.colour) == (state.value, colour) and f"border-color:{colour}" in page
+        assert STATUS_COLOURS[display_status(vehicle, clock.now)] == state.value
+        figures = figures_html(vehicle, clock.now)
+        assert ("would have detected an error of: aileron effectiveness 14 %, &lt;b&gt; 20 %" in figures) == (k == 1)
+    assert "would have detected an error of 14 % in aileron effectiveness" in page
 
 
 def test_a_horizon_that_has_passed_is_none_everywhere(clock: Clock) -> None:

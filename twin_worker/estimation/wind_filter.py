@@ -3,10 +3,12 @@
 from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass
-from math import atan2, cos, exp, hypot, inf, isfinite, log, sin, sqrt
+from math import asin, atan2, cos, exp, hypot, inf, isfinite, log, sin, sqrt
 
 import numpy as np
 
+from fleet.autopilots.control_law import eas2tas
+from fleet.frames import G, air_direction, wrap
 from fleet.physics.kernel import kernel
 from twin_worker.telemetry.history import TelemetryHistory
 
@@ -22,7 +24,9 @@ _HEADING_WALKS = (
 )  # random walk of the heading bias: constant, drifting [rad per sqrt(s)]
 _EVIDENCE_S = 60.0  # time constant of the log-likelihood ratio of the two walks [s]
 _EVIDENCE = 3.0  # log-likelihood ratio from which the bias drifts: 20 to 1
+_AIRSPEED_S = 30.0  # time constant of the mean airspeed: longer than gusts [s]
 _SIGMA = 1.0  # sideslip and sensors in one ground-velocity component [m/s]
+_YAW_LAG_S = 1.0  # between bank and turn of the nose [s]
 _GATE = 25.0  # normalised innovation squared (NIS) from which a row is rejected
 _NIS_AVERAGE_S = 60.0  # time constant of the mean NIS [s]
 _MIN_NIS, _MAX_NIS = 0.05, 10.0  # bounds of the mean NIS [-]
@@ -38,8 +42,12 @@ def _predict_and_correct(
     dt: float,
     c: float,
     s: float,
+    mean_airspeed: float,
+    north_before: float,
+    east_before: float,
     north: float,
     east: float,
+    variance: float,
     gate: float,
     drift: float,
     heading_walk: float,
@@ -49,21 +57,27 @@ def _predict_and_correct(
     Args:
         x, P: state (8,) and covariance (8, 8), changed in place
         dt: time since the previous row [s]
-        c, s: horizontal reported air velocity along north and east, by the heading [m/s]
+        c, s: horizontal reported air velocity along north and east, by the attitude [m/s]
+        mean_airspeed: of the last half minute, reported [m/s]
+        north_before, east_before: ground velocity of the previous row [m/s]
         north, east: ground velocity [m/s]
+        variance: of sideslip and sensors in each of its components [m2/s2]
         gate: NIS from which the correction is skipped
         drift: standard deviation of the slow changes of the wind [m/s]
         heading_walk: random walk of the heading bias [rad per sqrt(s)]
     Returns:
         the normalised innovation squared (NIS); the log-likelihood of the row without its constant
-    Source: Bar-Shalom 2001, 5.2.4 (Joseph form).
+
+    A gust changes the readings of airspeed and heading at once and the ground velocity late: corrections weighted with
+    these readings reduce the scale by 1 to 3 %. Instruments that a gust does not change weigh them: the mean airspeed,
+    and the direction of the previous ground velocity minus the wind.
+    Source: Bar-Shalom 2001, 5.2.4 (Joseph form); Söderström & Stoica 1983 (instrumental variables).
     """
     decay, H, HP, y = np.ones(8), np.zeros((2, 8)), np.zeros((2, 8)), np.empty(2)
     for i in range(2):
         decay[4 + i], decay[6 + i] = exp(-dt / DRIFT_S), exp(-dt / GUST_S)
         H[i, 2 + i] = H[i, 4 + i] = H[i, 6 + i] = 1.0
-    H[0, 0], H[0, 1], H[1, 0], H[1, 1] = c, -s, s, c
-    y[0], y[1] = north, east
+    y[0], y[1] = north - c * x[0] + s * x[1], east - s * x[0] - c * x[1]
     for i in range(8):
         x[i] *= decay[i]
         for j in range(8):
@@ -75,26 +89,38 @@ def _predict_and_correct(
     P[1, 1] += (heading_walk * x[0]) ** 2 * dt
     P[0, 1] -= heading_walk**2 * x[0] * x[1] * dt
     P[1, 0] -= heading_walk**2 * x[0] * x[1] * dt
+    n, e = north_before - x[2] - x[4], east_before - x[3] - x[5]
+    calm_speed = sqrt((n * n + e * e) * (x[0] * x[0] + x[1] * x[1]))
+    if calm_speed > 3.0:  # the instruments; else the readings themselves
+        c, s = mean_airspeed * (n * x[0] + e * x[1]) / calm_speed, mean_airspeed * (e * x[0] - n * x[1]) / calm_speed
+    H[0, 0], H[0, 1], H[1, 0], H[1, 1] = c, -s, s, c
     for k in range(2):
         for i in range(8):
-            y[k] -= H[k, i] * x[i]
+            if i > 1:
+                y[k] -= H[k, i] * x[i]
             for j in range(8):
                 HP[k, i] += H[k, j] * P[j, i]
     S00 = S01 = S11 = 0.0
     for i in range(8):
         S00, S01, S11 = S00 + HP[0, i] * H[0, i], S01 + HP[0, i] * H[1, i], S11 + HP[1, i] * H[1, i]
-    S00, S11 = S00 + _SIGMA**2, S11 + _SIGMA**2
+    S00, S11 = S00 + variance, S11 + variance
     det = S00 * S11 - S01 * S01
     a, b = (S11 * y[0] - S01 * y[1]) / det, (S00 * y[1] - S01 * y[0]) / det
     nis = y[0] * a + y[1] * b
     if nis < gate:
-        _correct(x, P, H, HP, np.array((a, b)), np.array((S11 / det, -S01 / det, S00 / det)))
+        _correct(x, P, H, HP, np.array((a, b)), np.array((S11 / det, -S01 / det, S00 / det)), variance)
     return nis, -0.5 * (min(nis, _GATE) + log(det))
 
 
 @kernel
 def _correct(
-    x: np.ndarray, P: np.ndarray, H: np.ndarray, HP: np.ndarray, weighted: np.ndarray, S_inv: np.ndarray
+    x: np.ndarray,
+    P: np.ndarray,
+    H: np.ndarray,
+    HP: np.ndarray,
+    weighted: np.ndarray,
+    S_inv: np.ndarray,
+    variance: float,
 ) -> None:
     K, A, AP = np.empty((8, 2)), np.eye(8), np.zeros((8, 8))
     for i in range(8):
@@ -108,7 +134,7 @@ def _correct(
                 AP[i, j] += A[i, k] * P[k, j]
     for i in range(8):
         for j in range(8):
-            P[i, j] = _SIGMA**2 * (K[i, 0] * K[j, 0] + K[i, 1] * K[j, 1])
+            P[i, j] = variance * (K[i, 0] * K[j, 0] + K[i, 1] * K[j, 1])
             for k in range(8):
                 P[i, j] += AP[i, k] * A[j, k]
 
@@ -117,8 +143,9 @@ def _correct(
 class WindFilter:
     """Estimate a, b, mean, drift, gust of  v = Va cos(gamma) (a e(psi) + b e(psi + 90 deg)) + mean + drift + gust.
 
-    a, b are airspeed scale times cosine and sine of the heading bias. The mean is a random walk. Drift and gust are
-    first-order Gauss-Markov processes, which separates gusts from wind. The heading bias is constant, or drifts as that
+    psi is the direction by the attitude (`fleet.frames.air_direction`); a, b are airspeed scale times cosine and sine
+    of the heading bias. The mean is a random walk. Drift and gust are first-order Gauss-Markov processes, which
+    separates gusts from wind. The heading bias is constant, or drifts as that
     of an attitude estimate in a long turn does: both hypotheses are filtered, and the likelihood of the flight selects.
     How much the wind drifts depends on the weather: three standard deviations are filtered, and their posterior mean
     variance tells how much the wind may change in the next minutes. The state is that of the middle one.
@@ -133,9 +160,12 @@ class WindFilter:
     _drift_evidence: np.ndarray  # log-likelihood of each drift, without their mean, (3,)
     _row_count: int
     _mean_nis: np.ndarray  # (3, 2)
+    _mean_airspeed: float  # reported [m/s]
+    _ground: tuple[float, float]  # ground velocity of the newest row, north, east [m/s]
+    _scale: float  # true over reported airspeed, expected at the first row [-]
 
     def __init__(self) -> None:
-        self.t = -np.inf
+        self.t, self._scale = -np.inf, 1.0
         self._reset()
 
     @property
@@ -157,21 +187,32 @@ class WindFilter:
         """Return its covariance, (8, 8)."""
         return self._P[self._selected]
 
-    def update(self, t: float, ground: Iterable[float], Va: float, psi: float) -> None:
-        """Update with one row: ground velocity NED (3,) [m/s], reported airspeed [m/s], heading [rad]."""
+    def update(self, t: float, ground: Iterable[float], Va: float, psi: float, p: float = 0.0) -> None:
+        """Update with one row.
+
+        Args:
+            t: time [s since 1970]
+            ground: ground velocity NED, (3,) [m/s]
+            Va: reported airspeed [m/s]
+            psi: direction of the velocity through the air by the reported attitude [rad]
+            p: roll rate; the nose follows the turn late, which is sideslip while the bank changes [rad/s]
+        """
         dt = min(t - self.t, 5.0) if isfinite(self.t) else 0.2
         north, east, down = map(float, ground)
         if dt <= 0 or not 3.0 <= Va < _MAX_SPEED or not hypot(north, east, down) < _MAX_SPEED:
             return
         self.t = t
+        self._mean_airspeed += min(dt / _AIRSPEED_S, 1.0) * (Va - self._mean_airspeed) if self._row_count else Va
         level = Va * sqrt(max(1 - (down / Va) ** 2, 0.25))
         self._row_count += 1
         gate = inf if self._row_count < 50 else _GATE
-        along, across = level * cos(psi), level * sin(psi)
+        readings = (dt, level * cos(psi), level * sin(psi), self._mean_airspeed, *self._ground, north, east)
+        self._ground = north, east
+        variance = _SIGMA**2 + (_YAW_LAG_S * G * p) ** 2
         likelihood = np.empty((len(_DRIFTS), 2))
         for i, drift in enumerate(_DRIFTS.tolist()):
             for j, walk in enumerate(_HEADING_WALKS):
-                row = (self._x[i, j], self._P[i, j], dt, along, across, north, east, gate, drift, walk)
+                row = (self._x[i, j], self._P[i, j], *readings, variance, gate, drift, walk)
                 nis, likelihood[i, j] = _predict_and_correct(*row)  # type: ignore[call-arg]
                 self._mean_nis[i, j] += dt / _NIS_AVERAGE_S * (min(nis, _GATE) / 2 - self._mean_nis[i, j])
         ratio = likelihood[:, 1] - likelihood[:, 0]
@@ -187,13 +228,24 @@ class WindFilter:
         total = self._x[..., 2:4] + self._x[..., 4:6]
         return bool((np.hypot(total[..., 0], total[..., 1]) < _MAX_WIND).all() and np.isfinite(self._P).all())
 
+    def expect_scale(self, altitude: float) -> None:
+        """Begin with the scale of the standard atmosphere at an altitude [m]; ignored after the first row.
+
+        Most autopilots report equivalent, some true airspeed: half of the difference is a standard deviation.
+        """
+        if not self._row_count:
+            self._scale = eas2tas(altitude)
+            self._reset()
+
     def _reset(self) -> None:
         """Reset the estimates to zero wind; the time stays."""
         drifts, walks = len(_DRIFTS), len(_HEADING_WALKS)
-        self._x = np.tile([1.0, *np.zeros(7)], (drifts, walks, 1))
+        self._x = np.tile([self._scale, *np.zeros(7)], (drifts, walks, 1))
         self._P = np.tile(np.diag(_INITIAL_SIGMA**2), (drifts, walks, 1, 1))
+        self._P[..., 0, 0] += (0.5 * (self._scale - 1.0)) ** 2
         self._P[..., [4, 5], [4, 5]] = (_DRIFTS**2)[:, None, None]
         self._row_count, self._mean_nis = 0, np.ones((drifts, walks))
+        self._mean_airspeed, self._ground = 0.0, (0.0, 0.0)
         self._walk_evidence, self._drift_evidence = np.zeros(drifts), np.zeros(drifts)
 
     def reset_wind(self, t: float, wind: np.ndarray) -> None:
@@ -263,6 +315,13 @@ class WindFilter:
 
 _ROW_INTERVAL_S = 0.199  # interval of the rows used [s]
 _STALE_S = 0.5  # older airspeed and heading are not combined with a velocity [s]
+_MIN_AIRSPEED, _MAX_PATH_SINE, _MAX_BANK = 3.0, 0.5, 1.2  # bounds of the direction by attitude [m/s, -, rad]
+
+
+def reported_direction(phi: float, theta: float, psi: float, down: float, Va: float) -> float:
+    """Return the direction through the air by reported attitude [rad], sink rate and airspeed [m/s], [rad]."""
+    gamma = -asin(min(max(down / max(Va, _MIN_AIRSPEED), -_MAX_PATH_SINE), _MAX_PATH_SINE))
+    return float(air_direction(min(max(phi, -_MAX_BANK), _MAX_BANK), theta, psi, gamma))
 
 
 def update_from_history(
@@ -279,14 +338,27 @@ def update_from_history(
     times, velocity = history.rows_since("velocity", since)
     air_times, air = history.rows_since("air", since - 1.0)
     att_times, attitude = history.rows_since("attitude", since - 1.0)
+    position_times, position = history.rows_since("position", since - 1.0)
+    if len(position_times):
+        wind_filter.expect_scale(float(position[-1, 2]) * 1e-3)
     t_air, t_att = air_times.tolist(), att_times.tolist()  # bisect on a short list is faster than on an array
-    if not (t_air and t_att):
-        return last_t
     for t, ground in zip(times.tolist(), velocity.tolist(), strict=True):
         if t - last_t < _ROW_INTERVAL_S or t >= until:
             continue
-        i, j = bisect_left(t_air, t) - 1, bisect_left(t_att, t) - 1
-        if i >= 0 and j >= 0 and t - t_air[i] < _STALE_S and t - t_att[j] < _STALE_S:
+        i, j = bisect_left(t_air, t), bisect_left(t_att, t)
+        if i == len(t_air) or j == len(t_att):
+            break  # not received yet
+        if i and j and t - t_air[i - 1] < _STALE_S and t - t_att[j - 1] < _STALE_S:
             last_t = t
-            wind_filter.update(t, ground, float(air[i, 0]), float(attitude[j, 2]))
+            Va = _between(air_times, air[:, 0], i, t)
+            phi, theta = _between(att_times, attitude[:, 0], j, t), _between(att_times, attitude[:, 1], j, t)
+            turned = wrap(attitude[j, 2] - attitude[j - 1, 2])
+            psi = attitude[j - 1, 2] + (t - t_att[j - 1]) / (t_att[j] - t_att[j - 1]) * turned
+            p = (attitude[j, 0] - attitude[j - 1, 0]) / (t_att[j] - t_att[j - 1])
+            wind_filter.update(t, ground, Va, reported_direction(phi, theta, psi, ground[2], Va), float(p))
     return last_t
+
+
+def _between(times: np.ndarray, values: np.ndarray, k: int, t: float) -> float:
+    """Interpolate linearly between rows k - 1 and k."""
+    return float(values[k - 1] + (t - times[k - 1]) / (times[k] - times[k - 1]) * (values[k] - values[k - 1]))

@@ -1,6 +1,6 @@
 """`python -m twin_worker.evaluation.replay FILE…`: replay recordings through the twins, offline.
 
-Per UAV: vehicle, predictions by method, time of the first verified model, the share of predictions within 10 %
+Per UAV: vehicle, predictions by method, time of the first plausible or verified model, share of predictions within 10 %
 (relative error M1) up to 10, 30, 60 and 120 s (predictions that an event ends are censored), and the last sentences.
 """
 
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from fleet.cli import make_parser, run_command
-from fleet.contract import Message, Model, Outcome, Prediction
+from fleet.contract import Message, Model, Prediction
 from fleet.process.logs import report_progress
 from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
 from fleet.telemetry.recording.recordings import replay_messages
@@ -89,7 +89,7 @@ def replay(messages: Iterable[Message], progress: str = "") -> dict[str, dict[st
                 uav_summary.sentence = result.sentence
             elif isinstance(result, Model):
                 uav_summary.verdict = result.verdict.sentence
-                if result.verdict.outcome is Outcome.VERIFIED and uav_summary.verified_s is None:
+                if result.verdict.outcome.is_accepted and uav_summary.verified_s is None:
                     uav_summary.verified_s = result.t - start
         _collect_passages(uav_summary, twins[message.uav])
     for uav, twin in twins.items():

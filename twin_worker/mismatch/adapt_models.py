@@ -27,7 +27,7 @@ from twin_worker.twin.steps.rollouts import method_paths
 
 _CHECKPOINT_MARGIN_S = 2.0  # a checkpoint nearer to the onset can contain the effect already [s]
 _HINDCAST_S = (20.0, 15.0, 10.0)  # newest flight simulated with both models, from several starts [s]
-_MAX_ERROR_RATIO = 0.95  # the adapted model is used if its error is below this share of the present error [-]
+_MAX_ERROR_RATIO = 0.95  # the adapted model is used if its mean error is below this share of the present one [-]
 _EFFECT_UNCERTAINTY = 0.3  # relative uncertainty of an effect's increments: diagnosis and baseline are not exact [-]
 _RIDGE = 0.02  # regularisation of an increment towards zero, as a share of its term's length
 _PRIOR_SPAN_S = 60.0  # assumed data span of the adapted model; its weight fades as that of earlier data does [s]
@@ -60,7 +60,7 @@ class AdaptationResult:
 
 
 def adapt_models(twin: Twin, outputs: EffectOutputs, names: str) -> AdaptationResult:
-    """Add diagnosed effects to the models of a twin if this lowers the error over the newest flight.
+    """Add diagnosed effects to the models of a twin if this lowers the error over the newest flight from every start.
 
     Args:
         twin: changed in place only if the error is lower
@@ -77,7 +77,8 @@ def adapt_models(twin: Twin, outputs: EffectOutputs, names: str) -> AdaptationRe
     if not pairs:
         return AdaptationResult()
     present_error, adapted_error = np.mean(pairs, axis=0).tolist()
-    if not adapted_error < _MAX_ERROR_RATIO * present_error:
+    is_lower_everywhere = all(adapted < present for present, adapted in pairs)
+    if not (is_lower_everywhere and adapted_error < _MAX_ERROR_RATIO * present_error):
         return AdaptationResult(False, present_error, adapted_error)
     twin.environment.set_wind(adapted.environment.wind, adapted.environment.wind_t)
     twin.models.adopt(adapted.models, ActiveEffects(names, outputs.onset))
@@ -103,7 +104,7 @@ def _adapted_copy(twin: Twin, outputs: EffectOutputs, checkpoint: Checkpoint) ->
     after_onset = window.part(min(int(np.searchsorted(window.t, outputs.onset)), len(window) - 2), len(window))
     if checkpoint.derivatives_model is not None and twin.models.active_verdict is not None:
         plant = adapted_derivatives(checkpoint.derivatives_model, outputs, window)
-        verdict = msgspec.structs.replace(twin.models.active_verdict, outcome=Outcome.VERIFIED)
+        verdict = msgspec.structs.replace(twin.models.active_verdict, outcome=Outcome.PLAUSIBLE)
         adapted.identification.store_prior(plant)
         adapted.models.activate(VerifiedModel(plant, verdict, float(window.t[-1]), np.nan))
     if checkpoint.point_mass is not None:

@@ -40,7 +40,7 @@ _SUSPEND_S, _MAX_SUSPEND_S = 60.0, 3600.0  # after an internal error, doubled ea
 _SAME_ONSET_S = 20.0  # findings of one effect with onsets further apart count as different [s]
 _CLEAR_COUNT = 2  # consecutive diagnoses without a finding that clear a mismatch
 _CONFIRMED = (DiagnosisOutcome.NAMED, DiagnosisOutcome.UNKNOWN)
-_VALID_OUTCOMES = (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST, Outcome.INSUFFICIENT_DATA)
+_VALID_OUTCOMES = (Outcome.VERIFIED, Outcome.PLAUSIBLE, Outcome.WORSE_THAN_LAST, Outcome.INSUFFICIENT_DATA)
 
 
 @dataclass

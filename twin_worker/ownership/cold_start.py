@@ -13,13 +13,11 @@ from fleet.contract import (
     Message,
     Mission,
     Model,
-    Outcome,
     Params,
     Prediction,
     Rows,
     Sample,
     Status,
-    TwinState,
 )
 from fleet.physics.wrench import N_PAR, NAMES
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel, prior
@@ -97,13 +95,13 @@ def restore_model(twin: Twin, model: Model) -> bool:
     the model's own window, so that no data count twice when that window is identified again.
     """
     plant = _decode_model(twin, model)
-    if plant is None or model.active_verdict is None or model.active_verdict.outcome is not Outcome.VERIFIED:
+    if plant is None or model.active_verdict is None or not model.active_verdict.outcome.is_accepted:
         return False
     sentence = f"{model.active_verdict.sentence}; taken over from another worker"
     verdict = msgspec.structs.replace(model.active_verdict, sentence=sentence)
     twin.models.activate(VerifiedModel(plant, verdict, model.t, float("nan")))
     twin.identification.restore(model, verdict, plant)
-    twin.prediction.set_state(TwinState.VERIFIED)
+    twin.prediction.set_state(twin.models.state)
     twin.environment.wind.reset_wind(model.t, np.array([model.wind_n, model.wind_e, 0.0]))
     return True
 

@@ -25,7 +25,7 @@ from fleet.telemetry.recording.options import NO_OPTIONS, RecordingOptions
 from fleet.telemetry.recording.recordings import replay_messages
 from fleet.window import STATES as ALL
 from fleet.window import Window
-from twin_worker.estimation.wind_filter import WindFilter
+from twin_worker.estimation.wind_filter import WindFilter, reported_direction
 from twin_worker.identification.fixed_wing.derivatives_model import identify
 from twin_worker.identification.linear.linear_model import AXES, INPUTS, STATES, AxisModel
 from twin_worker.identification.linear.multiple_shooting import refine_with_starts
@@ -108,7 +108,9 @@ def _wind(history: TelemetryHistory, recording: Window) -> np.ndarray:
     Va = np.interp(recording.t, t_air, air[:, 0])
     for k in range(0, len(recording), every):
         if recording.ok[k]:
-            filt.update(float(recording.t[k]), recording.v[k], float(Va[k]), float(recording.x[k, 8]))
+            phi, theta, psi = recording.x[k, 6:].tolist()
+            direction = reported_direction(phi, theta, psi, float(recording.v[k, 2]), float(Va[k]))
+            filt.update(float(recording.t[k]), recording.v[k], float(Va[k]), direction)
         wind[k : k + every] = filt.wind
     return wind
 

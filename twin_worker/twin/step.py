@@ -225,12 +225,11 @@ def _update_link(twin: Twin, now: float) -> list[Message]:
     if lost == twin.telemetry.link_lost:
         return []
     twin.telemetry.set_link(lost, now)
-    model_state = TwinState.WAITING if twin.models.active_model is None else TwinState.VERIFIED
     plan = failsafe_plan(twin) if lost else None
     if plan is not None and plan.steps:  # another route than that of the open predictions, which say nothing of it
         twin.confidence.tracker.censor_open()
         twin.prediction.expire()  # the newest ensemble flew that route as well
-    twin.prediction.set_state(TwinState.LINK_LOST if lost else model_state)
+    twin.prediction.set_state(TwinState.LINK_LOST if lost else twin.models.state)
     record_event(
         twin, Event.LINK_LOST if lost else Event.LINK_RESTORED, now, f"no sample for {silence_s:.1f} s" if lost else ""
     )

@@ -1,4 +1,4 @@
-"""Verify a model: free runs on held-out data against a threshold, persistence and the active model.
+"""Verify a model on held-out data: free runs against a threshold, persistence and the active model; consistency.
 
 fit = 100 (1 - ||y - y_hat|| / ||y - mean(y)||).  Source: Huang 2021, eq. 22.
 """
@@ -9,7 +9,9 @@ import numpy as np
 
 from fleet.contract import Outcome, Verdict
 from fleet.window import STATES, Window
+from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
 from twin_worker.identification.fixed_wing.plant import Plant, is_finite
+from twin_worker.validation.consistency import MAX_DETECTABLE, error_text, estimate_errors, has_power, power_text
 from twin_worker.validation.held_out import HeldOut
 
 LAGS = 20  # samples
@@ -124,6 +126,8 @@ def verify(
 ) -> Verdict:
     """Verify a model on held-out data: above the threshold, better than persistence, no worse than the active model.
 
+    A derivatives model that passes is plausible; `with_consistency` verifies it. Linear axes have the threshold only.
+
     Args:
         plant: the model
         window: flight; rows from `start` on are held out
@@ -153,6 +157,8 @@ def verify(
             outcome, reason = Outcome.WORSE_THAN_LAST, f"the active model has {active_fit:.0f} % and stays active"
         elif outcome in (Outcome.BELOW_THRESHOLD, Outcome.DIVERGED) and active_fit <= threshold:
             outcome, reason = Outcome.DRIFTING, f"active model {active_fit:.0f} %: aircraft or air has changed"
+    if outcome is Outcome.VERIFIED and isinstance(plant, DerivativesModel):
+        outcome = Outcome.PLAUSIBLE
     if not is_finite(plant):
         outcome, reason = Outcome.DIVERGED, "the model is not finite; trying again"
     return Verdict(
@@ -162,6 +168,28 @@ def verify(
         fit_persistence=persistence,
         horizon_s=horizon,
         threshold=threshold,
+    )
+
+
+def with_consistency(verdict: Verdict, plant: Plant, window: Window, start: int) -> Verdict:
+    """Test a plausible model for consistency with held-out data; verified if it passes and its power is stated."""
+    if verdict.outcome is not Outcome.PLAUSIBLE or not isinstance(plant, DerivativesModel):
+        return verdict
+    errors = estimate_errors(plant, window, start)
+    failed, power = (errors.failed(), errors.power()) if errors is not None else ({}, {})
+    verified = not failed and has_power(power)
+    if failed:
+        reason = f"plausible only: {error_text(failed)}"
+    elif not verified:
+        reason = f"plausible only: no error of derivatives up to {MAX_DETECTABLE:.0%} would be detected in both axes"
+    else:
+        reason = f"consistent, {power_text(power)}"
+    return msgspec.structs.replace(
+        verdict,
+        outcome=Outcome.VERIFIED if verified else Outcome.PLAUSIBLE,
+        sentence=f"{verdict.sentence}; {reason}",
+        derivative_error=failed,
+        detectable_error=power,
     )
 
 

@@ -274,6 +274,7 @@ class Browser:
         self.absence: Absence | None = None  # until its events are marked as read
         self.uav: int | None = None  # stored selection, until a UAV is selected
         self.light: bool | None = None  # light theme; None: not chosen
+        self.aviation = False  # speeds in knots and heights in feet
         self.layout = Layout()
         self._saved, self._loaded = "", False
         self._selected: int | None = None  # UAV stored last
@@ -303,6 +304,7 @@ class Browser:
             values = json.loads(text[:200])
             if isinstance(values, dict):
                 uav, light = values.get("uav"), values.get("light")
+                self.aviation = values.get("aviation") is True
                 self.uav = uav if isinstance(uav, int) and not isinstance(uav, bool) else None
                 self.light = light if isinstance(light, bool) else None
 
@@ -317,10 +319,17 @@ class Browser:
         self.save(self._selected)
         self._wake()
 
+    def set_units(self, *, aviation: bool) -> None:
+        """Select the units and store them."""
+        self.aviation = aviation
+        self.save(self._selected)
+        self._wake()
+
     def save(self, uav: int | None) -> None:
-        """Store selection and theme in the browser when they changed and were loaded before."""
+        """Store selection, theme and units in the browser when they changed and were loaded before."""
         self._selected = uav
-        text = json.dumps({"uav": uav if self.uav is None else self.uav, "light": self.light})
+        stored = {"uav": uav if self.uav is None else self.uav, "light": self.light}
+        text = json.dumps(stored | ({"aviation": True} if self.aviation else {}))
         if self._loaded and text != self._saved:
             self._saved = text
             self._storage.set_item(PREFERENCES_KEY, text)

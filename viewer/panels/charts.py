@@ -9,6 +9,7 @@ from viewer.store.forecast import LOOK_AHEADS_S, prediction_errors, rms_by_look_
 from viewer.store.place import UNIT_M
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
+from viewer.text.units import METRIC, Units
 from viewer.text.words import is_located
 from viewer.theme.palette import Palette
 
@@ -33,14 +34,11 @@ class Charts:
             (placeholder,) * 3,
         )
         self._fit = self._chart("Mean fit per verdict, %", (("fit", p.verified),), (placeholder, placeholder))
-        self._alt = self._chart("Altitude, m", (("flown", p.actual), ("predicted", p.predicting)), (placeholder,) * 3)
+        self._alt_lines, self._units = (("flown", p.actual), ("predicted", p.predicting)), METRIC
+        self._alt = self._chart("Altitude, m", self._alt_lines, (placeholder,) * 3)
 
     def _chart(self, title: str, lines: tuple, data: tuple) -> tuple[Any, Any]:
-        legend = " ".join(
-            f'<span class="soft" style="white-space:nowrap"><span style="color:{colour}">━</span> {name}</span>'
-            for name, colour in lines
-        )
-        head = self._gui.add_html(f'<div class="uav" style="padding-bottom:0"><b>{title}</b> {legend}</div>')
+        head = self._gui.add_html(_heading(title, lines))
         series = tuple(
             uplot.Series(label=name, stroke=colour, width=2, points={"show": False}) for name, colour in lines
         )
@@ -55,8 +53,10 @@ class Charts:
         )
         return head, plot
 
-    def draw(self, vehicle: Vehicle | None, store: FleetStore, now: float) -> None:
+    def draw(self, vehicle: Vehicle | None, store: FleetStore, now: float, units: Units = METRIC) -> None:
         """Update the data; hide a chart without data."""
+        if units != self._units:
+            self._units, self._alt[0].content = units, _heading(f"Altitude, {units.height}", self._alt_lines)
         if vehicle is None:
             for chart in (self._band, self._error, self._fit, self._alt):
                 _show(chart, None)
@@ -66,7 +66,16 @@ class Charts:
         _show(self._band, band(vehicle, distances), from_zero=True)
         _show(self._error, over_time(issued, distances, vehicle), from_zero=True)
         _show(self._fit, _history(store.fits(vehicle), 1))
-        _show(self._alt, _altitude(vehicle, trail, now))
+        altitude = _altitude(vehicle, trail, now)
+        _show(self._alt, altitude and (altitude[0], *(metres * units.per_m for metres in altitude[1:])))
+
+
+def _heading(title: str, lines: tuple) -> str:
+    legend = " ".join(
+        f'<span class="soft" style="white-space:nowrap"><span style="color:{colour}">━</span> {name}</span>'
+        for name, colour in lines
+    )
+    return f'<div class="uav" style="padding-bottom:0"><b>{title}</b> {legend}</div>'
 
 
 def _show(chart: tuple[Any, Any], data: tuple[np.ndarray, ...] | None, *, from_zero: bool = False) -> None:

@@ -3,9 +3,10 @@
 from html import escape
 from math import isfinite
 
-from fleet.contract import AlertKind, Controller, Outcome, TwinState
+from fleet.contract import AlertKind, Controller, Outcome, TwinState, Verdict
 from viewer.store.inbox import rate_text, timestamp
 from viewer.store.vehicle import StatusRecord, Vehicle, mean_fit
+from viewer.text.units import METRIC, Units
 from viewer.text.words import (
     LOW_FIT,
     SHORT_HORIZON_S,
@@ -26,32 +27,37 @@ MAX_TEXT = 500  # characters of a received text
 REFUSED_S = 10.0  # how long a rejected message is reported [s]
 
 
-def status_html(vehicle: Vehicle, palette: Palette, now: float) -> str:
+def status_html(vehicle: Vehicle, palette: Palette, now: float, units: Units = METRIC) -> str:
     """Return the status of the UAV and its twin as HTML. Received texts are escaped here."""
     label = status_label(vehicle, palette, now)
-    cards = _cards(vehicle, vehicle.record(now)) + _sentences(vehicle, palette, now)
+    cards = _cards(vehicle, vehicle.record(now), units) + _sentences(vehicle, palette, now)
     return (
         f'<div class="uav"><div class="head"><h1>{vehicle.name}</h1><b style="color:{label.colour}">'
         f"{label.glyph} {label.text}</b></div>{cards}</div>"
     )
 
 
-def figures_html(vehicle: Vehicle, now: float) -> str:
+def figures_html(vehicle: Vehicle, now: float, units: Units = METRIC) -> str:
     """Return fits, figures and controller as HTML."""
-    return f'<div class="uav">{_fits(vehicle)}{_facts(vehicle, now)}{law_html(vehicle.controller)}</div>'
+    return f'<div class="uav">{_fits(vehicle)}{_facts(vehicle, now, units)}{law_html(vehicle.controller)}</div>'
 
 
-def _cards(vehicle: Vehicle, record: StatusRecord) -> str:
+def _cards(vehicle: Vehicle, record: StatusRecord, units: Units) -> str:
     cards = {
         "fit": fit_text(record),
         "horizon": horizon_text(record),
-        "airspeed": f"{vehicle.Va:.1f} m/s" if isfinite(vehicle.Va) else "–",
+        "airspeed": units.speed_text(vehicle.Va),
     }
     html = "".join(f'<div class="card"><span class="soft">{k}</span><b>{v}</b></div>' for k, v in cards.items())
     return f'<div class="cards">{html}</div><div class="soft">{escape(fit_and_horizon(vehicle, record))}</div>'
 
 
-IDENTIFIED_METHODS = {"dynamics": "coupled", "paper": "linear"}  # methods that roll out the identified model, its kind
+IDENTIFIED_METHODS = {  # methods that roll out identified models, and their kind
+    "dynamics": "coupled",
+    "paper": "linear",
+    "hybrid": "point-mass",
+    "both": "mean of coupled and point-mass",
+}
 
 
 def fit_and_horizon(vehicle: Vehicle, record: StatusRecord) -> str:
@@ -92,7 +98,7 @@ def limitations(vehicle: Vehicle, now: float) -> list[str]:
     elif vehicle.forecast is None:
         rows = vehicle.track_rows()
         observed_s = record.t - float(rows[0, 0]) if len(rows) else 0.0
-        texts.append(f"No horizon yet after {age_text(observed_s)} of telemetry; it needs a verified model.")
+        texts.append(f"No horizon yet after {age_text(observed_s)} of telemetry; it needs a plausible model.")
     if record.prediction_lag_s:
         replay_advice = "play the recording more slowly, or " if vehicle.recorded else ""
         advice = f": its worker is overloaded; {replay_advice}assign fewer UAVs to each worker"
@@ -116,8 +122,11 @@ def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
     if vehicle.model is not None and verdict is not None:
         is_active = vehicle.model.active_verdict in (None, verdict) or record.fit is None
         active = "" if is_active else f"; predictions use an earlier model with fit {fit_text(record)}"
-        colour = fit_colour(mean_fit(verdict.fit), palette) if verdict.outcome is Outcome.VERIFIED else ""
-        colour = colour or palette.identifying
+        accepted = {
+            Outcome.VERIFIED: fit_colour(mean_fit(verdict.fit), palette),
+            Outcome.PLAUSIBLE: palette.plausible,
+        }
+        colour = accepted.get(verdict.outcome, palette.identifying)
         least = f", threshold {verdict.threshold:.0f} %" if verdict.threshold > 0 else ""
         cards.append(
             f'<div class="say" style="border-color:{colour}"><b>{escape(verdict.outcome.value.replace("_", " "))}</b> '
@@ -143,9 +152,16 @@ def _fits(vehicle: Vehicle) -> str:
         for name in names
     )
     return (
-        f'<div class="soft">fit per state over {verdict.horizon_s:.1f} s, %</div><table><tr><th></th>{head}</tr>'
-        f"<tr><td>model</td>{fits}</tr><tr class=soft><td>persistence</td>{persistence}</tr></table>"
+        f'<div class="soft">fit per state over {verdict.horizon_s:.1f} s, %</div><table><tr><td></td>{head}</tr>'
+        f"<tr><td>model</td>{fits}</tr><tr class=soft><td>persistence</td>{persistence}</tr></table>{_power(verdict)}"
     )
+
+
+def _power(verdict: Verdict) -> str:
+    """Describe the detectable error of each group of derivatives; empty without a stated power."""
+    pairs = list(verdict.detectable_error.items())[:12]
+    errors = ", ".join(f"{escape(name[:40].replace('_', ' '))} {value:.0f} %" for name, value in pairs)
+    return f'<div class="soft">the verification would have detected an error of: {errors}</div>' if errors else ""
 
 
 def coverage_text(vehicle: Vehicle) -> str:
@@ -178,13 +194,14 @@ def law_html(controller: Controller | None) -> str:
     return head + key_value_table(rows, ' class="law"')
 
 
-def _facts(vehicle: Vehicle, now: float) -> str:
+def _facts(vehicle: Vehicle, now: float, units: Units) -> str:
     prediction, status, row = vehicle.prediction, vehicle.status, vehicle.row
     record = vehicle.record(now)
     at, age_s, rate = record.t, record.sample_age_s, vehicle.time.rate
     time_name = "recorded" if vehicle.recorded else "data time"
     names = "calibration", "method", "mode", "link", time_name, "sample", "prediction", "within 10 %", "worker"
     figures = {"coverage": coverage_text(vehicle)} | dict.fromkeys(names, "–")
+    figures |= {"altitude": f"{units.height_text(vehicle.alt_m)} above mean sea level"}
     figures[time_name] = timestamp(at)
     if vehicle.recorded and rate and not vehicle.ended:
         figures[time_name] += f", played {rate_text(rate)}"

@@ -15,10 +15,12 @@ from viewer.store.states import notices
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.text.missed_events import missed_events_html, parse_click
+from viewer.text.units import AVIATION, METRIC, Units
 from viewer.text.words import (
     MAX_ROWS,
     alerts_html,
     empty_html,
+    key_value_table,
     legend_html,
     severity,
     state_style,
@@ -56,6 +58,19 @@ def _row(event: TimelineEvent, palette: Palette, seek: str) -> str:
     )
 
 
+KEYS = {
+    "J, K": "next, previous aircraft; in the list also ↓ and ↑",
+    "/": "search; Enter selects the id or the first row",
+    "T, V, C": "camera from above, from the side, behind the selected aircraft",
+    "F, L": "fit all; follow the selected aircraft",
+    "N": "next aircraft with an alert",
+    "P": "pause, or live again",
+    ", and .": "1 s back, forward",
+    "[ and ]": "previous, next event",
+    "W A S D, arrows": "move the camera",
+    "Ctrl+K": "all commands",
+}
+"""Keys of the page and what each does."""
 MAX_OFFERED = 200  # UAVs in the palette; the search field finds the others
 
 
@@ -71,13 +86,13 @@ class Panels:
         browser: Browser,
         palette: Palette,
         choose: Callable[..., None],
-        actions: dict[str, Callable[[], None]],
+        actions: dict[str, tuple[str, Callable[[], None]]],
     ) -> None:
         self._gui, self._palette, self._choose = browser.client.gui, palette, choose
         self._browser = browser
         self._offered: set[int] = set()  # UAVs with a selection command
-        for label, act in actions.items():
-            self._gui.add_command(label).on_trigger(lambda _, act=act: act())
+        for label, (key, act) in actions.items():
+            self._gui.add_command(label, hotkey=key).on_trigger(lambda _, act=act: act())  # type: ignore[arg-type]
         self._pulse = False
         self.ground_error = ""  # error of the terrain files
         self.seek = ""  # page code that seeks to the time of an event
@@ -92,7 +107,7 @@ class Panels:
         layout_input.on_update(lambda _: self._set_layout(layout_input.value))
         report = f"window.reportLayout('{layout_input._impl.uuid}')"  # defined in first.html
         self._gui.add_html(f'<img src="data:," alt="" style="display:none" onerror="{report}">')
-        self._banner, self._error, self._legend = (self._gui.add_html("") for _ in range(3))
+        self._banner, self._error, self._legend, self._unit_style = (self._gui.add_html("") for _ in range(4))
         self._build_left()
         self._build_right()
 
@@ -119,11 +134,15 @@ class Panels:
             self.routes = gui.add_checkbox("Routes of all", False)
             self.follow: Any = gui.add_checkbox("Follow selected", False)
             light = gui.add_checkbox("Light colours", not self._palette.dark)
+            aviation = gui.add_checkbox("Knots, feet, nautical miles", browser.aviation)
             self.glyph = gui.add_slider("Aircraft size", min=0.5, max=4.0, step=0.1, initial_value=1.0)
+            keys = key_value_table((f"<b>{escape(key)}</b>", escape(text)) for key, text in KEYS.items())
+            gui.add_html(f'<div class="uav keys"><b>Keys</b>{keys}</div>')
         self._acknowledge.on_click(lambda _: setattr(browser, "absence", None))
         self._menu.on_update(lambda _: self._pick(self._menu.value.removeprefix("UAV-")))
         self._pick_input.on_update(lambda _: self._pick(self._pick_input.value))
         light.on_update(lambda _: browser.set_theme(light=light.value))
+        aviation.on_update(lambda _: browser.set_units(aviation=aviation.value))
         self._show.on_click(lambda _: setattr(self, "_filter", self._show.value))
 
     def _build_right(self) -> None:
@@ -142,6 +161,10 @@ class Panels:
         if (layout := parse_layout(text)) is not None:
             self._browser.layout = layout
             self._fit_panels()
+
+    @property
+    def _units(self) -> Units:
+        return AVIATION if self._browser.aviation else METRIC
 
     def _fit_panels(self) -> None:
         if (widths := self._browser.layout.panel_widths()) != self._widths:
@@ -170,6 +193,7 @@ class Panels:
         self._browser.mark_present()
         missed = missed_events_html(fleet, self._browser.absence, palette, pick)
         contents = (
+            (self._unit_style, f"<style>:root{{--aviation:{int(self._browser.aviation)}}}</style>"),
             (self._banner, f'<div class="stale {"a" if self._pulse else "b"}">{STALE}</div>'),
             (self._notices, notices(store, self.ground_error, palette, now)),
             (self._summary, summary_html(fleet, store, palette, now) if fleet else empty_html(store, now)),
@@ -177,7 +201,7 @@ class Panels:
             (self._legend, legend_html(fleet, palette)),
             (self._missed, missed),
             (self._alerts, alerts_html(fleet, palette, now, pick)),
-            (self._facts, figures_html(selected_vehicle, now) if selected_vehicle is not None else ""),
+            (self._facts, figures_html(selected_vehicle, now, self._units) if selected_vehicle is not None else ""),
         )
         with self._browser.client.atomic():  # contents first: the block delays all other messages
             for html, text in contents:
@@ -189,7 +213,7 @@ class Panels:
             self.show(selected_vehicle, now)
             events = selected_vehicle.events if selected_vehicle is not None else None
             _update(self._events, "" if events is None else event_list_html(events, palette, self.seek))
-        self._charts.draw(selected_vehicle, store, now)
+        self._charts.draw(selected_vehicle, store, now, self._units)
         self._offer(fleet)
 
     def _offer(self, fleet: list[Vehicle]) -> None:
@@ -203,7 +227,9 @@ class Panels:
     def show(self, vehicle: Vehicle | None, now: float) -> None:
         """Show the status of the selected UAV."""
         placeholder = '<div class="uav soft">No UAV selected: click a row or an aircraft, or press Ctrl+K.</div>'
-        _update(self._about, status_html(vehicle, self._palette, now) if vehicle is not None else placeholder)
+        _update(
+            self._about, status_html(vehicle, self._palette, now, self._units) if vehicle is not None else placeholder
+        )
 
     def _passes(self, vehicle: Vehicle, now: float, selected: int | None) -> bool:
         if self._filter == "Alerts" and not vehicle.alerts:

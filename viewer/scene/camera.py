@@ -13,6 +13,8 @@ FOCUS_MARGIN = 1.3  # margin around a focused aircraft for its labels [-]
 BOTTOM_SHARE, MAX_BOTTOM_SHARE = 0.12, 0.6  # least and greatest share of the image height left free below [-]
 CLOSEST = 5.0  # smallest distance [10 m]
 EMPTY_VIEW = 60.0 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)  # framed without UAVs [10 m]
+FROM_ABOVE = np.array([0.0, -1e-3, 1.0])  # north is up on the page
+SIDE_ELEVATION, CHASE_ELEVATION = np.radians(7.0), np.radians(22.0)  # of the camera [rad]
 VIEW_ANGLES = (np.radians(-125.0), np.radians(38.0))  # camera direction: azimuth from east, elevation [rad]
 
 
@@ -102,8 +104,12 @@ class Camera:
     def fly_to(self, points: np.ndarray) -> None:
         """Frame points (n, 3) [10 m] from the current direction."""
         camera = self._client.camera
+        self.look_from(np.array(camera.position) - np.array(camera.look_at), points)
+
+    def look_from(self, direction: np.ndarray, points: np.ndarray) -> None:
+        """Frame points (n, 3) [10 m] from a direction, from the points to the camera, (3,)."""
+        camera = self._client.camera
         self._moved_by_page = True
-        direction = np.array(camera.position) - np.array(camera.look_at)
         placed = frame(points, self.aspect, FOCUS_MARGIN, direction, self.bottom_share)
         with self._client.atomic():
             camera.position, camera.look_at = placed
@@ -112,6 +118,18 @@ class Camera:
         """Translate by the step (3,) of the followed UAV [10 m]."""
         camera = self._client.camera
         camera.position, camera.look_at = camera.position + step, camera.look_at + step
+
+
+def direction_from(psi: float, azimuth: float, elevation: float) -> np.ndarray:
+    """Return the direction to a camera beside an aircraft, ENU (3,).
+
+    Args:
+        psi: heading of the aircraft, clockwise from north [rad]
+        azimuth: of the camera from its nose, clockwise; pi is behind it [rad]
+        elevation: above the horizontal plane [rad]
+    """
+    bearing = psi + azimuth
+    return np.array([np.sin(bearing) * np.cos(elevation), np.cos(bearing) * np.cos(elevation), np.sin(elevation)])
 
 
 def set_initial_view(server: Any, points: np.ndarray = EMPTY_VIEW) -> None:

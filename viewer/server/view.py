@@ -11,7 +11,16 @@ from viewer.browser.http_server import Browser
 from viewer.export import Export
 from viewer.panels.detail import MAX_TEXT
 from viewer.panels.panels import Panels
-from viewer.scene.camera import IN_VIEW_M, Camera, within_reach
+from viewer.scene.camera import (
+    CHASE_ELEVATION,
+    EMPTY_VIEW,
+    FROM_ABOVE,
+    IN_VIEW_M,
+    SIDE_ELEVATION,
+    Camera,
+    direction_from,
+    within_reach,
+)
 from viewer.scene.fleet_arrays import LOST, MISMATCH, FleetArrays, display_status
 from viewer.scene.labels import Labels, alert_labels
 from viewer.scene.routes import NOTHING, mission_lines
@@ -27,6 +36,7 @@ from viewer.timeline.recordings import RecordingStore
 
 RECOVERY_S = 3.0  # time without an error after which the error text is removed [s]
 FOCUS_PATH_S = 40.0  # flown path framed with a focused aircraft [s]
+CHASE_BOX = 4.0  # half edge of the box around a chased aircraft [10 m]
 FRAME_MARGIN = 1.35  # margin of the frame while the flown path grows [-]
 
 
@@ -46,9 +56,12 @@ class View:
         self.scene = Scene(client.scene, palette, self.select)
         self.selection, self._labels = Selection(client.scene, palette), Labels(client.scene)
         commands = {
-            "Show the whole fleet": self.show_all,
-            "Next aircraft with an alert": self.next_exception,
-            "Toggle following the selected aircraft": self.toggle_follow,
+            "Camera: show the whole fleet": ("F", self.show_all),
+            "Camera: from above": ("T", self.look_from_above),
+            "Camera: from the side": ("V", self.look_from_side),
+            "Camera: behind the selected aircraft": ("C", self.chase),
+            "Next aircraft with an alert": ("N", self.next_exception),
+            "Toggle following the selected aircraft": ("L", self.toggle_follow),
         }
         self.panels = Panels(browser, palette, self.focus_on, commands)
         self.timeline = Timeline(client, store, recordings, palette, self._redraw)
@@ -59,6 +72,7 @@ class View:
         self.selected: int | None = None
         self.dirty = True  # the selection changed and is not drawn yet
         self.offset = 0  # tick of the second at which slow content is drawn
+        self._fleet_points = EMPTY_VIEW  # fleet, paths and route of the last frame, (n, 3) [10 m]
         self._framed_key: tuple = ()
         self._force_framing = False  # frame again even if the camera was moved
         self._framed_box = np.zeros((2, 3))  # corners of the box last framed [10 m]
@@ -95,6 +109,30 @@ class View:
         """Frame everything again, even if the camera was moved."""
         self.panels.follow.value = False
         self._framed_key, self._force_framing = (), True
+
+    def look_from_above(self) -> None:
+        """Show the fleet from above, north up."""
+        self._look_from(FROM_ABOVE, self._fleet_points)
+
+    def _look_from(self, direction: np.ndarray, points: np.ndarray) -> None:
+        """Frame points (n, 3) [10 m] from a direction (3,) in place of any pending framing."""
+        self._force_framing = False
+        self.camera.look_from(direction, points)
+
+    def look_from_side(self) -> None:
+        """Show the fleet from the left of the selected UAV, else from the south, close to the horizontal."""
+        vehicle = self.selected_vehicle()
+        psi = vehicle.attitude[2] if vehicle is not None else np.pi / 2
+        self._look_from(direction_from(psi, -np.pi / 2, SIDE_ELEVATION), self._fleet_points)
+
+    def chase(self) -> None:
+        """Follow the selected UAV from behind."""
+        vehicle = self.selected_vehicle()
+        if vehicle is None or (at := vehicle.position(time.monotonic())) is None:
+            return
+        near = at + CHASE_BOX * np.array([[1, 1, 1], [-1, -1, -1]])
+        self._look_from(direction_from(vehicle.attitude[2], np.pi, CHASE_ELEVATION), near)
+        self.panels.follow.value = True
 
     def next_exception(self) -> None:
         """Focus on the next UAV with an alert, mismatch or lost link, in the order of ids."""
@@ -237,6 +275,7 @@ class View:
             lines, track = mission_lines(vehicle.mission, scene_frame, ground), self._store.track(vehicle)[:, 1:]
         content = np.vstack([points, lines.points, lines.circles.reshape(-1, 3), track])
         points = within_reach(content, IN_VIEW_M / UNIT_M)
+        self._fleet_points = points
         key = (*key, bool(len(lines.points)), round(self.camera.aspect, 1), round(self.camera.bottom_share, 1))
         if key == self._framed_key and not outgrown(points, self._framed_box):
             return

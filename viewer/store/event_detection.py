@@ -52,7 +52,11 @@ QUIET_S = 2.5  # without a gateway status for this long, link alerts of the work
 MAX_CAUSES = 8  # names accepted of one mismatch
 MAX_STEPS = 20  # mission item changes accepted of one sample
 UNVERIFIED_S = 12.0  # failing verifications for this long are an event: about three verdicts [s]
-ACCEPTED = (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST)  # outcomes that confirm a model, new or active
+ACCEPTED = (
+    Outcome.VERIFIED,
+    Outcome.PLAUSIBLE,
+    Outcome.WORSE_THAN_LAST,
+)  # confirm a new or active model
 
 
 class DetectorState(NamedTuple):
@@ -176,7 +180,7 @@ def _item(items: tuple[Item, ...], seq: int) -> str:
 
 
 def _model(state: DetectorState, model: Model) -> Detection:
-    """Detect the first verified model, persistent verification failure, and recovery.
+    """Detect the first accepted model, persistent verification failure, and recovery.
 
     Verdicts arrive every few seconds and alternate near a threshold: only a lasting change is an event.
     """
@@ -187,9 +191,11 @@ def _model(state: DetectorState, model: Model) -> Detection:
         status, event = "none", TimelineEvent(model.t, EventKind.NO_MODEL, f"no model yet: {_outcome(newest)}")
     elif before in (None, "none"):
         summary = _without_uav_prefix(model.active_verdict.sentence, model.uav)
-        status, event = "accepted", TimelineEvent(model.t, EventKind.VERIFIED, f"model verified: {summary}")
+        word = "plausible" if model.active_verdict.outcome is Outcome.PLAUSIBLE else "verified"
+        text = f"model {word}: {summary}"
+        status, event = "accepted", TimelineEvent(model.t, EventKind.VERIFIED, text)
     elif newest.outcome in ACCEPTED:
-        status, event = "accepted", TimelineEvent(model.t, EventKind.ACCEPTED, "model verified again")
+        status, event = "accepted", TimelineEvent(model.t, EventKind.ACCEPTED, "model accepted again")
     elif model.t - accepted_t >= UNVERIFIED_S:
         text = f"no verification for {UNVERIFIED_S:.0f} s ({_outcome(newest)}); an earlier model stays active"
         status, event = "unverified", TimelineEvent(model.t, EventKind.UNVERIFIED, text)

@@ -19,6 +19,7 @@ from fleet.contract import (
     Mismatch,
     Mission,
     Model,
+    Outcome,
     Prediction,
     Rows,
     Status,
@@ -116,7 +117,10 @@ class Vehicle:
         if self.prediction is not None:
             return self.prediction.state
         if self.model is not None:
-            return TwinState.VERIFIED if self.model.active_verdict is not None else TwinState.IDENTIFYING
+            active = self.model.active_verdict
+            if active is None:
+                return TwinState.IDENTIFYING
+            return TwinState.PLAUSIBLE if active.outcome is Outcome.PLAUSIBLE else TwinState.VERIFIED
         return TwinState.WAITING
 
     def record(self, now: float) -> StatusRecord:

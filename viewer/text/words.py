@@ -195,9 +195,10 @@ def summary_html(fleet: list[Vehicle], store: FleetStore, palette: Palette, now:
         for label, n in Counter(status_label(vehicle, palette, now) for vehicle in ordered).items()
     )
     horizons = sorted(h for vehicle in fleet if (h := vehicle.record(now).horizon_s))
-    median = f" · median horizon {horizons[len(horizons) // 2]:.0f} s" if horizons else ""
+    median = f'<span class="dot"> · </span>median horizon {horizons[len(horizons) // 2]:.0f} s' if horizons else ""
     n, coverage, quantile = fleet_coverage(fleet)
-    covered = f" · cov. {coverage * 100:.0f}/{quantile * 100:.0f} %" if n else ""
+    measured = f"cov. {coverage * 100:.0f}/{quantile * 100:.0f} %"
+    covered = f' · <span title="coverage of the region: measured, nominal">{measured}</span>' if n else ""
     notes = "".join(f'<div class="soft">{escape(text)}</div>' for text in store.worker_texts())
     plural = "UAV" if len(fleet) == 1 else "UAVs"
     head = f"<h1>{len(fleet)} {plural}<small>{median}{covered}</small></h1>"
@@ -220,10 +221,10 @@ def table(fleet: list[Vehicle], palette: Palette, now: float, *, total: int, pic
     longest = max([FULL_BAR_S, *(vehicle.record(now).horizon_s for vehicle in worst)])
     rows = "".join(_row(vehicle, palette, now, pick, on=vehicle.uav == selected, longest=longest) for vehicle in worst)
     return (
-        '<div class="uav list"><table><tr><th></th><th>UAV</th><th>status</th><th class="num">fit %</th>'
-        f'<th class="num">horizon</th></tr>{rows}</table>'
+        '<div class="uav list" tabindex="0" role="region" aria-label="Aircraft"><table><tr><td></td><th>UAV</th>'
+        f'<th>status</th><th class="num">fit %</th><th class="num">horizon</th></tr>{rows}</table>'
         f'<div class="foot">{len(worst)} of {total} · alerts and worst state first, then shortest horizon '
-        "· keys J, K: next, previous</div></div>"
+        "· keys: tab Display</div></div>"
     )
 
 

@@ -12,11 +12,20 @@ STATE_STYLE = {  # glyph and `Palette` field of each state, the most severe firs
     TwinState.UNCLAIMED: ("○", "muted"),
     TwinState.WAITING: ("◌", "muted"),
     TwinState.IDENTIFYING: ("◐", "identifying"),
+    TwinState.PLAUSIBLE: ("≈", "plausible"),
     TwinState.PREDICTING: ("➤", "predicting"),
     TwinState.VERIFIED: ("✓", "verified"),
 }
 STATE_TEXT = {state: state.value.replace("_", " ") for state in TwinState}
-STATUS_COLOURS = ("muted", "predicting", "verified", "identifying", "lost", "mismatch")  # of the display statuses
+STATUS_COLOURS = (
+    "muted",
+    "predicting",
+    "verified",
+    "plausible",
+    "identifying",
+    "lost",
+    "mismatch",
+)  # of the display statuses
 
 
 @dataclass(frozen=True)
@@ -26,6 +35,7 @@ class Palette:
     dark: bool = True
     predicting: str = "#3E96DC"
     verified: str = "#2BC49A"
+    plausible: str = "#B7BE5A"
     identifying: str = "#F0B8E0"
     lost: str = "#7F8894"
     mismatch: str = "#FF6B35"
@@ -41,7 +51,7 @@ class Palette:
     sky: tuple[str, str] = ("#0B0F17", "#1A2433")
 
     def status_colours(self) -> np.ndarray:
-        """Return the colours of the display statuses, (6, 3) [0..255]."""
+        """Return the colours of the display statuses, (7, 3) [0..255]."""
         return np.array([rgb(getattr(self, name)) for name in STATUS_COLOURS])
 
     def event(self, kind: EventKind) -> str:
@@ -54,6 +64,7 @@ LIGHT = Palette(
     dark=False,
     predicting="#0072B2",
     verified="#00795A",
+    plausible="#676B00",
     identifying="#6A2C7A",
     lost="#6B7280",
     mismatch="#B93A00",

@@ -11,7 +11,7 @@ import viser
 from viewer.scene.fleet_arrays import FleetArrays
 from viewer.scene.routes import NOTHING
 from viewer.scene.strokes import Strokes, chain
-from viewer.store.inbox import timestamp
+from viewer.store.inbox import is_dated, timestamp
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.theme.events import TimelineEvent
@@ -242,8 +242,10 @@ class Timeline:
         duration, n = strip.duration_text(span.end - span.begin), len(self._recordings.by_uav)
         storage = f"{duration} of {n} aircraft recorded, {strip.size_text(self._recordings.nbytes())}"
         interval = f"one prediction per UAV every {self._recordings.prediction_step_s:.0f} s"
+        shown_t = span.end if t is None else t
+        local = f' <span class="soft local" data-t="{shown_t:.0f}"></span>' if is_dated(shown_t) else ""  # first.html
         return (
-            f'<div class="head"><b class="now">{timestamp(span.end if t is None else t)}</b>'
+            f'<div class="head"><span><b class="now">{timestamp(shown_t)}</b>{local}</span>'
             f'<span class="soft" title="{interval}">{lag_text}{rate_text} · {storage}</span></div>'
         )
 

@@ -1,7 +1,8 @@
 """Check this machine, the connection to the bus, and the fleet: one line per check, with a remedy where needed.
 
 Each line is `ok`, `note` (something optional is missing) or `BAD` (exit code 1). With a router: certificates, clocks
-and sources of all machines, the writer of each aircraft, aircraft without writer or with two.
+and sources of all machines, the writer of each aircraft, aircraft without writer or with two; late clocks of aircraft,
+stalled predictions, and two writers of one key. A port that another program uses is named with that program.
 """
 
 import argparse
@@ -14,7 +15,7 @@ from fleet.access.entry import BusConfig
 from fleet.bus.session import connect
 from fleet.config import bus_config_from, router_arguments
 from fleet.contract import GatewayCounters
-from fleet.health import claims, machine
+from fleet.health import claims, machine, ports, traffic
 from fleet.health.machine import BAD, CheckResult
 from fleet.process.sanitise import printable
 
@@ -47,17 +48,19 @@ def run(args: argparse.Namespace) -> int:
 
 def _checks(bus_config: BusConfig) -> Iterator[CheckResult]:
     yield from machine.check_machine()
+    yield ports.viewer_port()
     yield from claims.check_certificates(bus_config)
     reachable = yield from claims.check_router(bus_config)
     if not reachable:
-        yield machine.mavlink_port()
+        yield ports.mavlink_port()
         return
     try:
         bus = connect(bus_config)
     except ConnectionError as error:
-        yield CheckResult(BAD, "router", str(error))
+        yield CheckResult(BAD, "router", f"{error}{claims.at_router_port(bus_config)}")
         return
     with bus:
         local = [counters for counters, _ in bus.get(GatewayCounters) if counters.machine == platform.node()]
-        yield machine.mavlink_port([link for counters in local for link in counters.links])
+        yield ports.mavlink_port([link for counters in local for link in counters.links])
         yield from claims.check_fleet(bus)
+        yield from traffic.check_traffic(bus)

@@ -1,4 +1,4 @@
-"""Fly simulated aircraft: fixed-wing UAVs on JSBSim that send MAVLink 2 over UDP, or into a recording."""
+"""Fly simulated aircraft: wings on JSBSim, rotors on RotorPy, which send MAVLink 2 over UDP or into a recording."""
 
 import argparse
 from pathlib import Path
@@ -9,16 +9,22 @@ from fleet.process.logs import report_status
 
 if TYPE_CHECKING:
     from fleet.simulator.faults.physics import Fault
+    from fleet.simulator.multirotor.uav import SimulatedMultirotor
 
 EXAMPLES = """
   fleet fly --uavs 0-7
   fleet fly --uavs 0-49 --to 127.0.0.1:14550 --wind 6 --turbulence 4 --loss 0.05
   fleet fly --uavs 0-1 --autopilot px4 --aircraft c172p
+  fleet fly --uavs 0-5 --aircraft mixed                    wings and quadrotors in turn
   fleet fly --uavs 0-3 --fault drag_increase,dCD=0.03,at=120 --fault actuator_lag:elevator,tau_s=0.3 --fault-uav 2
   fleet fly --uavs 0 --seed 3 --for 300 --tlog flight.tlog     as fast as possible, no network
 """
 AUTOPILOTS = ("ardupilot", "px4")  # both as in `fleet.simulator.flight.tuning`, which loads slowly
 AIRCRAFT = ("small", "c172p")
+MULTIROTORS = ("quad", "quad_large")  # as in `fleet.simulator.multirotor.airframes`
+GROUPS = {"plane": ("small",), "mixed": ("small", "quad")}  # taken in turn by the aircraft of one fleet
+CHOICES = (*AIRCRAFT, *MULTIROTORS, *GROUPS)
+AIRCRAFT_HELP = "small (11 kg, electric) or plane, c172p, quad, quad_large, mixed: small and quad in turn (small)"
 _DEFAULT_TLOG_S = 300.0  # length of a recording when --for is not given [s]
 
 
@@ -29,7 +35,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--autopilot", choices=AUTOPILOTS, default="ardupilot", help="autopilot law and MAVLink dialect (ardupilot)"
     )
-    parser.add_argument("--aircraft", choices=AIRCRAFT, default="small", help="11 kg electric or a Cessna 172 (small)")
+    parser.add_argument("--aircraft", choices=CHOICES, default="small", help=AIRCRAFT_HELP)
     parser.add_argument("--seed", type=int, default=1, help="random seed of aircraft, missions, weather and noise (1)")
     parser.add_argument("--wind", type=float, default=4.0, metavar="M/S", help="mean wind at 100 m (4)")
     parser.add_argument(
@@ -70,14 +76,17 @@ def run(args: argparse.Namespace) -> int:
     stop = stop_on_signal()
     level = turbulence_level(args.turbulence)
     host, port = host_and_port("--to", args.to)
-    options = {"autopilot": args.autopilot, "aircraft": args.aircraft}
+    options = {"autopilot": args.autopilot, "wind": args.wind, "turbulence": level}
     faulty = faults_of(args, args.uavs)
-    uavs = [
-        SimulatedUav(i, args.seed, wind=args.wind, turbulence=level, **options, faults=faulty.get(i, ()))
-        for i in args.uavs
-    ]
-    report_status("fly", "compiling the autopilot, first start only")
-    SimulatedUav(args.uavs[0], args.seed).step(0.2)
+    uavs: list[drive.SimulatedAircraft] = []
+    for uav, aircraft in zip(args.uavs, aircraft_types(args.aircraft, args.uavs), strict=True):
+        if aircraft in MULTIROTORS:
+            uavs.append(_multirotor_class()(uav, args.seed, aircraft=aircraft, **options))
+        else:
+            uavs.append(SimulatedUav(uav, args.seed, aircraft=aircraft, faults=faulty.get(uav, ()), **options))
+    if args.aircraft not in MULTIROTORS:
+        report_status("fly", "compiling the autopilot, first start only")
+        SimulatedUav(args.uavs[0], args.seed).step(0.2)
     if args.tlog is not None:
         seconds = args.seconds or _DEFAULT_TLOG_S
         title = f"flying into {args.tlog.name}"
@@ -88,6 +97,28 @@ def run(args: argparse.Namespace) -> int:
     max_delay = drive.to_udp(uavs, (host, port), seconds=args.seconds, loss=args.loss, seed=args.seed, stop=stop)
     report_status("fly", f"stopped; at most {max_delay * 1e3:.0f} ms behind real time")
     return 0
+
+
+def _multirotor_class() -> "type[SimulatedMultirotor]":
+    """Return the class of simulated multirotors.
+
+    Raises:
+        ValueError: when RotorPy is not installed.
+    """
+    try:
+        from fleet.simulator.multirotor.uav import SimulatedMultirotor
+    except ModuleNotFoundError as error:
+        if error.name is None or not error.name.startswith("rotorpy"):
+            raise
+        remedy = "pip install --no-deps rotorpy, or run make setup"
+        raise ValueError(f"--aircraft: found no package rotorpy, expected it for multirotors; {remedy}") from None
+    return SimulatedMultirotor
+
+
+def aircraft_types(name: str, uavs: range) -> list[str]:
+    """Return the type of each aircraft of a fleet; the types of a group alternate by id."""
+    group = GROUPS.get(name, (name,))
+    return [group[uav % len(group)] for uav in uavs]
 
 
 def faults_of(args: argparse.Namespace, uavs: range) -> "dict[int, tuple[Fault, ...]]":
@@ -103,7 +134,10 @@ def faults_of(args: argparse.Namespace, uavs: range) -> "dict[int, tuple[Fault, 
         raise ValueError(f"--fault-uav: found {uav} without a fault, expected one; add --fault")
     if uav not in uavs:
         raise ValueError(f"--fault-uav: found {uav}, expected one of {uavs[0]}-{uavs[-1]}; change --fault-uav")
-    faults = tuple(parse_fault(text, args.aircraft) for text in args.fault)
+    aircraft = aircraft_types(args.aircraft, range(uav, uav + 1))[0]
+    if args.fault and aircraft in MULTIROTORS:
+        raise ValueError(f"--fault: found aircraft {aircraft}, expected wings; add --fault-uav or change --aircraft")
+    faults = tuple(parse_fault(text, aircraft) for text in args.fault)
     return {uav: faults} if faults else {}
 
 

@@ -3,23 +3,31 @@
 import argparse
 import json
 import sys
+import threading
+import time
 from math import isfinite
 
 import msgspec
-from rich.console import Console
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from fleet.bus.codec import is_plausible_epoch
 from fleet.bus.session import Bus, connect
+from fleet.cli import stop_on_signal
 from fleet.config import bus_config_from, router_arguments
 from fleet.contract import Claim, FleetRow, FleetState, GatewayCounters, Status, TwinState
 from fleet.process.sanitise import printable
 from fleet.report.report_text import id_ranges
 
+STATE_COLOUR = {TwinState.VERIFIED: "green", TwinState.PLAUSIBLE: "yellow"}  # of the table; others: none
+WATCH_S = 1.0  # pause between two queries of `--watch` [s]
 LATE_S = 5.0  # an older prediction is shown in red; the viewer reports it as late from the same age on [s]
 EXAMPLES = """
   fleet status
+  fleet status --watch                          until Ctrl-C
   fleet status --json
   fleet status --router tcp/192.168.1.10:7447
 """
@@ -29,24 +37,48 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     router_arguments(parser)
     parser.add_argument("--json", action="store_true", help="a list of objects instead of a table")
+    parser.add_argument("--watch", action="store_true", help="repeat every second until Ctrl-C")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Query the fleet once and print it; return exit code 1 if no UAV is known."""
+    """Query the fleet and print it, once or repeatedly; return exit code 1 if no UAV is known."""
+    if args.json and args.watch:
+        raise ValueError("--watch: found --json too, expected only one; drop one, or repeat `fleet status --json`")
+    if args.watch:
+        stop = stop_on_signal()
+        with connect(bus_config_from(args)) as bus:
+            return watch(bus, stop, Console())
     with connect(bus_config_from(args)) as bus:
         rows = fleet_rows(bus)
-        running = [] if args.json else processes(bus)
-    if args.json:
-        json.dump(as_objects(rows), sys.stdout, indent=1)
-        print()
-    else:
-        console = Console()
-        console.print(
-            fleet_table(rows) if rows else "no UAV known yet: is a gateway running and an aircraft connected?"
-        )
-        if running:
-            console.print("", machines(running), sep="\n")
+        if args.json:
+            json.dump(as_objects(rows), sys.stdout, indent=1)
+            print()
+        else:
+            Console().print(_overview(rows, processes(bus)))
     return 0 if rows else 1
+
+
+def watch(bus: Bus, stop: threading.Event, console: Console) -> int:
+    """Print the fleet every second until stopped; in place on a terminal, one below the other elsewhere."""
+    rows: list[FleetRow] = []
+    with Live(console=console, auto_refresh=False, vertical_overflow="crop") as live:
+        while not stop.is_set():
+            rows = fleet_rows(bus)
+            heading = Text(f"{time.strftime('%H:%M:%S')}, every {WATCH_S:g} s until Ctrl-C", style="dim")
+            view = Group(heading, _overview(rows, processes(bus)))
+            if console.is_terminal:
+                live.update(view, refresh=True)
+            else:
+                console.print(view)
+            stop.wait(WATCH_S)
+    return 0 if rows else 1
+
+
+def _overview(rows: list[FleetRow], running: list[tuple[str, str, str, str]]) -> RenderableType:
+    """Return the tables of aircraft and processes."""
+    empty = Text("no UAV known yet: is a gateway running and an aircraft connected?")
+    parts: list[RenderableType] = [fleet_table(rows) if rows else empty]
+    return Group(*parts, Text(""), machines(running)) if running else Group(*parts)
 
 
 def fleet_rows(bus: Bus) -> list[FleetRow]:
@@ -111,7 +143,8 @@ def fleet_table(rows: list[FleetRow]) -> Table:
         details = "\n".join(
             (*(f"! {escape(printable(alert))}" for alert in row.alerts), *mismatch, escape(printable(row.verdict)))
         )
-        out.add_row(str(row.uav), row.state.value, fit, horizon, *ages, details)
+        state = Text(row.state.value, STATE_COLOUR.get(row.state, ""))
+        out.add_row(str(row.uav), state, fit, horizon, *ages, details)
     return out
 
 

@@ -15,7 +15,7 @@ from rich.text import Text
 from fleet.access.knock import probe_router
 from fleet.bus.session import Bus, connect, open_router
 from fleet.cli import check_file, check_parent, check_port, host_and_port, stop_on_signal
-from fleet.commands.live.fly import AIRCRAFT, AUTOPILOTS, fault_arguments, faults_of
+from fleet.commands.live.fly import AIRCRAFT_HELP, AUTOPILOTS, CHOICES, fault_arguments, faults_of
 from fleet.commands.live.replay import check_arguments as check_playing
 from fleet.commands.live.replay import replay_link
 from fleet.commands.live.status import as_objects, fleet_rows, fleet_table
@@ -29,6 +29,7 @@ from fleet.telemetry.recording.options import add_recording_arguments
 EXAMPLES = """
   fleet up --uavs 8
   fleet up --uavs 4 --autopilot px4 --aircraft c172p
+  fleet up --uavs 8 --aircraft mixed                                         wings and quadrotors in turn
   fleet up --uavs 4 --fault drag_increase,dCD=0.04,at=120 --fault-uav 2      its twin should diagnose the fault
   fleet up --link udpin:0.0.0.0:14550
   fleet up --link serial:/dev/ttyUSB0:57600 --forward udpin:127.0.0.1:14551      QGroundControl in addition, at 14551
@@ -45,7 +46,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--uavs", type=int, default=8, metavar="N", help="simulated aircraft, ids 0 to N-1 (8)")
     parser.add_argument("--autopilot", choices=AUTOPILOTS, default="ardupilot", help="simulated autopilot (ardupilot)")
-    parser.add_argument("--aircraft", choices=AIRCRAFT, default="small", help="simulated aircraft type (small)")
+    parser.add_argument("--aircraft", choices=CHOICES, default="small", help=AIRCRAFT_HELP)
     fault_arguments(parser)
     parser.add_argument(
         "--mavlink", default=_MAVLINK, metavar="HOST:PORT", help=f"UDP address they send to ({_MAVLINK})"

@@ -7,16 +7,33 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from threading import Event
-from typing import BinaryIO
+from typing import BinaryIO, Protocol
 
 import numpy as np
 from rich.progress import Progress
 
-from fleet.simulator.flight.uav import SimulatedUav
-
 DELAY_S = 0.015  # minimum delay [s]
 JITTER_S = 0.004  # mean additional delay [s]
 FADE_S = (0.2, 1.4)  # range of the duration of a fade [s]
+
+
+class SimulatedAircraft(Protocol):
+    """Interface of a simulated aircraft of any vehicle class."""
+
+    uav_id: int
+    tick: int
+
+    def step(self, t: float) -> list[bytes]:
+        """Advance to `t` [s] since simulation start and return the frames sent meanwhile."""
+        ...
+
+    def receive(self, data: bytes) -> list[bytes]:
+        """Process bytes from the ground and return the replies."""
+        ...
+
+    def initial_frames(self) -> list[bytes]:
+        """Return the frames for the start of a recording."""
+        ...
 
 
 class RadioLink:
@@ -68,7 +85,7 @@ _SPEED_WINDOW_S = 5.0  # real time to measure the achieved speed before logging 
 
 def to_tlog(
     path: Path,
-    uavs: Sequence[SimulatedUav],
+    uavs: Sequence[SimulatedAircraft],
     *,
     seconds: float,
     loss: float,
@@ -107,7 +124,7 @@ def to_tlog(
     return written
 
 
-def _fly_until(uav: SimulatedUav, link: RadioLink, until: float) -> list[tuple[float, bytes]]:
+def _fly_until(uav: SimulatedAircraft, link: RadioLink, until: float) -> list[tuple[float, bytes]]:
     """Simulate to `until` [s] tick by tick and return the frames received on the ground."""
     t = uav.tick * TICK_S
     while t < until - TICK_S / 2:
@@ -124,7 +141,7 @@ def write(file: BinaryIO, stamped_frames: list[tuple[float, bytes]]) -> int:
 
 
 def to_udp(
-    uavs: Sequence[SimulatedUav],
+    uavs: Sequence[SimulatedAircraft],
     address: tuple[str, int],
     *,
     seconds: float | None,
@@ -215,7 +232,7 @@ def _socket(address: tuple[str, int]) -> socket.socket:
     return sock
 
 
-def _serve(uav: SimulatedUav, link: RadioLink, sock: socket.socket, t: float, drop_uplink: bool) -> None:
+def _serve(uav: SimulatedAircraft, link: RadioLink, sock: socket.socket, t: float, drop_uplink: bool) -> None:
     """Simulate one aircraft to `t` [s], receive requests, send frames."""
     link.send(t, uav.step(t))
     try:

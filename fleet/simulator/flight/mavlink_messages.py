@@ -175,10 +175,10 @@ def _gps_raw(f: TelemetryState) -> Any:
     return mav.MAVLink_gps_raw_int_message(round(f.t * 1e6), *fix, 80, 120, ground_speed, course, 14)
 
 
-MessageSchedule = tuple[tuple[float, int, Callable[[TelemetryState], Any]], ...]
-"""Rate [Hz], phase [ticks], message function."""
+MessageSchedule = tuple[tuple[float, int, Callable[[Any], Any]], ...]
+"""Rate [Hz], phase [ticks], message function of the telemetry state of the vehicle class."""
 
-_COMMON: MessageSchedule = (
+COMMON: MessageSchedule = (
     (25, 0, _attitude),
     (25, 2, _imu),
     (20, 1, _servos),
@@ -186,7 +186,7 @@ _COMMON: MessageSchedule = (
     (10, 5, _hud),
 )
 TELEMETRY: MessageSchedule = (
-    *_COMMON,
+    *COMMON,
     (5, 7, _nav),
     (1, 11, _mission_current),
     (1, 23, _heartbeat),
@@ -194,7 +194,7 @@ TELEMETRY: MessageSchedule = (
     (2, 41, _destination),
 )
 TELEMETRY_PX4: MessageSchedule = (
-    *_COMMON,
+    *COMMON,
     (10, 7, _attitude_target),
     (1, 11, _mission_current),
     (1, 23, _heartbeat_px4),

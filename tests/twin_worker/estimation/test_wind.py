@@ -5,7 +5,8 @@ from math import cos, sin
 import numpy as np
 import pytest
 
-from twin_worker.estimation.wind_filter import WindFilter
+from fleet.frames import rotation
+from twin_worker.estimation.wind_filter import WindFilter, reported_direction
 
 WIND = np.array([5.0, -3.0])
 VA, RATE = 20.0, 0.2
@@ -65,7 +66,11 @@ def test_the_flight_tells_how_much_the_wind_drifts(drift, least, most):
             slow = slow * np.exp(-0.2 / 60.0) + drift * np.sqrt(1 - np.exp(-0.4 / 60.0)) * rng.standard_normal(2)
             gust = gust * np.exp(-0.2 / 7.0) + 0.8 * np.sqrt(1 - np.exp(-0.4 / 7.0)) * rng.standard_normal(2)
             air = VA * np.array([cos(psi), sin(psi)])
-            filt.update(k / 5, np.array([*(air + WIND + slow + gust + rng.standard_normal(2)), 0.0]), VA, psi)
+            read = (
+                air - gust + rng.standard_normal(2)
+            )  # a gust changes what is read at once, and the ground velocity late
+            north, east = air + WIND + slow
+            filt.update(k / 5, (north, east, 0.0), float(np.hypot(*read)), float(np.arctan2(read[1], read[0])))
         found.append(filt.drift_sigma)
     assert least <= np.median(found) <= most
 
@@ -104,3 +109,39 @@ def test_a_wind_that_cannot_be_is_never_told():
         filt.inflate_after_step(np.array([odd, 0.0, 0.0]), 1.0, 0.1)
     filt.inflate_after_step(np.zeros(3), np.inf, 0.1)
     assert np.array_equal(filt.wind, before) and np.isfinite(filt.P).all()
+
+
+def test_gusts_in_the_readings_do_not_reduce_the_scale():
+    """A gust is read at once, by pitot tube and nose; the ground velocity hardly follows it."""
+    found = []
+    for seed in range(6):
+        rng, filt, gust = np.random.default_rng(seed), WindFilter(), np.zeros(2)
+        for k in range(5 * 300):
+            psi = 0.02 * k / 5 + 0.8 * np.sin(0.05 * k / 5)
+            gust = gust * np.exp(-0.2 / 2.0) + 1.5 * np.sqrt(1 - np.exp(-0.4 / 2.0)) * rng.standard_normal(2)
+            air = 1.03 * VA * np.array([cos(psi), sin(psi)])
+            read = air - gust
+            reported = float(np.hypot(*read)) / 1.03
+            filt.update(k / 5, (*(air + WIND), 0.0), reported, float(np.arctan2(read[1], read[0])))
+        found.append(filt.scale)
+    assert np.mean(found) == pytest.approx(1.03, abs=0.01)
+
+
+def test_the_scale_begins_with_the_standard_atmosphere():
+    filt = WindFilter()
+    filt.expect_scale(2_000.0)
+    assert filt.scale == pytest.approx(1.10, abs=0.01)
+    filt.update(0.0, (*(np.array([VA, 0.0]) + WIND), 0.0), VA, 0.0)
+    begun = filt.scale
+    filt.expect_scale(0.0)
+    assert filt.scale == begun
+
+
+def test_the_angle_of_attack_turns_the_air_velocity_out_of_the_turn():
+    """Against the exact rotation of (cos alpha, 0, sin alpha), at the pitch of a level turn."""
+    for phi in (-0.7, -0.3, 0.0, 0.5, 0.8):
+        alpha, psi = 0.09, 2.0
+        theta = float(np.arctan2(np.sin(alpha) * cos(phi), np.cos(alpha)))  # level flight
+        air = rotation(phi, theta, psi) @ np.array([cos(alpha), 0.0, sin(alpha)])
+        assert air[2] == pytest.approx(0.0, abs=1e-9)
+        assert reported_direction(phi, theta, psi, 0.0, VA) == pytest.approx(np.arctan2(air[1], air[0]), abs=0.006)

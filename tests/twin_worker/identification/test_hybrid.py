@@ -204,10 +204,12 @@ def control() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return laws.init(par, way.legs, 0, p, p, v, np.zeros(3), SPEED, 0.0, 0.5), par, way.legs  # type: ignore
 
 
-def flown(air: np.ndarray, chance: np.ndarray, seconds: float = 60.0, dt: float = H.STEP) -> np.ndarray:
+def flown(
+    air: np.ndarray, chance: np.ndarray, seconds: float = 60.0, dt: float = H.STEP, phi: float = 0.0
+) -> np.ndarray:
     ctl, par, legs = control()
     start = np.zeros(H.N_START)
-    start[2], start[H.V], start[H.THROTTLE] = -100.0, SPEED, 0.5
+    start[2], start[H.V], start[H.THROTTLE], start[H.PHI] = -100.0, SPEED, 0.5, phi
     out = np.empty((round(seconds / dt) + 1, 3))
     assert H.simulate_route(ctl, par, legs, body(), air, start, chance, dt, out) == len(out)
     return out
@@ -228,6 +230,16 @@ def test_wind_carries_it_and_a_gust_passes():
     gust = (flown(calm(REST_N=3.0), none) - still)[:, 0]
     assert 0.0 < gust[10] < 3.3 and abs(gust[-1] - gust[-100]) < 6.0  # carried for seconds, not for a minute
     assert np.abs(still[:, 1]).max() < 1.0 and np.abs(still[:, 2] + 100.0).max() < 6.0
+
+
+def test_a_turn_keeps_to_its_tangent_whatever_the_step():
+    """Seconds into a steady turn, before guidance rolls out: as the course that a bank of 0.6 rad turns."""
+    none = np.empty((0, 4))
+    for dt in (0.05, H.STEP, H.COARSE_STEP):
+        path = flown(calm(), none, seconds=2.0, dt=dt, phi=0.6)
+        course = np.arctan2(*np.diff(path, axis=0)[0, 1::-1])
+        rate = 9.81 * np.tan(0.6) / SPEED
+        assert course == pytest.approx(0.5 * rate * dt, abs=0.15 * rate * dt)
 
 
 def test_coarse_steps_fly_the_same_flight():

@@ -140,7 +140,7 @@ def test_nothing_changes_without_a_mark_from_before(twin):
 
 def test_an_effect_that_is_not_there_is_not_flown_with(twin):
     tried = adapt_models(twin, push(twin, twin.telemetry.history.newest - 30.0, airspeed_scale=0.6), "airspeed_scale")
-    assert not tried.used and tried.adapted_error > tried.present_error and twin.models.active_effect is None
+    assert not tried.used and twin.models.active_effect is None
     assert "the identified model is used unchanged" in tried.message
 
 

@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from fleet.autopilots import copter
+from fleet.autopilots import copter, copter_legs
 from fleet.contract import Mission, Params, Prediction, Sample, Status, TwinState
 from fleet.frames import to_ned
 from tests.support import hover
@@ -47,7 +47,7 @@ def misses(flight: hover.Flight, made: list[Prediction], ahead: float) -> np.nda
 def test_it_follows_its_route_by_its_own_law(mission, answered):
     twin, made = answered
     late = [p for p in made if p.t > mission.t[0] + 5.0]
-    assert {p.method for p in late} == {"copter"} and {p.law for p in late} == {copter.LAW}
+    assert {p.method for p in late} == {"copter"} and {p.law for p in late} == {copter_legs.LAW}
     assert all(p.state is TwinState.PREDICTING and p.seq >= 1 for p in late)
     assert "kinematic twin: lag" in late[-1].sentence
     assert "no wings to identify" in twin.identification.verdict.sentence and twin.models.active_model is None

@@ -119,6 +119,17 @@ def test_fleet_status_shows_alerts_as_written() -> None:
     assert "! uav-3: near [b]uav-4[/b]" in text and "all is [well]" in text
 
 
+def test_fleet_status_colours_what_is_verified_and_what_is_only_plausible() -> None:
+    states = (TwinState.VERIFIED, TwinState.PLAUSIBLE, TwinState.WAITING)
+    table = fleet_table([FleetRow(uav=k, state=state, verdict="") for k, state in enumerate(states)])
+    cells = list(table.columns[1].cells)
+    assert [(str(cell), cell.style) for cell in cells] == [  # type: ignore[union-attr]
+        ("verified", "green"),
+        ("plausible", "yellow"),
+        ("waiting", ""),
+    ]
+
+
 def test_alerts_are_strict_json() -> None:
     """A foreign tool may put them into JSON: no nan."""
     alerts = conflicts(offline.run_offline(opposite(), {}))

@@ -171,12 +171,12 @@ def test_nothing_raises_but_the_sentence_and_nothing_published_is_no_number(spoi
     rng = np.random.default_rng(KINDS.index(spoil))
     became = Counter(met(spoilt(spoil, rng), rng) for _ in range(EACH))
     assert sum(became.values()) == EACH
-    assert became[Outcome.VERIFIED.value] < EACH or spoil in (gaps, not_numbers, stuck_input, huge_offset)
+    assert became[Outcome.PLAUSIBLE.value] < EACH or spoil in (gaps, not_numbers, stuck_input, huge_offset)
 
 
 def test_there_are_two_thousand():
     assert len(KINDS) * EACH == 2000
-    assert met(GOOD[0], np.random.default_rng(0)) == "verified"  # and it is not the harness that refuses
+    assert met(GOOD[0], np.random.default_rng(0)) == "plausible"  # and it is not the harness that refuses
 
 
 @pytest.mark.parametrize("spoil", [kind for kind in KINDS if kind is not same_stamps], ids=lambda kind: kind.__name__)

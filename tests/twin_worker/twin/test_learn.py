@@ -139,3 +139,13 @@ def test_what_runs_have_earned_is_learnt_on_flight_and_published():
         and min(twin.identification.shrinkage.kappa_at(10.0).values()) > 0.6
     )
     assert HeldOut(truth(), WINDOW, 100).shrinkage_sample(20.0, 5.0) is None
+
+
+@pytest.mark.parametrize(("outcome", "state"), [(Outcome.PLAUSIBLE, "plausible"), (Outcome.VERIFIED, "verified")])
+def test_a_plausible_model_predicts_as_a_verified_one_and_the_twin_says_which(choose, outcome, state):
+    verdict = Verdict(outcome=outcome, sentence="mean fit 30 %")
+    twin, after = choose({"new": 9.0}, new="new", verdict=verdict)
+    assert twin.models.active_model == "new" and after is verdict and twin.models.state == state
+    twin.identification.conclude(verdict)
+    assert twin.identification.tries == 0 and twin.verdict_text == "mean fit 30 %"
+    assert Twin.of(1).models.state == "waiting"

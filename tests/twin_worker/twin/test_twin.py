@@ -30,7 +30,7 @@ FLOWN_S = 100.0
 
 def test_it_is_verified_within_the_flight_and_at_what_horizon(flown):
     verdicts = [r.verdict for r in flown[1] if isinstance(r, Model)]
-    good = [v for v in verdicts if v.outcome is Outcome.VERIFIED]
+    good = [v for v in verdicts if v.outcome.is_accepted]
     assert good and good[-1].horizon_s >= 4.0
     assert all(np.mean(list(v.fit.values())) > max(0.0, np.mean(list(v.fit_persistence.values()))) for v in good)
     assert all(v.sentence.startswith("uav-1: ") for v in verdicts)
@@ -136,7 +136,7 @@ def test_another_mode_invalidates_at_once(twin, heard):
     results = drive(twin, [status(twin, mode="FBWA")])
     (said,) = predictions(results)
     assert said.method == "imm" and "FBWA follows no mission" in said.sentence and said.seq == -1
-    assert twin.onboard.plan_changed_t == now and twin.prediction.state is TwinState.VERIFIED
+    assert twin.onboard.plan_changed_t == now and twin.prediction.state is twin.models.state
     assert all(
         t >= now - 1.0 for t in twin.confidence.tracker.open_start_times
     )  # what was predicted in AUTO is not scored

@@ -181,9 +181,9 @@ class EstimationResult:
     cost: float
 
 
-def unbroken_segments(ok: np.ndarray, dt: float) -> np.ndarray:
-    """Split gap-free rows into free runs of an integer number of groups, (m, 2)."""
-    longest, least = (int(seconds / dt) // GROUP * GROUP for seconds in (SEGMENT_S, MIN_SEGMENT_S))
+def unbroken_segments(ok: np.ndarray, dt: float, longest_s: float = SEGMENT_S) -> np.ndarray:
+    """Split gap-free rows into free runs of at most `longest_s` and an integer number of groups, (m, 2)."""
+    longest, least = (int(seconds / dt) // GROUP * GROUP for seconds in (longest_s, MIN_SEGMENT_S))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], ok, [False]]).astype(int)))
     pieces = []
     for start, stop in edges.reshape(-1, 2):

@@ -4,6 +4,7 @@ from math import asin
 
 import numpy as np
 
+from fleet.frames import air_direction
 from fleet.physics import point_mass as H
 from fleet.window import Window
 from twin_worker.estimation.wind_filter import DRIFT_S, GUST, GUST_S
@@ -65,7 +66,8 @@ def unexplained_velocity(start: np.ndarray, air: np.ndarray, v: np.ndarray) -> n
         air: (..., N_AIR)
         v: north and east
     """
-    level, course = start[..., H.V] * np.cos(start[..., H.GAMMA]), start[..., H.PSI] + air[..., H.D_PSI]
+    phi, theta, psi, gamma = (start[..., k] for k in (H.PHI, H.THETA, H.PSI, H.GAMMA))
+    level, course = start[..., H.V] * np.cos(gamma), air_direction(phi, theta, psi + air[..., H.D_PSI], gamma)
     along = np.stack([level * np.cos(course), level * np.sin(course)], axis=-1)
     return v - along - air[..., [H.W_N, H.W_E]] - air[..., [H.DRIFT_N, H.DRIFT_E]]
 

@@ -10,10 +10,16 @@ from math import isfinite, tan
 import numpy as np
 
 from fleet.frames import G
-from twin_worker.prediction.multirotor.rollout import MultirotorConfig, MultirotorModel, MultirotorTwin, fly_segments
-from twin_worker.prediction.multirotor.route import segments_from_mission
+from twin_worker.prediction.multirotor.rollout import (
+    MultirotorConfig,
+    MultirotorModel,
+    MultirotorTwin,
+    fly_segments,
+    time_on_item,
+)
 from twin_worker.telemetry.track import STEP, Track
 
+_HISTORY_ROWS = 300  # flight before each start
 _MIN_TRACK_S = 2.0  # minimum track before a rollout [s]
 _COMPARE_S = 60.0  # compared flight [s]
 _MIN_TILT_S, _TILT_ROWS = 20.0, 5  # minimum flight for drag and wind [s], rows from one to the next
@@ -37,17 +43,15 @@ def fit_model(track: Track, seq: np.ndarray, config: MultirotorConfig, model: Mu
     starts = _starts(track, seq, config)
     if len(starts) < 3:
         return model
-    segments_of = {}
-    for k in starts:
-        if seq[k] not in segments_of:
-            segments_of[seq[k]] = segments_from_mission(
-                config.items, int(seq[k]) + config.seq_offset, config.origin, track.p[k], config.params
-            )[0]
+    segments_of = {
+        k: config.segments(track.part(max(k - _HISTORY_ROWS, 0), k + 1), seq[max(k - _HISTORY_ROWS, 0) : k + 1])[0]
+        for k in starts
+    }
 
     def cost_of(candidate: MultirotorModel) -> float:
         errors = [
             _rollout_error(
-                track, k, segments_of[seq[k]], int(seq[k]) + config.seq_offset, MultirotorTwin(config, candidate)
+                (track, seq), k, segments_of[k], int(seq[k]) + config.seq_offset, MultirotorTwin(config, candidate)
             )
             for k in starts
         ]
@@ -76,11 +80,15 @@ def _moves(track: Track, k: int, run_rows: int) -> bool:
     return bool(np.linalg.norm(track.p[k + run_rows] - track.p[k]) > 3.0)
 
 
-def _rollout_error(track: Track, k: int, segments: np.ndarray, seq: int, twin: MultirotorTwin) -> float:
+def _rollout_error(
+    history: tuple[Track, np.ndarray], k: int, segments: np.ndarray, seq: int, twin: MultirotorTwin
+) -> float:
     if not len(segments):
         return 0.0
     ahead = np.arange(0.0, _RUN_S + 0.5)
-    path = fly_segments(track.part(max(k - 100, 0), k + 1), segments, seq, twin, ahead)
+    track, items = history
+    past = track.part(max(k - _HISTORY_ROWS, 0), k + 1)
+    path = fly_segments(past, segments, seq, twin, ahead, since=time_on_item(items[: k + 1]))
     actual = track.p[k + np.rint(ahead / STEP).astype(int)]
     return float(np.linalg.norm(path - actual, axis=1).mean())
 

@@ -9,17 +9,19 @@ from math import isfinite
 
 import numpy as np
 
-from fleet.autopilots import copter
+from fleet.autopilots import copter, copter_legs, px4_multirotor
 from fleet.autopilots.copter import Limits
 from fleet.contract import Item, Mission
 from fleet.frames import Origin
 from fleet.mission import join_remarks, route_items
 from twin_worker.numerics.interpolation import zero_order_hold
+from twin_worker.prediction.multirotor import copter_rollout, px4_rollout
 from twin_worker.prediction.multirotor.route import (
     limit_speeds,
     numbered_from_one,
     return_segments,
     segments_from_mission,
+    stop_position,
     stopping_segment,
 )
 from twin_worker.telemetry.track import STEP, Track
@@ -30,6 +32,7 @@ _ZETA = 0.9
 _TRANSITION_ACCEL = 4.0  # acceleration of a quadplane in transition [m/s2]
 _ITEM_MAX_AGE_S = 15.0  # maximum age of a reported item [s]
 _STATIONARY_SPEED = 0.8  # stationary below this speed [m/s]
+_WAYPOINT, _TURNS, _LAST_NAV = 16, 18, 95  # MAV_CMD
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,9 @@ class MultirotorConfig:
         limit: limits from the parameters
         absent: limits without a received parameter
         changed_t: last change of route, mode or parameters [s since 1970]
+        origin: of the twin's frame
+        plans_legs: flies jerk-limited legs as ArduCopter does
+        smooths_velocity: flies a jerk-limited velocity as PX4 does; with neither, the general law of `copter`
     """
 
     items: tuple[Item, ...]
@@ -87,6 +93,51 @@ class MultirotorConfig:
     absent: tuple[str, ...]
     changed_t: float
     origin: Origin
+    plans_legs: bool = False
+    smooths_velocity: bool = False
+
+    @property
+    def law(self) -> str:
+        """Return the name of the law."""
+        return copter_legs.LAW if self.plans_legs else px4_multirotor.LAW if self.smooths_velocity else copter.LAW
+
+    def segments(self, track: Track, seq: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+        """Return the route from the current item on, for ArduCopter from the leg before it; and the mission's problems.
+
+        Args:
+            track: newest flight
+            seq: reported mission item of each row
+        """
+        item = int(seq[-1]) + self.seq_offset
+        arcs = self.plans_legs
+        route, problems = segments_from_mission(self.items, item, self.origin, track.p[-1], self.params, arcs=arcs)
+        if not self.plans_legs or not len(route):
+            return route, problems
+        before = self._previous(item, seq)
+        if before is None:
+            return route, problems
+        if before.command == _WAYPOINT and not before.param1 > 0 and before.seq < item:
+            arguments = (self.items, before.seq, self.origin, track.p[-1], self.params)
+            longer, more = segments_from_mission(*arguments, arcs=arcs)
+            k = np.flatnonzero(longer[:, copter.SEQ] == item)
+            return (longer, more) if len(k) and k[0] <= 1 else (route, problems)
+        changed = int(np.flatnonzero(seq != seq[-1])[-1]) if (seq != seq[-1]).any() else None
+        if before.command == _TURNS and changed is not None:
+            v = track.v[changed]
+            start = track.p[changed] + v * float(np.linalg.norm(v)) / (2 * self.limit.acc)
+        else:
+            start = stop_position(self.items, before.seq, self.origin)
+        if start is not None:
+            route[0, copter.A_N : copter.A_N + 3] = start
+        return route, problems
+
+    def _previous(self, item: int, seq: np.ndarray) -> Item | None:
+        """Return the navigation item before the current one: the one reported before, else the one listed before."""
+        other = np.flatnonzero(np.isfinite(seq) & (seq != seq[-1]))
+        number = int(seq[other[-1]]) + self.seq_offset if len(other) else item
+        listed = [i for i in self.items if 0 < i.seq < item and 0 < i.command < _LAST_NAV]
+        reported = [i for i in self.items if i.seq == number and 0 < i.command < _LAST_NAV]
+        return reported[0] if reported and number != item else (listed[-1] if listed else None)
 
 
 def multirotor_config(
@@ -107,7 +158,8 @@ def multirotor_config(
     if "speed" in absent and track is not None:
         limit = limit._replace(speed=_cruise_speed(track, limit.speed))
     items = numbered_from_one(items, origin) if seq_offset else items
-    return MultirotorConfig(items, seq_offset, params, limit, absent, since, origin)
+    plans_legs, smooths_velocity = (autopilot == name and not prefix for name in ("ardupilot", "px4"))
+    return MultirotorConfig(items, seq_offset, params, limit, absent, since, origin, plans_legs, smooths_velocity)
 
 
 def _cruise_speed(track: Track, default: float) -> float:
@@ -131,15 +183,22 @@ def fly_route(
     if not isfinite(seq[-1]):
         return None, "the current mission item is not reported (MISSION_CURRENT)"
     item_seq = int(seq[-1]) + config.seq_offset
-    segments, problems = segments_from_mission(config.items, item_seq, config.origin, track.p[-1], config.params)
+    segments, problems = config.segments(track, seq)
     if not len(segments):
         return None, join_remarks(("the mission has nothing to fly", *problems))
-    return fly_segments(track, segments, item_seq, MultirotorTwin(config, model), ahead), join_remarks(problems)
+    twin = MultirotorTwin(config, model)
+    return fly_segments(track, segments, item_seq, twin, ahead, since=time_on_item(seq)), join_remarks(problems)
+
+
+def time_on_item(seq: np.ndarray) -> float:
+    """Return how long the current item has been reported [s]; nan if from the first row on."""
+    other = np.flatnonzero(seq != seq[-1])
+    return STEP * (len(seq) - 1 - int(other[-1])) if len(other) else float("nan")
 
 
 def fly_home(track: Track, config: MultirotorConfig, model: MultirotorModel, ahead: np.ndarray) -> np.ndarray | None:
     """Predict a return to launch from the end of the track; None if home is unknown."""
-    segments = return_segments(config.items, config.origin, track.p[-1], config.params)
+    segments = return_segments(config.items, config.origin, track.p[-1], config.params, arcs=config.plans_legs)
     return fly_segments(track, segments, -1, MultirotorTwin(config, model), ahead) if len(segments) else None
 
 
@@ -174,12 +233,33 @@ class MultirotorTwin:
         return np.array([self.config.limit.jerk, self.model.wn, _ZETA, self.model.max_tilt_airspeed, *self.model.wind])
 
 
-def fly_segments(track: Track, commanded: np.ndarray, seq: int, twin: MultirotorTwin, ahead: np.ndarray) -> np.ndarray:
-    """Simulate route segments from the end of the track with current item `seq`; return the path, (k, 3) [m]."""
+def fly_segments(
+    track: Track,
+    commanded: np.ndarray,
+    seq: int,
+    twin: MultirotorTwin,
+    ahead: np.ndarray,
+    *,
+    since: float = float("nan"),
+) -> np.ndarray:
+    """Simulate route segments from the end of the track with current item `seq`; return the path, (k, 3) [m].
+
+    `since` is the time since this item was first reported [s].
+    """
     segments = limit_speeds(commanded, twin.limit)
     stops = (segments[:, copter.HOLD] > 0) & np.isfinite(segments[:, copter.HOLD])
-    segments[stops, copter.HOLD] += twin.model.stop_delay_s
+    planned = (
+        twin.config.plans_legs or twin.config.smooths_velocity
+    ) and not twin.model.n_starts  # its stops are part of the law
+    segments[stops, copter.HOLD] += 0.0 if planned else twin.model.stop_delay_s
     segments[:, copter.SPEED] *= np.where(commanded[:, copter.SPEED] > 0, twin.model.speed_fraction, 1.0)
+    if segments.shape[1] == copter_legs.N_COLUMNS:
+        par = copter_rollout.parameters(twin.limit, twin.config.params)
+        return copter_rollout.fly(track, segments, (seq, since), par, ahead)
+    if twin.config.smooths_velocity:
+        segments = px4_rollout.limit_takeoff(segments, twin.config.items, twin.config.params)
+        par = px4_rollout.parameters(twin.limit, twin.config.params)
+        return px4_rollout.fly(track, segments, (seq, since), par, ahead)
     p, v = track.p[-1].copy(), track.v[-3:].mean(axis=0)
     ref = _initial_reference(track, segments, seq, twin.model.wn)
     out = np.empty((int(ahead[-1] / STEP) + 2, 3))

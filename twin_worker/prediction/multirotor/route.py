@@ -8,10 +8,10 @@ import msgspec
 import numpy as np
 
 from fleet import mission as m
-from fleet.autopilots import copter
+from fleet.autopilots import copter, copter_legs
 from fleet.autopilots.copter import Limits
 from fleet.contract import Item
-from fleet.frames import Origin
+from fleet.frames import Origin, to_ned
 
 STOP_WAIT_S = 1e-3  # minimal wait that marks a stop [s]
 _NUDGE_E7 = 108  # 1.2 m north [1e-7 deg]
@@ -19,27 +19,38 @@ _MAX_LEGS = 24  # maximum legs of the route
 _MAX_SEGMENTS = 90  # maximum segments
 _CIRCLE_SEGMENTS = 12  # segments of one circle
 _SLOW_LANDING_M = 10.0  # height below which a landing is slow [m]
-_RETURN, _JUMP = 20, 177  # MAV_CMD
+_RETURN, _JUMP, _DELAY = 20, 177, 93  # MAV_CMD
 _RTL_M = 15.0  # ArduCopter's default RTL_ALT [m]
 _CIRCLE_M, _CIRCLE_RATE = 10.0, 20.0  # ArduCopter's default CIRCLE_RADIUS and CIRCLE_RATE [m, deg/s]
 
 
 @dataclass
 class _SegmentBuilder:
-    """Builder of route segments."""
+    """Builder of route segments; `arcs`: a circle is one segment instead of many straight ones."""
 
     end: np.ndarray  # (3,) NED [m]
     rows: list[np.ndarray]
+    arcs: bool = False
 
     def add(self, b: np.ndarray, seq: float, hold: float = 0.0, speed: float = 0.0) -> None:
         """Add a segment to `b`; skip a segment of zero length without a wait."""
         if np.linalg.norm(b - self.end) < 0.3 and not hold:
             return
-        row = np.zeros(copter.N_SEGMENT)
+        row = np.zeros(copter_legs.N_COLUMNS if self.arcs else copter.N_SEGMENT)
         row[copter.A_N : copter.A_N + 3], row[copter.B_N : copter.B_N + 3] = self.end, b
         row[copter.SPEED], row[copter.HOLD], row[copter.SEQ] = speed, hold, seq
         self.rows.append(row)
         self.end = np.array(b, float)
+
+    def stop(self) -> None:
+        """Let the aircraft stop at the end of the last segment."""
+        if self.arcs and self.rows:
+            self.rows[-1][copter.HOLD] = max(self.rows[-1][copter.HOLD], STOP_WAIT_S)
+
+    @property
+    def array(self) -> np.ndarray:
+        """Return all segments."""
+        return np.array(self.rows).reshape(-1, copter_legs.N_COLUMNS if self.arcs else copter.N_SEGMENT)
 
 
 def numbered_from_one(items: Sequence[Item], home: Origin) -> tuple[Item, ...]:
@@ -52,7 +63,7 @@ def numbered_from_one(items: Sequence[Item], home: Origin) -> tuple[Item, ...]:
 
 
 def segments_from_mission(
-    items: Sequence[Item], seq: int, origin: Origin, p: np.ndarray, params: Mapping[str, float]
+    items: Sequence[Item], seq: int, origin: Origin, p: np.ndarray, params: Mapping[str, float], *, arcs: bool = False
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Convert the route from item `seq` on to segments with the commanded speed, 0 if there is none.
 
@@ -62,6 +73,7 @@ def segments_from_mission(
         origin: origin of the twin's NED frame
         p: position of the aircraft, NED, (3,) [m]
         params: autopilot parameters
+        arcs: a circle is one segment with the columns of `copter_legs`
     Returns:
         segments (n, N_SEGMENT), and the problems of the mission
     """
@@ -72,14 +84,19 @@ def segments_from_mission(
         and np.isfinite(mission_route.start).all()
     ):
         mission_route.start[2] = p[2]  # approach at the present height
-    wait_times = {item.seq: item.param1 for item in items if item.command in (16, 82) and 0 < item.param1 < 1e5}
+    wait_times = {item.seq: item.param1 for item in items if item.command in (16, 82, _DELAY) and 0 < item.param1 < 1e5}
+    delays = {item.seq for item in items if item.command == _DELAY}
     returns = {item.seq for item in items if item.command == _RETURN}
-    builder = _SegmentBuilder(mission_route.start if np.isfinite(mission_route.start).all() else np.array(p, float), [])
+    start = mission_route.start if np.isfinite(mission_route.start).all() else np.array(p, float)
+    builder = _SegmentBuilder(start, [], arcs)
     home = _home(items, origin)
     for leg in mission_route.legs:
         if leg[m.SEQ] < 0 or len(builder.rows) > _MAX_SEGMENTS:
             break  # a multirotor holds position after the last item
-        if int(leg[m.SEQ]) in returns:
+        if int(leg[m.SEQ]) in delays:
+            builder.add(builder.end, leg[m.SEQ], wait_times.get(int(leg[m.SEQ]), STOP_WAIT_S))
+        elif int(leg[m.SEQ]) in returns:
+            builder.stop()
             _add_return(builder, home, params, leg[m.SEQ])
         else:
             _add_leg(builder, leg, wait_times.get(int(leg[m.SEQ]), 0.0), home[2], params)
@@ -87,7 +104,7 @@ def segments_from_mission(
         builder.rows[-1][copter.HOLD] = inf
     # multirotor speeds are ground speeds
     problems = tuple(s for s in mission_route.sentences if "ground speed" not in s)
-    return np.array(builder.rows).reshape(-1, copter.N_SEGMENT), problems
+    return builder.array, problems
 
 
 def _separate_vertical(items: Sequence[Item]) -> list[Item]:
@@ -104,8 +121,18 @@ def _separate_vertical(items: Sequence[Item]) -> list[Item]:
         )
         if above and item.command == 16 and previous is not None and abs(item.alt_m - previous.alt_m) > 1.0:
             item = msgspec.structs.replace(item, lat_e7=item.lat_e7 + _NUDGE_E7)
+        if item.command == _DELAY:
+            item = _wait_item(item, next((i for i in reversed(out) if i.lat_e7 or i.lon_e7), None))
         out.append(item)
     return out
+
+
+def _wait_item(item: Item, previous: Item | None) -> Item:
+    """Return a delay as a waypoint beside the previous one: a wing flies on, a multirotor waits."""
+    if previous is None:
+        return item
+    place = {"lat_e7": previous.lat_e7 + _NUDGE_E7, "lon_e7": previous.lon_e7, "alt_m": previous.alt_m}
+    return msgspec.structs.replace(item, command=16, frame=previous.frame, **place)
 
 
 def _home(items: Sequence[Item], origin: Origin) -> np.ndarray:
@@ -124,6 +151,7 @@ def _add_leg(
     if kind == m.TAKEOFF:
         builder.add(np.array([*builder.end[:2], b[2]]), seq, STOP_WAIT_S)
     elif kind == m.LAND:
+        builder.stop()
         builder.add(np.array([*b[:2], builder.end[2]]), seq, STOP_WAIT_S, leg[m.VA_C])
         if builder.rows:  # the quadplane decelerates more gently than it accelerates
             builder.rows[-1][copter.ACC] = max(params.get("Q_TRANS_DECEL", 0.0), 0.0)
@@ -143,11 +171,12 @@ def _add_descent(builder: _SegmentBuilder, ground: float, seq: float) -> None:
 
 
 def _add_return(builder: _SegmentBuilder, home: np.ndarray, params: Mapping[str, float], seq: float) -> None:
-    height = params.get("RTL_ALT_M", params.get("RTL_ALT", 100.0 * _RTL_M) * 0.01)
+    height = params.get("RTL_ALT_M", params.get("RTL_RETURN_ALT", params.get("RTL_ALT", 100.0 * _RTL_M) * 0.01))
     height = min(height, 1e3) if height > 0 else 0.0
     top = min(home[2] - height, builder.end[2])
     builder.add(np.array([*builder.end[:2], top]), seq, STOP_WAIT_S if top < builder.end[2] - 0.3 else 0.0)
-    builder.add(np.array([*home[:2], top]), seq, STOP_WAIT_S)
+    wait_s = params.get("RTL_LOIT_TIME", 0.0) * 1e-3
+    builder.add(np.array([*home[:2], top]), seq, wait_s if STOP_WAIT_S < wait_s < 1e3 else STOP_WAIT_S)
     if not params.get("RTL_ALT_FINAL", 0.0) > 0:
         _add_descent(builder, home[2], seq)
 
@@ -158,6 +187,9 @@ def _add_circle(builder: _SegmentBuilder, leg: np.ndarray, params: Mapping[str, 
     radius = leg[m.RADIUS] or params.get("CIRCLE_RADIUS_M", params.get("CIRCLE_RADIUS", 100 * _CIRCLE_M) * 0.01)
     direction, abs_radius = (1.0 if radius >= 0 else -1.0), min(max(abs(radius), 1.0), 1e4)
     rate = abs(params.get("CIRCLE_RATE", _CIRCLE_RATE)) * pi / 180
+    if builder.arcs:
+        _add_arc(builder, leg, direction * abs_radius, rate)
+        return
     start_angle = atan2(builder.end[1] - b[1], builder.end[0] - b[0]) if hypot(*(builder.end - b)[:2]) > 0.1 else 0.0
     for k in range(ceil(turns * _CIRCLE_SEGMENTS) + 1):
         angle = start_angle + direction * 2 * pi * k / _CIRCLE_SEGMENTS
@@ -165,12 +197,41 @@ def _add_circle(builder: _SegmentBuilder, leg: np.ndarray, params: Mapping[str, 
         builder.add(point, leg[m.SEQ], 0.0, max(rate * abs_radius, 0.3) if k else leg[m.VA_C])
 
 
-def return_segments(items: Sequence[Item], origin: Origin, p: np.ndarray, params: Mapping[str, float]) -> np.ndarray:
+def _add_arc(builder: _SegmentBuilder, leg: np.ndarray, radius: float, rate: float) -> None:
+    """Add a leg to the circle, with a stop, and the circle as one segment; radius positive clockwise."""
+    centre, seq, turns = leg[m.P_N : m.P_D + 1], leg[m.SEQ], min(max(leg[m.TURNS], 1.0), 20.0)
+    offset = (builder.end - centre)[:2]
+    distance = hypot(*offset)
+    out = offset / distance if distance > 0.1 else np.array([1.0, 0.0])
+    builder.stop()
+    builder.add(np.array([*(centre[:2] + abs(radius) * out), centre[2]]), seq, STOP_WAIT_S, leg[m.VA_C])
+    builder.add(builder.end, seq, STOP_WAIT_S, max(rate * abs(radius), 0.3))
+    row = builder.rows[-1]
+    row[copter_legs.RADIUS], row[copter_legs.TURN] = abs(radius), 2 * pi * turns * (1 if radius >= 0 else -1)
+    row[copter_legs.C_N], row[copter_legs.C_E] = centre[:2]
+
+
+def stop_position(items: Sequence[Item], seq: int, origin: Origin) -> np.ndarray | None:
+    """Return where an aircraft waits after item `seq`, NED, (3,) [m]; None if the mission does not tell."""
+    home, place = _home(items, origin), None
+    for item in sorted(items, key=lambda i: i.seq):
+        if 0 < item.seq <= seq and item.command in (16, 17, 19, 22, 82):
+            down = -item.alt_m - origin.alt_mm * -1e-3 if item.frame in m.ABSOLUTE else home[2] - item.alt_m
+            north_east = home[:2]
+            if item.lat_e7 or item.lon_e7:
+                north_east = to_ned(origin, *(np.array([x], float) for x in (item.lat_e7, item.lon_e7, 0.0)))[0, :2]
+            place = np.array([*north_east, down])
+    return place
+
+
+def return_segments(
+    items: Sequence[Item], origin: Origin, p: np.ndarray, params: Mapping[str, float], *, arcs: bool = False
+) -> np.ndarray:
     """Return the segments of a return to launch from `p`, NED (3,) [m]; empty if home is unknown."""
-    builder = _SegmentBuilder(np.array(p, float), [])
+    builder = _SegmentBuilder(np.array(p, float), [], arcs)
     if any(item.seq == 0 for item in items):
         _add_return(builder, _home(items, origin), params, -1.0)
-    return np.array(builder.rows).reshape(-1, copter.N_SEGMENT)
+    return builder.array
 
 
 def stopping_segment(p: np.ndarray, v: np.ndarray, limit: Limits) -> np.ndarray:
@@ -194,6 +255,8 @@ def limit_speeds(segments: np.ndarray, limit: Limits) -> np.ndarray:
         row[copter.SPEED] = min(copter.limit_along(horizontal, limit.up, down, t[k]), 100.0)
         horizontal = min(limit.acc, row[copter.ACC]) if row[copter.ACC] > 0 else limit.acc
         row[copter.ACC] = min(copter.limit_along(horizontal, limit.acc_z, limit.acc_z, t[k]), 20.0)
+        if out.shape[1] > copter_legs.TURN and row[copter_legs.TURN]:
+            row[copter.SPEED] = min(segments[k, copter.SPEED], limit.speed)
     end_speed = 0.0
     for k in range(len(out) - 1, -1, -1):
         row = out[k]

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 import msgspec
 import numpy as np
 
-from fleet.contract import Model, Outcome, Verdict
+from fleet.contract import Model, Outcome, TwinState, Verdict
 from twin_worker.estimation.wind_filter import WindFilter
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
 from twin_worker.identification.fixed_wing.plant import Plant
@@ -97,7 +97,7 @@ class Identification(msgspec.Struct):
     def conclude(self, verdict: Verdict) -> None:
         """Store the verdict on the newest model, or why there is none."""
         self.verdict = verdict
-        if verdict.outcome in (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST, Outcome.NOT_IDENTIFIABLE):
+        if verdict.outcome.is_accepted or verdict.outcome in (Outcome.WORSE_THAN_LAST, Outcome.NOT_IDENTIFIABLE):
             self.tries = 0
 
     def count_try(self) -> None:
@@ -137,7 +137,7 @@ class Identification(msgspec.Struct):
 
 
 class VerifiedModel(msgspec.Struct):
-    """A verified model, and its error in closed loop over the newest held-out data.
+    """A plausible or verified model, and its error in closed loop over the newest held-out data.
 
     Attributes:
         plant: the model
@@ -205,6 +205,14 @@ class ModelBank(msgspec.Struct):
     checkpoints: deque[Checkpoint] = msgspec.field(default_factory=lambda: deque(maxlen=MAX_CHECKPOINTS))
     multirotor: MultirotorModel = msgspec.field(default_factory=MultirotorModel)
     kinematic: KinematicModel = msgspec.field(default_factory=KinematicModel)
+
+    @property
+    def state(self) -> TwinState:
+        """Return the state of a twin that has these models and no path: waiting without an active model."""
+        if self.active_model is None:
+            return TwinState.WAITING
+        plausible = self.active_verdict is not None and self.active_verdict.outcome is Outcome.PLAUSIBLE
+        return TwinState.PLAUSIBLE if plausible else TwinState.VERIFIED
 
     def add(self, candidate: VerifiedModel) -> None:
         """Add a candidate."""

@@ -134,9 +134,11 @@ class Twin(msgspec.Struct):
 
     @property
     def verdict_text(self) -> str:
-        """Return the verdict of the active model, and the outcome of the newest identification if it differs."""
-        if self.models.active_verdict is None or self.identification.verdict.outcome is Outcome.VERIFIED:
+        """Return the verdict of the active model, and the newest outcome if that model was not accepted."""
+        if self.models.active_verdict is None:
             return self.identification.verdict.sentence
+        if self.identification.verdict.outcome.is_accepted:
+            return self.models.active_verdict.sentence
         return (
             f"{self.models.active_verdict.sentence}; newest identification: "
             f"{self.identification.verdict.outcome.value.replace('_', ' ')}"

@@ -23,7 +23,7 @@ from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.kinematic_prediction import fit_kinematic_models
 from twin_worker.twin.steps.point_mass_step import update_point_mass
 from twin_worker.validation.held_out import HeldOut
-from twin_worker.validation.verify import verify, with_diagnostics
+from twin_worker.validation.verify import verify, with_consistency, with_diagnostics
 
 SHRINKAGE_LOOKAHEAD_S = 10.0  # look-ahead of the published shrinkage weights [s]
 _MIN_DATA_SHARE = 0.5  # reduction of the prior variance above which a parameter counts as determined by the data [-]
@@ -102,26 +102,30 @@ def select_model(twin: Twin, window: Window, n_train: int, plant: Plant, verdict
     Returns:
         the verdict, changed if the closed-loop result contradicts it
     """
-    if twin.models.verified_models and window.t[-1] - twin.models.scored.last < SELECTION_PERIOD_S:
+    if not _selection_due(twin, window):
         return verdict
     twin.models.scored.restart(float(window.t[-1]))
     start = max(n_train, len(window) - 1 - int(_HINDCAST_S / window.dt))
     initial = synchronise_controller(twin.situation(window.part(0, start + 1))) if not twin.no_route_reason() else None
     for model in twin.models.verified_models:
         model.update_error(hindcast_error(initial, window, start, model.plant))
-    if verdict.outcome is Outcome.VERIFIED:
+    if verdict.outcome.is_accepted:
         verdict = _add_verified(twin, window, plant, verdict, hindcast_error(initial, window, start, plant))
     best = twin.models.select(_MAX_MODELS)
     if best is None:
         return verdict
-    if verdict.outcome is Outcome.VERIFIED and best.plant is not plant:
+    if verdict.outcome.is_accepted and best.plant is not plant:
         sentence = f"{verdict.sentence}; but an earlier model has a lower closed-loop error and stays active"
         return msgspec.structs.replace(verdict, outcome=Outcome.WORSE_THAN_LAST, sentence=sentence)
     return verdict
 
 
+def _selection_due(twin: Twin, window: Window) -> bool:
+    return not twin.models.verified_models or window.t[-1] - twin.models.scored.last >= SELECTION_PERIOD_S
+
+
 def _add_verified(twin: Twin, window: Window, plant: Plant, verdict: Verdict, error: float) -> Verdict:
-    """Add a verified model, unless its closed-loop run on the route diverges."""
+    """Add an accepted model, unless its closed-loop run on the route diverges."""
     if np.isinf(error):
         sentence = f"{verdict.sentence}; but the closed-loop run leaves the flight envelope; identification is repeated"
         return msgspec.structs.replace(verdict, outcome=Outcome.DIVERGED, sentence=sentence)
@@ -209,10 +213,12 @@ def identify_and_verify(twin: Twin) -> list[Message]:
     verdict = msgspec.structs.replace(
         verdict, sentence=f"{twin.name}: {verdict.sentence}", attempts=twin.identification.tries
     )
-    verdict = select_model(twin, window, n_train, plant, verdict)
-    if verdict.outcome is Outcome.VERIFIED and isinstance(plant, derivatives_model.DerivativesModel):
-        twin.identification.store_prior(plant)
     repeat = window.t[-1] - twin.identification.published.last >= _PUBLISH_PERIOD_S
+    if repeat or _selection_due(twin, window) or _outcome_changed(verdict, twin.identification.verdict):
+        verdict = with_consistency(verdict, plant, window, n_train)
+    verdict = select_model(twin, window, n_train, plant, verdict)
+    if verdict.outcome.is_accepted and isinstance(plant, derivatives_model.DerivativesModel):
+        twin.identification.store_prior(plant)
     publish = _outcome_changed(verdict, twin.identification.verdict) or repeat
     twin.identification.conclude(verdict)
     if not publish:
@@ -228,7 +234,7 @@ def identify_and_verify(twin: Twin) -> list[Message]:
 
 def _outcome_changed(verdict: Verdict, previous: Verdict) -> bool:
     """Return whether the outcome changed; alternation between two valid outcomes does not count."""
-    valid = (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST)
+    valid = (Outcome.VERIFIED, Outcome.PLAUSIBLE, Outcome.WORSE_THAN_LAST)
     return verdict.outcome is not previous.outcome and not (verdict.outcome in valid and previous.outcome in valid)
 
 

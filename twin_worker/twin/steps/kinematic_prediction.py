@@ -5,7 +5,7 @@ from math import isfinite
 
 import numpy as np
 
-from fleet.autopilots import copter, greybox
+from fleet.autopilots import greybox
 from fleet.contract import Mission
 from fleet.mission import route_items
 from twin_worker.prediction import kinematic
@@ -240,13 +240,13 @@ def _predict_multirotor(twin: Twin, recent: Track, ahead: np.ndarray) -> PathFor
         ):
             return no_prediction(f"mode {mode}, but under manual control")
         hover_path = rollout.stop_and_hold(recent, config, twin.models.multirotor, ahead)
-        return PathForecast(hover_path, "copter", copter.LAW, -1, f"mode {mode} holds position", control)
+        return PathForecast(hover_path, "copter", config.law, -1, f"mode {mode} holds position", control)
     if mode in rollout.RETURN_MODES and twin.vehicle_class.is_rotorcraft:
         path = rollout.fly_home(recent, config, twin.models.multirotor, ahead)
         text = f"returns to launch; {rollout.describe(config, twin.models.multirotor)}"
         if path is None:
             return no_prediction("home position unknown")
-        return PathForecast(path, "copter", copter.LAW, -1, text, control)
+        return PathForecast(path, "copter", config.law, -1, text, control)
     if reason := twin.no_route_reason():
         return no_prediction(reason)
     seq = rollout.items_in_force(recent.t, twin.telemetry.history.rows_since("leg"), twin.onboard.mission)
@@ -258,4 +258,4 @@ def _predict_multirotor(twin: Twin, recent: Track, ahead: np.ndarray) -> PathFor
         return no_prediction(problem, item)
     hover_text = "hovering on rotors; " if twin.vehicle_class.is_vtol else ""
     text = " ".join(filter(None, (hover_text + rollout.describe(config, twin.models.multirotor), problem)))
-    return PathForecast(path, "copter", copter.LAW, item, text, control)
+    return PathForecast(path, "copter", config.law, item, text, control)

@@ -165,7 +165,7 @@ def _best_forecast(twin: Twin, recent: Track, ahead: np.ndarray) -> tuple[PathFo
     usable = window is not None and bool(window.ok[-1])
     reason = twin.identification.verdict.sentence
     if twin.environment.flight_phase.landed and twin.prediction.override is None:
-        _set_state(twin, TwinState.VERIFIED if twin.models.active_model else TwinState.WAITING)
+        _set_state(twin, twin.models.state)
         resting_path = np.tile(recent.p[-1], (len(ahead), 1))
         return PathForecast(resting_path, "imm", _NO_LAW, -1, EVENT_TEXTS[Event.TOUCH_DOWN]), float(recent.t[-1])
     has_model = twin.models.active_model is not None or twin.models.point_mass is not None
@@ -194,7 +194,7 @@ def _best_forecast(twin: Twin, recent: Track, ahead: np.ndarray) -> tuple[PathFo
 def _state_without_route(twin: Twin) -> TwinState:
     """Return the state of a twin that predicts no route, as the identification sees it."""
     if twin.models.active_model is not None:
-        return TwinState.VERIFIED
+        return twin.models.state
     waits = twin.identification.verdict.outcome is Outcome.INSUFFICIENT_DATA
     return TwinState.WAITING if waits or not twin.vehicle_class.has_wings else TwinState.IDENTIFYING
 

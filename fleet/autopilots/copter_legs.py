@@ -1,0 +1,271 @@
+"""ArduCopter's waypoint navigation: legs as jerk-limited profiles of time that overlap at corners, and circles.
+
+    s(t)            seven phases of constant jerk from rest to rest, within speed, acceleration and jerk of the leg
+    r = sum of the present leg, the rest of the one before and the begin of the next
+    t' = clip(0.05 + (v . d - P (r - x) . d) / |r'|, 0, 1), first-order lag WPNAV_ACCEL / WPNAV_JERK
+    x''' = (r'' + Pv (r' + P (r - x) - x') - x'') / tau                                 position loop behind attitude
+
+The next leg begins when the path between both deviates from the corner by less than WPNAV_RADIUS and its acceleration
+stays below the corner limit half-way to the end of the present one. A circle starts from rest with angular acceleration
+max(a / R, 2 deg/s2) and has a speed of at most sqrt(a R / 2); the leg after it starts at the stopping point.
+
+Source: ArduCopter 4.x documentation of waypoint navigation (S-curves), circle mode and position control.
+"""
+
+from math import atan2, cos, radians, sin, sqrt
+
+import numba as nb
+import numpy as np
+
+from fleet.autopilots.copter import A_N, ACC, B_N, END, HOLD, N_SEGMENT, SPEED
+
+LAW = "copter: jerk-limited legs that overlap at corners, behind the position loop"
+
+RADIUS, TURN, C_N, C_E = N_SEGMENT, N_SEGMENT + 1, N_SEGMENT + 2, N_SEGMENT + 3
+"""Columns of a circle: radius [m], signed angle [rad], centre [m]; angle 0 is a straight leg."""
+N_COLUMNS = N_SEGMENT + 4
+
+# state of the navigation: segment; time on it, on the one before (-1: over) and on the next (-1: not begun) [s]; time
+# waited at its end [s]; time scale [-]; angle, rate and angle flown of a circle [rad, rad/s, rad]; start of the leg [m]
+SEGMENT, T, TAIL, LEAD, WAIT, SCALE, ANGLE, RATE, TURNED, START_N, START_E, START_D = range(12)
+N_STATE = 12
+
+# parameters: gains [1/s], lag of the attitude [s], jerk [m/s3], WPNAV_RADIUS [m], corner and horizontal limit [m/s2]
+POS_P, VEL_P, POS_P_Z, VEL_P_Z, TAU, JERK, WP_RADIUS, ACC_CORNER, ACC_MAX, ACC_XY = range(10)
+N_PAR = 10
+
+_SUBSTEPS = 2
+_MIN_CIRCLE_ACC = radians(2.0)  # angular [rad/s2]
+_LOOK_S = 12.0  # time before the end of a leg within which the next may begin [s]
+_TAU_Z = 0.1  # lag of the thrust [s]
+
+
+@nb.njit(cache=True, error_model="numpy", nogil=True)
+def _plan(segment: np.ndarray, start: np.ndarray, jerk: float, out: np.ndarray) -> None:
+    """Plan a leg: direction (3), length, jerk time, constant acceleration time, cruise time, duration."""
+    length = 0.0
+    for i in range(3):
+        out[i] = segment[B_N + i] - start[i]
+        length += out[i] ** 2
+    length = sqrt(length)
+    for i in range(3):
+        out[i] = out[i] / length if length > 1e-6 else 0.0
+    acc, speed = segment[ACC], segment[SPEED]
+    if length >= 2.0 * acc**3 / jerk**2:
+        peak = 0.5 * acc * (sqrt((acc / jerk) ** 2 + 4.0 * length / acc) - acc / jerk)
+    else:
+        peak = jerk * (0.5 * length / jerk) ** (2.0 / 3.0)
+    speed = max(min(speed, peak), 1e-6)
+    ramp = min(acc / jerk, sqrt(speed / jerk))
+    steady = max(speed / (ramp * jerk) - ramp, 0.0)
+    cruise = max(length - speed * (2.0 * ramp + steady), 0.0) / speed
+    out[3], out[4], out[5], out[6], out[7] = length, ramp, steady, cruise, 4.0 * ramp + 2.0 * steady + cruise
+
+
+@nb.njit(cache=True, error_model="numpy", nogil=True)
+def _at(plan: np.ndarray, jerk: float, t: float) -> tuple[float, float, float]:
+    """Return distance, speed and acceleration of a planned leg at a time."""
+    if t >= plan[7]:
+        return plan[3], 0.0, 0.0
+    backward = t > 0.5 * plan[7]  # the profile is symmetric
+    left = plan[7] - t if backward else t
+    s, v, a = 0.0, 0.0, 0.0
+    for phase in range(4):
+        h = min(left, plan[4] if phase % 2 == 0 else plan[5] if phase == 1 else plan[6])
+        j = jerk if phase == 0 else -jerk if phase == 2 else 0.0
+        s += h * (v + h * (0.5 * a + h * j / 6.0))
+        v += h * (a + 0.5 * h * j)
+        a += h * j
+        left -= h
+        if left <= 0.0:
+            break
+    return (plan[3] - s, v, -a) if backward else (s, v, a)
+
+
+@nb.njit(cache=True, error_model="numpy", nogil=True)
+def _may_begin(plan: np.ndarray, t: float, following: np.ndarray, par: np.ndarray) -> bool:
+    """Return whether the next leg may begin now."""
+    left = plan[7] - t
+    if left < 0.0 or left > _LOOK_S or left >= 0.5 * following[7]:
+        return False
+    s0, v0, a0 = _at(plan, par[JERK], t + 0.5 * left)
+    s1, v1, a1 = _at(following, par[JERK], 0.5 * left)
+    deviation, speed, acceleration = 0.0, 0.0, 0.0
+    for i in range(3):
+        deviation += (plan[i] * (s0 - plan[3]) + following[i] * s1) ** 2
+        if i < 2:
+            speed += (plan[i] * v0 + following[i] * v1) ** 2
+            acceleration += (plan[i] * a0 + following[i] * a1) ** 2
+    top = min(plan[4] * (plan[4] + plan[5]), following[4] * (following[4] + following[5])) * par[JERK]
+    return deviation < par[WP_RADIUS] ** 2 and speed < top**2 and acceleration < par[ACC_CORNER] ** 2
+
+
+@nb.njit(cache=True, error_model="numpy", nogil=True)
+def navigate(
+    state: np.ndarray, segments: np.ndarray, xv: np.ndarray, par: np.ndarray, dt: float, r: np.ndarray
+) -> None:
+    """Advance the navigation by dt.
+
+    Args:
+        state: changed in place, (N_STATE,)
+        segments: (n, N_COLUMNS), n > 0
+        xv: position and velocity of the aircraft, (2, 3) [m, m/s]
+        par: (N_PAR,)
+        dt: step [s]
+        r: reference position, velocity, acceleration, filled in, (3, 3)
+    """
+    k = int(state[SEGMENT])
+    segment = segments[k]
+    if segment[TURN] != 0.0:
+        _circle(state, segments, xv, par, dt, r)
+        return
+    plan, other = np.empty(8), np.empty(8)
+    _plan(segment, state[START_N : START_D + 1], par[JERK], plan)
+    step = dt * state[SCALE]
+    state[T] += step
+    s, v, a = _at(plan, par[JERK], state[T])
+    for i in range(3):
+        r[0, i], r[1, i], r[2, i] = state[START_N + i] + plan[i] * s, plan[i] * v, plan[i] * a
+    if state[TAIL] >= 0.0 and k > 0:
+        _plan(segments[k - 1], segments[k - 1, A_N : A_N + 3], par[JERK], other)
+        state[TAIL] += step
+        s, v, a = _at(other, par[JERK], state[TAIL])
+        for i in range(3):
+            r[0, i] += other[i] * (s - other[3])
+            r[1, i] += other[i] * v
+            r[2, i] += other[i] * a
+        if state[TAIL] >= other[7]:
+            state[TAIL] = -1.0
+    more = k + 1 < len(segments)
+    if segment[END] > 0.0 and more and segments[k + 1, TURN] == 0.0:
+        _plan(segments[k + 1], segments[k + 1, A_N : A_N + 3], par[JERK], other)
+        if state[LEAD] < 0.0 and _may_begin(plan, state[T], other, par):
+            state[LEAD] = 0.0
+        if state[LEAD] >= 0.0:
+            state[LEAD] += step
+            s, v, a = _at(other, par[JERK], state[LEAD])
+            for i in range(3):
+                r[0, i] += other[i] * s
+                r[1, i] += other[i] * v
+                r[2, i] += other[i] * a
+            if state[LEAD] >= plan[7] - state[T]:
+                state[SEGMENT] += 1.0
+                state[TAIL], state[T], state[LEAD], state[WAIT] = state[T], state[LEAD], -1.0, 0.0
+                state[START_N : START_D + 1] = segments[k + 1, A_N : A_N + 3]
+                return
+    _scale(state, xv, par, dt, r)
+    if state[T] < plan[7] or state[LEAD] >= 0.0:
+        return
+    distance = 0.0
+    for i in range(3):
+        distance += (xv[0, i] - segment[B_N + i]) ** 2
+    if state[WAIT] > 0.0 or distance < par[WP_RADIUS] ** 2:
+        state[WAIT] += dt
+        if state[WAIT] >= segment[HOLD] and more:
+            state[SEGMENT] += 1.0
+            state[T], state[TAIL], state[LEAD], state[WAIT] = 0.0, -1.0, -1.0, 0.0
+            state[START_N : START_D + 1] = segments[k + 1, A_N : A_N + 3]
+            if segments[k + 1, TURN] != 0.0:
+                begin_circle(state, segments[k + 1], xv[0], 0.0)
+
+
+@nb.njit(cache=True, error_model="numpy", nogil=True)
+def begin_circle(state: np.ndarray, segment: np.ndarray, x: np.ndarray, rate: float) -> None:
+    """Set the state at the begin of a circle, or within it with an angular rate [rad/s]."""
+    state[ANGLE] = atan2(x[1] - segment[C_E], x[0] - segment[C_N])
+    state[RATE], state[TURNED] = rate, 0.0
+
+
+@nb.njit(cache=True, error_model="numpy", nogil=True)
+def _circle(state: np.ndarray, segments: np.ndarray, xv: np.ndarray, par: np.ndarray, dt: float, r: np.ndarray) -> None:
+    k = int(state[SEGMENT])
+    segment = segments[k]
+    radius, sense = segment[RADIUS], 1.0 if segment[TURN] > 0.0 else -1.0
+    top = min(segment[SPEED], sqrt(0.5 * par[ACC_XY] * radius)) / radius
+    state[RATE] = min(state[RATE] + max(par[ACC_XY] / radius, _MIN_CIRCLE_ACC) * dt, top)
+    state[ANGLE] += sense * state[RATE] * dt
+    state[TURNED] += state[RATE] * dt
+    c, s = cos(state[ANGLE]), sin(state[ANGLE])
+    r[0, 0], r[0, 1], r[0, 2] = segment[C_N] + radius * c, segment[C_E] + radius * s, segment[B_N + 2]
+    r[1, 0], r[1, 1], r[1, 2] = -sense * state[RATE] * radius * s, sense * state[RATE] * radius * c, 0.0
+    r[2, 0], r[2, 1], r[2, 2] = -(state[RATE] ** 2) * radius * c, -(state[RATE] ** 2) * radius * s, 0.0
+    if state[TURNED] >= abs(segment[TURN]) and k + 1 < len(segments):
+        state[SEGMENT] += 1.0
+        state[T], state[TAIL], state[LEAD], state[WAIT] = 0.0, -1.0, -1.0, 0.0
+        speed = sqrt(xv[1, 0] ** 2 + xv[1, 1] ** 2 + xv[1, 2] ** 2)
+        for i in range(3):
+            state[START_N + i] = xv[0, i] + xv[1, i] * speed / (2.0 * par[ACC_XY])
+        if segments[k + 1, TURN] != 0.0:
+            begin_circle(state, segments[k + 1], xv[0], 0.0)
+
+
+@nb.njit(cache=True, error_model="numpy", nogil=True)
+def _scale(state: np.ndarray, xv: np.ndarray, par: np.ndarray, dt: float, r: np.ndarray) -> None:
+    speed = sqrt(r[1, 0] ** 2 + r[1, 1] ** 2 + r[1, 2] ** 2)
+    scale_c = 1.0
+    if speed > 0.1:
+        behind, along = 0.0, 0.0
+        for i in range(3):
+            behind += (r[0, i] - xv[0, i]) * r[1, i] / speed
+            along += xv[1, i] * r[1, i] / speed
+        scale_c = min(max(0.05 + (along - par[POS_P] * behind) / speed, 0.0), 1.0)
+    state[SCALE] += (scale_c - state[SCALE]) * min(dt * par[JERK] / par[ACC_XY], 1.0)
+
+
+@nb.njit(cache=True, error_model="numpy", nogil=True)
+def track_reference(xva: np.ndarray, r: np.ndarray, par: np.ndarray, dt: float) -> None:
+    """Advance position, velocity and acceleration (3, 3) of the aircraft behind a reference (3, 3) by dt."""
+    a = np.empty(3)
+    for i in range(3):
+        pos_p, vel_p = (par[POS_P], par[VEL_P]) if i < 2 else (par[POS_P_Z], par[VEL_P_Z])
+        a[i] = r[2, i] + vel_p * (r[1, i] + pos_p * (r[0, i] - xva[0, i]) - xva[1, i])
+    excess = max(sqrt(a[0] ** 2 + a[1] ** 2) / par[ACC_MAX], 1.0)
+    for i in range(3):
+        limited = a[i] / excess if i < 2 else min(max(a[2], -5.0), 5.0)
+        xva[2, i] += (limited - xva[2, i]) * min(dt / (par[TAU] if i < 2 else _TAU_Z), 1.0)
+        xva[1, i] += dt * xva[2, i]
+        xva[0, i] += dt * xva[1, i]
+
+
+@nb.njit(cache=True, error_model="numpy", nogil=True)
+def follow(
+    state: np.ndarray, segments: np.ndarray, xva: np.ndarray, par: np.ndarray, dt: float, out: np.ndarray
+) -> None:
+    """Simulate the flight along the segments.
+
+    Args:
+        state: of the navigation, changed in place, (N_STATE,)
+        segments: (n, N_COLUMNS), n > 0
+        xva: position, velocity, acceleration at the start, changed in place, (3, 3)
+        par: (N_PAR,)
+        dt: step [s]
+        out: positions, filled in, NED, (k, 3) [m]; out[0] is the start
+    """
+    r = np.zeros((3, 3))
+    for k in range(len(out)):
+        out[k] = xva[0]
+        for _ in range(_SUBSTEPS):
+            navigate(state, segments, xva[:2], par, dt / _SUBSTEPS, r)
+            track_reference(xva, r, par, dt / _SUBSTEPS)
+
+
+@nb.njit(cache=True, error_model="numpy", nogil=True)
+def reference_states(segments: np.ndarray, par: np.ndarray, dt: float, states: np.ndarray, refs: np.ndarray) -> int:
+    """Run the navigation from the first segment with an aircraft that follows exactly; return the number of rows.
+
+    Args:
+        segments, par, dt: as of `follow`
+        states: state of the navigation at each step, filled in, (n, N_STATE)
+        refs: reference of each step, filled in, (n, 3, 3)
+    """
+    state, r = np.zeros(N_STATE), np.zeros((3, 3))
+    state[TAIL], state[LEAD], state[SCALE] = -1.0, -1.0, 1.0
+    state[START_N : START_D + 1] = segments[0, A_N : A_N + 3]
+    if segments[0, TURN] != 0.0:
+        begin_circle(state, segments[0], segments[0, A_N : A_N + 3], 0.0)
+    for k in range(len(states)):
+        navigate(state, segments, r[:2], par, dt, r)
+        states[k], refs[k] = state, r
+        if state[WAIT] > 0.0 and segments[int(state[SEGMENT]), HOLD] > 1e6:
+            return k + 1
+    return len(states)

@@ -1,0 +1,1 @@
+"""Convert messages of the bus to files of other tools: GeoJSON, KML, MCAP with Foxglove schemas."""

@@ -1,0 +1,1 @@
+"""Simulated multirotors: RotorPy physics under an ArduCopter or a PX4 multirotor autopilot, with MAVLink interface."""
