@@ -335,7 +335,7 @@ class Derivatives(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Model(Message, frozen=True, kw_only=True):
-    """Active model (none before the first plausible or verified one), newest identification window and its verdict."""
+    """Active model (none before the first accepted one), newest identification window and its verdict."""
 
     topic: ClassVar[str] = "model"
     version: ClassVar[int] = 2

@@ -54,7 +54,8 @@ def _program(folder: Path) -> str:
     except OSError:
         return "a program"
     if re.match(r"python", Path(words[0]).name) and len(words) > 1:
-        after = words[words.index("-m") + 1] if "-m" in words[:-1] else words[1]
+        scripts = (word for word in words[1:] if not word.startswith("-"))
+        after = words[words.index("-m") + 1] if "-m" in words[:-1] else "" if "-c" in words else next(scripts, "")
         return Path(after).name.removesuffix(".cli") or name
     return name
 

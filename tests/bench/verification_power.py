@@ -4,10 +4,11 @@
     python -m tests.bench.verification_power --flights 0 flight.tlog.xz other.tlog
 
 Simulated aircraft (JSBSim, no equation in common with the model) fly in winds of 0, 2, 4 and 6 m/s with turbulence 0
-to 3, each with a seed of its own; recordings may be added. The twin replays each flight; every 20 s the newest accepted
-model and its held-out data are kept. Of these models each group of derivatives with a stated power is made wrong by 0,
-half, one and one and a half times its detectable error, too large and too small, with the trim of the identification
-window kept. Shares of rejections, by size and group, and their range over flights: the flight is the unit of chance.
+to 3, each with a seed of its own; recordings may be added. The twin replays each flight; the newest accepted model and
+its held-out data are stored every 20 s. In these models each group of derivatives with a stated power is made wrong by
+0, half, one and one and a half times its detectable error, too large and too small; the trim of the identification
+window is unchanged. Shares of rejections, by size and group, and their range over flights, because flights are
+independent.
 Seeds 1000 to 1023 were used for tuning.
 """
 
@@ -60,14 +61,14 @@ def replayed(flight: str, messages: Iterable[Message]) -> list[Case]:
     twins: dict[int, Twin] = {}
     verify = identify_step.verify
 
-    def kept(plant: Any, window: Window, start: int, threshold: float, active: Any) -> Verdict:
+    def recorded(plant: Any, window: Window, start: int, threshold: float, active: Any) -> Verdict:
         verdict = verify(plant, window, start, threshold, active)
         due = not cases or window.t[-1] - cases[-1].window.t[-1] >= EVERY_S
         if verdict.outcome is Outcome.PLAUSIBLE and due:
             cases.append(Case(flight, plant, window, start, verdict))
         return verdict
 
-    identify_step.verify = kept  # type: ignore[assignment]
+    identify_step.verify = recorded  # type: ignore[assignment]
     try:
         for message in messages:
             if message.uav not in twins:

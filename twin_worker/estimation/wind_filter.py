@@ -235,14 +235,18 @@ class WindFilter:
         """
         if not self._row_count:
             self._scale = eas2tas(altitude)
-            self._reset()
+            self._begin_scale()
+
+    def _begin_scale(self) -> None:
+        self._x[..., 0] = self._scale
+        self._P[..., 0, 0] = _INITIAL_SIGMA[0] ** 2 + (0.5 * (self._scale - 1.0)) ** 2
 
     def _reset(self) -> None:
         """Reset the estimates to zero wind; the time stays."""
         drifts, walks = len(_DRIFTS), len(_HEADING_WALKS)
-        self._x = np.tile([self._scale, *np.zeros(7)], (drifts, walks, 1))
+        self._x = np.zeros((drifts, walks, 8))
         self._P = np.tile(np.diag(_INITIAL_SIGMA**2), (drifts, walks, 1, 1))
-        self._P[..., 0, 0] += (0.5 * (self._scale - 1.0)) ** 2
+        self._begin_scale()
         self._P[..., [4, 5], [4, 5]] = (_DRIFTS**2)[:, None, None]
         self._row_count, self._mean_nis = 0, np.ones((drifts, walks))
         self._mean_airspeed, self._ground = 0.0, (0.0, 0.0)

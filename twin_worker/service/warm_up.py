@@ -4,7 +4,7 @@ import numpy as np
 
 from fleet.airframes import GENERIC, load
 from fleet.airframes.airframe import servo_map
-from fleet.autopilots import arduplane, copter, greybox
+from fleet.autopilots import arduplane, copter, copter_legs, greybox, px4_multirotor
 from fleet.autopilots.laws import remember
 from fleet.autopilots.shadow import NO_MEMORY, replay_controller
 from fleet.contract import Array, Item, Prediction, TwinState
@@ -16,13 +16,14 @@ from fleet.window import Window
 from twin_worker.alerts.traffic import TrafficMonitor
 from twin_worker.confidence.adaptive_conformal import AdaptiveLevels
 from twin_worker.confidence.prediction_log import PredictionLog
-from twin_worker.estimation.wind_filter import WindFilter
+from twin_worker.estimation.wind_filter import WindFilter, reported_direction
 from twin_worker.identification.fixed_wing.derivatives_model import identify, linearise
 from twin_worker.identification.fixed_wing.energy_balance import fit_attitude_lag
 from twin_worker.identification.fixed_wing.plant import bias_corrected
 from twin_worker.identification.linear.linear_model import AXES, identify_axis
 from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.numerics.prediction_errors import AHEAD, displacement_along_path
+from twin_worker.prediction.fixed_wing.point_mass_rollout import unexplained_velocity
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.resample import Resampler
 from twin_worker.twin.state.flight_phase import speed_extremes
@@ -61,12 +62,11 @@ def warm_up() -> None:
     ahead, factors = np.empty((5, 3)), np.ones(greybox.N_PAR)
     start = np.array([*window.p[-1], _SPEED, 0.0, 0.0, 0.0])
     greybox.follow(kinematic_ctl, par, legs, factors, start, np.zeros(2), 0.1, ahead)  # type: ignore
-    segments, parameters = np.ones((2, copter.N_SEGMENT)), np.ones(copter.N_PAR)
+    _run_multirotors()
     _run_traffic()
     _run_propagation()
     _run_telemetry(window)
     _run_identification()
-    copter.follow(np.zeros(copter.N_FOLLOW), segments, np.zeros(3), np.zeros(3), parameters, 0.1, ahead)  # type: ignore
 
 
 def _run_point_mass(control: tuple[np.ndarray, np.ndarray, np.ndarray], window: Window) -> None:
@@ -80,6 +80,17 @@ def _run_point_mass(control: tuple[np.ndarray, np.ndarray, np.ndarray], window: 
     batch = [np.tile(row, (2, 1)) for row in (parameters, air, start)]
     point_mass.simulate_ensemble(control, *batch, noise, np.arange(0, 17, 4), np.empty((2, 5, 3)))  # type: ignore
     fit_attitude_lag(np.ascontiguousarray(window.x[:, 6]), window.x[:, 6])
+
+
+def _run_multirotors() -> None:
+    """Run the three multirotor laws along two segments."""
+    segments, out, motion = np.ones((2, copter.N_SEGMENT)), np.empty((5, 3)), np.zeros((3, 3))
+    copter.follow(np.zeros(copter.N_FOLLOW), segments, np.zeros(3), np.zeros(3), np.ones(copter.N_PAR), 0.1, out)
+    px4_multirotor.follow(np.zeros(px4_multirotor.N_STATE), segments, motion, np.ones(px4_multirotor.N_PAR), 0.1, out)
+    segments, par = np.ones((2, copter_legs.N_COLUMNS)), np.ones(copter_legs.N_PAR)
+    copter_legs.follow(np.zeros(copter_legs.N_STATE), segments, np.zeros((3, 3)), par, 0.1, out)
+    states, references = np.empty((5, copter_legs.N_STATE)), np.empty((5, 3, 3))
+    copter_legs.reference_states(segments, par, 0.1, states, references)
 
 
 def _run_traffic() -> None:
@@ -108,7 +119,10 @@ def _run_propagation() -> None:
     shift_to_position(ahead, path, 1.0, np.zeros(3), np.empty((4, 3), np.float32))  # type: ignore[call-arg]
     widen_tube(ahead, path, 1.0, np.empty((4, 3), np.float32))  # type: ignore[call-arg]
     speed_extremes(np.zeros((3, 3)))  # type: ignore[call-arg]
-    WindFilter().update(1e9, np.array([_SPEED, 0.0, 0.0]), _SPEED, 0.0)
+    WindFilter().update(1e9, np.array([_SPEED, 0.0, 0.0]), _SPEED, reported_direction(0.0, 0.0, 0.0, 0.0, _SPEED))
+    for rows in ((), (2,)):
+        start, air = np.ones((*rows, point_mass.N_START)), np.ones((*rows, point_mass.N_AIR))
+        unexplained_velocity(start, air, np.zeros((*rows, 2)))
 
 
 def _run_telemetry(window: Window) -> None:

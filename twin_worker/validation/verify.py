@@ -181,7 +181,9 @@ def with_consistency(verdict: Verdict, plant: Plant, window: Window, start: int)
     if failed:
         reason = f"plausible only: {error_text(failed)}"
     elif not verified:
-        reason = f"plausible only: no error of derivatives up to {MAX_DETECTABLE:.0%} would be detected in both axes"
+        reason = (
+            f"plausible only: these data would not show an error of {100 * MAX_DETECTABLE:.0f} % in one of the axes"
+        )
     else:
         reason = f"consistent, {power_text(power)}"
     return msgspec.structs.replace(

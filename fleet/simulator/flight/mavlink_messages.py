@@ -132,20 +132,24 @@ def _heartbeat_px4(f: TelemetryState) -> Any:
     )
 
 
-def _attitude_target(f: TelemetryState) -> Any:
-    (cf, ct, cp), (sf, st, sp) = (
-        [wave(a / 2) for a in (f.phi_c, f.theta_c, f.estimate.euler[2])] for wave in (cos, sin)
-    )
-    q = [
+def quaternion(phi: float, theta: float, psi: float) -> list[float]:
+    """Return the quaternion of an attitude [rad], scalar first. Source: Beard & McLain 2012, appendix B."""
+    (cf, ct, cp), (sf, st, sp) = ([wave(a / 2) for a in (phi, theta, psi)] for wave in (cos, sin))
+    return [
         cf * ct * cp + sf * st * sp,
         sf * ct * cp - cf * st * sp,
         cf * st * cp + sf * ct * sp,
         cf * ct * sp - sf * st * cp,
     ]
+
+
+def _attitude_target(f: TelemetryState) -> Any:
+    q = quaternion(f.phi_c, f.theta_c, f.estimate.euler[2])
     return mav.MAVLink_attitude_target_message(_boot_ms(f.t), 0, q, 0.0, 0.0, 0.0, f.delta_t)
 
 
-def _home(f: TelemetryState) -> Any:
+def home_position(f: Any) -> Any:
+    """Return HOME_POSITION of a state with `home` and `t`."""
     unset = [nan] * 4
     return mav.MAVLink_home_position_message(*f.home, 0.0, 0.0, 0.0, unset, nan, nan, nan, round(f.t * 1e6))
 
@@ -201,7 +205,7 @@ TELEMETRY_PX4: MessageSchedule = (
     (1, 37, _sys_status),
     (1, 41, _destination),
     (1, 43, _wind_cov),
-    (0.5, 53, _home),
+    (0.5, 53, home_position),
 )
 TELEMETRY_ONBOARD: MessageSchedule = (  # onboard log, without the bandwidth limit of a radio
     (25, 0, _attitude),

@@ -3,13 +3,21 @@
 Source: MAVLink common and ardupilotmega dialects; streams of ArduCopter 4.7 as recorded; PX4 MAVLink documentation.
 """
 
-from math import atan2, cos, degrees, hypot, nan, sin
+from math import atan2, degrees, hypot
 from typing import Any, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from fleet.simulator.flight.mavlink import MavlinkEndpoint
-from fleet.simulator.flight.mavlink_messages import COMMON, PX4_AUTO, PX4_MODES, MavlinkDialect, MessageSchedule
+from fleet.simulator.flight.mavlink_messages import (
+    COMMON,
+    PX4_AUTO,
+    PX4_MODES,
+    MavlinkDialect,
+    MessageSchedule,
+    home_position,
+    quaternion,
+)
 from fleet.simulator.vehicle.sensors import Estimate
 
 COPTER_MODES = {"STABILIZE": 0, "AUTO": 3, "GUIDED": 4, "LOITER": 5, "RTL": 6, "LAND": 9, "BRAKE": 17}
@@ -83,25 +91,13 @@ def _sys_status(f: MultirotorState) -> Any:
     return mav.MAVLink_sys_status_message(present, present, present, 250, volts, *rest)
 
 
-def _home(f: MultirotorState) -> Any:
-    unset = [nan] * 4
-    return mav.MAVLink_home_position_message(*f.home, 0.0, 0.0, 0.0, unset, nan, nan, nan, round(f.t * 1e6))
-
-
 def _landed(f: MultirotorState) -> Any:
     state = mav.MAV_LANDED_STATE_ON_GROUND if f.landed else mav.MAV_LANDED_STATE_IN_AIR
     return mav.MAVLink_extended_sys_state_message(0, state)
 
 
 def _attitude_target(f: MultirotorState) -> Any:
-    (cf, ct, cp), (sf, st, sp) = ([wave(a / 2) for a in f.command] for wave in (cos, sin))
-    q = [
-        cf * ct * cp + sf * st * sp,
-        sf * ct * cp - cf * st * sp,
-        cf * st * cp + sf * ct * sp,
-        cf * ct * sp - sf * st * cp,
-    ]
-    return mav.MAVLink_attitude_target_message(_ms(f.t), 0, q, 0.0, 0.0, 0.0, f.delta_t)
+    return mav.MAVLink_attitude_target_message(_ms(f.t), 0, quaternion(*f.command), 0.0, 0.0, 0.0, f.delta_t)
 
 
 def _local_target(f: MultirotorState) -> Any:
@@ -115,7 +111,7 @@ _SHARED: MessageSchedule = (
     (10, 3, _local),
     (1, 11, _mission_current),
     (1, 37, _sys_status),
-    (0.2, 53, _home),
+    (0.2, 53, home_position),
 )
 DIALECTS = {
     "ardupilot": MavlinkDialect((*_SHARED, (5, 7, _nav), (1, 23, _heartbeat)), 0x040600FF, ()),

@@ -302,12 +302,12 @@ def test_a_live_export_ends_with_ctrl_c_and_is_whole(tmp_path: Path) -> None:
             stop.wait(0.1)
         stop.wait(3.0)  # of data: a slow machine collects fewer messages
         process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=60)
+        _, log = process.communicate(timeout=60)
         stop.set()
         feeder.join()
     session.close()
-    assert process.returncode == 0 and "Traceback" not in told, told
-    assert "LocationFix" in told and not partial.exists()
+    assert process.returncode == 0 and "Traceback" not in log, log
+    assert "LocationFix" in log and not partial.exists()
     with out.open("rb") as file:
         assert sum(1 for _ in make_reader(file, validate_crcs=True).iter_messages()) > 5
 

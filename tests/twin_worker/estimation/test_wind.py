@@ -137,6 +137,14 @@ def test_the_scale_begins_with_the_standard_atmosphere():
     assert filt.scale == begun
 
 
+def test_a_reported_wind_outlasts_the_expected_scale():
+    """Without airspeed there are no rows: each altitude sets the scale anew, and the wind of the autopilot stays."""
+    filt = WindFilter()
+    filt.reset_wind(0.0, np.array([*WIND, 0.0]))
+    filt.expect_scale(2_000.0)
+    assert np.allclose(filt.wind, [*WIND, 0.0])
+
+
 def test_the_angle_of_attack_turns_the_air_velocity_out_of_the_turn():
     """Against the exact rotation of (cos alpha, 0, sin alpha), at the pitch of a level turn."""
     for phi in (-0.7, -0.3, 0.0, 0.5, 0.8):

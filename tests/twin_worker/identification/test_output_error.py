@@ -131,9 +131,8 @@ def test_segments_cross_no_gap_and_are_whole_groups():
 
 
 @pytest.mark.parametrize(("seconds", "lengths"), [(1.8, []), (2.1, [52]), (8.0, [200]), (9.0, [112, 112])])
-def test_segments_by_hand(seconds, lengths, monkeypatch):
-    monkeypatch.setattr(oe, "SEGMENT_S", 8.0)
-    pieces = unbroken_segments(np.ones(round(seconds / DT), bool), DT)
+def test_segments_by_hand(seconds, lengths):
+    pieces = unbroken_segments(np.ones(round(seconds / DT), bool), DT, 8.0)
     assert (pieces[:, 1] - pieces[:, 0]).tolist() == lengths
     assert pieces.dtype == np.int64 and pieces.shape == (len(lengths), 2)
 

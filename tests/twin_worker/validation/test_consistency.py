@@ -66,7 +66,7 @@ def test_too_little_data_state_no_power(flown):
     verdict = with_consistency(verify(model, short, SEEN), model, short, SEEN)
     assert estimate_errors(model, short, SEEN) is None
     assert verdict.outcome is Outcome.PLAUSIBLE and not verdict.detectable_error
-    assert "no error of derivatives up to 50% would be detected" in verdict.sentence
+    assert "these data would not show an error of 50 % in one of the axes" in verdict.sentence
 
 
 def test_steady_flight_states_less_power_than_manoeuvres():
