@@ -23,7 +23,7 @@ _LASTING = (Onset.STEP, Onset.RAMP)
 
 
 class OnsetPosterior(NamedTuple):
-    """Onsets, their probabilities, (m,), the most probable one, and the 95 % interval of its time [s]."""
+    """Onsets, their probabilities, (m,), the most probable one of the most probable kind, and its 95 % interval [s]."""
 
     onsets: list[OnsetProfile]
     probability: np.ndarray
@@ -61,4 +61,6 @@ def onset_posterior(
     order = np.argsort(t0)
     rows = np.minimum(np.searchsorted(np.cumsum(probability[order]), _LEVELS), len(t0) - 1)
     low, high = t0[order][rows].tolist()
-    return OnsetPosterior(onsets, probability, onsets[int(np.argmax(probability))], (low, high))
+    is_step = np.array([onset.kind is Onset.STEP for onset in onsets])
+    own_kind = is_step == (probability[is_step].sum() > 0.5)  # one ramp stands for many steps: the sums decide
+    return OnsetPosterior(onsets, probability, onsets[int(np.argmax(probability * own_kind))], (low, high))

@@ -81,8 +81,13 @@ class ChannelEquation:
 
 
 def channel_equations(whitened: WhitenedResiduals) -> Iterator[ChannelEquation]:
-    """Yield every sufficiently calibrated channel with the terms that may change."""
+    """Yield every sufficiently calibrated channel with the terms that may change.
+
+    No coefficient changes where the lift is outside what the nominal flights calibrated: the equations extrapolate there.
+    """
     eq_terms = whitened.modelled.equation_terms(whitened.conditions)
+    c_z, envelope = eq_terms.intermediate["c_z"], whitened.base.envelope
+    inside = 1.0 if envelope is None else ((c_z >= envelope.c_z[0]) & (c_z <= envelope.c_z[1])).astype(float)
     f_x, f_y, _ = eq_terms.intermediate["f"]
     # thrust, and loads that shift under specific force
     extra_terms = {"force_x": {"thrust": eq_terms.regressors["T"][0]}, "roll": {"f_y": f_y}, "pitch": {"f_x": f_x}}
@@ -90,7 +95,7 @@ def channel_equations(whitened: WhitenedResiduals) -> Iterator[ChannelEquation]:
         if whitened.base.r2.get(equation, 1.0) > MIN_R2:
             own = eq_terms.regressors[equation] * eq_terms.scale.get(equation, 1.0)
             terms = dict(zip(eq.TERMS[equation], own, strict=False)) | extra_terms.get(channel, {})
-            yield ChannelEquation(whitened, channel, terms)
+            yield ChannelEquation(whitened, channel, {name: x * inside for name, x in terms.items()})
     flow = eq_terms.flow
     constant = np.ones_like(flow.Va)
     if "Va" in whitened.modelled.flight.readings:
