@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import zip_longest
 from statistics import median
 from typing import Any
 
@@ -20,7 +21,9 @@ CHANNELS: Mapping[str, tuple[str, ...]] = {  # effect: correct channels
     **dict.fromkeys(("actuator_lag", "actuator_delay", "actuator_rate_limit", "actuator_deadband"), _ACTUATOR),
     **dict.fromkeys(("actuator_saturation", "actuator_offset", "actuator_stuck"), _ACTUATOR),
     "control_effectiveness_loss": _ACTUATOR,
-    "prop_torque": ("roll",),
+    **dict.fromkeys(("prop_torque", "roll_damping"), ("roll",)),
+    "pitch_damping": ("pitch",),
+    "yaw_damping": ("yaw",),
     "p_factor": ("yaw", "pitch"),
     "slipstream_tail": ("pitch", "yaw"),
     "thrust_loss": ("thrust", "force_x", OUTPUT_CHANNEL),
@@ -88,7 +91,8 @@ class GradedFlight:
         located, surfaces: whether channel and surface are correct, for correctly named effects
         force: force prediction of the named effects, evaluated again; None where forces do not show them
         before, after: residual on held-out blocks as the report states it, None where nothing was named
-        statements: stated probabilities of the candidates, and which are true
+        statements: stated probability of each reported class, and whether one of its effects is concealed
+        name_statements: the same of the first name of each class alone
         acts: strength of the effect in standard deviations of the sensors
         values: concealed parameters of the first effect; part: its surface or axis, or empty
     """
@@ -109,6 +113,7 @@ class GradedFlight:
     before: float | None = None
     after: float | None = None
     statements: tuple[Statement, ...] = ()
+    name_statements: tuple[Statement, ...] = ()
     acts: Sequence[Mapping[str, Any]] = ()
     values: Mapping[str, float] = field(default_factory=dict)
     part: str = ""
@@ -150,6 +155,7 @@ def grade(
     diagnosis = rejected if report is None or report["verdict"] == "refused" else report
     named = tuple(name.split(":")[0] for name in diagnosis["named"])
     onset_errors, sizes, located, surfaces = [], [], [], []
+    of_classes, of_names = _statements(label, named, diagnosis)
     for effect in label["effects"]:
         if effect["name"] not in named:
             continue
@@ -179,7 +185,8 @@ def grade(
         force=force if _is_in_forces(named, diagnosis) else None,
         before=diagnosis.get("fit_before") if named else None,
         after=diagnosis.get("fit_after") if named else None,
-        statements=_statements(label, named, diagnosis),
+        statements=of_classes,
+        name_statements=of_names,
         acts=label.get("acts", ()),
         values=label["effects"][0]["params"] if label["effects"] else {},
         part=next((effect.get("surface") or effect.get("of") or "" for effect in label["effects"]), ""),
@@ -196,12 +203,26 @@ def _is_in_forces(named: tuple[str, ...], diagnosis: Mapping[str, Any]) -> bool:
 
 def _statements(
     label: Mapping[str, Any], named: tuple[str, ...], diagnosis: Mapping[str, Any]
-) -> tuple[Statement, ...]:
-    """Return the stated probabilities of named and suspected candidates; none where the report states none."""
-    pairs = list(zip(named, diagnosis.get("posterior") or (), strict=False))
-    pairs += [(suspect["name"].split(":")[0], suspect.get("posterior")) for suspect in diagnosis.get("suspects", ())]
+) -> tuple[tuple[Statement, ...], tuple[Statement, ...]]:
+    """Return the stated probabilities of named and suspected classes, and of their first names alone.
+
+    `posterior` is the probability that an effect of the class acts, `name_posterior` that of its first name. Where the
+    report states none there is no statement.
+    """
+    columns = (named, *(diagnosis.get(key) or () for key in ("equivalents", "posterior", "name_posterior")))
+    rows = list(zip_longest(*columns)) if named else []
+    rows += [
+        (one["name"].split(":")[0], one.get("equivalents"), one.get("posterior"), one.get("name_posterior"))
+        for one in diagnosis.get("suspects", ())
+    ]
     concealed = {effect["name"] for effect in label["effects"]}
-    return tuple(Statement(float(p), name in concealed) for name, p in pairs if p is not None and 0.0 <= p <= 1.0)
+    of_classes = [(p, not concealed.isdisjoint((name, *(rivals or ())))) for name, rivals, p, _ in rows]
+    of_names = [(p, name in concealed) for name, _, _, p in rows]
+    return _valid(of_classes), _valid(of_names)
+
+
+def _valid(pairs: Iterable[tuple[float | None, bool]]) -> tuple[Statement, ...]:
+    return tuple(Statement(float(p), true) for p, true in pairs if p is not None and 0.0 <= p <= 1.0)
 
 
 _NEAR_EQUIVALENT = {("thrust_asymmetry", "thrust_loss"), ("stall", "drag_increase"), ("ground_effect", "drag_increase")}
@@ -230,6 +251,10 @@ REPORTED = {  # score without a bound: meaning
 }
 
 
+PROBABILITIES = {"probabilities": "probability of a class", "name_probabilities": "probability of its first name"}
+"""Scores of stated probabilities: meaning."""
+
+
 def score_rows(scores: Mapping[str, Any]) -> Iterator[tuple[bool | None, str, str, str]]:
     """Format every score: whether it meets its requirement, if any, meaning, requirement, value with interval."""
     for name, (required, meaning) in REQUIREMENTS.items():
@@ -237,10 +262,12 @@ def score_rows(scores: Mapping[str, Any]) -> Iterator[tuple[bool | None, str, st
         yield meets_requirement(name, scores[name]), meaning, bound, score_text(scores, name)
     for name, meaning in REPORTED.items():
         yield None, meaning, "", score_text(scores, name)
-    if scores["probabilities"] is not None:
-        error = scores["probabilities"]["calibration_error"]
-        text = f"{error:.3f}, Brier score {scores['probabilities']['brier']:.3f}, {scores['probabilities']['n']} stated"
-        yield error <= MAX_CALIBRATION_ERROR, "calibration error", f"at most {MAX_CALIBRATION_ERROR:g}", text
+    for key, meaning in PROBABILITIES.items():
+        if (stated := scores[key]) is not None:
+            error = stated["calibration_error"]
+            text = f"{error:.3f}, Brier score {stated['brier']:.3f}, {stated['n']} stated"
+            bound = f"at most {MAX_CALIBRATION_ERROR:g}"
+            yield error <= MAX_CALIBRATION_ERROR, f"calibration error, {meaning}", bound, text
 
 
 def score_text(scores: Mapping[str, Any], name: str) -> str:
@@ -291,7 +318,8 @@ def score(results: Sequence[GradedFlight]) -> dict[str, Any]:
     intervals = {name: wilson(sum(outcomes), len(outcomes)) for name, outcomes in rates.items()}
     intervals |= {name: median_interval(values) for name, values in medians.items()}
     intervals["compound_extra_per_flight"] = poisson(sum(extra), len(extra))
-    probabilities = score_probabilities([statement for one in results for statement in one.statements])
+    of_classes = score_probabilities([statement for one in results for statement in one.statements])
+    of_names = score_probabilities([statement for one in results for statement in one.name_statements])
     errors = medians["magnitude_median_err"]
     return {
         **{name: sum(outcomes) / len(outcomes) if outcomes else None for name, outcomes in rates.items()},
@@ -306,7 +334,8 @@ def score(results: Sequence[GradedFlight]) -> dict[str, Any]:
         "magnitude_p90_err": float(np.percentile(errors, 90)) if errors else None,
         "intervals": intervals,
         "counts": {name: (sum(outcomes), len(outcomes)) for name, outcomes in rates.items() if outcomes},
-        "probabilities": asdict(probabilities) if probabilities else None,
+        "probabilities": asdict(of_classes) if of_classes else None,
+        "name_probabilities": asdict(of_names) if of_names else None,
         "n": {kind: len(flights) for kind, flights in by_role.items()}
         | {"sizes": len(parameters), "onsets": len(onset_errors)},
     }

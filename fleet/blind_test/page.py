@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from fleet.blind_test.course import BlindTestConfig, BlindTestResult
-from fleet.blind_test.mark import GradedFlight, score_rows
+from fleet.blind_test.mark import PROBABILITIES, GradedFlight, score_rows
 from fleet.blind_test.shown import confusion, fit_text, misses_first, parameter_texts
 from fleet.report.ink import GRID, LINES, MUTED, document, escape_text
 
@@ -33,7 +33,7 @@ def write(config: BlindTestConfig, outcome: BlindTestResult, scores: Mapping[str
             f'<p class="soft">labels sha256 <code>{outcome.labels_sha256}</code><br>'
             f"reports sha256 <code>{outcome.reports_sha256}</code></p>",
             _scores(scores),
-            _reliability(scores["probabilities"]),
+            *(_reliability(scores[key], meaning) for key, meaning in PROBABILITIES.items()),
             _flights(outcome.results),
             _confusion(outcome.results),
         )
@@ -53,7 +53,7 @@ def _scores(scores: Mapping[str, Any]) -> str:
     return f'<div class="cards">{"".join(cards)}</div>'
 
 
-def _reliability(probabilities: Mapping[str, Any] | None) -> str:
+def _reliability(probabilities: Mapping[str, Any] | None, meaning: str) -> str:
     """Draw the reliability diagram: stated probability against the share of true candidates, with intervals."""
     if probabilities is None:
         return ""
@@ -73,7 +73,7 @@ def _reliability(probabilities: Mapping[str, Any] | None) -> str:
     texts = [(x(0.5), _PLOT_PX + 28, "stated probability"), (x(0.0), 6, "share of true candidates")]
     marks += [f'<text x="{at}" y="{down}" font-size="11" fill="{MUTED}">{text}</text>' for at, down, text in texts]
     size = _PLOT_PX + 2 * _MARGIN_PX
-    return f'<h3>Stated probabilities</h3><svg viewBox="0 0 {size} {size}" width="{size}">{"".join(marks)}</svg>'
+    return f'<h3>Stated: {meaning}</h3><svg viewBox="0 0 {size} {size}" width="{size}">{"".join(marks)}</svg>'
 
 
 def _flights(results: Sequence[GradedFlight]) -> str:

@@ -68,6 +68,16 @@ def _density(rng: np.random.Generator, is_small: bool) -> Values:
     return {"density_ratio": float(rng.choice([rng.uniform(0.84, 0.93), rng.uniform(1.06, 1.1)], p=[0.75, 0.25]))}
 
 
+def _damping(key: str, derivative: Mapping[str, float]) -> Draw:
+    """Draw a change of a damping derivative: 40 to 70 % less, or 50 to 110 % more."""
+
+    def draw(rng: np.random.Generator, is_small: bool) -> Values:
+        share = rng.choice([rng.uniform(-0.7, -0.4), rng.uniform(0.5, 1.1)])
+        return {key: float(share) * derivative["small" if is_small else "c172p"]}
+
+    return draw
+
+
 def _both(low: float, high: float) -> tuple[tuple[float, float], tuple[float, float]]:
     return (low, high), (low, high)
 
@@ -104,13 +114,13 @@ HIDDEN: dict[str, HiddenEffect] = {
     "accel_bias": HiddenEffect("imu", _uniform_signed("bias_mps2", *_both(0.3, 0.8)), parts=("x", "y", "z")),
     "heading_bias": HiddenEffect("heading", _uniform_signed("bias_deg", *_both(6.0, 15.0))),
     # a constant bias is equivalent to a different sea level pressure
+    "roll_damping": HiddenEffect("roll", _damping("dC_l_p", {"c172p": -0.484, "small": -0.51})),
+    "pitch_damping": HiddenEffect("pitch", _damping("dC_m_q", {"c172p": -12.4, "small": -38.21})),
     "baro_bias": HiddenEffect("baro", _uniform_signed("bias_m", (10.0, 25.0), (8.0, 20.0)), _STEPS),
 }
 UNKNOWN: dict[str, HiddenEffect] = {
     "_crossed_linkage": HiddenEffect("", _uniform_signed("gain", *_both(0.7, 1.2)), _STEPS),
     "_torn_fin": HiddenEffect("", _fixed(C_n_beta=0.3, C_Y_beta=0.5), _STEPS),
-    "_roll_damping": HiddenEffect("", lambda rng, _: {"C_l_p": float(rng.choice([0.35, 1.9]))}, _STEPS),
-    "_pitch_damping": HiddenEffect("", lambda rng, _: {"C_m_q": float(rng.choice([0.2, 2.2]))}, _STEPS),
     "_loose_hinge": HiddenEffect(
         "", lambda rng, _: {"half_width": rng.uniform(0.03, 0.05), "hertz": rng.uniform(0.6, 1.2)}
     ),
@@ -119,6 +129,8 @@ UNKNOWN: dict[str, HiddenEffect] = {
     ),
     "_sloshing_tank": HiddenEffect("", _fixed(m_per_mps2=0.35, most_m=0.7, tau_s=1.5), airframes=CESSNA),
     "_gyro_scale": HiddenEffect("", _uniform_signed("scale", *_both(0.15, 0.3)), _STEPS),
+    "_accelerometer_scale": HiddenEffect("", _uniform_signed("scale", *_both(0.06, 0.12)), _STEPS),
+    "_static_line_lag": HiddenEffect("", _uniform("tau_s", *_both(5.0, 10.0)), _STEPS),
     "_pitot_lag": HiddenEffect("", _uniform("tau_s", *_both(3.0, 6.0)), _STEPS),
 }
 _UNREPORTED = (  # values that a report contains in other terms

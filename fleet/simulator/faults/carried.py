@@ -89,6 +89,23 @@ def _gyro_scale(fault: Fault, dt: float) -> SensorFault:
     return lambda e, share: e._replace(rates=e.rates * (1 + share * fault.values["scale"]))
 
 
+def _accelerometer_scale(fault: Fault, dt: float) -> SensorFault:
+    return lambda e, share: e._replace(force=e.force * (1 + share * fault.values["scale"]))
+
+
+def _static_line_lag(fault: Fault, dt: float) -> SensorFault:
+    """Apply a first-order lag to the static pressure of the height, as from a partly blocked static line."""
+    state: list[float] = []
+
+    def apply(e: Estimate, intensity: float) -> Estimate:
+        previous, tau = state[0] if state else e.pressure, intensity * fault.values["tau_s"]
+        state[:] = [e.pressure + (previous - e.pressure) * exp(-dt / tau) if tau > 0 else e.pressure]
+        lag = pressure_height(e.pressure) - pressure_height(state[0])
+        return e._replace(p=e.p + np.array([0.0, 0.0, lag]), pressure=state[0])  # p is NED
+
+    return apply
+
+
 def _pitot_lag(fault: Fault, dt: float) -> SensorFault:
     """Apply a first-order lag to the airspeed, as from water in the pitot line."""
     state: list[float] = []
@@ -111,6 +128,8 @@ SENSOR_FAULTS: dict[str, Callable[[Fault, float], SensorFault]] = {
     "heading_bias": _heading_bias,
     "baro_bias": _baro_bias,
     "_gyro_scale": _gyro_scale,
+    "_accelerometer_scale": _accelerometer_scale,
+    "_static_line_lag": _static_line_lag,
     "_pitot_lag": _pitot_lag,
 }
 

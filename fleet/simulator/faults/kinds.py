@@ -50,6 +50,8 @@ KINDS: dict[str, FaultKind] = {
     "flap_deployed": FaultKind({"flap_deg": (0.0, 30.0)}, aircraft=_CESSNA),
     "mass_change": FaultKind({"dmass_kg": (-200.0, 200.0)}),
     "cg_shift": FaultKind({"dx_m": (-0.3, 0.3)}),
+    "roll_damping": FaultKind({"dC_l_p": (-2.0, 2.0)}),
+    "pitch_damping": FaultKind({"dC_m_q": (-60.0, 60.0)}),
     "prop_torque": FaultKind({"sense": (-1.0, 1.0)}, aircraft=_CESSNA),
     "p_factor": FaultKind({"inches_per_rad": (-300.0, 300.0)}, aircraft=_CESSNA),
     "slipstream_tail": FaultKind({"share": (0.0, 3.0)}, aircraft=_CESSNA),

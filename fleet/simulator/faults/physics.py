@@ -87,6 +87,18 @@ def _cg_shift(aircraft: Aircraft, values: Mapping[str, float]) -> Increments:
     return {f"inertia/pointmass-location-X-inches{load}": -values["dx_m"] / mass_fraction / _INCH}
 
 
+_DERIVATIVES = {  # of the aircraft files: model -> derivative [1/rad]
+    "c172p": {"C_l_p": -0.484, "C_m_q": -12.4},
+    "aerosonde": {"C_l_p": -0.51, "C_m_q": -38.21},
+}
+
+
+def _damping_change(aircraft: Aircraft, values: Mapping[str, float]) -> Increments:
+    """Add to a damping derivative, by its factor conceal/* or vary/*."""
+    prefix, derivatives = "conceal" if aircraft.kind.from_jsbsim else "vary", _DERIVATIVES[aircraft.kind.model]
+    return {f"{prefix}/{key[1:]}": x / derivatives[key[1:]] for key, x in values.items()}
+
+
 PHYSICS_FAULTS: dict[str, PhysicsFault] = {
     "air_density": _air_density,
     "turbulence": _turbulence,
@@ -96,6 +108,8 @@ PHYSICS_FAULTS: dict[str, PhysicsFault] = {
     "flap_deployed": lambda aircraft, values: {"fcs/flap-cmd-norm": values["flap_deg"] / _FLAP_DEG},
     "mass_change": _mass_change,
     "cg_shift": _cg_shift,
+    "roll_damping": _damping_change,
+    "pitch_damping": _damping_change,
     "prop_torque": lambda aircraft, values: {
         "propulsion/engine/propeller-sense": values["sense"] - aircraft["propulsion/engine/propeller-sense"]
     },
@@ -167,8 +181,6 @@ def _sloshing_tank(aircraft: Aircraft, values: Mapping[str, float]) -> TimedFaul
 
 TIMED_FAULTS: dict[str, Callable[[Aircraft, Mapping[str, float]], TimedFault]] = {
     "_torn_fin": _scaled_derivatives,
-    "_roll_damping": _scaled_derivatives,
-    "_pitch_damping": _scaled_derivatives,
     "_surging_engine": _surging_engine,
     "_sloshing_tank": _sloshing_tank,
 }

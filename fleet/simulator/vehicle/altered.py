@@ -21,7 +21,7 @@ _FACTORS = {  # property: functions it multiplies
     "conceal/C_n_beta": ("aero/coefficient/Cnb",),
     "conceal/C_Y_beta": ("aero/coefficient/CYb",),
     "conceal/C_l_p": ("aero/coefficient/Clp",),
-    "conceal/C_m_q": ("aero/coefficient/Cmq", "aero/coefficient/Cmadot"),
+    "conceal/C_m_q": ("aero/coefficient/Cmq",),
 }
 _IMU_POSITION_IN = (41.9, -0.7, 37.3)
 _INDUCED_PRESSURE = "aero/function/qbar-induced-psf"

@@ -23,14 +23,14 @@ from tests.bench.mismatch.offline import Cache, cases, source_hash
 from twin_worker.diagnosis.baseline.calibrate import calibrate
 from twin_worker.diagnosis.data.card import read_card
 from twin_worker.diagnosis.data.flight import FlightData, read_flights
-from twin_worker.diagnosis.inference.isolation.decision import (
+from twin_worker.diagnosis.inference.diagnose import NAMED_PROBABILITY
+from twin_worker.diagnosis.inference.isolation.decision import decide, posterior
+from twin_worker.diagnosis.inference.isolation.evidence import (
     TURBULENCE,
     DecisionTable,
     EvidenceTerms,
     Explanation,
     Weights,
-    decide,
-    posterior,
 )
 from twin_worker.diagnosis.inference.isolation.search import Search
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
@@ -48,16 +48,18 @@ START = {  # mean and standard deviation of the prior; rows and error as logarit
     "block_weight": (0.1, 0.3),
     "further": ((-3.0, -3.0, -3.0), 2.0),
     "changes": ((-5.0,) * len(CHANGES), 3.0),
+    "beside": (0.0, 3.0),
 }
 _FLOOR = 0.02  # probability of a wrong label: bounds the loss of one flight
 _FOLDS = 4
 
 
 class LabelledFlight(NamedTuple):
-    """One flight with its explanations, of which `right` are true; the last entry is none."""
+    """One flight with its concealed effects and its explanations, of which `right` are true; the last entry is none."""
 
     name: str
     role: str
+    concealed: frozenset[str]
     explanations: list[Explanation]
     right: np.ndarray
 
@@ -92,8 +94,9 @@ def right_explanations(label: dict[str, Any], explanations: Sequence[Explanation
 def weights(x: np.ndarray) -> Weights:
     """Return the weights at a point of the search."""
     rows, error, *rest = x.tolist()
-    changes = dict(zip(CHANGES, rest[7:], strict=True))
-    return Weights(float(np.exp(rows)), float(np.exp(error)), *rest[:4], (rest[4], rest[5], rest[6]), changes)
+    changes = dict(zip(CHANGES, rest[7:-1], strict=True))
+    further = rest[4], rest[5], rest[6]
+    return Weights(float(np.exp(rows)), float(np.exp(error)), *rest[:4], further, changes, rest[-1])
 
 
 def fit(flights: Sequence[LabelledFlight]) -> Weights:
@@ -110,10 +113,14 @@ def fit(flights: Sequence[LabelledFlight]) -> Weights:
     return weights(minimize(loss, mean, method="L-BFGS-B", options={"maxiter": 80}).x)
 
 
-def cross_validated(flights: Sequence[LabelledFlight]) -> None:
-    """Print the decisions of four-fold cross-validation, and the reliability of their probabilities."""
+def cross_validated(flights: Sequence[LabelledFlight]) -> float:
+    """Print the decisions of four-fold cross-validation; return the probability that the search misses the cause.
+
+    It makes the mean of the stated probabilities of named classes their share of true ones.
+    """
     fold = np.random.default_rng(1).integers(_FOLDS, size=len(flights))
     counts: dict[str, list[int]] = {}
+    stated, true_classes = [0.0], [0.0]
     for k in range(_FOLDS):
         at = fit([flight for flight, other in zip(flights, fold, strict=True) if other != k])
         for flight in (one for one, own in zip(flights, fold, strict=True) if own == k):
@@ -128,7 +135,13 @@ def cross_validated(flights: Sequence[LabelledFlight]) -> None:
             row = counts.setdefault(flight.role, [0, 0])
             row[0] += true >= max(rows.values()) - 1e-6
             row[1] += 1
-    print(counts)
+            if decision.best is not None and decision.effects > NAMED_PROBABILITY:
+                for member in decision.best.members:
+                    names = {one.hypothesis.effect.name for one in (member, *member.rivals)}
+                    stated.append(decision.probability(names))
+                    true_classes.append(float(not flight.concealed.isdisjoint(names)))
+    print(counts, f"named classes: {len(stated) - 1}, stated {sum(stated):.1f}, true {sum(true_classes):.0f}")
+    return max(1.0 - sum(true_classes) / max(sum(stated), 1e-9), 0.0)
 
 
 def main() -> int:
@@ -153,15 +166,16 @@ def main() -> int:
                 key = f"explained-{case.base}-{flight.name}-{version}"
                 explanations = cache.get(key, partial(explained, flight, base))
                 right = right_explanations(case.label, explanations)
-                flights.append(LabelledFlight(flight.name, case.label["role"], explanations, right))
-    cross_validated(flights)
+                concealed = frozenset(effect["name"] for effect in case.label["effects"])
+                flights.append(LabelledFlight(flight.name, case.label["role"], concealed, explanations, right))
+    missed = cross_validated(flights)
     roles = [sum(flight.role == role for flight in flights) for role in ("control", "single", "compound", "unknown")]
     provenance = {
         "fitted_on": ", ".join(Path(name).name for name in args.sets),
         "flights": "{} controls, {} single, {} compound, {} unknown".format(*roles),
         "command": "python -m tests.bench.mismatch.fit_decision",
     }
-    table = DecisionTable(provenance, fit(flights))
+    table = DecisionTable(provenance, msgspec.structs.replace(fit(flights), missed=missed))
     args.out.write_bytes(msgspec.json.format(msgspec.json.encode(table), indent=1) + b"\n")
     return 0
 

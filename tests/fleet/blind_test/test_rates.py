@@ -71,8 +71,22 @@ def test_stated_probabilities_are_taken_from_names_and_suspects_where_the_report
     assert named.statements == (Statement(0.9, True), Statement(0.6, False))
     assert suspected.statements == (Statement(0.4, True),) and silent.statements == ()
     scores = score([named, suspected, silent])
-    assert scores["probabilities"]["n"] == 3 and "calibration error" in {row[1] for row in score_rows(scores)}
+    assert scores["probabilities"]["n"] == 3 and "calibration error, probability of a class" in {
+        row[1] for row in score_rows(scores)
+    }
     assert score([silent])["probabilities"] is None
+
+
+def test_a_probability_of_a_class_is_scored_by_the_class_and_that_of_a_name_by_the_name() -> None:
+    numbers = {"equivalents": [["icing", "stall"]], "posterior": [0.98], "name_posterior": [0.6]}
+    one = grade("a", label("icing"), report("drag_increase", **numbers))
+    assert one.statements == (Statement(0.98, True),) and one.name_statements == (Statement(0.6, False),)
+    doubt = {"name": "drag_increase", "equivalents": ["stall"], "posterior": 0.3, "name_posterior": 0.2}
+    other = grade("b", label("icing"), report(verdict="none", suspects=[doubt]))
+    assert other.statements == (Statement(0.3, False),) and other.name_statements == (Statement(0.2, False),)
+    scores = score([one, other])
+    assert scores["probabilities"]["n"] == scores["name_probabilities"]["n"] == 2
+    assert scores["probabilities"]["brier"] < scores["name_probabilities"]["brier"]
 
 
 def test_every_rate_is_printed_with_its_interval_and_counts() -> None:

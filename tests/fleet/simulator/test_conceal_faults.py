@@ -184,6 +184,29 @@ def test_forces_are_measured_where_the_mass_is(airframe: str) -> None:
     assert aircraft.truth().force == pytest.approx(aircraft.evaluate_accelerations()[3:], abs=0.02)
 
 
+@pytest.mark.parametrize("airframe", ["small", "c172p"])
+@pytest.mark.parametrize(("name", "key", "change"), [("roll_damping", "dC_l_p", 0.2), ("pitch_damping", "dC_m_q", 5.0)])
+def test_damping_changes_by_the_derivative_labelled(airframe: str, name: str, key: str, change: float) -> None:
+    """The moment changes by q_bar S dC rate length^2 / 2 Va."""
+    aircraft = flying(airframe)
+    for _ in range(40):
+        aircraft.set_controls(0.3, 0.3, 0.0, 0.6)
+        aircraft.step()
+    i, length, inertia = {"dC_l_p": (0, "bw", "ixx"), "dC_m_q": (1, "cbarw", "iyy")}[key]
+    x, span = aircraft.truth(), aircraft[f"metrics/{length}-ft"] * FT
+    assert abs(x.rates[i]) > 0.02
+    moment = pressed(aircraft, name, **{key: change})[i] * aircraft[f"inertia/{inertia}-slugs_ft2"] * 1.3558
+    assert moment == pytest.approx(loads(aircraft)[0] * change * x.rates[i] * span**2 / (2.0 * x.Va), rel=0.06)
+
+
+def test_a_blocked_static_line_lags_and_an_accelerometer_scales() -> None:
+    spoil = SENSOR_FAULTS["_static_line_lag"](Fault("_static_line_lag", "", {"tau_s": 5.0}), 0.02)
+    true = [100.0 + 0.06 * k for k in range(2000)]
+    height = [pressure_height(spoil(GOOD._replace(pressure=pressure_at(h)), 1.0).pressure) for h in true]
+    assert true[-1] - height[-1] == pytest.approx(3.0 * 5.0, rel=0.02)  # climbing with 3 m/s
+    assert spoilt("_accelerometer_scale", scale=0.1).force == pytest.approx(1.1 * GOOD.force)
+
+
 def test_the_small_engine_loses_the_share_it_is_told_to() -> None:
     aircraft = flying("small")
     before = aircraft["external/thrust-n"]

@@ -4,25 +4,22 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
 from fleet.effects import Onset, catalogue
 from twin_worker.diagnosis.data.card import FaultHypothesis, OnsetProfile
 from twin_worker.diagnosis.inference.diagnose import _outcome
-from twin_worker.diagnosis.inference.isolation.decision import (
-    CLASS_PROBABILITY,
-    TURBULENCE,
-    Explanation,
-    Weights,
-    decide,
-    load_table,
-    smallest_set,
-)
+from twin_worker.diagnosis.inference.isolation.decision import CLASS_PROBABILITY, decide, smallest_set
+from twin_worker.diagnosis.inference.isolation.evidence import TURBULENCE, Explanation, Weights, load_table
 from twin_worker.diagnosis.inference.isolation.isolate import ScoredHypothesis
+from twin_worker.diagnosis.inference.isolation.onset import onset_posterior
+from twin_worker.diagnosis.inference.isolation.search import _variance_onset
 from twin_worker.diagnosis.inference.isolation.unmodelled import Anomaly, ChannelEquation, find_tones
 from twin_worker.diagnosis.inference.report import ReportOutcome
 from twin_worker.diagnosis.inference.validation.cross_validate import CrossValidation
+from twin_worker.diagnosis.inference.validation.force_prediction import held_out_gain, is_in_forces
 from twin_worker.diagnosis.model.baseline import CHANNELS, unit_noise
 
 STEP = OnsetProfile(Onset.STEP, 60.0)
@@ -65,7 +62,26 @@ def test_the_class_holds_what_is_close_and_leaves_out_what_is_not() -> None:
     (member,) = decision.best.members
     assert member.hypothesis.effect.name == "thrust_loss"
     assert [rival.hypothesis.effect.name for rival in member.rivals] == ["drag_increase"]
-    assert sum(decision.names.values()) == pytest.approx(1.0)
+    assert decision.probability(("thrust_loss", "drag_increase", "icing")) == pytest.approx(1.0 - decision.none)
+    assert 0.5 < decision.probability(("thrust_loss",)) < decision.probability(("thrust_loss", "drag_increase"))
+    both = explained({"force_x": 5000.0}, "thrust_loss", "drag_increase")
+    assert decide([both], WEIGHTS).probability(("thrust_loss", "drag_increase")) <= 1.0  # one set counts once
+
+
+def test_no_statement_is_more_certain_than_the_search() -> None:
+    found = [explained({"force_x": 5000.0}, "thrust_loss")]
+    decision = decide(found, msgspec.structs.replace(WEIGHTS, missed=0.06))
+    assert decision.probability(("thrust_loss",)) == pytest.approx(0.94, abs=1e-6)
+    assert decision.effects == pytest.approx(0.94, abs=1e-6) and decision.missed == 0.06
+
+
+def test_a_change_beside_effects_has_its_own_prior() -> None:
+    loss = explained({"roll": 3000.0}, "roll_damping")
+    rate = replace(loss, change="odd", anomaly=Anomaly(600.0, "gyro_roll", 60.0), channel_gain=loss.channel_gain.copy())
+    rate.channel_gain[CHANNELS.index("gyro_roll")] = 600.0
+    assert decide([loss, rate], WEIGHTS).unmodelled > 0.9
+    unlikely = msgspec.structs.replace(WEIGHTS, beside=-20.0)
+    assert decide([loss, rate], unlikely).unmodelled < 0.1
 
 
 def test_a_second_effect_is_judged_in_its_own_channel() -> None:
@@ -157,6 +173,45 @@ def with_added(sight: Any, channel: str, x: np.ndarray) -> Any:
     return sight
 
 
+@pytest.mark.parametrize("onset", [STEP, OnsetProfile(Onset.RAMP, 45.0, 60.0)], ids=["step", "ramp"])
+def test_the_onset_is_a_change_point_with_an_interval(onset: OnsetProfile) -> None:
+    sight = quiet(7)
+    shape = np.zeros((len(T), len(CHANNELS)))
+    shape[:, CHANNELS.index("force_x")] = 3.0 * np.random.default_rng(8).standard_normal(len(T))
+    sight.e -= onset.gate(T)[:, None] * shape
+    sight.raw = sight.e
+    sight.residuals = lambda hypotheses: sight.raw + shape
+    effect = catalogue()["icing"]
+    effect = replace(effect, onsets=(Onset.STEP, Onset.RAMP))
+    found = onset_posterior(sight, FaultHypothesis(effect, "", (0.1,) * 3, STEP), WEIGHTS)
+    assert found is not None and found.mode.kind is onset.kind
+    assert abs(found.mode.t0 - onset.t0) <= (1.0 if onset is STEP else 10.0)
+    assert found.interval[0] <= onset.t0 <= found.interval[1] + 1.0 and found.probability.sum() == pytest.approx(1.0)
+    assert onset_posterior(sight, FaultHypothesis(replace(effect, onsets=(Onset.ALWAYS,)), "", ()), WEIGHTS) is None
+
+
+def test_turbulence_begins_where_the_variance_changes() -> None:
+    square = np.random.default_rng(9).standard_normal((len(T), 3)) ** 2
+    assert _variance_onset(T, square, 28.0) is None
+    square[T >= ONSET_S] *= 5.0
+    found = _variance_onset(T, square, 28.0)
+    assert found is not None and abs(found - ONSET_S) < 3.0
+
+
+def test_the_interval_of_a_force_gain_holds_zero_where_the_effect_predicts_nothing() -> None:
+    noise = np.random.default_rng(10).standard_normal((2, len(T), 3))
+    sight: Any = SimpleNamespace(t=T, ok=np.ones(len(T), bool))
+    loss = FaultHypothesis(catalogue()["thrust_loss"], "", (0.2,), STEP)
+    offset = np.where(STEP.t0 < T, 2.0, 0.0)[:, None] * np.ones(3)
+    measured = noise[0] + offset
+    gain, low, high = held_out_gain(sight, measured, (np.zeros_like(measured), offset))
+    assert 0.3 < low < gain < high < 0.9
+    gain, low, high = held_out_gain(sight, measured, (offset, offset + 0.1 * noise[1]))
+    assert low < 0.0 and gain < 0.05
+    assert np.isnan(held_out_gain(sight, measured, (measured, measured))[0])
+    assert is_in_forces(loss) and not is_in_forces(FaultHypothesis(catalogue()["gyro_bias"], "p", (0.1,)))
+
+
 @pytest.mark.parametrize("hertz", [0.17, 0.93])
 def test_a_hum_is_heard_in_its_channel_and_noise_is_none(hertz: float) -> None:
     hum = 1.6 * np.sin(2 * np.pi * hertz * T + 1.0) * (T > ONSET_S)
@@ -169,7 +224,7 @@ def test_a_constant_term_does_not_drown_the_others() -> None:
     rate = np.random.default_rng(2).standard_normal(len(T))
     sight = with_added(quiet(3), "gyro_yaw", 0.8 * rate * (T > ONSET_S))
     equation = ChannelEquation(sight, "gyro_yaw", {"1": np.ones_like(T), "rate": rate})
-    (_, alone), (worth, t0) = next(equation.gain_per_term()), equation.gain_of_all()
+    (_, alone), (worth, t0, _) = next(equation.gain_per_term()), equation.gain_of_all()
     assert alone[0] > 250.0 and worth > alone[0] - 20.0 and abs(t0 - ONSET_S) < 3.0
     assert equation.gain_in_flight()[0] > 100.0
 

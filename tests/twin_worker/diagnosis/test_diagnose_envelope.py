@@ -20,9 +20,16 @@ def flight(height: float, speed: float, day: float) -> Any:
     return SimpleNamespace(readings=readings, ok=np.ones(n, bool), t_start=day * 86400.0)
 
 
+def modelled(flown: Any, lift: float) -> Any:
+    """The parts of a modelled flight that the envelope reads."""
+    c_z = np.linspace(-lift, -0.1, len(flown.ok))
+    terms = SimpleNamespace(intermediate={"c_z": c_z})
+    return SimpleNamespace(flight=flown, ok=flown.ok, equation_terms=lambda: terms)
+
+
 @pytest.fixture
 def base() -> Baseline:
-    nominal = [flight(600.0, 21.0, 100.0), flight(500.0, 23.0, 100.1)]
+    nominal = [modelled(flight(600.0, 21.0, 100.0), 0.2), modelled(flight(500.0, 23.0, 100.1), 0.9)]
     return replace(Baseline(UNKNOWN, {}, 22.0), envelope=nominal_envelope(nominal))
 
 
@@ -52,3 +59,7 @@ def test_effects_with_one_sign_keep_it(name: str) -> None:
     effect = catalogue()[name]
     negative = FaultHypothesis(effect, "", ()).with_parameters(np.full(effect.n_parameters, -0.01))
     assert all(x == 0.0 or p.nuisance for p, x in zip(effect.parameters, negative.par, strict=True))
+
+
+def test_the_envelope_holds_the_lift_that_was_flown(base: Baseline) -> None:
+    assert base.envelope is not None and base.envelope.c_z == (-0.9, -0.1)

@@ -59,8 +59,9 @@ def calibrate(
     partial_fits = [fit([f for f in parts if f is not part], card, timing, vane)[0] for part in parts]
     modelled_flights = list(map(ModelledFlight, parts, partial_fits))
     others = [{name: b.coef[name] - x for name, x in base.coef.items()} for b in partial_fits]
-    drag = drag_uncertainty(terms_in_wind([ModelledFlight(flight, base) for flight in flights], winds))
-    base = replace(base, others=(*others, drag), envelope=nominal_envelope(flights))
+    whole_flights = [ModelledFlight(flight, base) for flight in flights]
+    drag = drag_uncertainty(terms_in_wind(whole_flights, winds))
+    base = replace(base, others=(*others, drag), envelope=nominal_envelope(whole_flights))
     _check_plausible(base)
     winds = [fit_wind(modelled, np.zeros(4)) for modelled in modelled_flights]
     _check_consistent(modelled_flights, winds)

@@ -6,9 +6,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from fleet.effects import Onset, Stage, catalogue
-from twin_worker.diagnosis.data.card import FaultHypothesis
+from twin_worker.diagnosis.data.card import ALWAYS, FaultHypothesis, OnsetProfile
 from twin_worker.diagnosis.data.flight import FlightData, decimated
-from twin_worker.diagnosis.inference.isolation.decision import TURBULENCE, Decision, decide
+from twin_worker.diagnosis.inference.isolation.decision import Decision, decide
+from twin_worker.diagnosis.inference.isolation.evidence import TURBULENCE
 from twin_worker.diagnosis.inference.isolation.isolate import MIN_R2, ScoredHypothesis
 from twin_worker.diagnosis.inference.isolation.search import Search, turbulence_evidence
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
@@ -23,7 +24,11 @@ from twin_worker.diagnosis.inference.report import (
 )
 from twin_worker.diagnosis.inference.validation import cross_validate, force_prediction
 from twin_worker.diagnosis.inference.validation.cross_validate import CrossValidation, free_form, high_segments
-from twin_worker.diagnosis.inference.validation.force_prediction import free_run_errors
+from twin_worker.diagnosis.inference.validation.force_prediction import (
+    free_run_errors,
+    held_out_gain,
+    is_in_forces,
+)
 from twin_worker.diagnosis.inference.validation.spread import covariances, recommend_manoeuvre, reported_sigma
 from twin_worker.diagnosis.model.baseline import CHANNEL_OF, CHANNELS, Baseline
 from twin_worker.diagnosis.model.residual import ModelledFlight
@@ -76,6 +81,9 @@ def diagnose(flight: FlightData, base: Baseline, progress: ReportProgress = lamb
         outcome = _outcome(decision, confirmed, _fits(before, after))
     measured, simulated, with_effects = force_prediction.predict_forces(modelled, weather, validation.fitted)
     errors = [force_prediction.rms(modelled, measured - x) for x in (simulated, with_effects)]
+    if outcome is ReportOutcome.NAMED and any(is_in_forces(finding.hypothesis) for finding in findings):
+        gain, _, _ = held_out_gain(modelled, measured, (simulated, with_effects))
+        outcome = ReportOutcome.SUSPECTED if gain <= 0.0 else outcome
     if outcome is not ReportOutcome.NAMED:
         whitened.condition_on(weather)
     where: tuple[str, tuple[tuple[float, float], ...]] = ("", ())
@@ -216,8 +224,10 @@ def _findings(
                 channel=hypothesis.effect.channel,
                 surface=hypothesis.target if hypothesis.effect.stage is Stage.DELTA else "",
                 segments=(_segment(hypothesis, float(whitened.modelled.t[0]), float(whitened.modelled.t[-1])),),
+                onset_interval=selected.onset_interval,
                 held_out_share=validation.held_out_gains[k] / max(selected.gain, 1e-9),
-                probability=decision.names.get(hypothesis.effect.name, 0.0),
+                probability=decision.probability((hypothesis.effect.name, *(rival.effect.name for rival in rivals))),
+                name_probability=decision.probability((hypothesis.effect.name,)),
             )
         )
     return tuple(findings)
@@ -233,14 +243,17 @@ def _segment(hypothesis: FaultHypothesis, first: float, last: float) -> tuple[fl
 
 def _turbulence_finding(whitened: WhitenedResiduals, decision: Decision) -> DiagnosisFinding:
     """Return turbulence as a finding; its intensity follows from the scatter of sideslip."""
-    gain, variance_ratio = turbulence_evidence(whitened)
+    gain, variance_ratio, onset = turbulence_evidence(whitened)
+    first, last = float(whitened.modelled.t[0]), float(whitened.modelled.t[-1])
+    after = whitened.ok & (whitened.modelled.t >= (first if onset is None else onset))
+    profile = ALWAYS if onset is None else OnsetProfile(Onset.STEP, onset)
     effect = catalogue()["turbulence"]
     eq_terms = whitened.modelled.equation_terms(whitened.conditions)
-    beta = np.radians(whitened.modelled.residuals(whitened.conditions)[whitened.ok][:, CHANNELS.index("side")])
+    beta = np.radians(whitened.modelled.residuals(whitened.conditions)[after][:, CHANNELS.index("side")])
     intensity = float(np.sqrt(1.0 - 1.0 / variance_ratio) * beta.std() * np.median(eq_terms.flow.Va))
     reported = effect.reported(effect, np.array([intensity]), whitened.base.card.body)
     return DiagnosisFinding(
-        hypothesis=FaultHypothesis(effect, "", (intensity,)),
+        hypothesis=FaultHypothesis(effect, "", (intensity,), profile),
         gain=float(gain.sum()),
         reported=reported,
         sigma={name: _INTENSITY_SIGMA * x for name, x in reported.items()},
@@ -249,9 +262,10 @@ def _turbulence_finding(whitened: WhitenedResiduals, decision: Decision) -> Diag
         manoeuvres=(),
         channel="air",
         surface="",
-        segments=((float(whitened.modelled.t[0]), float(whitened.modelled.t[-1])),),
+        segments=((first if onset is None else onset, last),),
         held_out_share=1.0,
-        probability=decision.names[TURBULENCE],
+        probability=decision.probability((TURBULENCE,)),
+        name_probability=decision.probability((TURBULENCE,)),
     )
 
 
@@ -278,7 +292,7 @@ def _outcome(decision: Decision, confirmed: bool, fits: bool) -> ReportOutcome:
         return ReportOutcome.UNKNOWN
     members = decision.best.members if decision.best else ()
     separable = all(1 + len(member.rivals) <= MAX_CLASS for member in members)
-    if confirmed and separable and decision.effects > NAMED_PROBABILITY:
+    if confirmed and separable and decision.effects > NAMED_PROBABILITY * (1.0 - decision.missed):
         return ReportOutcome.NAMED
     least = SUSPECTED_PROBABILITY if separable else NAMED_PROBABILITY
     return ReportOutcome.SUSPECTED if decision.effects > least else ReportOutcome.NONE

@@ -34,8 +34,10 @@ class DiagnosisFinding:
         manoeuvres: for each rival, the manoeuvre that separates the two
         channel, surface: location; surface may be empty
         segments: start and end times since the start of the flight [s]
+        onset_interval: 95 % interval of the onset since the start of the flight [s]; None without an onset
         held_out_share: share of the gain that is present on held-out data
-        probability: posterior probability that this effect acts; nan where none is computed
+        probability: posterior probability that this effect or one of its rivals acts; nan where none is computed
+        name_probability: the same of this effect alone
     """
 
     hypothesis: FaultHypothesis
@@ -49,7 +51,9 @@ class DiagnosisFinding:
     surface: str
     segments: tuple[tuple[float, float], ...]
     held_out_share: float = 0.0
+    onset_interval: tuple[float, float] | None = None
     probability: float = float("nan")
+    name_probability: float = float("nan")
 
 
 @dataclass(frozen=True)

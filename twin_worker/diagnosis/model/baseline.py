@@ -55,11 +55,13 @@ class Envelope:
         ln_density: lowest and highest logarithm of the standard density at the flown heights, in kg/m3
         ln_speed: the same of the speed over ground, in m/s
         days: start of each flight [days since 1970]
+        c_z: lowest and highest coefficient of the vertical body force
     """
 
     ln_density: tuple[float, float]
     ln_speed: tuple[float, float]
     days: tuple[float, ...]
+    c_z: tuple[float, float] = (-np.inf, np.inf)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 
 from twin_worker.diagnosis.data.flight import FlightData
 from twin_worker.diagnosis.model.baseline import Baseline, Envelope
-from twin_worker.diagnosis.model.residual import density
+from twin_worker.diagnosis.model.residual import ModelledFlight, density
 
 DENSITY_SIGMA = {"thrust": 1.0, "rho": 1.0, "airspeed_scale:log_scale": 0.5}
 """Nuisance -> standard deviation of its exponent of density [-]."""
@@ -23,12 +23,15 @@ SAME_DAY_DAYS = 0.5  # flights further apart are of different days
 _RANGE_PERCENTILES = 1.0, 99.0  # of the valid rows
 
 
-def nominal_envelope(flights: Sequence[FlightData]) -> Envelope:
+def nominal_envelope(modelled_flights: Sequence[ModelledFlight]) -> Envelope:
     """Return the conditions of nominal flights."""
+    flights = [modelled.flight for modelled in modelled_flights]
     ln_density = np.concatenate([_ln_density(flight) for flight in flights])
     ln_speed = np.concatenate([_ln_speed(flight) for flight in flights])
     low, high = (np.percentile(x, _RANGE_PERCENTILES).tolist() for x in (ln_density, ln_speed))
-    return Envelope(tuple(low), tuple(high), tuple(flight.t_start / 86400.0 for flight in flights))
+    c_z = np.concatenate([one.equation_terms().intermediate["c_z"][one.ok] for one in modelled_flights])
+    days = tuple(flight.t_start / 86400.0 for flight in flights)
+    return Envelope(tuple(low), tuple(high), days, (float(c_z.min()), float(c_z.max())))
 
 
 def extrapolation_sigma(base: Baseline, flight: FlightData) -> dict[str, float]:

@@ -89,8 +89,10 @@ class Simulation:
             first, middle = deflections(actuated), deflections(actuated + half_step * (faulty - actuated))
             actuated = actuated + full_step * (faulty - actuated)
             k1, force[k], speed[k], rho[k] = self.derivatives(x, first, t, used)
+            self._gate(t + 0.5 * DT)
             k2 = self.derivatives(x + 0.5 * DT * k1, middle, t + 0.5 * DT, used)[0]
             k3 = self.derivatives(x + 0.5 * DT * k2, middle, t + 0.5 * DT, used)[0]
+            self._gate(t + DT)
             k4 = self.derivatives(x + DT * k3, deflections(actuated), t + DT, used)[0]
             x = x + DT / 6.0 * (k1 + 2 * k2 + 2 * k3 + k4)
             diverged = ~(np.abs(x[3:6]).max(axis=0) < _MAX_RATE)
@@ -133,7 +135,7 @@ class Simulation:
         return out
 
     def _gate(self, t: np.ndarray) -> None:
-        """Set the parameters of all grouped effects for one step from their onset profiles."""
+        """Set the parameters of all grouped effects at times t, (runs,) [s], from their onset profiles."""
         for group in self._groups:
             group.gate(t)
 

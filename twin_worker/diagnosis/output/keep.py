@@ -118,7 +118,9 @@ def as_json(report: Report, predictions: Path | None = None) -> dict[str, Any]:
             "name": finding.hypothesis.effect.name,
             "parameters": _finite(finding.reported),
             "sigma": _finite(finding.sigma),
+            "equivalents": list(finding.rivals),
             "posterior": _or_none(finding.probability),
+            "name_posterior": _or_none(finding.name_probability),
         }
         for finding in report.findings
     ]
@@ -131,9 +133,11 @@ def as_json(report: Report, predictions: Path | None = None) -> dict[str, Any]:
         "equivalents": [list(finding.rivals) for finding in named],
         "told_apart_by": [list(finding.manoeuvres) for finding in named],
         "located": located,
+        "onset_intervals": [finding.onset_interval and list(finding.onset_interval) for finding in named],
         "parameters": [_finite(finding.reported) for finding in named],
         "sigma": [_finite(finding.sigma) for finding in named],
         "posterior": [_or_none(finding.probability) for finding in named],
+        "name_posterior": [_or_none(finding.name_probability) for finding in named],
         "explanations": report.posterior,
         "suspects": suspects if not named else [],
         "fit_before": _or_none(report.fit_before),

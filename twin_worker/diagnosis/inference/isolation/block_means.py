@@ -18,6 +18,8 @@ from twin_worker.diagnosis.model.residual import ModelledFlight
 BLOCK_S = 10.0  # longer than the correlation of whitened residuals
 _CLIP = 6.0  # of block means, in standard deviations: one block does not decide
 BLOCK_ROWS = round(BLOCK_S / STEP_S)
+Change = tuple[int, np.ndarray]
+"""Channel, and what is added to its residual, (n,)."""
 
 
 def block_sums(x: np.ndarray, ok: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -61,18 +63,22 @@ class BlockMeans:
         self._J = (self.slopes * self._weight[:, :, None]).reshape(-1, slopes.shape[2])
         self._A = self._J.T @ self._J + np.diag(whitened.precision)
 
-    def residuals(self, hypotheses: Sequence[FaultHypothesis]) -> np.ndarray:
-        """Return the block means with these hypotheses, (b, c)."""
+    def residuals(self, hypotheses: Sequence[FaultHypothesis], change: Change | None = None) -> np.ndarray:
+        """Return the block means with these hypotheses and a further change of one channel, (b, c)."""
         modelled = self._whitened.modelled
-        return block_sums(modelled.residuals((*self.conditions, *hypotheses)), self._whitened.ok, modelled.t)[0]
+        x = modelled.residuals((*self.conditions, *hypotheses))
+        if change is not None:
+            x = x.copy()
+            x[:, change[0]] += change[1]
+        return block_sums(x, self._whitened.ok, modelled.t)[0]
 
     def squares(self, hypotheses: Sequence[FaultHypothesis], nuisances: np.ndarray) -> np.ndarray:
         """Return the sum of squares of each block mean at these values of the nuisances, (b,)."""
         e = np.clip((self.residuals(hypotheses) + self.slopes @ nuisances) * self._weight, -_CLIP, _CLIP)
         return np.asarray((e * e).sum(axis=1))
 
-    def cost(self, hypotheses: Sequence[FaultHypothesis]) -> float:
+    def cost(self, hypotheses: Sequence[FaultHypothesis], change: Change | None = None) -> float:
         """Return the sum of squares of the block means with these hypotheses, the nuisances profiled out."""
-        e = np.clip(self.residuals(hypotheses) * self._weight, -_CLIP, _CLIP).ravel()
+        e = np.clip(self.residuals(hypotheses, change) * self._weight, -_CLIP, _CLIP).ravel()
         b = self._J.T @ e
         return float(e @ e - b @ np.linalg.solve(self._A, b))

@@ -28,6 +28,7 @@ class ScoredHypothesis:
     gain: float
     hypothesis: FaultHypothesis
     rivals: tuple["ScoredHypothesis", ...] = ()  # best first
+    onset_interval: tuple[float, float] | None = None  # 95 % interval of the onset [s]
 
     @property
     def kind(self) -> str:

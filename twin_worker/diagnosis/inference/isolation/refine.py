@@ -14,6 +14,8 @@ _MIN_GAIN = 0.5  # gain below which fitting stops
 _ONSET_STEPS_S = (8.0, 4.0, 2.0, 1.0, 0.5, 0.2)
 # search steps for the onset of a sensor jump
 _COARSE_STEPS_S, _FINE_STEPS_S = np.arange(-2.0, 2.1, 0.2), np.arange(-0.16, 0.17, 0.04)
+# the same of an effect with memory: its scan has the onset from the effect throughout, and the cost has many minima
+_MEMORY_STEPS_S = np.arange(-12.0, 12.1, 0.4)
 _ALTERNATIONS = {Onset.BUMP: 3}  # rounds of onset search and fit: a misplaced bump is fitted too small at first
 _STRETCH_FACTORS = (1.5, 1.2, 1.1)
 
@@ -79,14 +81,18 @@ def _search_onset(
     if hypothesis.onset.kind is Onset.ALWAYS:
         return hypothesis, best_cost
     best = hypothesis
-    if hypothesis.effect.stage is Stage.SENSOR and hypothesis.onset.kind is Onset.STEP:
-        # the slope of a jump is visible only at the exact sample: search a fine grid first
-        for moves in (_COARSE_STEPS_S, _FINE_STEPS_S):
-            trials = [best.with_parameters(np.array(best.par), best.onset.shifted(dt)) for dt in moves]
-            costs = [whitened.cost((trial,)) for trial in trials]
-            k = int(np.argmin(costs))
-            if costs[k] < best_cost:
-                best, best_cost = trials[k], costs[k]
+    grids: tuple[np.ndarray, ...] = ()
+    if hypothesis.onset.kind is Onset.STEP:
+        if hypothesis.effect.stage is Stage.SENSOR:  # the slope of a jump is visible only at the exact sample
+            grids = _COARSE_STEPS_S, _FINE_STEPS_S
+        elif hypothesis.effect.initial_guesses:
+            grids = (_MEMORY_STEPS_S,)
+    for moves in grids:
+        trials = [best.with_parameters(np.array(best.par), best.onset.shifted(dt)) for dt in moves]
+        costs = [whitened.cost((trial,)) for trial in trials]
+        k = int(np.argmin(costs))
+        if costs[k] < best_cost:
+            best, best_cost = trials[k], costs[k]
     changes = [partial(OnsetProfile.shifted, dt=dt) for move in _ONSET_STEPS_S for dt in (move, -move)]
     if hypothesis.onset.kind is not Onset.STEP:
         factors = (*_STRETCH_FACTORS, *(1 / s for s in _STRETCH_FACTORS))

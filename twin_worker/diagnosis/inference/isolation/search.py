@@ -9,14 +9,10 @@ import numpy as np
 
 from fleet.effects import Onset, Stage
 from twin_worker.diagnosis.data.card import ALWAYS, FaultHypothesis
-from twin_worker.diagnosis.inference.isolation.block_means import BlockMeans
-from twin_worker.diagnosis.inference.isolation.decision import (
-    TURBULENCE,
-    EvidenceTerms,
-    Explanation,
-    load_table,
-)
+from twin_worker.diagnosis.inference.isolation.block_means import BLOCK_S, BlockMeans
+from twin_worker.diagnosis.inference.isolation.evidence import TURBULENCE, EvidenceTerms, Explanation, load_table
 from twin_worker.diagnosis.inference.isolation.isolate import Scanner, ScoredHypothesis
+from twin_worker.diagnosis.inference.isolation.onset import onset_posterior
 from twin_worker.diagnosis.inference.isolation.refine import refine
 from twin_worker.diagnosis.inference.isolation.unmodelled import Anomaly, find_anomalies, find_changed_coefficients
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
@@ -27,7 +23,6 @@ _N_REFINED = {1: 12, 2: 6, 3: 4}  # hypotheses refined per scan, by size of the 
 _BEAM = {1: 3, 2: 2}  # sets of each size that are extended
 _MIN_SCAN_GAIN = 40.0  # gain of the scan below which a hypothesis is not refined
 _REFINE_SHARE = 0.6  # share of the best score from which the onset is refined
-BESIDE_SHARE = 0.5  # share of the gain of effects above which a change beside them is more than their model error [-]
 _PRUNED_NATS = 6.0  # a set this far below the best one is not extended
 
 ReportProgress = Callable[[str], None]
@@ -84,8 +79,24 @@ class Search:
             given = copy(self.whitened)
             others = (one.hypothesis for k, one in enumerate(refined) if k != i)
             given.condition_on((*self.whitened.conditions, *others))
-            refined[i] = replace(refine(given, member.hypothesis), rivals=member.rivals)
+            refined[i] = replace(self._with_onset(given, member.hypothesis), rivals=member.rivals)
         return tuple(refined)
+
+    def _with_onset(self, given: WhitenedResiduals, hypothesis: FaultHypothesis) -> ScoredHypothesis:
+        """Refine an effect from its onset, and from the most probable one; return the more probable, with interval."""
+        best = refine(given, hypothesis)
+        if hypothesis.onset.kind not in (Onset.STEP, Onset.RAMP):
+            return best
+        posterior = onset_posterior(given, best.hypothesis, self.weights)
+        if posterior is None:
+            return best
+        moved = refine(given, replace(best.hypothesis, onset=posterior.mode))
+        best = max(best, moved, key=self._onset_evidence)
+        return replace(best, onset_interval=posterior.interval)
+
+    def _onset_evidence(self, scored: ScoredHypothesis) -> float:
+        nats = self.weights.nats_per_onset * scored.hypothesis.onset.n_parameters
+        return scored.gain / (2.0 * self.weights.rows_per_sample) - nats
 
     def _evidence(self, explanations: Sequence[Explanation]) -> np.ndarray:
         reference = [*explanations, *self.explanations]
@@ -202,9 +213,8 @@ class Search:
         if (best := self.best()) is not None:
             given = self.whitened.conditioned(tuple(member.hypothesis for member in best.members))
             for anomaly in find_anomalies(given):
-                if anomaly.net_gain > BESIDE_SHARE * best.gain:
-                    self._add_anomaly(best, anomaly)
-        gain, _ = turbulence_evidence(self.whitened)
+                self._add_anomaly(best, anomaly)
+        gain, _, _ = turbulence_evidence(self.whitened)
         if gain.any():
             self._explanations[(TURBULENCE,)] = Explanation((), gain, change=TURBULENCE)
             if self._constants_differ:
@@ -212,11 +222,23 @@ class Search:
                 self._explanations[("nominal", TURBULENCE)] = Explanation((), gain, nominal_nats=nats)
 
     def _add_anomaly(self, beside: Explanation, anomaly: Anomaly) -> None:
-        gain = beside.channel_gain.copy()
-        gain[CHANNELS.index(anomaly.channel)] += max(anomaly.net_gain, 0.0)
+        gain, channel = beside.channel_gain.copy(), CHANNELS.index(anomaly.channel)
+        gain[channel] += max(anomaly.net_gain, 0.0)
+        block_gain = beside.block_gain
+        if anomaly.series is not None:
+            hypotheses = [member.hypothesis for member in beside.members]
+            block_gain = self._no_effect_blocks - self.blocks.cost(hypotheses, (channel, anomaly.series))
         chance = beside.chance + self.whitened.base.chance.get(anomaly.kind, 0.0)
         key = (*sorted(member.kind for member in beside.members), anomaly.kind)
-        changed = replace(beside, channel_gain=gain, chance=chance, change=anomaly.change, anomaly=anomaly)
+        changed = replace(
+            beside,
+            channel_gain=gain,
+            block_gain=block_gain,
+            parameters=beside.parameters + anomaly.parameters,
+            chance=chance,
+            change=anomaly.change,
+            anomaly=anomaly._replace(series=None),
+        )
         self._explanations[key] = changed
 
 
@@ -299,17 +321,39 @@ def own_share(whitened: WhitenedResiduals, hypothesis: FaultHypothesis) -> float
 _GUST_RATIOS = 1.2, 1.5  # variance ratio of the air channels in turbulence: least, median
 
 
-def turbulence_evidence(whitened: WhitenedResiduals) -> tuple[np.ndarray, float]:
-    """Return gain by channel, (c + 1,), and variance ratio of gusts.
+def turbulence_evidence(whitened: WhitenedResiduals) -> tuple[np.ndarray, float, float | None]:
+    """Return gain by channel, (c + 1,), variance ratio of gusts, and their onset [s]; None if it is before the flight.
 
-    Sideslip, lift and airspeed scatter more, the sensor channels do not.
+    Sideslip, lift and airspeed scatter more, the sensor channels do not. The onset is the change point of the variance,
+    r_1 before and r_2 after it:  G = -sum n_i ln r_i, against n (r - 1 - ln r) of one variance throughout.
     """
     air_channels = [CHANNELS.index(name) for name in ("side", "lift", "airspeed")]
     sensor_channels = [k for k, name in enumerate(CHANNELS) if name.startswith(("gps", "gyro"))]
-    mean_square = whitened.mean_square() / whitened.base.usual
-    ratio, sensor_ratio = mean_square[air_channels], mean_square[sensor_channels].mean()
     gain = np.zeros(len(CHANNELS) + 1)
+    square = ((whitened.e + whitened.Jn @ whitened.xn) ** 2 / whitened.base.usual)[whitened.ok]
+    t = whitened.modelled.t[whitened.ok]
+    onset = _variance_onset(t, square[:, air_channels], load_table().weights.rows_per_sample)
+    after = square if onset is None else square[t >= onset]
+    ratio, sensor_ratio = after[:, air_channels].mean(axis=0), after[:, sensor_channels].mean()
     if ratio.min() < _GUST_RATIOS[0] or np.median(ratio) < _GUST_RATIOS[1] or sensor_ratio > _GUST_RATIOS[1]:
-        return gain, 1.0
-    gain[air_channels] = int(whitened.ok.sum()) * (ratio - 1 - np.log(ratio))
-    return gain, float(np.median(ratio))
+        return gain, 1.0, None
+    gain[air_channels] = len(after) * (ratio - 1 - np.log(ratio))
+    return gain, float(np.median(ratio)), onset
+
+
+def _variance_onset(t: np.ndarray, square: np.ndarray, rows_per_sample: float) -> float | None:
+    """Return the change point of the variance of channels, (n, c); None if one variance throughout is as probable."""
+    n = len(t)
+    rows = np.arange(1, n)
+    inside = rows[(t[rows] > t[0] + BLOCK_S) & (t[rows] < t[-1] - BLOCK_S)]
+    if not len(inside):
+        return None
+    total = np.cumsum(square, axis=0)
+    before = np.maximum(total[inside - 1] / inside[:, None], 1e-6)
+    after = np.maximum((total[-1] - total[inside - 1]) / (n - inside)[:, None], 1e-6)
+    whole = np.log(np.maximum(total[-1] / n, 1e-6))
+    gain = (n * whole - inside[:, None] * np.log(before) - (n - inside)[:, None] * np.log(after)).sum(axis=1)
+    best = int(np.argmax(gain))
+    if gain[best] / (2.0 * rows_per_sample) < np.log(len(inside)) or after[best].mean() < before[best].mean():
+        return None
+    return float(t[inside[best]])

@@ -27,14 +27,21 @@ from twin_worker.diagnosis.model.baseline import CHANNEL_OF, CHANNELS
 
 _AIR_LAG_S = 4.0  # time constant of a partly blocked pressure line
 _MIN_SIDE_S = 25.0  # least length of data before and after the onset
-_UNCATALOGUED_TERMS = {  # terms without an effect: damping, stability, cross-coupled surface, moving loads
-    "L": ("beta", "p", "r", "delta_r"),
-    "M": ("q", "c_x"),
-    "N": ("beta", "p", "r", "delta_a"),
+_UNCATALOGUED_TERMS = {  # terms without an effect: stability, cross damping, cross-coupled surface, moving loads
+    "L": ("beta", "r", "delta_r"),
+    "M": ("c_x",),
+    "N": ("beta", "p", "delta_a"),
 }
-_SLOW, _RATE = "lagging", "rate"  # sensor terms: delayed airspeed, gyro scale error
-Gain = tuple[float, float]
-"""Gain less the parameter cost, and onset [s]."""
+# sensor terms: lagging pressures, scale errors of gyros and accelerometers
+_SLOW, _RATE, _FORCE = "lagging", "rate", "force"
+
+
+class Gain(NamedTuple):
+    """Gain less the parameter cost, onset [s], and what is added to the raw residual, (n,)."""
+
+    net: float
+    t0: float
+    series: np.ndarray
 
 
 class ChannelEquation:
@@ -52,29 +59,35 @@ class ChannelEquation:
         slopes = np.zeros((len(whitened.modelled.t), len(CHANNELS), len(terms)))
         slopes[:, c] = np.transpose(list(terms.values()))
         white = whitened.noise.whiten(slopes)[:, c] * whitened.ok[:, None]
-        self._J = (white / (np.linalg.norm(white, axis=0) + 1e-12))[:, None, :]
+        norm = np.linalg.norm(white, axis=0) + 1e-12
+        self._J, self._raw = (white / norm)[:, None, :], slopes[:, c] / norm
         self._whitened = copy(whitened)  # this channel alone; the nuisance information of the other channels stays
         self._whitened.e, self._whitened.Jn = whitened.e[:, [c]], whitened.Jn[:, [c]]
 
     def gain_of_all(self) -> Gain:
         """Return the gain of freeing all terms from the best onset."""
-        return _step_gain(self._whitened, self._J)
+        return _step_gain(self._whitened, self._J, self._raw)
 
     def gain_in_flight(self) -> Gain:
         """Return the gain of a step at the best onset with all terms free throughout, whatever the calibration."""
-        return _step_gain(_with_free_terms(self._whitened, self._J), self._J, _MIN_SIDE_S)
+        return _step_gain(_with_free_terms(self._whitened, self._J), self._J, self._raw, _MIN_SIDE_S)
 
     def gain_per_term(self) -> Iterator[tuple[str, Gain]]:
         """Yield the gain of freeing each single term that has no effect in the catalogue."""
         equation = next((name for name, channel in CHANNEL_OF.items() if channel == self.channel), "")
         for k, name in enumerate(self.names):
-            if name in (*_UNCATALOGUED_TERMS.get(equation, ()), _SLOW, _RATE):
-                yield name, _step_gain(self._whitened, self._J[:, :, [k]])
+            if name in (*_UNCATALOGUED_TERMS.get(equation, ()), _SLOW, _RATE, _FORCE):
+                yield name, _step_gain(self._whitened, self._J[:, :, [k]], self._raw[:, [k]])
 
 
 def channel_equations(whitened: WhitenedResiduals) -> Iterator[ChannelEquation]:
-    """Yield every sufficiently calibrated channel with the terms that may change."""
+    """Yield every sufficiently calibrated channel with the terms that may change.
+
+    No coefficient changes where the lift is outside what the nominal flights calibrated: the equations extrapolate there.
+    """
     eq_terms = whitened.modelled.equation_terms(whitened.conditions)
+    c_z, envelope = eq_terms.intermediate["c_z"], whitened.base.envelope
+    inside = 1.0 if envelope is None else ((c_z >= envelope.c_z[0]) & (c_z <= envelope.c_z[1])).astype(float)
     f_x, f_y, _ = eq_terms.intermediate["f"]
     # thrust, and loads that shift under specific force
     extra_terms = {"force_x": {"thrust": eq_terms.regressors["T"][0]}, "roll": {"f_y": f_y}, "pitch": {"f_x": f_x}}
@@ -82,25 +95,34 @@ def channel_equations(whitened: WhitenedResiduals) -> Iterator[ChannelEquation]:
         if whitened.base.r2.get(equation, 1.0) > MIN_R2:
             own = eq_terms.regressors[equation] * eq_terms.scale.get(equation, 1.0)
             terms = dict(zip(eq.TERMS[equation], own, strict=False)) | extra_terms.get(channel, {})
-            yield ChannelEquation(whitened, channel, terms)
+            yield ChannelEquation(whitened, channel, {name: x * inside for name, x in terms.items()})
     flow = eq_terms.flow
     constant = np.ones_like(flow.Va)
     if "Va" in whitened.modelled.flight.readings:
-        decay = np.exp(-STEP_S / _AIR_LAG_S)
-        late = lfilter([1.0 - decay], [1.0, -decay], flow.Va, zi=[decay * flow.Va[0]])[0] - flow.Va
-        yield ChannelEquation(whitened, "airspeed", {"1": constant, "Va": flow.Va, _SLOW: late})
+        yield ChannelEquation(whitened, "airspeed", {"1": constant, "Va": flow.Va, _SLOW: _lag(flow.Va)})
+    if "baro" in whitened.modelled.flight.readings:
+        yield ChannelEquation(whitened, "baro", {_SLOW: _lag(np.asarray(flow.h))})
+    for channel, force in zip(("gps_x", "gps_y", "gps_z"), eq_terms.intermediate["f"], strict=True):
+        yield ChannelEquation(whitened, channel, {"1": constant, _FORCE: force})
     for channel, rate in (("gyro_roll", flow.p), ("gyro_pitch", flow.q), ("gyro_yaw", flow.r)):
         yield ChannelEquation(whitened, channel, {"1": constant, _RATE: rate})
 
 
-def _step_gain(whitened: WhitenedResiduals, J: np.ndarray, margin_s: float = 0.0) -> Gain:
-    """Return gain and onset of a step in terms, (n, 1, k), at least `margin_s` from both ends [s]."""
+def _lag(x: np.ndarray) -> np.ndarray:
+    """Return the difference that a first-order lag in a pressure line makes."""
+    decay = np.exp(-STEP_S / _AIR_LAG_S)
+    return np.asarray(lfilter([1.0 - decay], [1.0, -decay], x, zi=[decay * x[0]])[0] - x)
+
+
+def _step_gain(whitened: WhitenedResiduals, J: np.ndarray, raw: np.ndarray, margin_s: float = 0.0) -> Gain:
+    """Return the gain of a step in terms, (n, 1, k), at least `margin_s` from both ends [s]; raw: before whitening."""
     t = whitened.modelled.t
     onset_rows, onsets = onset_gates(t, Onset.STEP)
-    gain, _ = solve_onsets(whitened, *normal_equations(whitened, J, onset_rows, Onset.STEP))
+    gain, x = solve_onsets(whitened, *normal_equations(whitened, J, onset_rows, Onset.STEP))
     gain = np.where((t[onset_rows] > t[0] + margin_s) & (t[onset_rows] < t[-1] - margin_s), gain, 0.0)
     best = int(np.argmax(gain))
-    return float(gain[best]) - PARAMETER_COST * J.shape[2], onsets[best].t0
+    series = raw @ x[best] * onsets[best].gate(t)
+    return Gain(float(gain[best]) - PARAMETER_COST * J.shape[2], onsets[best].t0, series)
 
 
 def _with_free_terms(whitened: WhitenedResiduals, J: np.ndarray) -> WhitenedResiduals:
@@ -115,6 +137,7 @@ def _with_free_terms(whitened: WhitenedResiduals, J: np.ndarray) -> WhitenedResi
 
 
 _BAND_HZ = 0.1, 1.45  # the mission is slower, the filter removes what is faster
+_TONE_PARAMETERS = 3  # amplitude, phase, frequency
 _OVERSAMPLING = 2.0  # oversampling of the frequency resolution
 _BLOCKS, _MIN_BLOCKS = 12, 4  # tested starts; least blocks after a start
 
@@ -122,9 +145,11 @@ _BLOCKS, _MIN_BLOCKS = 12, 4  # tested starts; least blocks after a start
 def find_tones(whitened: WhitenedResiduals) -> Iterator["Anomaly"]:
     """Yield the strongest tone of each calibrated channel, with the nuisances profiled out.
 
-    Its gain is the peak of the periodogram over the mean power; for a pure tone this is the row count.
+    Its gain is the peak of the periodogram, the drop of the sum of squares, less the peak that white noise of the
+    remaining variance would have: 2 sigma^2 ln(tested frequencies and starts).
     """
     t = whitened.modelled.t
+    ok = whitened.ok.astype(float)
     profiled = (whitened.e + np.einsum("tck,k->tc", whitened.Jn, whitened.xn)) * whitened.ok[:, None]
     frequencies = np.arange(*_BAND_HZ, 1.0 / (_OVERSAMPLING * (t[-1] - t[0])))
     starts = np.linspace(0, len(t), _BLOCKS, endpoint=False).astype(int)
@@ -132,9 +157,14 @@ def find_tones(whitened: WhitenedResiduals) -> Iterator["Anomaly"]:
     for equation, channel in CHANNEL_OF.items():
         if whitened.base.r2.get(equation, 1.0) > MIN_R2:
             x = profiled[:, CHANNELS.index(channel)]
-            power = np.abs(_tail_sums(waves * x[:, None], starts)) ** 2 / (_tail_sums(x * x, starts)[:, None] + 1e-9)
-            start, peak = np.unravel_index(int(np.argmax(power[:-_MIN_BLOCKS])), power[:-_MIN_BLOCKS].shape)
-            yield Anomaly(2.0 * float(power[start, peak]), channel, float(t[starts[start]]), "tone")
+            rows = np.maximum(_tail_sums(ok, starts), 1.0)[:, None]
+            drop = 2.0 * np.abs(_tail_sums(waves * x[:, None], starts)) ** 2 / rows
+            rest = np.maximum(_tail_sums(x * x, starts)[:, None] - drop, 0.0) / rows
+            gain = (drop - 2.0 * rest * np.log(drop.size))[:-_MIN_BLOCKS]
+            start, peak = np.unravel_index(int(np.argmax(gain)), gain.shape)
+            yield Anomaly(
+                float(gain[start, peak]), channel, float(t[starts[start]]), "tone", parameters=_TONE_PARAMETERS
+            )
 
 
 def _tail_sums(x: np.ndarray, starts: np.ndarray) -> np.ndarray:
@@ -143,13 +173,15 @@ def _tail_sums(x: np.ndarray, starts: np.ndarray) -> np.ndarray:
 
 
 class Anomaly(NamedTuple):
-    """Gain of a changed equation less its cost, or power ratio of a tone, with channel, onset [s], kind and term."""
+    """Gain of a change less its cost, with channel, onset [s], kind, term, part of the residual and parameters."""
 
     net_gain: float
     channel: str
     t0: float
     change: str = "odd"
     term: str = ""
+    series: np.ndarray | None = None
+    parameters: int = 1
 
     @property
     def kind(self) -> str:
@@ -170,8 +202,9 @@ def find_anomalies(whitened: WhitenedResiduals) -> list[Anomaly]:
     bounded = whitened.with_nuisance_priors()  # no nuisance released
     out = list(find_tones(bounded))
     for equation in channel_equations(bounded):
-        for change, (net_gain, t0) in (("odd", equation.gain_of_all()), ("shift", equation.gain_in_flight())):
-            out.append(Anomaly(net_gain, equation.channel, t0, change))
+        for change, gain in (("odd", equation.gain_of_all()), ("shift", equation.gain_in_flight())):
+            n = len(equation.names)
+            out.append(Anomaly(gain.net, equation.channel, gain.t0, change, series=gain.series, parameters=n))
     return out
 
 
@@ -180,7 +213,7 @@ def find_changed_coefficients(whitened: WhitenedResiduals) -> list[Anomaly]:
     if not whitened.base.vane:
         return []
     return [
-        Anomaly(net_gain, equation.channel, t0, "one", name)
+        Anomaly(gain.net, equation.channel, gain.t0, "one", name, gain.series)
         for equation in channel_equations(whitened)
-        for name, (net_gain, t0) in equation.gain_per_term()
+        for name, gain in equation.gain_per_term()
     ]

@@ -9,7 +9,7 @@ from scipy.special import expit
 from fleet.effects import Onset, Stage
 from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.inference.isolation.block_means import BlockMeans
-from twin_worker.diagnosis.inference.isolation.decision import Weights
+from twin_worker.diagnosis.inference.isolation.evidence import Weights
 from twin_worker.diagnosis.inference.isolation.refine import refine
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 from twin_worker.diagnosis.inference.validation.force_prediction import BLOCK_S, blocks

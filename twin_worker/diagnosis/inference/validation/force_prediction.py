@@ -22,6 +22,9 @@ SIDE = ("velocity", "roll", "yaw")
 PRESSURE = ("velocity", "airspeed")
 BLOCK_S = 10.0
 _ITERATIONS = 4  # of the pitching moment equation, whose drag depends on lift
+_ACTING = 0.95  # share of the change of the prediction in the blocks resampled
+_MIN_BLOCKS, _RESAMPLES, _SEED = 3, 500, 17
+_LEVELS = 2.5, 97.5  # percentiles of the interval
 _MAX_SIDESLIP = 0.35  # limit of the predicted sideslip [rad]
 
 
@@ -58,6 +61,46 @@ def rms(modelled: ModelledFlight, error: np.ndarray) -> float:
     """Return the rms of an error, (n, 3), on valid held-out rows."""
     mask = modelled.ok & blocks(modelled.t, odd=True) & np.isfinite(error).all(axis=1)
     return float(np.sqrt((error[mask] ** 2).mean())) if mask.any() else float("nan")
+
+
+def is_in_forces(hypothesis: FaultHypothesis) -> bool:
+    """Return whether a prediction of forces shows an effect: not a sensor fault, except of the airspeed."""
+    effect = hypothesis.effect
+    return not effect.variance and (effect.stage is not Stage.SENSOR or effect.channel == "airspeed")
+
+
+def held_out_gain(
+    modelled: ModelledFlight,
+    measured: np.ndarray,
+    predicted: tuple[np.ndarray, np.ndarray],
+) -> tuple[float, float, float]:
+    """Return the gain 1 - rms(after) / rms(before) on held-out blocks and its 95 % interval, by resampling of blocks.
+
+    Only blocks in which the effects act are resampled, those with 95 % of the squared change of the prediction.
+
+    Args:
+        modelled: the flight with its baseline
+        measured, predicted: specific force, without and with the effects, (n, 3)
+    Returns:
+        gain and limits; nan with fewer than three such blocks, from which no interval follows
+    """
+    finite = np.isfinite(predicted).all(axis=(0, 2)) & np.isfinite(measured).all(axis=1)
+    rows = modelled.ok & finite & blocks(modelled.t, odd=True)
+    pairs = (predicted[0], measured), (predicted[1], measured), predicted
+    squares = np.array([np.where(rows, np.nan_to_num(((x - y) ** 2).sum(axis=1)), 0.0) for x, y in pairs])
+    labels = np.floor(modelled.t / BLOCK_S).astype(int)
+    labels -= labels[0]
+    by_block = np.stack([np.bincount(labels, row) for row in squares], axis=1)
+    order = np.argsort(-by_block[:, 2])
+    change = np.cumsum(by_block[order, 2])
+    sums = by_block[order[: int(np.searchsorted(change, _ACTING * change[-1])) + 1]]
+    if len(sums) < _MIN_BLOCKS or change[-1] <= 0.0:
+        return np.nan, np.nan, np.nan
+    drawn = np.random.default_rng(_SEED).integers(len(sums), size=(_RESAMPLES, len(sums)))
+    before, after, _ = sums[drawn].sum(axis=1).T
+    low, high = np.percentile(1.0 - np.sqrt(after / np.maximum(before, 1e-12)), _LEVELS)
+    total = sums.sum(axis=0)
+    return float(1.0 - np.sqrt(total[1] / max(total[0], 1e-12))), float(low), float(high)
 
 
 def predict_force(eq_terms: EquationTerms, source: tuple[str, str, str]) -> np.ndarray:
