@@ -250,22 +250,25 @@ def follow(
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
-def reference_states(segments: np.ndarray, par: np.ndarray, dt: float, states: np.ndarray, refs: np.ndarray) -> int:
-    """Run the navigation from the first segment with an aircraft that follows exactly; return the number of rows.
+def flown_states(segments: np.ndarray, par: np.ndarray, dt: float, states: np.ndarray, flown: np.ndarray) -> int:
+    """Simulate the flight from rest at the first segment; return the number of rows.
 
     Args:
         segments, par, dt: as of `follow`
-        states: state of the navigation at each step, filled in, (n, N_STATE)
-        refs: reference of each step, filled in, (n, 3, 3)
+        states: state of the navigation after each step, filled in, (n, N_STATE)
+        flown: position, velocity, acceleration of the aircraft after each step, filled in, (n, 3, 3)
     """
-    state, r = np.zeros(N_STATE), np.zeros((3, 3))
+    state, r, xva = np.zeros(N_STATE), np.zeros((3, 3)), np.zeros((3, 3))
     state[TAIL], state[LEAD], state[SCALE] = -1.0, -1.0, 1.0
     state[START_N : START_D + 1] = segments[0, A_N : A_N + 3]
+    xva[0] = segments[0, A_N : A_N + 3]
     if segments[0, TURN] != 0.0:
-        begin_circle(state, segments[0], segments[0, A_N : A_N + 3], 0.0)
+        begin_circle(state, segments[0], xva[0], 0.0)
     for k in range(len(states)):
-        navigate(state, segments, r[:2], par, dt, r)
-        states[k], refs[k] = state, r
+        for _ in range(_SUBSTEPS):
+            navigate(state, segments, xva[:2], par, dt / _SUBSTEPS, r)
+            track_reference(xva, r, par, dt / _SUBSTEPS)
+        states[k], flown[k] = state, xva
         if state[WAIT] > 0.0 and segments[int(state[SEGMENT]), HOLD] > 1e6:
             return k + 1
     return len(states)

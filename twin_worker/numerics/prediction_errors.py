@@ -12,6 +12,7 @@ AHEAD = np.concatenate([np.arange(0.0, 61.0), np.arange(64.0, 181.0, 4.0)])  # l
 ERROR_LIMIT = 0.10  # relative error that ends the confidence horizon [-]
 NOMINAL_COVERAGE = 0.9  # nominal coverage of tube and horizon [-]
 _FLOOR_S = 2.0  # minimum path length, in seconds of ground speed [s]
+_FLOOR_M = 5.0  # and at least this: ten times the position error of a GNSS receiver in hover [m]
 
 
 def track_frame(path: np.ndarray, ahead: np.ndarray = AHEAD) -> np.ndarray:
@@ -113,7 +114,7 @@ def axes_error(path: np.ndarray, actual: np.ndarray, ahead: np.ndarray = AHEAD) 
 
 
 def path_length(path: np.ndarray, speed: float, length_before: float = 0.0) -> np.ndarray:
-    """Return the cumulative path length, at least two seconds of ground speed, (n,) [m].
+    """Return the cumulative path length, at least `min_path_length`, (n,) [m].
 
     Args:
         path: positions, (n, 3) [m]
@@ -125,8 +126,8 @@ def path_length(path: np.ndarray, speed: float, length_before: float = 0.0) -> n
 
 
 def min_path_length(speed: float) -> float:
-    """Return the minimum path length: two seconds of ground speed, at least a metre [m]."""
-    return max(_FLOOR_S * speed, 1.0)
+    """Return the minimum path length: two seconds of ground speed, at least 5 m [m]."""
+    return max(_FLOOR_S * speed, _FLOOR_M)
 
 
 def first_passage(relative: np.ndarray, ahead: np.ndarray = AHEAD) -> tuple[float, bool]:

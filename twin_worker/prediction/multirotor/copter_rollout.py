@@ -1,7 +1,7 @@
 """Rollout of ArduCopter's route: synchronise its waypoint navigation with the flight so far, and simulate it.
 
-The state of the navigation is that of an undisturbed flight, from the leg before the present one, whose reference lies
-nearest to the newest positions and velocities.
+The state of the navigation is that of an undisturbed simulated flight, from the leg before the present one, at the time
+that lies nearest to the newest positions and velocities.
 """
 
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from fleet.frames import G
 from twin_worker.telemetry.track import STEP, Track
 
 _MAX_RUN = 1200  # steps of the undisturbed flight
-_MATCH_ROWS = (0, 5, 10, 20)  # rows of the track, before the newest one, that are compared
+_MATCH_ROWS = range(0, 50, 5)  # rows of the track, before the newest one, that are compared
 _VELOCITY_S = 0.7  # weight of a velocity against a position [s]
 _MAX_OFFSET_M = 5.0  # from the leg; beyond it a new leg begins at the aircraft
 _ATTITUDE_LAG_S = 0.25
@@ -82,12 +82,13 @@ def _synchronise(track: Track, segments: np.ndarray, item: tuple[int, float], pa
     if len(circle) and (state := _on_circle(track, segments[circle[0]])) is not None:
         state[copter_legs.SEGMENT] = circle[0]
         return state
-    if len(own) and _length(segments[first]) < 0.1 and isfinite(since):  # waits where it is
+    waits = len(own) > 0 and _length(segments[first]) < 0.1
+    if waits and not first and isfinite(since):  # without the leg before, the report tells since when
         state = _new_leg(track, segments, first, par)
         state[copter_legs.T], state[copter_legs.WAIT] = _LONG_S, since + _REPORT_DELAY_S
         return state
-    states, refs = np.zeros((_MAX_RUN, copter_legs.N_STATE)), np.zeros((_MAX_RUN, 3, 3))
-    n = copter_legs.reference_states(segments, par, STEP, states, refs)
+    states, flown = np.zeros((_MAX_RUN, copter_legs.N_STATE)), np.zeros((_MAX_RUN, 3, 3))
+    n = copter_legs.flown_states(segments, par, STEP, states, flown)
     segment = states[:n, copter_legs.SEGMENT].astype(int)
     rows = np.flatnonzero((segments[segment, copter.SEQ] == seq) & (segments[segment, copter_legs.TURN] == 0.0))
     if not len(rows):
@@ -95,22 +96,23 @@ def _synchronise(track: Track, segments: np.ndarray, item: tuple[int, float], pa
     stopped = int(_stationary_s(track) / STEP)
     at_end = np.linalg.norm(track.p[-1] - segments[own[-1], copter.B_N : copter.B_N + 3]) < 3.0
     back = min(stopped, len(track) - 2) if stopped and at_end else 0  # rows since it was moving
-    row = int(rows[np.argmin(_distance(track, refs, rows, back))])
-    if np.linalg.norm(refs[row, 0] - track.p[-1 - back]) > _MAX_OFFSET_M:
+    matched = np.arange(rows[-1] + 1) if waits else rows  # it was moving on the leg before
+    row = int(matched[np.argmin(_distance(track, flown, matched, back))])
+    if np.linalg.norm(flown[row, 0] - track.p[-1 - back]) > _MAX_OFFSET_M:
         return _new_leg(track, segments, int(segment[row]), par)
-    return states[min(row + back, int(rows[-1]))].copy()
+    return states[min(max(row + back, int(rows[0])), int(rows[-1]))].copy()
 
 
-def _distance(track: Track, refs: np.ndarray, rows: np.ndarray, back: int) -> np.ndarray:
-    """Return the squared distance of reference rows from the track until `back` rows ago, (n,) [m2]."""
+def _distance(track: Track, flown: np.ndarray, rows: np.ndarray, back: int) -> np.ndarray:
+    """Return the squared distance of simulated rows from the track until `back` rows ago, (n,) [m2]."""
     cost = np.zeros(len(rows))
     for lag in _MATCH_ROWS:
         k = len(track) - 1 - back - lag
         if k >= 0:
             earlier = np.maximum(rows - lag, 0)
             v = track.v[max(k - 1, 0) : k + 1].mean(axis=0)
-            cost += np.sum((refs[earlier, 0] - track.p[k]) ** 2, axis=1)
-            cost += _VELOCITY_S**2 * np.sum((refs[earlier, 1] - v) ** 2, axis=1)
+            cost += np.sum((flown[earlier, 0] - track.p[k]) ** 2, axis=1)
+            cost += _VELOCITY_S**2 * np.sum((flown[earlier, 1] - v) ** 2, axis=1)
     return cost
 
 
