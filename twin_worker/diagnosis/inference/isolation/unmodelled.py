@@ -83,7 +83,7 @@ class ChannelEquation:
 def channel_equations(whitened: WhitenedResiduals) -> Iterator[ChannelEquation]:
     """Yield every sufficiently calibrated channel with the terms that may change.
 
-    No coefficient changes where the lift is outside what the nominal flights calibrated: the equations extrapolate there.
+    No coefficient changes where the lift is outside that of the nominal flights: the equations extrapolate there.
     """
     eq_terms = whitened.modelled.equation_terms(whitened.conditions)
     c_z, envelope = eq_terms.intermediate["c_z"], whitened.base.envelope
