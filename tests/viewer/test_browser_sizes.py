@@ -14,7 +14,7 @@ from fleet.contract import Prediction, TwinState
 from tests.bench.viewing.page import PLACES, differing
 from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import PretendFleet
-from tests.viewer.test_browser import ARGS, IN_SCENE, PATIENCE_MS, SCHEME
+from tests.viewer.test_browser import ARGS, FEW_FRAMES, IN_SCENE, PATIENCE_MS, SCHEME
 from viewer.browser.http_server import serve, without_stdout
 from viewer.scene.labels import EM_PX, overlap
 from viewer.server.app import App
@@ -106,6 +106,7 @@ def live(chromium: str) -> Iterator[SimpleNamespace]:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium, args=ARGS)
         page = browser.new_page(viewport={"width": 1280, "height": 720})
+        page.add_init_script(FEW_FRAMES)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.goto(f"http://127.0.0.1:{port}/?fixedDpr=0.5")
         page.wait_for_function(IN_SCENE, timeout=PATIENCE_MS)
