@@ -250,11 +250,14 @@ def follow(
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
-def reference_states(segments: np.ndarray, par: np.ndarray, dt: float, states: np.ndarray, refs: np.ndarray) -> int:
+def reference_states(
+    segments: np.ndarray, last: int, par: np.ndarray, dt: float, states: np.ndarray, refs: np.ndarray
+) -> int:
     """Run the navigation from the first segment with an aircraft that follows exactly; return the number of rows.
 
     Args:
         segments, par, dt: as of `follow`
+        last: segment after whose end the run stops
         states: state of the navigation at each step, filled in, (n, N_STATE)
         refs: reference of each step, filled in, (n, 3, 3)
     """
@@ -266,6 +269,6 @@ def reference_states(segments: np.ndarray, par: np.ndarray, dt: float, states: n
     for k in range(len(states)):
         navigate(state, segments, r[:2], par, dt, r)
         states[k], refs[k] = state, r
-        if state[WAIT] > 0.0 and segments[int(state[SEGMENT]), HOLD] > 1e6:
+        if state[SEGMENT] > last or (state[WAIT] > 0.0 and segments[int(state[SEGMENT]), HOLD] > 1e6):
             return k + 1
     return len(states)
