@@ -46,7 +46,7 @@ ANSWERS = {  # command line -> part of the last line
     "fleet up --mavlink 127.0.0.1": "--mavlink: found '127.0.0.1', expected HOST:PORT such as 127.0.0.1:14550",
     "fleet up --terrain nosuch.tif": "--terrain: found no file 'nosuch.tif', expected a raster file; check the path",
     "fleet up --imagery folder": "--imagery: found a folder 'folder', expected a raster file; name a file in it",
-    "fleet up --fault nosuch": "fault: found 'nosuch', expected one of actuator_lag",
+    "fleet up --fault nosuch": "--fault: found 'nosuch', expected one of actuator_lag",
     "fleet up --baseline nosuch.json": "--baseline: found no file 'nosuch.json', expected a model from",
     "fleet up --baseline 3=nosuch.json": "--baseline: found no file 'nosuch.json', expected a model from",
     "fleet up --replay text.txt --speed fast": "--speed: found 'fast', expected a number above 0 or max; write e.g. 4",
