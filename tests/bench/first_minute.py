@@ -48,6 +48,10 @@ class Terminal:
     def screen(self) -> str:
         """Give all lines as a terminal shows them: progress displays move the cursor up and write again."""
         lines, row, column = [""], 0, 0
+        read = -1
+        while read < len(self.text):  # not in the middle of a display
+            read = len(self.text)
+            threading.Event().wait(0.1)
         for number, command, control, text in PARTS.findall(self.text):
             if control == "\n":
                 row += 1
