@@ -32,11 +32,10 @@ def recording(tmp_path: Path) -> tuple[Path, list[Prediction]]:
 
 
 def test_the_notebook_reads_predictions_of_a_fleet_and_of_a_recording(
-    router: str, recording: tuple[Path, list[Prediction]], monkeypatch: pytest.MonkeyPatch
+    router: str, recording: tuple[Path, list[Prediction]]
 ) -> None:
     path, told = recording
-    monkeypatch.setenv("PARAUAV_ROUTER", router)
-    monkeypatch.setenv("PARAUAV_RECORDING", str(path))
+    given = {'"tcp/127.0.0.1:7447"': repr(router), '"flight.parauav"': repr(str(path))}
     notebook = json.loads((ROOT / "docs" / "predictions.ipynb").read_text())
     names: dict[str, object] = {}
     with connect(router) as bus:
@@ -45,7 +44,11 @@ def test_the_notebook_reads_predictions_of_a_fleet_and_of_a_recording(
         for cell in notebook["cells"]:
             if cell["cell_type"] == "code":
                 assert not cell["outputs"]
-                exec(compile("".join(cell["source"]), "predictions.ipynb", "exec"), names)
+                source = "".join(cell["source"])
+                for text in [text for text in given if text in source]:
+                    source = source.replace(text, given.pop(text))
+                exec(compile(source, "predictions.ipynb", "exec"), names)
+    assert not given
     answered = [uav.prediction(T, 0.0) for uav in fleet.uavs]
     check(names["live"], [message for message in answered if message is not None and len(message.ahead.numpy())])
     check(names["recorded"], told)
