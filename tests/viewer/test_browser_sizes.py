@@ -168,15 +168,19 @@ def test_keys_select_the_next_and_the_previous_row(live: SimpleNamespace) -> Non
 def test_all_places_of_the_page_tell_what_the_bus_told(live: SimpleNamespace, uav: int) -> None:
     """Three seconds of each, twenty looks a second; `python -m tests.bench.viewing --consistency 60` looks longer.
 
-    The ring is compared two frames after a change of the row: the scene of a message is drawn with the next frame.
+    The ring is compared three frames after a change of the row: the scene of a message is drawn with the next frame.
     """
     page = live.page
     page.locator(f'tr[data-uav="{uav}"]').dispatch_event("pointerdown")
     page.wait_for_function(
         "uav => document.querySelector('tr.on').dataset.uav === uav", arg=str(uav), timeout=PATIENCE_MS
     )
-    samples = page.evaluate(PLACES, 3.0)
-    assert len(samples) > 10 and len({tuple(one["row"]) for one in samples}) > 2
+    samples: list[dict] = []
+    for _ in range(20):  # a busy machine draws few rows in three seconds
+        samples += page.evaluate(PLACES, 3.0)
+        if len({tuple(one["row"]) for one in samples}) > 2:
+            break
+    assert len({tuple(one["row"]) for one in samples}) > 2
     assert differing(samples) == []
     if uav == SHORT:
         page.get_by_role("tab", name="Alerts").click()

@@ -105,12 +105,12 @@ def differing(samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def drawn(samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Give the samples of `PLACES` whose row is as old as two frames: by then the scene is drawn as well."""
+    """Give the samples of `PLACES` whose row is as old as three frames: by then the scene is drawn as well."""
     found, since = [], samples[0] if samples else {}
     for one in samples:
         if (one["name"], one["row"]) != (since["name"], since["row"]):
             since = one
-        if one["frame"] >= since["frame"] + 2 and one["ring"] is not None:
+        if one["frame"] >= since["frame"] + 3 and one["ring"] is not None:
             found.append(one)
     return found
 
