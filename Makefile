@@ -8,6 +8,16 @@ LOCK := requirements.lock
 BENCH_LOCK := requirements-bench.lock
 DOCS_LOCK := requirements-docs.lock
 STAMP := .venv/setup-done
+# The main path: contract, bus, gateway, twin, worker and page, a fleet of processes, a recorded flight, a diagnosis.
+QUICK := tests/test_architecture.py tests/fleet/test_contract.py tests/fleet/test_bus.py \
+  tests/fleet/test_wrong_inputs.py tests/fleet/simulator/test_pretend.py tests/fleet/telemetry/mavlink \
+  tests/fleet/telemetry/test_recordings.py tests/gateway/test_gateway.py tests/twin_worker/twin/test_twin.py \
+  tests/twin_worker/validation tests/twin_worker/prediction/test_predict.py tests/twin_worker/confidence/test_horizon.py \
+  tests/twin_worker/service/test_worker.py tests/twin_worker/diagnosis/test_output_faults.py \
+  tests/viewer/test_viewer.py tests/viewer/test_viewer_states.py tests/viewer/test_viewer_feed.py \
+  tests/viewer/test_browser_sizes.py::test_all_places_of_the_page_tell_what_the_bus_told \
+  tests/test_end_to_end.py::test_a_fleet_of_two_flies_answers_and_leaves_a_summary \
+  tests/test_end_to_end.py::test_a_flight_of_another_autopilot_is_predicted_on_its_own_mission
 export PARAUAV_RECORDINGS ?= $(abspath ../shared/recordings)
 
 # The stamp names the folder and the interpreter it was made for: a moved checkout sets up again.
@@ -15,11 +25,12 @@ ifneq ($(shell cat $(STAMP) 2>/dev/null && $(BIN)/python -c '' 2>&1),$(CURDIR))
 STALE := stale
 endif
 
-.PHONY: help setup bench-setup run test lint docs browser lock clean stale
+.PHONY: help setup bench-setup run test test-quick lint docs browser lock clean stale
 
 help:
 	@echo "make run [UP='--uavs 8']    set up, then fly a fleet, twin it and show it; Ctrl-C ends it"
 	@echo "make test [TESTS='…']       set up, then run every test, the browser's included"
+	@echo "make test-quick             the main path end to end, in about a minute once everything is compiled"
 	@echo "make setup                  only set up: packages into .venv, by version and hash"
 	@echo "make lint                   ruff and mypy"
 	@echo "make docs                   build the documentation into site/; the result works offline"
@@ -44,6 +55,9 @@ run: setup
 
 test: setup browser
 	@$(BIN)/python -m pytest -n 2 --dist loadfile $(TESTS)
+
+test-quick: setup browser
+	@$(BIN)/python -m pytest -n 2 --dist loadfile $(QUICK)
 
 lint: setup
 	@$(BIN)/ruff check .

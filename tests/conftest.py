@@ -32,9 +32,10 @@ from twin_worker.twin.step import Twin
 ROOT = Path(__file__).resolve().parent.parent
 LONG_FILES = pytest.StashKey[list[str]]()
 HEAVY = (  # files by the time they take, so that none begins when the others have ended; the rest follows by name
-    *("effect_injection", "twin", "prove", "foresee_hostile", "end_to_end", "diagnose_flightstack"),
-    *("diagnose_concealed", "paper", "every_vehicle", "mismatch_shown", "diagnose_real", "diagnose_past"),
-    *("hostile_windows", "conceal", "live_offline", "assess", "long_tlog", "rotor", "browser", "bench_identification"),
+    *("effect_injection", "twin", "prove", "browser_access", "diagnose_flightstack", "end_to_end"),
+    *("diagnose_concealed", "browser", "assess", "damage", "mismatch_shown", "diagnose_past", "browser_sizes"),
+    *("inject", "paper", "rotor", "diagnose_page", "readme", "takeover", "diagnose_bad_input", "security"),
+    *("calibration", "diagnose_real", "late_arrival", "mismatch_live", "live_offline", "conceal", "every_vehicle"),
 )
 """The first two begin at once: one compiles the twin's physics, the other has no need of it."""
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")

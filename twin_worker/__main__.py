@@ -7,7 +7,7 @@ import logging
 import os
 import sys
 import threading
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 SWITCH_INTERVAL_S = 5e-4  # maximum wait of a bus thread for the interpreter [s]
 EXIT_TIMEOUT_S = 10.0  # time from a stop signal to a forced exit [s]
+COMPILING_PERIOD_S = 1.0  # between two reports that the worker compiles [s]
 NICE_INCREMENT = 5  # increment of the nice value of the warm-up thread
 GC_THRESHOLD = 50_000  # allocations between garbage collections
 MMAP_THRESHOLD_B = 16 << 20  # malloc blocks above this are mapped separately [bytes]
@@ -105,9 +106,12 @@ def _run(args: argparse.Namespace) -> int:
     stop = stop_on_signal()
     threading.Thread(target=_force_exit, args=(stop,), daemon=True).start()
     with connect(bus_config_from(args, WORKER)) as bus:
-        bus.publish(FleetState(t=0.0, sentence="compiling the twin's physics, once"))
         with ThreadPoolExecutor(1) as pool:  # a thread can lower its priority but not raise it again
-            pool.submit(_prepare).result()
+            prepared, done = pool.submit(_prepare), False
+            while not done:  # repeated, for a viewer that starts later
+                bus.publish(FleetState(t=0.0, sentence="compiling the twin's physics, once"))
+                done = bool(wait([prepared], COMPILING_PERIOD_S).done)
+            prepared.result()
         from twin_worker.alerts.conflict_probability import Separation
         from twin_worker.mismatch.coordinator import Coordinator
         from twin_worker.mismatch.process import DiagnosisProcess

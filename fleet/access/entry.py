@@ -92,8 +92,8 @@ _CONGESTION = "transport/link/tx/queue/congestion_control"
 _CONNECT_TIMEOUT_MS = 10_000  # an accepted session takes less, also on a busy machine
 
 
-def parse_endpoint(router: str) -> tuple[str, int]:
-    """Split `tcp/127.0.0.1:7447` into host and port.
+def parse_endpoint(router: str, option: str = "--router") -> tuple[str, int]:
+    """Split `tcp/127.0.0.1:7447` into host and port; `option` names it in errors.
 
     Raises:
         ValueError: when it is not a tcp or tls endpoint.
@@ -101,7 +101,7 @@ def parse_endpoint(router: str) -> tuple[str, int]:
     kind, _, rest = router.partition("/")
     host, _, port = rest.rpartition(":")
     if kind not in ("tcp", "tls") or not host or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise ValueError(f"--router: found {router!r}, expected e.g. {ROUTER}; name protocol, host and port")
+        raise ValueError(f"{option}: found {router!r}, expected e.g. {ROUTER}; name protocol, host and port")
     return host.strip("[]"), int(port)
 
 

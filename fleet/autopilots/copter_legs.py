@@ -250,11 +250,14 @@ def follow(
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
-def flown_states(segments: np.ndarray, par: np.ndarray, dt: float, states: np.ndarray, flown: np.ndarray) -> int:
+def flown_states(
+    segments: np.ndarray, last: int, par: np.ndarray, dt: float, states: np.ndarray, flown: np.ndarray
+) -> int:
     """Simulate the flight from rest at the first segment; return the number of rows.
 
     Args:
         segments, par, dt: as of `follow`
+        last: segment after whose end the run stops
         states: state of the navigation after each step, filled in, (n, N_STATE)
         flown: position, velocity, acceleration of the aircraft after each step, filled in, (n, 3, 3)
     """
@@ -269,6 +272,6 @@ def flown_states(segments: np.ndarray, par: np.ndarray, dt: float, states: np.nd
             navigate(state, segments, xva[:2], par, dt / _SUBSTEPS, r)
             track_reference(xva, r, par, dt / _SUBSTEPS)
         states[k], flown[k] = state, xva
-        if state[WAIT] > 0.0 and segments[int(state[SEGMENT]), HOLD] > 1e6:
+        if state[SEGMENT] > last or (state[WAIT] > 0.0 and segments[int(state[SEGMENT]), HOLD] > 1e6):
             return k + 1
     return len(states)

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from conftest import ROOT
 
 from fleet import cli
 from fleet.commands.offline.completion import SCRIPTS, verb_parsers
@@ -18,6 +17,7 @@ from gateway import __main__ as gateway
 from twin_worker import __main__ as twin_worker
 from viewer import __main__ as viewer
 
+ROOT = Path(__file__).resolve().parents[2]
 MAINS = {"fleet": cli.main, "gateway": gateway.main, "twin_worker": twin_worker.main, "viewer": viewer.main}
 ANSWERS = {  # command line -> part of the last line
     "fleet": "found no verb, expected assess, calibrate",
@@ -46,7 +46,12 @@ ANSWERS = {  # command line -> part of the last line
     "fleet up --mavlink 127.0.0.1": "--mavlink: found '127.0.0.1', expected HOST:PORT such as 127.0.0.1:14550",
     "fleet up --terrain nosuch.tif": "--terrain: found no file 'nosuch.tif', expected a raster file; check the path",
     "fleet up --imagery folder": "--imagery: found a folder 'folder', expected a raster file; name a file in it",
-    "fleet up --fault nosuch": "fault: found 'nosuch', expected one of actuator_lag",
+    "fleet up --fault nosuch": "--fault: found 'nosuch', expected one of actuator_lag",
+    "fleet up --baseline nosuch.json": "--baseline: found no file 'nosuch.json', expected a model from",
+    "fleet up --baseline 3=nosuch.json": "--baseline: found no file 'nosuch.json', expected a model from",
+    "fleet up --replay text.txt --speed fast": "--speed: found 'fast', expected a number above 0 or max; write e.g. 4",
+    "fleet diagnose text.txt --model nosuch.json": "--model: found no file 'nosuch.json', expected a model from",
+    "fleet router --listen nowhere": "--listen: found 'nowhere', expected e.g. tcp/127.0.0.1:7447",
     "fleet inspect": "FILE: found none, expected at least one recording; name one",
     "fleet inspect nosuch.tlog": "FILE: found no file 'nosuch.tlog', expected a recording; check the path",
     "fleet inspect folder": "FILE: found a folder 'folder', expected a recording; name a file in it",
@@ -61,6 +66,8 @@ ANSWERS = {  # command line -> part of the last line
     "fleet export x.kml --from text.txt --for 3": "--for: found --from too, expected only one",
     "fleet export x.kml --uavs 9-3": "--uavs: found '9-3', expected a range of ids such as 0-49",
     "fleet whatif seven": "uav: found 'seven', expected a whole number; correct it",
+    "fleet whatif 7 --wind=nan,2": "--wind: found (nan, 2.0), expected two finite numbers; write e.g. --wind=6,-2",
+    "fleet whatif 7 --param WP_RADIUS=nan": "--param: found 'WP_RADIUS=nan', expected NAME=VALUE",
     "fleet whatif 7 --wind 3": "--wind: found 1 numbers, expected north and east; write e.g. --wind=6,-2",
     "fleet schema predictoin": "did you mean prediction?",
     "fleet effects nosuch": "found 'nosuch', expected an effect such as actuator_stuck",

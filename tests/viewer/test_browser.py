@@ -27,7 +27,15 @@ pytestmark = pytest.mark.browser
 UAVS, EVIL, LONG, NOWHERE, ABROAD = 20, 3, 17, 18, 19
 PLAIN = ["--headless=new", "--no-sandbox", "--disable-background-networking", "--disable-component-update"]
 PLAIN += ["--no-first-run"]
-ARGS = [*PLAIN, "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+ARGS = [*PLAIN, "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu-compositing"]
+FEW_FRAMES = """(() => {  // three a second: a renderer in software takes both cores at full rate
+  const next = window.requestAnimationFrame.bind(window), cancelled = new Set();
+  window.requestAnimationFrame = draw => {
+    const id = setTimeout(() => next(now => { if (!cancelled.delete(id)) draw(now); }), 300);
+    return id;
+  };
+  window.cancelAnimationFrame = id => cancelled.add(id);
+})()"""
 IN_SCENE = "window.__viserMutable && window.__viserMutable.nodeRefFromName['/fleet/vehicles']"
 NODES = "Object.keys(window.__viserMutable.nodeRefFromName).length"
 SHOWN = "name => [...document.querySelectorAll('.uav .head h1')].some(e => e.textContent === name)"
@@ -48,8 +56,7 @@ PROJECT = """n => {
 
 BANNER = "state => [...document.querySelectorAll('.stale')].some(e => getComputedStyle(e).visibility === state)"
 FRAMES = """ms => new Promise(done => {
-  const times = []; let last = performance.now(), until = last + ms;
-  const step = now => { times.push(now - last); last = now; now < until ? requestAnimationFrame(step) : done(times); };
+  const until = performance.now() + ms, step = now => now < until ? requestAnimationFrame(step) : done();
   requestAnimationFrame(step);
 })"""
 
@@ -147,6 +154,7 @@ def page(chromium: str, cable: Cable, errors: list[str], tmp_path_factory: pytes
             args=ARGS,
             viewport={"width": 1280, "height": 720},
         )
+        context.add_init_script(FEW_FRAMES)
         one = context.pages[0]
         one.on("pageerror", lambda error: errors.append(f"{error} {error.stack}"))
         one.goto(f"http://127.0.0.1:{cable.port}/?fixedDpr=0.5")
@@ -289,15 +297,14 @@ def test_colours_are_the_page_s_own_and_a_reload_brings_all_back(page, errors: l
 
 
 def test_what_it_costs(page, viewer: Viewer, cable: Cable, record_property) -> None:
-    """Bound the bytes of a tick; processor and frame time are told, they are the machine's."""
+    """Bound the bytes of a tick; processor time is told, it is the machine's."""
     bytes_, cpu_s, began = cable.received, viewer.cpu_s(), time.monotonic()
-    frames = page.evaluate(FRAMES, 3_000)
+    page.evaluate(FRAMES, 3_000)
     passed = time.monotonic() - began
     per_tick, share = (cable.received - bytes_) / passed / 10, (viewer.cpu_s() - cpu_s) / passed
     record_property("bytes_per_tick", round(per_tick))
     record_property("server_cpu", round(share, 3))
-    record_property("frame_ms", round(float(np.median(frames)), 1))
-    print(f"{per_tick / 1e3:.1f} kB a tick, server {share:.1%} of a core, frame {np.median(frames):.0f} ms, median")
+    print(f"{per_tick / 1e3:.1f} kB a tick, server {share:.1%} of a core")
     assert 0 < per_tick <= 60_000
 
 

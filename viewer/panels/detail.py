@@ -89,7 +89,10 @@ def limitations(vehicle: Vehicle, now: float) -> list[str]:
         note = "the twin predicts the position shown" if vehicle.forecast is not None else "no twin yet"
         texts.append(f"No sample for {age_text(record.sample_age_s)}: {note}; check the radio link.")
     elif state in (TwinState.WAITING, TwinState.UNCLAIMED) and vehicle.model is None:
-        texts.append("No worker result for this UAV yet; check that `twin_worker` runs on this router.")
+        texts.append(
+            "No worker result for this UAV yet: `twin_worker` compiles for about a minute at its first start. "
+            "If it takes longer, check that it runs on this router."
+        )
     elif state is TwinState.UNCLAIMED:
         texts.append(
             f"No worker result for this UAV for {age_text(record.result_age_s)}; the page shows the "

@@ -64,7 +64,7 @@ def _send(args: argparse.Namespace) -> int:
     for destination, numbers in zip(map(loopback_address, args.to), share_out(args.copies, len(args.to)), strict=True):
         ids = IdAllocator(1, MAX_PER_LINK)
         for name in args.file if numbers else ():
-            broadcasts.append(Broadcaster(Path(name), read_speed(args.speed), numbers, args.copies, ids))
+            broadcasts.append(Broadcaster(Path(name), read_speed(args.speed, "--speed"), numbers, args.copies, ids))
             destinations.append(destination)
     stop = stop_on_signal()
     pairs = zip(broadcasts, destinations, strict=True)
@@ -88,7 +88,7 @@ def check_arguments(args: argparse.Namespace) -> None:
     Raises:
         ValueError: when an option is invalid; the text names it.
     """
-    read_speed(args.speed)
+    read_speed(args.speed, "--speed")
     if getattr(args, "to", None) and RecordingOptions.of(args).arguments():
         raise ValueError("--to: found --mission, --params or --columns too, expected none of them; drop them")
     if not 1 <= args.copies <= 10_000:

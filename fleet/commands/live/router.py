@@ -28,8 +28,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the configuration."""
     bus_config = bus_config_from(args)
-    for address in (*(args.listen or ()), *(args.beside or ())):
-        parse_endpoint(address)
+    for option in ("listen", "beside"):
+        for address in getattr(args, option) or ():
+            parse_endpoint(address, f"--{option}")
     print(format_settings(bus_config.router_settings(args.listen, args.beside)))
     return 0
 

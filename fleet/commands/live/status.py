@@ -84,15 +84,18 @@ def _overview(rows: list[FleetRow], running: list[tuple[str, str, str, str]]) ->
 def fleet_rows(bus: Bus) -> list[FleetRow]:
     """Query the rows of every worker and add aircraft without a worker as unclaimed."""
     best: dict[int, FleetRow] = {}
-    for state, _ in bus.get(FleetState):
+    states = list(bus.get(FleetState))
+    for state, _ in states:
         for row in state.rows:
             current = best.get(row.uav)
             if not is_plausible_epoch(row.epoch):
                 continue
             if current is None or (row.epoch, row.worker) > (current.epoch, current.worker):
                 best[row.uav] = row
+    sentence = "no worker owns this id: start `twin_worker` with a wider --uavs"
+    if not states:
+        sentence = "no worker responds: its first start compiles for about a minute; if none runs, start `twin_worker`"
     for status, _ in bus.get(Status):
-        sentence = "no worker owns this id: start `twin_worker` with a wider --uavs"
         best.setdefault(status.uav, FleetRow(uav=status.uav, state=TwinState.UNCLAIMED, verdict=sentence))
     return [best[uav] for uav in sorted(best)]
 

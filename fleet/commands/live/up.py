@@ -108,6 +108,9 @@ def _check(args: argparse.Namespace) -> None:
         raise ValueError("--results: found no --replay, expected a recording made by `fleet record`; name one")
     for name in args.replay:
         check_file("--replay", name)
+    for text in args.baseline:
+        uav, _, model = text.partition("=")
+        check_file("--baseline", model if uav.isdecimal() else text, "a model from `fleet calibrate`")
     for option in ("terrain", "imagery"):
         if (file := getattr(args, option)) and not args.no_viewer:
             check_file(f"--{option}", file if Path(file).exists() else file.rpartition("@")[0] or file, "a raster file")

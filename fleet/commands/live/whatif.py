@@ -70,7 +70,7 @@ def _read_numbers(text: str) -> tuple[float, ...]:
     try:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected numbers separated by commas") from None
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected numbers separated by commas; correct it") from None
 
 
 def build_request(args: argparse.Namespace) -> WhatIf:
@@ -81,13 +81,17 @@ def build_request(args: argparse.Namespace) -> WhatIf:
     """
     if args.wind is not None and len(args.wind) != 2:
         raise ValueError(f"--wind: found {len(args.wind)} numbers, expected north and east; write e.g. --wind=6,-2")
+    if args.wind is not None and not np.isfinite(args.wind).all():
+        raise ValueError(f"--wind: found {args.wind}, expected two finite numbers; write e.g. --wind=6,-2")
     params = {}
     for pair in args.param:
         name, _, value = pair.partition("=")
         try:
             params[name] = float(value)
         except ValueError:
-            raise ValueError(f"--param: found {pair!r}, expected NAME=VALUE such as NAVL1_PERIOD=25") from None
+            params[name] = float("nan")
+        if not np.isfinite(params[name]):
+            raise ValueError(f"--param: found {pair!r}, expected NAME=VALUE such as NAVL1_PERIOD=25; correct it")
     return WhatIf(
         items=read_waypoints(args.items) if args.items else None,
         seq=args.seq,

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from fleet.cli import check_parent, run_module
+from fleet.cli import check_file, check_parent, run_module
 from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
 
 _MAX_PAST_S = 1e6
@@ -60,6 +60,8 @@ def check_arguments(args: argparse.Namespace) -> None:
         )
     if args.against_own_past is not None and not 0 < args.against_own_past < _MAX_PAST_S:
         raise ValueError(f"--against-own-past: found {args.against_own_past:g} s, expected more than 0; change it")
+    if args.model:
+        check_file("--model", args.model, "a model from `fleet calibrate`")
     check_parent("--json", args.json)
     check_parent("--report", args.report)
 

@@ -69,7 +69,7 @@ def parse_fault(text: str, aircraft: str) -> Fault:
     name, _, part = head.partition(":")
     kind = KINDS.get(name)
     if kind is None:
-        raise ValueError(f"fault: found {name!r}, expected one of {', '.join(KINDS)}; choose one")
+        raise ValueError(f"--fault: found {name!r}, expected one of {', '.join(KINDS)}; choose one")
     if aircraft not in kind.aircraft:
         raise ValueError(f"fault {name}: found aircraft {aircraft!r}, expected {' or '.join(kind.aircraft)}; use it")
     if part not in (kind.parts or ("",)):

@@ -152,8 +152,8 @@ class ReplayPace:
         return (f"{hours}:" if hours else "") + f"{minutes:02}:{seconds:02} recorded{speed_text}"
 
 
-def read_speed(text: str) -> float:
-    """Parse a replay speed: a multiple of real time, or `max`.
+def read_speed(text: str, option: str = "speed") -> float:
+    """Parse a replay speed: a multiple of real time, or `max`; `option` names it in errors.
 
     Raises:
         ValueError: if it is neither; pass a number above 0 or `max`.
@@ -163,5 +163,5 @@ def read_speed(text: str) -> float:
     except ValueError:
         speed = 0.0
     if not speed > 0:
-        raise ValueError(f"speed: found {text!r}, expected a number above 0 or max; write e.g. 4")
+        raise ValueError(f"{option}: found {text!r}, expected a number above 0 or max; write e.g. 4")
     return speed

@@ -54,15 +54,34 @@ ECHO = """() => new Promise(done => {
 PLACES = """seconds => new Promise(done => {
   const text = (root, what) => { const e = root && root.querySelector(what); return e ? e.textContent.trim() : ''; };
   const found = [], until = performance.now() + 1e3 * seconds;
+  let frame = 0;
+  const count = () => { frame++; if (performance.now() < until) requestAnimationFrame(count); };
+  requestAnimationFrame(count);
+  const ring = () => {  // centre of the ring at the horizon, scene [10 m]
+    const node = window.__viserMutable.nodeRefFromName['/selected/horizon']; let starts = null;
+    if (node) node.traverse(o => { starts = o.geometry?.attributes.instanceStart || starts; });
+    if (!starts || !starts.count) return null;
+    const n = starts.count, sum = [0, 0, 0];
+    for (let i = 0; i < n; i++)
+      ['getX', 'getY', 'getZ'].forEach((axis, k) => { sum[k] += starts[axis](i) / n; });
+    return sum;
+  };
   const look = () => {
     const row = document.querySelector('.uav.list tr.on'), cards = document.querySelectorAll('.uav .cards .card b');
     const sheet = cards.length && cards[0].closest('.uav'), said = sheet && sheet.textContent;
-    if (row && sheet && text(sheet, 'h1') === row.cells[1].textContent) {
-      const age = / for ([\\d.]+ \\w+):/.exec(said), lost = /link lost ([\\d.]+ \\w+)/.exec(row.cells[2].textContent);
+    const name = text(sheet, 'h1');
+    if (sheet && (!row || name === row.cells[1].textContent)) {
+      const cards_of = [...document.querySelectorAll('.uav .say.pick')];
+      const card = cards_of.find(e => text(e, 'b').endsWith(name)), alert = card ? card.lastChild.textContent : '';
+      const short = /^confidence horizon (.*);/.exec(alert), silent = /^no sample for ([\\d.]+ \\w+);/.exec(alert);
+      const age = / for ([\\d.]+ \\w+):/.exec(said);
+      const lost = row && /link lost ([\\d.]+ \\w+)/.exec(row.cells[2].textContent);
       found.push({
-        row: [row.cells[3].textContent + ' %', row.cells[4].textContent.trim(), lost ? lost[1] : ''],
+        row: row && [row.cells[3].textContent + ' %', row.cells[4].textContent.trim(), lost ? lost[1] : ''],
         tile: [cards[0].textContent, cards[1].textContent, age ? age[1] : ''],
-        state: [row.cells[2].textContent.replace(/ [\\d.]+ \\w+$/, ''), text(sheet, '.head b').slice(2)],
+        alert: [short ? short[1] : '', silent ? silent[1] : ''],
+        ring: ring(), name, frame,
+        state: row && [row.cells[2].textContent.replace(/ [\\d.]+ \\w+$/, ''), text(sheet, '.head b').slice(2)],
       });
     }
     performance.now() < until ? setTimeout(look, 50) : done(found);
@@ -72,9 +91,28 @@ PLACES = """seconds => new Promise(done => {
 ROWS = "[...document.querySelectorAll('tr.pick')].map(e => Number(e.dataset.uav))"
 
 
-def differing(samples: list[dict[str, list[str]]]) -> list[dict[str, list[str]]]:
-    """Give the samples of `PLACES` in which a row and the selected aircraft's tiles tell different things."""
-    return [one for one in samples if one["row"] != one["tile"] or one["state"][0] != one["state"][1]]
+def differing(samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Give the samples of `PLACES` in which row, tiles and alert of the selected aircraft tell different things.
+
+    The row is absent where another tab than the list is open, and the alert where it is not that of the alerts.
+    """
+    return [
+        one
+        for one in samples
+        if (one["row"] and (one["row"] != one["tile"] or one["state"][0] != one["state"][1]))
+        or any(said not in ("", shown) for said, shown in zip(one["alert"], one["tile"][1:], strict=True))
+    ]
+
+
+def drawn(samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Give the samples of `PLACES` whose row is as old as three frames: by then the scene is drawn as well."""
+    found, since = [], samples[0] if samples else {}
+    for one in samples:
+        if (one["name"], one["row"]) != (since["name"], since["row"]):
+            since = one
+        if one["frame"] >= since["frame"] + 3 and one["ring"] is not None:
+            found.append(one)
+    return found
 
 
 class Page:

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from fleet.bus.codec import Stamp
 from fleet.commands.live.status import fleet_rows, fleet_table
-from fleet.contract import Alert, AlertKind, FleetRow, FleetState, Message, Prediction, TwinState
+from fleet.contract import Alert, AlertKind, FleetRow, FleetState, Message, Prediction, Status, TwinState
 from fleet.frames import to_geodetic
 from tests.support import flights as f
 from tests.support.memory_bus import MemoryBus
@@ -134,3 +134,14 @@ def test_alerts_are_strict_json() -> None:
     """A foreign tool may put them into JSON: no nan."""
     alerts = conflicts(offline.run_offline(opposite(), {}))
     assert all(json.loads(json.dumps(msgspec.to_builtins(a), allow_nan=False)) for a in alerts)
+
+
+def test_without_any_worker_the_reason_is_its_first_start_and_with_one_its_range() -> None:
+    bus = MemoryBus()
+    status = Status(uav=7, t=1.0, mode="AUTO", armed=True, autopilot="ardupilot", vehicle="fixed_wing")
+    bus.declare_queryable(Status, lambda *_: iter([(status, None)]))
+    (row,) = fleet_rows(bus)
+    assert row.state is TwinState.UNCLAIMED and "first start compiles" in row.verdict
+    bus.declare_queryable(FleetState, lambda *_: iter([(FleetState(t=1.0), None)]))
+    (row,) = fleet_rows(bus)
+    assert row.state is TwinState.UNCLAIMED and "wider --uavs" in row.verdict

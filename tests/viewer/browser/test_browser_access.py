@@ -8,7 +8,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import TimeoutError as TooLate
 
-from tests.viewer.test_browser import PATIENCE_MS, SCHEME
+from tests.viewer.test_browser import FEW_FRAMES, PATIENCE_MS, SCHEME
 from tests.viewer.test_browser_sizes import SIZES, live, until, view_of
 
 pytestmark = pytest.mark.browser
@@ -267,6 +267,7 @@ def test_the_scale_bar_has_the_length_it_states(live: SimpleNamespace) -> None:
 def test_local_time_is_shown_beside_utc_where_it_differs(live: SimpleNamespace) -> None:
     context = live.page.context.browser.new_context(timezone_id="Asia/Kolkata", viewport={"width": 1280, "height": 720})
     page = context.new_page()
+    page.add_init_script(FEW_FRAMES)
     page.goto(live.page.url)
     page.locator(".uav .local", has_text=" local").wait_for(timeout=PATIENCE_MS)
     utc, local = page.locator(".time b.now").inner_text(), page.locator(".uav .local").inner_text()

@@ -87,8 +87,10 @@ def _synchronise(track: Track, segments: np.ndarray, item: tuple[int, float], pa
         state = _new_leg(track, segments, first, par)
         state[copter_legs.T], state[copter_legs.WAIT] = _LONG_S, since + _REPORT_DELAY_S
         return state
-    states, flown = np.zeros((_MAX_RUN, copter_legs.N_STATE)), np.zeros((_MAX_RUN, 3, 3))
-    n = copter_legs.flown_states(segments, par, STEP, states, flown)
+    if not len(own):
+        return _new_leg(track, segments, first, par)
+    states, flown = np.empty((_MAX_RUN, copter_legs.N_STATE)), np.empty((_MAX_RUN, 3, 3))
+    n = copter_legs.flown_states(segments, int(own[-1]), par, STEP, states, flown)
     segment = states[:n, copter_legs.SEGMENT].astype(int)
     rows = np.flatnonzero((segments[segment, copter.SEQ] == seq) & (segments[segment, copter_legs.TURN] == 0.0))
     if not len(rows):
@@ -111,8 +113,9 @@ def _distance(track: Track, flown: np.ndarray, rows: np.ndarray, back: int) -> n
         if k >= 0:
             earlier = np.maximum(rows - lag, 0)
             v = track.v[max(k - 1, 0) : k + 1].mean(axis=0)
-            cost += np.sum((flown[earlier, 0] - track.p[k]) ** 2, axis=1)
-            cost += _VELOCITY_S**2 * np.sum((flown[earlier, 1] - v) ** 2, axis=1)
+            offset, difference = flown[earlier, 0] - track.p[k], flown[earlier, 1] - v
+            cost += np.einsum("ij,ij->i", offset, offset)
+            cost += _VELOCITY_S**2 * np.einsum("ij,ij->i", difference, difference)
     return cost
 
 

@@ -28,7 +28,7 @@ _START_INTERVAL_S, _RUN_S = 4.0, 10.0  # interval of starts, length of a rollout
 _LAG_VALUES = (0.7, 1.0, 1.4, 2.0, 2.8)  # tried natural frequencies [rad/s]
 _FRACTIONS = (0.6, 0.8, 0.9, 1.0, 1.1, 1.25)  # tried fractions of the limits
 _STOP_DELAYS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)  # tried delays at each stop [s]
-_TRIALS = (
+_TRIALS: tuple[tuple[str, tuple[float, ...]], ...] = (
     ("speed_fraction", _FRACTIONS),
     ("stop_delay_s", _STOP_DELAYS),
     ("wn", _LAG_VALUES),
@@ -60,6 +60,8 @@ def fit_model(track: Track, seq: np.ndarray, config: MultirotorConfig, model: Mu
         )
 
     name, trials = _TRIALS[model.n_comparisons % len(_TRIALS)]
+    if name in ("wn", "stop_delay_s") and (config.plans_legs or config.smooths_velocity):
+        trials = ()  # these navigation laws have gains and stops of their own
     options = [replace(model, **{name: value}) for value in dict.fromkeys((getattr(model, name), *trials))]
     costs = [cost_of(option) for option in options]
     best = int(np.argmin(costs))

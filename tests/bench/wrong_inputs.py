@@ -1,0 +1,45 @@
+"""Wrong inputs, the answer of each, and its exit code: `python -m tests.bench.wrong_inputs > wrong-inputs.md`.
+
+The inputs are those of `tests/fleet/test_wrong_inputs.py`, which holds the answers. Each is given to a process of its
+own in a folder with `folder/`, `text.txt` and `bad.toml`; the answer is the last line on standard error.
+"""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from fleet.process.logs import strip_time
+from tests.fleet.test_wrong_inputs import ANSWERS
+
+ROOT = Path(__file__).resolve().parents[2]
+MODULES = {"fleet": "fleet.cli"}
+
+
+def answer(line: str, folder: str) -> tuple[str, int]:
+    """Give the last line on standard error and the exit code of a command."""
+    program, *words = line.split()
+    command = [sys.executable, "-m", MODULES.get(program, program), *words]
+    env = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=120, check=False)
+    return strip_time(done.stderr.rstrip().rpartition("\n")[2]), done.returncode
+
+
+def main() -> int:
+    """Print the table as Markdown; exit code 1 where an answer is not the tested one."""
+    wrong = 0
+    print("| Input | Answer | Exit code |\n| --- | --- | --- |")
+    with TemporaryDirectory() as folder:
+        (Path(folder) / "folder").mkdir()
+        (Path(folder) / "text.txt").write_text("no recording\n")
+        (Path(folder) / "bad.toml").write_text("[router\n")
+        for line, expected in ANSWERS.items():
+            said, code = answer(line, folder)
+            wrong += code != 2 or expected not in said
+            print(f"| `{line}` | {said.replace('|', chr(92) + '|')} | {code} |", flush=True)
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
