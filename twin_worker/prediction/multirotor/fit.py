@@ -34,7 +34,7 @@ _TRIALS: tuple[tuple[str, tuple[float, ...]], ...] = (
     ("wn", _LAG_VALUES),
     ("accel_fraction", _FRACTIONS),
 )  # one per call
-_PRIOR_COST = 20.0  # cost of a fraction e times the limit, as a sum of errors [m]
+_PRIOR_COST = 20.0, 200.0  # of a fraction e times the limit, assumed and received, as a sum of errors [m]
 
 
 def fit_model(track: Track, seq: np.ndarray, config: MultirotorConfig, model: MultirotorModel) -> MultirotorModel:
@@ -55,9 +55,9 @@ def fit_model(track: Track, seq: np.ndarray, config: MultirotorConfig, model: Mu
             )
             for k in starts
         ]
-        return float(np.mean(errors)) + _PRIOR_COST / len(starts) * (
-            abs(np.log(candidate.speed_fraction)) + 0.3 * abs(np.log(candidate.accel_fraction))
-        )
+        speed, accel = (_PRIOR_COST[name not in config.absent] for name in ("speed", "acc"))
+        prior = speed * abs(np.log(candidate.speed_fraction)) + 0.3 * accel * abs(np.log(candidate.accel_fraction))
+        return float(np.mean(errors)) + prior / len(starts)
 
     name, trials = _TRIALS[model.n_comparisons % len(_TRIALS)]
     if name in ("wn", "stop_delay_s") and (config.plans_legs or config.smooths_velocity):

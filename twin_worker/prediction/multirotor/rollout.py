@@ -248,10 +248,8 @@ def fly_segments(
     """
     segments = limit_speeds(commanded, twin.limit)
     stops = (segments[:, copter.HOLD] > 0) & np.isfinite(segments[:, copter.HOLD])
-    planned = (
-        twin.config.plans_legs or twin.config.smooths_velocity
-    ) and not twin.model.n_starts  # its stops are part of the law
-    segments[stops, copter.HOLD] += 0.0 if planned else twin.model.stop_delay_s
+    stops_by_law = twin.config.plans_legs or twin.config.smooths_velocity
+    segments[stops, copter.HOLD] += 0.0 if stops_by_law else twin.model.stop_delay_s
     segments[:, copter.SPEED] *= np.where(commanded[:, copter.SPEED] > 0, twin.model.speed_fraction, 1.0)
     if segments.shape[1] == copter_legs.N_COLUMNS:
         par = copter_rollout.parameters(twin.limit, twin.config.params)
