@@ -15,7 +15,7 @@ within the law's error of the last seconds.
 The level of a throttle output is arbitrary, since it contains the integral of the energy error. Its law is the
 regression of its change over `_LAG_S` on the change of energy error, climb rate, pitch demand, load and speed error; it
 predicts a run from the output before the run. The error of that prediction grows as a random walk. A throttle output
-at its lower limit is saturated where the prediction is within three such errors of the limit, or beyond it; one that the
+at its lower limit is saturated where the prediction is within three such errors of the limit or beyond it; one that the
 prediction does not bring there is cut. At its upper limit it loses no thrust.
 Source: Agresti 2013, Categorical Data Analysis, chapter 5; Lambregts 1983 (total energy control).
 """
