@@ -15,8 +15,8 @@ within the law's error of the last seconds.
 The level of a throttle output is arbitrary, since it contains the integral of the energy error. Its law is the
 regression of its change over `_LAG_S` on the change of energy error, climb rate, pitch demand, load and speed error; it
 predicts a run from the output before the run. The error of that prediction grows as a random walk. A throttle output
-at its lower limit is saturated where the prediction is within three such errors of the limit or beyond it; one that the
-prediction does not bring there is cut. At its upper limit it loses no thrust.
+at a limit is saturated where the prediction is within three such errors of the limit, or beyond it; one that the
+prediction does not bring there is cut.
 Source: Agresti 2013, Categorical Data Analysis, chapter 5; Lambregts 1983 (total energy control).
 """
 
@@ -267,10 +267,10 @@ class _ModelledThrottle(_ModelledOutput):
         """Return the log likelihood ratio of a run, from its prediction by the output before it.
 
         The variance of the prediction is that of the law's error, as large as in trusted flight or before the run,
-        growing as of a random walk, and that of the regression coefficients. Full throttle loses no thrust.
+        growing as of a random walk, and that of the regression coefficients.
         """
         recent, t = self._recent(first), self._outputs.t
-        if recent.stop - recent.start < 2 or self._y[first] >= self._high:
+        if recent.stop - recent.start < 2:
             return 0.0
         error = (self._y - self._predicted)[recent]
         scale = max(self._scale, float(np.median(np.abs(error - np.median(error)))) / _MEDIAN_SIGMAS)
@@ -281,7 +281,8 @@ class _ModelledThrottle(_ModelledOutput):
         )
         surprise = self._surprise[first:end]
         if self._at_limit[first]:
-            surprise = np.where(-sigmas > _SATURATED_SIGMAS, surprise, 0.0)  # the prediction is above the lower limit
+            inside = sigmas if self._y[first] >= self._high else -sigmas  # prediction inside the limit: positive
+            surprise = np.where(inside > _SATURATED_SIGMAS, surprise, 0.0)
         repeats = float(surprise.sum())
         return self._log_ratio(repeats, float(np.median(np.abs(sigmas))) if repeats else 0.0)
 
