@@ -78,7 +78,7 @@ TABLE = {
     "land": LimitSpec(0.5, (("LAND_SPD_MS", 1), ("LAND_SPEED", _CM), ("LAND_FINAL_SPD", 1), ("MPC_LAND_SPEED", 1))),
     "tilt": LimitSpec(radians(30.0), (("ANGLE_MAX", radians(_CM)), ("MPC_TILTMAX_AIR", radians(1.0)))),
 }
-_MIN_LIMIT, _MAX_LIMIT = 0.02, 60.0  # values outside are rejected
+_MIN_LIMIT, MAX_LIMIT = 0.02, 60.0  # values outside are rejected
 
 
 def limits(values: Mapping[str, float], prefix: str = "") -> tuple[Limits, tuple[str, ...]]:
@@ -93,7 +93,7 @@ def limits(values: Mapping[str, float], prefix: str = "") -> tuple[Limits, tuple
     resolved, defaulted = {}, []
     for limit, spec in TABLE.items():
         candidates = [values[prefix + name] * factor for name, factor in spec.names if prefix + name in values]
-        valid = [value for value in candidates if isfinite(value) and _MIN_LIMIT <= value <= _MAX_LIMIT]
+        valid = [value for value in candidates if isfinite(value) and _MIN_LIMIT <= value <= MAX_LIMIT]
         resolved[limit] = valid[0] if valid else spec.default
         if not valid and limit != "acc_corner":
             defaulted.append(limit)

@@ -4,6 +4,7 @@ The parameters are identified from flight, see `multirotor.fit`.
 Source: ArduCopter and PX4 limits as in `fleet.autopilots.copter`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
 
@@ -32,7 +33,7 @@ _ZETA = 0.9
 _TRANSITION_ACCEL = 4.0  # acceleration of a quadplane in transition [m/s2]
 _ITEM_MAX_AGE_S = 15.0  # maximum age of a reported item [s]
 _STATIONARY_SPEED = 0.8  # stationary below this speed [m/s]
-_WAYPOINT, _TURNS, _LAST_NAV = 16, 18, 95  # MAV_CMD
+_WAYPOINT, _TURNS, _LAST_NAV, _JUMP, _CHANGE_SPEED = 16, 18, 95, 177, 178  # MAV_CMD
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,8 @@ def multirotor_config(
         mission, params: as received
         autopilot: as `Status.autopilot`
         since: last change of mission or parameters [s since 1970]
-        options: `origin` of the twin's frame, `flown` track, `prefix` of the parameters
+        options: `origin` of the twin's frame, `flown` track, `prefix` of the parameters, `reported` mission items in the
+            order of their reports, (n,)
     """
     origin, track, prefix = options["origin"], options["flown"], options.get("prefix", "")
     items = route_items(mission)
@@ -158,8 +160,32 @@ def multirotor_config(
     if "speed" in absent and track is not None:
         limit = limit._replace(speed=_cruise_speed(track, limit.speed))
     items = numbered_from_one(items, origin) if seq_offset else items
+    speed = speed_in_force(items, options.get("reported", np.empty(0)) + seq_offset)
+    limit = limit._replace(speed=speed or limit.speed)
     plans_legs, smooths_velocity = (autopilot == name and not prefix for name in ("ardupilot", "px4"))
     return MultirotorConfig(items, seq_offset, params, limit, absent, since, origin, plans_legs, smooths_velocity)
+
+
+def speed_in_force(items: Sequence[Item], reported: np.ndarray) -> float:
+    """Return the ground speed of the last DO_CHANGE_SPEED that was executed [m/s]; 0 if none.
+
+    It outlasts a jump to an item before it, from where the list of items alone does not tell it.
+
+    Args:
+        items: mission, item 0 is home
+        reported: current items in the order of their reports, (n,)
+    """
+    changes = reported[np.flatnonzero(np.diff(reported, prepend=np.nan))].tolist()
+    speed = 0.0
+    for before, after in zip(changes[:-1], changes[1:], strict=True):
+        for item in sorted(items, key=lambda item: item.seq):
+            if item.seq <= before or (after > before and item.seq >= after):
+                continue
+            if item.command == _JUMP and after < before:
+                break
+            if item.command == _CHANGE_SPEED and item.param1 in (0, 1) and 0 < item.param2 < copter.MAX_LIMIT:
+                speed = item.param2
+    return speed
 
 
 def _cruise_speed(track: Track, default: float) -> float:

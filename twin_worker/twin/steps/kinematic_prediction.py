@@ -109,6 +109,7 @@ def _multirotor_config(twin: Twin, recent: Track, override: RouteOverride | None
         origin=twin.telemetry.origin,
         flown=recent,
         prefix=twin.vehicle_class.rotor_prefix,
+        reported=twin.telemetry.history.rows_since("leg", twin.onboard.plan_changed_t)[1][:, 0],
     )
     return rollout.with_wing_limits(config) if twin.vehicle_class.rotor_prefix else config
 
