@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 
+from fleet.autopilots import copter_legs
 from fleet.contract import Mission
 from fleet.simulator.multirotor.uav import SimulatedMultirotor
 from tests.support.flights import HERE, item
-from twin_worker.prediction.multirotor.rollout import MultirotorModel, fly_route, multirotor_config
-from twin_worker.prediction.multirotor.route import segments_from_mission
+from twin_worker.numerics.prediction_errors import min_path_length
+from twin_worker.prediction.multirotor import copter_rollout
+from twin_worker.prediction.multirotor.rollout import MultirotorModel, fly_route, multirotor_config, speed_in_force
+from twin_worker.prediction.multirotor.route import limit_speeds, segments_from_mission
 from twin_worker.telemetry.track import STEP, Track
 
 AHEAD = np.arange(0.0, 16.0)
@@ -43,3 +46,44 @@ def test_a_delay_is_a_wait_where_the_aircraft_is_and_a_circle_one_segment() -> N
         waits = rows[rows[:, 10] == 2]
         assert len(waits) == 1 and waits[0, 9] == 7.0 and np.allclose(waits[0, :3], waits[0, 3:6])
     assert np.count_nonzero(rows[:, 10] == 3) == 2 and rows[-1, 12] == pytest.approx(-4 * np.pi)
+
+
+def test_a_wait_ends_by_the_flight_before_it_not_by_the_late_report_of_the_item() -> None:
+    mission = (item(0), item(1), item(2, north=60.0), item(3, 93, param1=9.0), item(4, north=60.0, east=80.0))
+    config = multirotor_config(Mission(uav=0, t=0.0, items=mission), {}, "ardupilot", 0.0, origin=HERE, flown=None)
+    segments, _ = segments_from_mission(mission, 2, HERE, np.zeros(3), {}, arcs=True)
+    segments = limit_speeds(segments, config.limit)
+    par = copter_rollout.parameters(config.limit, {})
+    states, flown = np.zeros((500, copter_legs.N_STATE)), np.zeros((500, 3, 3))
+    copter_legs.flown_states(segments, len(segments), par, STEP, states, flown)
+    seq = segments[states[:, copter_legs.SEGMENT].astype(int), 10]
+    reported = np.concatenate([np.full(9, 2.0), seq[:-9]])
+    leaves = int(np.flatnonzero(seq == 4)[0])
+    ahead = np.arange(0.0, 8.0, 0.5)
+    for k in range(leaves - 40, leaves - 5, 5):
+        track = Track(
+            STEP * np.arange(k + 1),
+            flown[: k + 1, 0],
+            flown[: k + 1, 1],
+            np.zeros((k + 1, 3)),
+            np.ones(k + 1, bool),
+            "",
+        )
+        path, _ = fly_route(track, reported[: k + 1], config, MultirotorModel(), ahead)
+        assert path is not None
+        actual = flown[k + np.rint(ahead / STEP).astype(int), 0]
+        assert np.linalg.norm(path - actual, axis=1).max() < 0.5
+
+
+def test_a_commanded_speed_outlasts_a_jump_back() -> None:
+    change = item(3, 178, param1=1.0, param2=7.5)
+    items = (item(0), item(1), item(2), change, item(4), item(5, 177), item(6, 178, param1=1.0, param2=3.0), item(7))
+    assert speed_in_force(items, np.array([1.0, 1, 2])) == 0.0
+    assert speed_in_force(items, np.array([1.0, 2, 4, 4, 2])) == 7.5
+    assert speed_in_force(items, np.array([1.0, 2, 4, 2, 4, 7])) == 3.0
+    vertical = (item(0), item(1), item(2, 178, param1=2.0, param2=7.5), item(3))
+    assert speed_in_force(vertical, np.array([1.0, 3])) == 0.0 == speed_in_force(items, np.empty(0))
+
+
+def test_errors_in_hover_are_related_to_five_metres() -> None:
+    assert min_path_length(0.1) == 5.0 and min_path_length(6.0) == 12.0
