@@ -170,7 +170,8 @@ def test_folders_that_are_not_there_are_named_before_any_work(
 ) -> None:
     gone = str(tmp_path / "gone" / "x.json")
     assert learn.main(["a.tlog", "--out", gone]) == 2 and "--out: found no folder" in capsys.readouterr().err
-    assert diagnosis.main(["a.tlog", "--model", "m.json", "--json", gone]) == 2
+    (model := tmp_path / "m.json").write_text("{}")
+    assert diagnosis.main(["a.tlog", "--model", str(model), "--json", gone]) == 2
     assert "--json: found no folder" in capsys.readouterr().err
 
 
