@@ -6,6 +6,7 @@ Source: ArduCopter and PX4 limits as in `fleet.autopilots.copter`.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from math import isfinite
 
 import numpy as np
@@ -150,8 +151,8 @@ def multirotor_config(
         mission, params: as received
         autopilot: as `Status.autopilot`
         since: last change of mission or parameters [s since 1970]
-        options: `origin` of the twin's frame, `flown` track, `prefix` of the parameters, `reported` mission items in the
-            order of their reports, (n,)
+        options: `origin` of the twin's frame, `flown` track, `prefix` of the parameters, `reported` mission items in
+            the order of their reports, (n,)
     """
     origin, track, prefix = options["origin"], options["flown"], options.get("prefix", "")
     items = route_items(mission)
@@ -177,7 +178,7 @@ def speed_in_force(items: Sequence[Item], reported: np.ndarray) -> float:
     """
     changes = reported[np.flatnonzero(np.diff(reported, prepend=np.nan))].tolist()
     speed = 0.0
-    for before, after in zip(changes[:-1], changes[1:], strict=True):
+    for before, after in pairwise(changes):
         for item in sorted(items, key=lambda item: item.seq):
             if item.seq <= before or (after > before and item.seq >= after):
                 continue
