@@ -250,8 +250,8 @@ def follow(
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
-def flown_states(
-    segments: np.ndarray, last: int, par: np.ndarray, dt: float, states: np.ndarray, flown: np.ndarray
+def simulated_states(
+    segments: np.ndarray, last: int, par: np.ndarray, dt: float, states: np.ndarray, simulated: np.ndarray
 ) -> int:
     """Simulate the flight from rest at the first segment; return the number of rows.
 
@@ -259,7 +259,7 @@ def flown_states(
         segments, par, dt: as of `follow`
         last: segment after whose end the run stops
         states: state of the navigation after each step, filled in, (n, N_STATE)
-        flown: position, velocity, acceleration of the aircraft after each step, filled in, (n, 3, 3)
+        simulated: position, velocity, acceleration of the aircraft after each step, filled in, (n, 3, 3)
     """
     state, r, xva = np.zeros(N_STATE), np.zeros((3, 3)), np.zeros((3, 3))
     state[TAIL], state[LEAD], state[SCALE] = -1.0, -1.0, 1.0
@@ -271,7 +271,7 @@ def flown_states(
         for _ in range(_SUBSTEPS):
             navigate(state, segments, xva[:2], par, dt / _SUBSTEPS, r)
             track_reference(xva, r, par, dt / _SUBSTEPS)
-        states[k], flown[k] = state, xva
+        states[k], simulated[k] = state, xva
         if state[SEGMENT] > last or (state[WAIT] > 0.0 and segments[int(state[SEGMENT]), HOLD] > 1e6):
             return k + 1
     return len(states)

@@ -89,8 +89,8 @@ def _run_multirotors() -> None:
     px4_multirotor.follow(np.zeros(px4_multirotor.N_STATE), segments, motion, np.ones(px4_multirotor.N_PAR), 0.1, out)
     segments, par = np.ones((2, copter_legs.N_COLUMNS)), np.ones(copter_legs.N_PAR)
     copter_legs.follow(np.zeros(copter_legs.N_STATE), segments, np.zeros((3, 3)), par, 0.1, out)
-    states, flown = np.empty((5, copter_legs.N_STATE)), np.empty((5, 3, 3))
-    copter_legs.flown_states(segments, 1, par, 0.1, states, flown)
+    states, simulated = np.empty((5, copter_legs.N_STATE)), np.empty((5, 3, 3))
+    copter_legs.simulated_states(segments, 1, par, 0.1, states, simulated)
 
 
 def _run_traffic() -> None:

@@ -62,10 +62,10 @@ def test_first_passage_is_the_first_and_never_is_censored():
     assert first_passage(np.full(91, 0.2)) == (0.0, False)
 
 
-def test_the_relative_error_has_a_floor_of_two_seconds_of_flight():
+def test_the_relative_error_has_a_floor_of_two_seconds_of_flight_and_five_metres():
     assert path_length(LINE, V)[:4].tolist() == [40.0, 40.0, 40.0, 60.0]
     standing = np.zeros((5, 3))
-    assert path_length(standing, 0.0).tolist() == [1.0] * 5  # never a division by nothing
+    assert path_length(standing, 0.0).tolist() == [5.0] * 5  # position noise in hover
     assert path_length(LINE[::-1], V)[-1] == pytest.approx(180 * V)
 
 

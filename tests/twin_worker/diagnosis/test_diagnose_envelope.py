@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 
 from fleet.effects import catalogue
+from tests.support.effect_flights import CRAFT, Plan, flown
 from twin_worker.diagnosis.data.card import UNKNOWN, FaultHypothesis
-from twin_worker.diagnosis.model.baseline import Baseline
+from twin_worker.diagnosis.inference.isolation.isolate import PARAMETER_COST
+from twin_worker.diagnosis.inference.isolation.unmodelled import channel_equations
+from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
+from twin_worker.diagnosis.model.baseline import CHANNEL_OF, Baseline, Envelope
 from twin_worker.diagnosis.model.envelope import extrapolation_sigma, is_other_day, nominal_envelope
+from twin_worker.diagnosis.model.residual import ModelledFlight
 
 
 def flight(height: float, speed: float, day: float) -> Any:
@@ -63,3 +68,15 @@ def test_effects_with_one_sign_keep_it(name: str) -> None:
 
 def test_the_envelope_holds_the_lift_that_was_flown(base: Baseline) -> None:
     assert base.envelope is not None and base.envelope.c_z == (-0.9, -0.1)
+
+
+def test_coefficients_do_not_change_where_lift_was_not_calibrated() -> None:
+    nominal = ModelledFlight(flown([Plan("nominal", 2)])[0], CRAFT)
+    whitened = WhitenedResiduals(nominal)
+    highest = float(nominal.equation_terms().intermediate["c_z"].max())
+    everywhere = {one.channel: one.gain_of_all().net for one in channel_equations(whitened)}
+    envelope = Envelope((0.0, 1.0), (0.0, 9.0), (), (highest + 0.1, highest + 0.2))
+    whitened.base = replace(CRAFT, envelope=envelope)
+    for one in channel_equations(whitened):
+        if one.channel in CHANNEL_OF.values():
+            assert one.gain_of_all().net == -PARAMETER_COST * len(one.names) < everywhere[one.channel]

@@ -55,7 +55,7 @@ def test_a_wait_ends_by_the_flight_before_it_not_by_the_late_report_of_the_item(
     segments = limit_speeds(segments, config.limit)
     par = copter_rollout.parameters(config.limit, {})
     states, flown = np.zeros((500, copter_legs.N_STATE)), np.zeros((500, 3, 3))
-    copter_legs.flown_states(segments, len(segments), par, STEP, states, flown)
+    copter_legs.simulated_states(segments, len(segments), par, STEP, states, flown)
     seq = segments[states[:, copter_legs.SEGMENT].astype(int), 10]
     reported = np.concatenate([np.full(9, 2.0), seq[:-9]])
     leaves = int(np.flatnonzero(seq == 4)[0])

@@ -89,8 +89,8 @@ def _synchronise(track: Track, segments: np.ndarray, item: tuple[int, float], pa
         return state
     if not len(own):
         return _new_leg(track, segments, first, par)
-    states, flown = np.empty((_MAX_RUN, copter_legs.N_STATE)), np.empty((_MAX_RUN, 3, 3))
-    n = copter_legs.flown_states(segments, int(own[-1]), par, STEP, states, flown)
+    states, simulated = np.empty((_MAX_RUN, copter_legs.N_STATE)), np.empty((_MAX_RUN, 3, 3))
+    n = copter_legs.simulated_states(segments, int(own[-1]), par, STEP, states, simulated)
     segment = states[:n, copter_legs.SEGMENT].astype(int)
     rows = np.flatnonzero((segments[segment, copter.SEQ] == seq) & (segments[segment, copter_legs.TURN] == 0.0))
     if not len(rows):
@@ -99,13 +99,13 @@ def _synchronise(track: Track, segments: np.ndarray, item: tuple[int, float], pa
     at_end = np.linalg.norm(track.p[-1] - segments[own[-1], copter.B_N : copter.B_N + 3]) < 3.0
     back = min(stopped, len(track) - 2) if stopped and at_end else 0  # rows since it was moving
     matched = np.arange(rows[-1] + 1) if waits else rows  # it was moving on the leg before
-    row = int(matched[np.argmin(_distance(track, flown, matched, back))])
-    if np.linalg.norm(flown[row, 0] - track.p[-1 - back]) > _MAX_OFFSET_M:
+    row = int(matched[np.argmin(_distance(track, simulated, matched, back))])
+    if np.linalg.norm(simulated[row, 0] - track.p[-1 - back]) > _MAX_OFFSET_M:
         return _new_leg(track, segments, int(segment[row]), par)
     return states[min(max(row + back, int(rows[0])), int(rows[-1]))].copy()
 
 
-def _distance(track: Track, flown: np.ndarray, rows: np.ndarray, back: int) -> np.ndarray:
+def _distance(track: Track, simulated: np.ndarray, rows: np.ndarray, back: int) -> np.ndarray:
     """Return the squared distance of simulated rows from the track until `back` rows ago, (n,) [m2]."""
     cost = np.zeros(len(rows))
     for lag in _MATCH_ROWS:
@@ -113,7 +113,7 @@ def _distance(track: Track, flown: np.ndarray, rows: np.ndarray, back: int) -> n
         if k >= 0:
             earlier = np.maximum(rows - lag, 0)
             v = track.v[max(k - 1, 0) : k + 1].mean(axis=0)
-            offset, difference = flown[earlier, 0] - track.p[k], flown[earlier, 1] - v
+            offset, difference = simulated[earlier, 0] - track.p[k], simulated[earlier, 1] - v
             cost += np.einsum("ij,ij->i", offset, offset)
             cost += _VELOCITY_S**2 * np.einsum("ij,ij->i", difference, difference)
     return cost

@@ -34,7 +34,7 @@ _ZETA = 0.9
 _TRANSITION_ACCEL = 4.0  # acceleration of a quadplane in transition [m/s2]
 _ITEM_MAX_AGE_S = 15.0  # maximum age of a reported item [s]
 _STATIONARY_SPEED = 0.8  # stationary below this speed [m/s]
-_WAYPOINT, _TURNS, _LAST_NAV, _JUMP, _CHANGE_SPEED = 16, 18, 95, 177, 178  # MAV_CMD
+_WAYPOINT, _TURNS, _RETURN, _LAST_NAV, _JUMP, _CHANGE_SPEED = 16, 18, 20, 95, 177, 178  # MAV_CMD
 
 
 @dataclass(frozen=True)
@@ -86,6 +86,7 @@ class MultirotorConfig:
         origin: of the twin's frame
         plans_legs: flies jerk-limited legs as ArduCopter does
         smooths_velocity: flies a jerk-limited velocity as PX4 does; with neither, the general law of `copter`
+        speed: commanded before the current item, for all but a return; 0 if none [m/s]
     """
 
     items: tuple[Item, ...]
@@ -97,6 +98,7 @@ class MultirotorConfig:
     origin: Origin
     plans_legs: bool = False
     smooths_velocity: bool = False
+    speed: float = 0.0
 
     @property
     def law(self) -> str:
@@ -104,6 +106,15 @@ class MultirotorConfig:
         return copter_legs.LAW if self.plans_legs else px4_multirotor.LAW if self.smooths_velocity else copter.LAW
 
     def segments(self, track: Track, seq: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+        """Return the route as `_route`, at the speed commanded before the current item where no other one is."""
+        route, problems = self._route(track, seq)
+        returns = [item.seq for item in self.items if item.command == _RETURN]
+        if len(route):
+            uncommanded = (route[:, copter.SPEED] == 0.0) & ~np.isin(route[:, copter.SEQ], returns)
+            route[uncommanded, copter.SPEED] = self.speed
+        return route, problems
+
+    def _route(self, track: Track, seq: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
         """Return the route from the current item on, for ArduCopter from the leg before it; and the mission's problems.
 
         Args:
@@ -162,9 +173,9 @@ def multirotor_config(
         limit = limit._replace(speed=_cruise_speed(track, limit.speed))
     items = numbered_from_one(items, origin) if seq_offset else items
     speed = speed_in_force(items, options.get("reported", np.empty(0)) + seq_offset)
-    limit = limit._replace(speed=speed or limit.speed)
     plans_legs, smooths_velocity = (autopilot == name and not prefix for name in ("ardupilot", "px4"))
-    return MultirotorConfig(items, seq_offset, params, limit, absent, since, origin, plans_legs, smooths_velocity)
+    law = {"plans_legs": plans_legs, "smooths_velocity": smooths_velocity}
+    return MultirotorConfig(items, seq_offset, params, limit, absent, since, origin, speed=speed, **law)
 
 
 def speed_in_force(items: Sequence[Item], reported: np.ndarray) -> float:
