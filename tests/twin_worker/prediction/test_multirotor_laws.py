@@ -87,3 +87,13 @@ def test_a_commanded_speed_outlasts_a_jump_back() -> None:
 
 def test_errors_in_hover_are_related_to_five_metres() -> None:
     assert min_path_length(0.1) == 5.0 and min_path_length(6.0) == 12.0
+
+
+def test_the_speed_in_force_limits_legs_and_circles_but_no_return() -> None:
+    turns = item(2, 18, north=100.0, param1=1.0, param3=20.0)
+    mission = (item(0), item(1, north=50.0), turns, item(3, 178, param1=1.0, param2=7.0), item(4), item(5, 20))
+    for speed, leg, circle in ((0.0, 0.0, 20.0 * np.pi / 9.0), (4.0, 4.0, 4.0)):
+        rows, _ = segments_from_mission(mission, 1, HERE, np.zeros(3), {}, arcs=True, speed=speed)
+        arc = rows[:, copter_legs.TURN] != 0.0
+        assert rows[rows[:, 10] == 1, 6].tolist() == [leg] and rows[arc, 6] == pytest.approx(circle)
+        assert rows[rows[:, 10] == 4, 6].tolist() == [7.0] and rows[rows[:, 10] == 5, 6][0] == 0.0

@@ -34,7 +34,7 @@ _ZETA = 0.9
 _TRANSITION_ACCEL = 4.0  # acceleration of a quadplane in transition [m/s2]
 _ITEM_MAX_AGE_S = 15.0  # maximum age of a reported item [s]
 _STATIONARY_SPEED = 0.8  # stationary below this speed [m/s]
-_WAYPOINT, _TURNS, _RETURN, _LAST_NAV, _JUMP, _CHANGE_SPEED = 16, 18, 20, 95, 177, 178  # MAV_CMD
+_WAYPOINT, _TURNS, _LAST_NAV, _JUMP, _CHANGE_SPEED = 16, 18, 95, 177, 178  # MAV_CMD
 
 
 @dataclass(frozen=True)
@@ -106,15 +106,6 @@ class MultirotorConfig:
         return copter_legs.LAW if self.plans_legs else px4_multirotor.LAW if self.smooths_velocity else copter.LAW
 
     def segments(self, track: Track, seq: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
-        """Return the route as `_route`, at the speed commanded before the current item where no other one is."""
-        route, problems = self._route(track, seq)
-        returns = [item.seq for item in self.items if item.command == _RETURN]
-        if len(route):
-            uncommanded = (route[:, copter.SPEED] == 0.0) & ~np.isin(route[:, copter.SEQ], returns)
-            route[uncommanded, copter.SPEED] = self.speed
-        return route, problems
-
-    def _route(self, track: Track, seq: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
         """Return the route from the current item on, for ArduCopter from the leg before it; and the mission's problems.
 
         Args:
@@ -122,16 +113,14 @@ class MultirotorConfig:
             seq: reported mission item of each row
         """
         item = int(seq[-1]) + self.seq_offset
-        arcs = self.plans_legs
-        route, problems = segments_from_mission(self.items, item, self.origin, track.p[-1], self.params, arcs=arcs)
+        route, problems = self._segments_from(item, track)
         if not self.plans_legs or not len(route):
             return route, problems
         before = self._previous(item, seq)
         if before is None:
             return route, problems
         if before.command == _WAYPOINT and not before.param1 > 0 and before.seq < item:
-            arguments = (self.items, before.seq, self.origin, track.p[-1], self.params)
-            longer, more = segments_from_mission(*arguments, arcs=arcs)
+            longer, more = self._segments_from(before.seq, track)
             k = np.flatnonzero(longer[:, copter.SEQ] == item)
             return (longer, more) if len(k) and k[0] <= 1 else (route, problems)
         changed = int(np.flatnonzero(seq != seq[-1])[-1]) if (seq != seq[-1]).any() else None
@@ -143,6 +132,10 @@ class MultirotorConfig:
         if start is not None:
             route[0, copter.A_N : copter.A_N + 3] = start
         return route, problems
+
+    def _segments_from(self, item: int, track: Track) -> tuple[np.ndarray, tuple[str, ...]]:
+        p, arcs, speed = track.p[-1], self.plans_legs, self.speed
+        return segments_from_mission(self.items, item, self.origin, p, self.params, arcs=arcs, speed=speed)
 
     def _previous(self, item: int, seq: np.ndarray) -> Item | None:
         """Return the navigation item before the current one: the one reported before, else the one listed before."""
@@ -174,8 +167,8 @@ def multirotor_config(
     items = numbered_from_one(items, origin) if seq_offset else items
     speed = speed_in_force(items, options.get("reported", np.empty(0)) + seq_offset)
     plans_legs, smooths_velocity = (autopilot == name and not prefix for name in ("ardupilot", "px4"))
-    law = {"plans_legs": plans_legs, "smooths_velocity": smooths_velocity}
-    return MultirotorConfig(items, seq_offset, params, limit, absent, since, origin, speed=speed, **law)
+    law = plans_legs, smooths_velocity
+    return MultirotorConfig(items, seq_offset, params, limit, absent, since, origin, *law, speed)
 
 
 def speed_in_force(items: Sequence[Item], reported: np.ndarray) -> float:

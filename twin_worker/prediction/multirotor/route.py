@@ -63,7 +63,14 @@ def numbered_from_one(items: Sequence[Item], home: Origin) -> tuple[Item, ...]:
 
 
 def segments_from_mission(
-    items: Sequence[Item], seq: int, origin: Origin, p: np.ndarray, params: Mapping[str, float], *, arcs: bool = False
+    items: Sequence[Item],
+    seq: int,
+    origin: Origin,
+    p: np.ndarray,
+    params: Mapping[str, float],
+    *,
+    arcs: bool = False,
+    speed: float = 0.0,
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Convert the route from item `seq` on to segments with the commanded speed, 0 if there is none.
 
@@ -74,6 +81,7 @@ def segments_from_mission(
         p: position of the aircraft, NED, (3,) [m]
         params: autopilot parameters
         arcs: a circle is one segment with the columns of `copter_legs`
+        speed: commanded before the current item, for all but landing and return; 0 if none [m/s]
     Returns:
         segments (n, N_SEGMENT), and the problems of the mission
     """
@@ -93,6 +101,8 @@ def segments_from_mission(
     for leg in mission_route.legs:
         if leg[m.SEQ] < 0 or len(builder.rows) > _MAX_SEGMENTS:
             break  # a multirotor holds position after the last item
+        if int(leg[m.KIND]) != m.LAND:
+            leg[m.VA_C] = leg[m.VA_C] or speed
         if int(leg[m.SEQ]) in delays:
             builder.add(builder.end, leg[m.SEQ], wait_times.get(int(leg[m.SEQ]), STOP_WAIT_S))
         elif int(leg[m.SEQ]) in returns:
@@ -194,7 +204,7 @@ def _add_circle(builder: _SegmentBuilder, leg: np.ndarray, params: Mapping[str, 
     for k in range(ceil(turns * _CIRCLE_SEGMENTS) + 1):
         angle = start_angle + direction * 2 * pi * k / _CIRCLE_SEGMENTS
         point = np.array([b[0] + abs_radius * cos(angle), b[1] + abs_radius * sin(angle), b[2]])
-        builder.add(point, leg[m.SEQ], 0.0, max(rate * abs_radius, 0.3) if k else leg[m.VA_C])
+        builder.add(point, leg[m.SEQ], 0.0, max(min(rate * abs_radius, leg[m.VA_C] or inf), 0.3) if k else leg[m.VA_C])
 
 
 def _add_arc(builder: _SegmentBuilder, leg: np.ndarray, radius: float, rate: float) -> None:
@@ -205,7 +215,7 @@ def _add_arc(builder: _SegmentBuilder, leg: np.ndarray, radius: float, rate: flo
     out = offset / distance if distance > 0.1 else np.array([1.0, 0.0])
     builder.stop()
     builder.add(np.array([*(centre[:2] + abs(radius) * out), centre[2]]), seq, STOP_WAIT_S, leg[m.VA_C])
-    builder.add(builder.end, seq, STOP_WAIT_S, max(rate * abs(radius), 0.3))
+    builder.add(builder.end, seq, STOP_WAIT_S, max(min(rate * abs(radius), leg[m.VA_C] or inf), 0.3))
     row = builder.rows[-1]
     row[copter_legs.RADIUS], row[copter_legs.TURN] = abs(radius), 2 * pi * turns * (1 if radius >= 0 else -1)
     row[copter_legs.C_N], row[copter_legs.C_E] = centre[:2]
