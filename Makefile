@@ -15,7 +15,7 @@ QUICK := tests/test_architecture.py tests/fleet/test_contract.py tests/fleet/tes
   tests/twin_worker/validation tests/twin_worker/prediction/test_predict.py tests/twin_worker/confidence/test_horizon.py \
   tests/twin_worker/service/test_worker.py tests/twin_worker/diagnosis/test_output_faults.py \
   tests/viewer/test_viewer.py tests/viewer/test_viewer_states.py tests/viewer/test_viewer_feed.py \
-  tests/viewer/test_browser_sizes.py::test_all_places_of_the_page_tell_what_the_bus_told \
+  tests/viewer/test_browser_sizes.py::test_all_places_of_the_page_show_what_the_bus_carries \
   tests/test_end_to_end.py::test_a_fleet_of_two_flies_answers_and_leaves_a_summary \
   tests/test_end_to_end.py::test_a_flight_of_another_autopilot_is_predicted_on_its_own_mission
 export PARAUAV_RECORDINGS ?= $(abspath ../shared/recordings)

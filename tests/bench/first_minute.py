@@ -4,7 +4,7 @@
 
 `fleet up` runs in a pseudo-terminal of 120 columns on ports of its own. Seconds count from its start; with an empty
 compile cache the first of them show the compilation. For each time, OUT gets the text on the terminal (`10s.txt`) and
-the page of a browser that was opened as soon as its address was printed (`10s.png`; absent before that).
+the page of a browser that was opened as soon as its address was printed and served (`10s.png`; absent before that).
 """
 
 import argparse
@@ -20,6 +20,8 @@ import termios
 import threading
 import time
 from pathlib import Path
+
+from fleet.access.knock import accepts_connections
 
 from .viewing.page import Page
 from .viewing.process import free_port
@@ -46,7 +48,7 @@ class Terminal:
                 self.text += data.decode(errors="replace")
 
     def screen(self) -> str:
-        """Give all lines as a terminal shows them: progress displays move the cursor up and write again."""
+        """Return all lines as a terminal shows them: progress displays move the cursor up and write again."""
         lines, row, column = [""], 0, 0
         read = -1
         while read < len(self.text):  # not in the middle of a display
@@ -68,7 +70,7 @@ class Terminal:
         return "\n".join(line.rstrip() for line in lines).strip() + "\n"
 
     def end(self) -> int:
-        """Press Ctrl-C; give the exit code."""
+        """Press Ctrl-C and return the exit code."""
         os.kill(self._pid, signal.SIGINT)
         return os.waitstatus_to_exitcode(os.waitpid(self._pid, 0)[1])
 
@@ -90,7 +92,8 @@ def main() -> int:
         for at in TIMES_S:
             while (left := begun + at - time.monotonic()) > 0:
                 ticks.wait(min(left, 0.2))
-                if not opened and ADDRESS.search(terminal.text):
+                # the panel prints the address at once, the viewer serves it as soon as it has started
+                if not opened and ADDRESS.search(terminal.text) and accepts_connections(f"tcp/127.0.0.1:{port}"):
                     page.page.goto(f"http://127.0.0.1:{port}/")
                     opened = True
             name = f"{at:g}s"

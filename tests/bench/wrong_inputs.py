@@ -18,7 +18,7 @@ MODULES = {"fleet": "fleet.cli"}
 
 
 def answer(line: str, folder: str) -> tuple[str, int]:
-    """Give the last line on standard error and the exit code of a command."""
+    """Return the last line on standard error and the exit code of a command."""
     program, *words = line.split()
     command = [sys.executable, "-m", MODULES.get(program, program), *words]
     env = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -35,9 +35,9 @@ def main() -> int:
         (Path(folder) / "text.txt").write_text("no recording\n")
         (Path(folder) / "bad.toml").write_text("[router\n")
         for line, expected in ANSWERS.items():
-            said, code = answer(line, folder)
-            wrong += code != 2 or expected not in said
-            print(f"| `{line}` | {said.replace('|', chr(92) + '|')} | {code} |", flush=True)
+            text, code = answer(line, folder)
+            wrong += code != 2 or expected not in text
+            print(f"| `{line}` | {text.replace('|', chr(92) + '|')} | {code} |", flush=True)
     return 1 if wrong else 0
 
 

@@ -297,7 +297,7 @@ def test_colours_are_the_page_s_own_and_a_reload_brings_all_back(page, errors: l
 
 
 def test_what_it_costs(page, viewer: Viewer, cable: Cable, record_property) -> None:
-    """Bound the bytes of a tick; processor time is told, it is the machine's."""
+    """Bound the bytes of a tick; processor time is printed only, it depends on the machine."""
     bytes_, cpu_s, began = cable.received, viewer.cpu_s(), time.monotonic()
     page.evaluate(FRAMES, 3_000)
     passed = time.monotonic() - began

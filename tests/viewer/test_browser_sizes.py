@@ -81,12 +81,12 @@ class Wild(PretendFleet):
     def __init__(self, bus: MemoryBus) -> None:
         super().__init__(bus, UAVS)
         publish, start = bus.publish, time.time()
-        self.told: list[Prediction] = []
+        self.predictions: list[Prediction] = []
 
         def changed(message, *more):
             if isinstance(message, Prediction):
                 message = msgspec.structs.replace(message, horizon_s=6.0 + (message.t * 7.0) % 20.0)
-                self.told.append(message)
+                self.predictions.append(message)
             publish(message, *more)
 
         bus.publish, self._silent_from = changed, start + 1.0
@@ -120,7 +120,7 @@ def live(chromium: str) -> Iterator[SimpleNamespace]:
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.goto(f"http://127.0.0.1:{port}/?fixedDpr=0.5")
         page.wait_for_function(IN_SCENE, timeout=PATIENCE_MS)
-        yield SimpleNamespace(page=page, app=app, errors=errors, told=fleet.told)
+        yield SimpleNamespace(page=page, app=app, errors=errors, predictions=fleet.predictions)
         browser.close()
     stop.set()
     for thread in threads:
@@ -171,7 +171,7 @@ def test_keys_select_the_next_and_the_previous_row(live: SimpleNamespace) -> Non
 
 
 @pytest.mark.parametrize("uav", [0, SHORT, LOST])
-def test_all_places_of_the_page_tell_what_the_bus_told(live: SimpleNamespace, uav: int) -> None:
+def test_all_places_of_the_page_show_what_the_bus_carries(live: SimpleNamespace, uav: int) -> None:
     """Three seconds of each, twenty looks a second; `python -m tests.bench.viewing --consistency 60` looks longer.
 
     The ring is compared three frames after a change of the row: the scene of a message is drawn with the next frame.
@@ -199,12 +199,12 @@ def test_all_places_of_the_page_tell_what_the_bus_told(live: SimpleNamespace, ua
         if shown := [one for one in drawn(page.evaluate(PLACES, 3.0)) if one["row"][1] != "–"]:
             break
     assert shown or uav == LOST
-    told = [ScenePrediction(m, live.app.store.scene_frame, 0.0) for m in list(live.told) if m.uav == uav]
-    ends = np.array([one.position_at(one.horizon_s) for one in told])
+    forecasts = [ScenePrediction(m, live.app.store.scene_frame, 0.0) for m in list(live.predictions) if m.uav == uav]
+    ends = np.array([one.position_at(one.horizon_s) for one in forecasts])
     for one in shown:  # the ring belongs to one message, and its horizon stands in the row
         distance = np.linalg.norm(ends - one["ring"], axis=1)
         nearest = int(np.argmin(distance))
-        assert distance[nearest] < 1e-3 and one["row"][1] == f"{told[nearest].horizon_s:.0f} s", one
+        assert distance[nearest] < 1e-3 and one["row"][1] == f"{forecasts[nearest].horizon_s:.0f} s", one
 
 
 @pytest.mark.parametrize("light", [False, True], ids=["dark", "light"])

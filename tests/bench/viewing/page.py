@@ -92,7 +92,7 @@ ROWS = "[...document.querySelectorAll('tr.pick')].map(e => Number(e.dataset.uav)
 
 
 def differing(samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Give the samples of `PLACES` in which row, tiles and alert of the selected aircraft tell different things.
+    """Return the samples of `PLACES` in which row, tiles and alert of the selected aircraft differ.
 
     The row is absent where another tab than the list is open, and the alert where it is not that of the alerts.
     """
@@ -100,12 +100,12 @@ def differing(samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
         one
         for one in samples
         if (one["row"] and (one["row"] != one["tile"] or one["state"][0] != one["state"][1]))
-        or any(said not in ("", shown) for said, shown in zip(one["alert"], one["tile"][1:], strict=True))
+        or any(stated not in ("", shown) for stated, shown in zip(one["alert"], one["tile"][1:], strict=True))
     ]
 
 
 def drawn(samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Give the samples of `PLACES` whose row is as old as three frames: by then the scene is drawn as well."""
+    """Return the samples of `PLACES` whose row is as old as three frames: by then the scene is drawn as well."""
     found, since = [], samples[0] if samples else {}
     for one in samples:
         if (one["name"], one["row"]) != (since["name"], since["row"]):

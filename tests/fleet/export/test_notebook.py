@@ -19,22 +19,22 @@ UAVS, SECONDS = 5, 5
 @pytest.fixture
 def recording(tmp_path: Path) -> tuple[Path, list[Prediction]]:
     """Five seconds of a fleet, and the predictions in them."""
-    path, bus, told = tmp_path / "flight.parauav", MemoryBus(), []
+    path, bus, published = tmp_path / "flight.parauav", MemoryBus(), []
     with path.open("wb", buffering=0) as file:
         recorder = BusRecorder(bus, file)
         recorder.subscribe()
-        bus.subscribe(Prediction, lambda message, _: told.append(message))
+        bus.subscribe(Prediction, lambda message, _: published.append(message))
         fleet = PretendFleet(bus, UAVS)
         for k in range(10 * SECONDS):
             fleet.advance(T + k / 10)
         recorder.write()
-    return path, [message for message in told if len(message.ahead.numpy())]
+    return path, [message for message in published if len(message.ahead.numpy())]
 
 
 def test_the_notebook_reads_predictions_of_a_fleet_and_of_a_recording(
     router: str, recording: tuple[Path, list[Prediction]]
 ) -> None:
-    path, told = recording
+    path, published = recording
     given = {'"tcp/127.0.0.1:7447"': repr(router), '"flight.parauav"': repr(str(path))}
     notebook = json.loads((ROOT / "docs" / "predictions.ipynb").read_text())
     names: dict[str, object] = {}
@@ -51,15 +51,15 @@ def test_the_notebook_reads_predictions_of_a_fleet_and_of_a_recording(
     assert not given
     answered = [uav.prediction(T, 0.0) for uav in fleet.uavs]
     check(names["live"], [message for message in answered if message is not None and len(message.ahead.numpy())])
-    check(names["recorded"], told)
+    check(names["recorded"], published)
 
 
-def check(frame: object, told: list[Prediction]) -> None:
+def check(frame: object, published: list[Prediction]) -> None:
     """Compare a table with the messages it was made from."""
-    assert isinstance(frame, pd.DataFrame) and told
-    assert set(frame.uav) == {message.uav for message in told}
-    assert len(frame) == sum(len(message.ahead.numpy()) for message in told)
-    for message in told[-UAVS:]:
+    assert isinstance(frame, pd.DataFrame) and published
+    assert set(frame.uav) == {message.uav for message in published}
+    assert len(frame) == sum(len(message.ahead.numpy()) for message in published)
+    for message in published[-UAVS:]:
         rows = frame[(frame.uav == message.uav) & (frame.t == pd.to_datetime(message.t, unit="s", utc=True))]
         assert rows[["north_m", "east_m", "down_m"]].to_numpy() == pytest.approx(message.path.numpy())
         assert rows.ahead_s.to_numpy() == pytest.approx(message.ahead.numpy())

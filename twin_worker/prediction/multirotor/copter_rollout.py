@@ -83,7 +83,7 @@ def _synchronise(track: Track, segments: np.ndarray, item: tuple[int, float], pa
         state[copter_legs.SEGMENT] = circle[0]
         return state
     waits = len(own) > 0 and _length(segments[first]) < 0.1
-    if waits and not first and isfinite(since):  # without the leg before, the report tells since when
+    if waits and not first and isfinite(since):  # without the leg before, it waits since the report
         state = _new_leg(track, segments, first, par)
         state[copter_legs.T], state[copter_legs.WAIT] = _LONG_S, since + _REPORT_DELAY_S
         return state

@@ -34,7 +34,8 @@ _TRIALS: tuple[tuple[str, tuple[float, ...]], ...] = (
     ("wn", _LAG_VALUES),
     ("accel_fraction", _FRACTIONS),
 )  # one per call
-_PRIOR_COST = 20.0, 200.0  # of a fraction e times the limit, assumed and received, as a sum of errors [m]
+# cost of a fraction e times the limit, as a sum of errors [m]
+_PRIOR_COST_ASSUMED, _PRIOR_COST_RECEIVED = 20.0, 200.0
 
 
 def fit_model(track: Track, seq: np.ndarray, config: MultirotorConfig, model: MultirotorModel) -> MultirotorModel:
@@ -55,7 +56,9 @@ def fit_model(track: Track, seq: np.ndarray, config: MultirotorConfig, model: Mu
             )
             for k in starts
         ]
-        speed, accel = (_PRIOR_COST[name not in config.absent] for name in ("speed", "acc"))
+        speed, accel = (
+            _PRIOR_COST_ASSUMED if name in config.absent else _PRIOR_COST_RECEIVED for name in ("speed", "acc")
+        )
         prior = speed * abs(np.log(candidate.speed_fraction)) + 0.3 * accel * abs(np.log(candidate.accel_fraction))
         return float(np.mean(errors)) + prior / len(starts)
 

@@ -15,7 +15,8 @@ from fleet.autopilots import copter, copter_legs, px4_multirotor
 from fleet.autopilots.copter import Limits
 from fleet.contract import Item, Mission
 from fleet.frames import Origin
-from fleet.mission import join_remarks, route_items
+from fleet.mission import SPEED, join_remarks, route_items
+from fleet.mission_jumps import JUMPS
 from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.prediction.multirotor import copter_rollout, px4_rollout
 from twin_worker.prediction.multirotor.route import (
@@ -34,7 +35,7 @@ _ZETA = 0.9
 _TRANSITION_ACCEL = 4.0  # acceleration of a quadplane in transition [m/s2]
 _ITEM_MAX_AGE_S = 15.0  # maximum age of a reported item [s]
 _STATIONARY_SPEED = 0.8  # stationary below this speed [m/s]
-_WAYPOINT, _TURNS, _LAST_NAV, _JUMP, _CHANGE_SPEED = 16, 18, 95, 177, 178  # MAV_CMD
+_WAYPOINT, _TURNS, _LAST_NAV = 16, 18, 95  # MAV_CMD
 
 
 @dataclass(frozen=True)
@@ -174,21 +175,21 @@ def multirotor_config(
 def speed_in_force(items: Sequence[Item], reported: np.ndarray) -> float:
     """Return the ground speed of the last DO_CHANGE_SPEED that was executed [m/s]; 0 if none.
 
-    It outlasts a jump to an item before it, from where the list of items alone does not tell it.
+    It outlasts a jump to an earlier item, before which the mission has no such command.
 
     Args:
         items: mission, item 0 is home
         reported: current items in the order of their reports, (n,)
     """
     changes = reported[np.flatnonzero(np.diff(reported, prepend=np.nan))].tolist()
-    speed = 0.0
+    ordered, speed = sorted(items, key=lambda item: item.seq), 0.0
     for before, after in pairwise(changes):
-        for item in sorted(items, key=lambda item: item.seq):
+        for item in ordered:
             if item.seq <= before or (after > before and item.seq >= after):
                 continue
-            if item.command == _JUMP and after < before:
+            if item.command in JUMPS and after < before:
                 break
-            if item.command == _CHANGE_SPEED and item.param1 in (0, 1) and 0 < item.param2 < copter.MAX_LIMIT:
+            if item.command == SPEED and item.param1 in (0, 1) and 0 < item.param2 < copter.MAX_LIMIT:
                 speed = item.param2
     return speed
 
