@@ -11,6 +11,7 @@
     parauav/{uav}/mismatch               Mismatch     worker   location, effect, fit before and after; also queryable
     parauav/{uav}/alert                  Alert        worker   predicted conflict, geofence, ground, …; also queryable
                                                       gateway  a second sender with the same id; also queryable
+    parauav/{uav}/proposal               Proposal     worker   changes of plan against an alert; also queryable
     parauav/@fleet/state/{writer}        FleetState   worker   one row per UAV; also queryable
     parauav/@fleet/prediction/{writer}   Predictions  worker   query only: the newest prediction of all its aircraft
     parauav/@gateway/{writer}            GatewayCounters gateway counters of one gateway; also queryable
@@ -596,6 +597,52 @@ class Alert(Message, frozen=True, kw_only=True):
         return self.kind, self.other
 
 
+class Change(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Change of one aircraft's plan that a proposal suggests; unchanged where null or empty."""
+
+    uav: int
+    speed: Annotated[float | None, about("airspeed from now on (DO_CHANGE_SPEED) [m/s]")] = None
+    items: Annotated[tuple[Item, ...] | None, about("mission to upload, numbered as by the autopilot")] = None
+    seq: Annotated[int | None, about("mission item to fly to first")] = None
+    mode: Annotated[str, about("hold, return or land; empty: unchanged")] = ""
+
+
+class ProposedPath(msgspec.Struct, frozen=True, kw_only=True):
+    """Predicted path of one aircraft after the changes of an option, as in `Prediction`."""
+
+    uav: int
+    origin: Annotated[tuple[int, int, int], about("NED origin: lat, lon [1e-7 deg], alt [mm AMSL]")]
+    ahead: Annotated[Array, about("look-ahead from the proposal's `t`, (n,) <f4 [s]")]
+    path: Annotated[Array, about("mean position, NED from origin, (n, 3) <f4 [m]")]
+    prediction_region_half_axes: Annotated[Array, about("along, cross, vertical, (n, 3) <f4 [m]")]
+
+
+class Option(msgspec.Struct, frozen=True, kw_only=True):
+    """One way to avoid the event of a proposal, with what the experiments predict for it."""
+
+    sentence: Annotated[str, about("what changes, and why this option is offered")]
+    changes: tuple[Change, ...]
+    paths: tuple[ProposedPath, ...]
+    probability: Annotated[float, about("remaining probability of the event, 0..1")]
+    clearance_m: Annotated[float, about("predicted smallest distance to what is avoided [m]")]
+    delay_s: Annotated[float, about("later arrival at the end of the route, sum over aircraft [s]")] = 0.0
+    energy: Annotated[float, about("energy relative to the present plan [-]")] = 1.0
+    deviation_m: Annotated[float, about("largest distance from the present plan [m]")] = 0.0
+
+
+class Proposal(Message, frozen=True, kw_only=True):
+    """At most three changes of plan that avoid one predicted event; withdrawn with no options."""
+
+    topic: ClassVar[str] = "proposal"
+
+    id: Annotated[str, about("unique identifier, which an approval repeats")]
+    kind: Annotated[AlertKind | None, about("the alert that it answers; null: requested by a person")] = None
+    other: Annotated[int, about("the other UAV of a conflict; -1 none")] = -1
+    options: tuple[Option, ...] = ()
+    valid_until: Annotated[float, about("fleet time after which it must not be approved [s since 1970]")] = 0.0
+    sentence: Annotated[str, about("the event, and what the options avoid; or why there is none")] = ""
+
+
 class FleetRow(msgspec.Struct, frozen=True, kw_only=True):
     """One row of the fleet table."""
 
@@ -735,7 +782,10 @@ class HandoverRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     uavs: Annotated[tuple[int, ...], about("UAV ids")] = ()
 
 
-PER_UAV: tuple[type[Message], ...] = (Sample, Status, Mission, Params, History, Model, Prediction, Mismatch, Alert)
+PER_UAV: tuple[type[Message], ...] = (
+    *(Sample, Status, Mission, Params, History),
+    *(Model, Prediction, Mismatch, Alert, Proposal),
+)
 CONTROL: tuple[type, ...] = (FleetState, Predictions, GatewayCounters, Claim, Handover)
 QUERIES: dict[type, type] = {Prediction: WhatIf, Handover: HandoverRequest}  # optional payload of a query on a key
 TOPICS: dict[str, type] = {c.topic: c for c in (*PER_UAV, *CONTROL)}  # type: ignore[attr-defined]

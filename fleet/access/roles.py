@@ -37,6 +37,7 @@ TOPIC_RULES: dict[str, TopicRule] = {
     "prediction": TopicRule((WORKER,), 256 * KB),
     "mismatch": TopicRule((WORKER,), 256 * KB),
     "alert": TopicRule((GATEWAY, WORKER), 64 * KB),  # from the gateway: a second sender
+    "proposal": TopicRule((WORKER,), MB),
     "@fleet/state": TopicRule((WORKER,), MB),
     "@fleet/prediction": TopicRule((WORKER,), 32 * MB),  # 4 KB for each of its aircraft
     "@gateway": TopicRule((GATEWAY,), MB),
