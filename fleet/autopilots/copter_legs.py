@@ -3,7 +3,7 @@
     s(t)            seven phases of constant jerk from rest to rest, within speed, acceleration and jerk of the leg
     r = sum of the present leg, the rest of the one before and the begin of the next
     t' = clip(0.05 + (v . d - P (r - x) . d) / |r'|, 0, 1), first-order lag WPNAV_ACCEL / WPNAV_JERK
-    x''' = (r'' + Pv (r' + P (r - x) - x') - x'') / tau                                 position loop behind attitude
+    x''' = (r'' + Pv e + D e' + b - x'') / tau,   e = r' + P (r - x) - x',   b' = I e - k x''   position loop, attitude
 
 The next leg begins when the path between both deviates from the corner by less than WPNAV_RADIUS and its acceleration
 stays below the corner limit half-way to the end of the present one. A circle starts from rest with angular acceleration
@@ -12,7 +12,7 @@ max(a / R, 2 deg/s2) and has a speed of at most sqrt(a R / 2); the leg after it 
 Source: ArduCopter 4.x documentation of waypoint navigation (S-curves), circle mode and position control.
 """
 
-from math import atan2, cos, radians, sin, sqrt
+from math import atan2, cos, exp, radians, sin, sqrt
 
 import numba as nb
 import numpy as np
@@ -30,9 +30,12 @@ N_COLUMNS = N_SEGMENT + 4
 SEGMENT, T, TAIL, LEAD, WAIT, SCALE, ANGLE, RATE, TURNED, START_N, START_E, START_D = range(12)
 N_STATE = 12
 
-# parameters: gains [1/s], lag of the attitude [s], jerk [m/s3], WPNAV_RADIUS [m], corner and horizontal limit [m/s2]
+# parameters: gains [1/s], lag of the attitude [s], jerk [m/s3], WPNAV_RADIUS [m], corner and horizontal limit [m/s2],
+# integral and derivative of the horizontal velocity [1/s2, -], whether the derivative is of the error (1) or of the
+# velocity alone (0), drag over mass and airspeed [1/s]
 POS_P, VEL_P, POS_P_Z, VEL_P_Z, TAU, JERK, WP_RADIUS, ACC_CORNER, ACC_MAX, ACC_XY = range(10)
-N_PAR = 10
+VEL_I, VEL_D, D_OF_ERROR, DRAG = range(10, 14)
+N_PAR = 14
 
 _SUBSTEPS = 2
 _MIN_CIRCLE_ACC = radians(2.0)  # angular [rad/s2]
@@ -214,17 +217,26 @@ def _scale(state: np.ndarray, xv: np.ndarray, par: np.ndarray, dt: float, r: np.
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
 def track_reference(xva: np.ndarray, r: np.ndarray, par: np.ndarray, dt: float) -> None:
-    """Advance position, velocity and acceleration (3, 3) of the aircraft behind a reference (3, 3) by dt."""
+    """Advance the aircraft behind a reference (3, 3), that in the middle of the step, by dt.
+
+    `xva` (4, 3) has position, velocity, acceleration, and the integrator less the drag that it has to balance [m/s2].
+    """
     a = np.empty(3)
     for i in range(3):
         pos_p, vel_p = (par[POS_P], par[VEL_P]) if i < 2 else (par[POS_P_Z], par[VEL_P_Z])
-        a[i] = r[2, i] + vel_p * (r[1, i] + pos_p * (r[0, i] - xva[0, i]) - xva[1, i])
+        error = r[1, i] + pos_p * (r[0, i] - xva[0, i]) - xva[1, i]
+        a[i] = r[2, i] + vel_p * error
+        if i < 2:
+            target = par[D_OF_ERROR] * (r[2, i] + pos_p * (r[1, i] - xva[1, i]))
+            a[i] += xva[3, i] + par[VEL_D] * (target - xva[2, i])
+            xva[3, i] += dt * (par[VEL_I] * error - par[DRAG] * xva[2, i])
     excess = max(sqrt(a[0] ** 2 + a[1] ** 2) / par[ACC_MAX], 1.0)
     for i in range(3):
         limited = a[i] / excess if i < 2 else min(max(a[2], -5.0), 5.0)
-        xva[2, i] += (limited - xva[2, i]) * min(dt / (par[TAU] if i < 2 else _TAU_Z), 1.0)
-        xva[1, i] += dt * xva[2, i]
-        xva[0, i] += dt * xva[1, i]
+        change = (limited - xva[2, i]) * (1.0 - exp(-dt / (par[TAU] if i < 2 else _TAU_Z)))
+        xva[0, i] += dt * (xva[1, i] + dt * (0.5 * xva[2, i] + change / 6.0))
+        xva[1, i] += dt * (xva[2, i] + 0.5 * change)
+        xva[2, i] += change
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
@@ -236,17 +248,27 @@ def follow(
     Args:
         state: of the navigation, changed in place, (N_STATE,)
         segments: (n, N_COLUMNS), n > 0
-        xva: position, velocity, acceleration at the start, changed in place, (3, 3)
+        xva: as of `track_reference` at the start, changed in place, (4, 3)
         par: (N_PAR,)
         dt: step [s]
         out: positions, filled in, NED, (k, 3) [m]; out[0] is the start
     """
     r = np.zeros((3, 3))
+    navigate(state, segments, xva[:2], par, 0.0, r)
     for k in range(len(out)):
         out[k] = xva[0]
         for _ in range(_SUBSTEPS):
-            navigate(state, segments, xva[:2], par, dt / _SUBSTEPS, r)
-            track_reference(xva, r, par, dt / _SUBSTEPS)
+            _step(state, segments, xva, r, (par, dt / _SUBSTEPS))
+
+
+@nb.njit(cache=True, error_model="numpy", nogil=True)
+def _step(
+    state: np.ndarray, segments: np.ndarray, xva: np.ndarray, r: np.ndarray, par_dt: tuple[np.ndarray, float]
+) -> None:
+    par, dt = par_dt
+    before = r.copy()
+    navigate(state, segments, xva[:2], par, dt, r)
+    track_reference(xva, 0.5 * (before + r), par, dt)
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
@@ -261,17 +283,17 @@ def simulated_states(
         states: state of the navigation after each step, filled in, (n, N_STATE)
         simulated: position, velocity, acceleration of the aircraft after each step, filled in, (n, 3, 3)
     """
-    state, r, xva = np.zeros(N_STATE), np.zeros((3, 3)), np.zeros((3, 3))
+    state, r, xva = np.zeros(N_STATE), np.zeros((3, 3)), np.zeros((4, 3))
     state[TAIL], state[LEAD], state[SCALE] = -1.0, -1.0, 1.0
     state[START_N : START_D + 1] = segments[0, A_N : A_N + 3]
     xva[0] = segments[0, A_N : A_N + 3]
     if segments[0, TURN] != 0.0:
         begin_circle(state, segments[0], xva[0], 0.0)
+    r[0] = xva[0]
     for k in range(len(states)):
         for _ in range(_SUBSTEPS):
-            navigate(state, segments, xva[:2], par, dt / _SUBSTEPS, r)
-            track_reference(xva, r, par, dt / _SUBSTEPS)
-        states[k], simulated[k] = state, xva
+            _step(state, segments, xva, r, (par, dt / _SUBSTEPS))
+        states[k], simulated[k] = state, xva[:3]
         if state[SEGMENT] > last or (state[WAIT] > 0.0 and segments[int(state[SEGMENT]), HOLD] > 1e6):
             return k + 1
     return len(states)

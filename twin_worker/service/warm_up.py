@@ -84,11 +84,14 @@ def _run_point_mass(control: tuple[np.ndarray, np.ndarray, np.ndarray], window: 
 
 def _run_multirotors() -> None:
     """Run the three multirotor laws along two segments."""
-    segments, out, motion = np.ones((2, copter.N_SEGMENT)), np.empty((5, 3)), np.zeros((3, 3))
+    segments, out, motion = np.ones((2, copter.N_SEGMENT)), np.empty((5, 3)), np.zeros((4, 3))
     copter.follow(np.zeros(copter.N_FOLLOW), segments, np.zeros(3), np.zeros(3), np.ones(copter.N_PAR), 0.1, out)
-    px4_multirotor.follow(np.zeros(px4_multirotor.N_STATE), segments, motion, np.ones(px4_multirotor.N_PAR), 0.1, out)
+    segments = np.ones((2, px4_multirotor.N_COLUMNS))
+    state, par = np.zeros(px4_multirotor.N_STATE), np.ones(px4_multirotor.N_PAR)
+    px4_multirotor.begin_trajectory(state, motion, par)
+    px4_multirotor.follow(state, segments, motion, par, 0.1, out)
     segments, par = np.ones((2, copter_legs.N_COLUMNS)), np.ones(copter_legs.N_PAR)
-    copter_legs.follow(np.zeros(copter_legs.N_STATE), segments, np.zeros((3, 3)), par, 0.1, out)
+    copter_legs.follow(np.zeros(copter_legs.N_STATE), segments, motion, par, 0.1, out)
     states, simulated = np.empty((5, copter_legs.N_STATE)), np.empty((5, 3, 3))
     copter_legs.simulated_states(segments, 1, par, 0.1, states, simulated)
 

@@ -130,6 +130,10 @@ DIALECTS = {
 class MultirotorEndpoint(MavlinkEndpoint):
     """One MAVLink system with the flight modes of a multirotor."""
 
+    def item_changed(self, state: MultirotorState) -> list[bytes]:
+        """Return what the autopilot sends at once when the current mission item changes: PX4 the item."""
+        return [self._pack(_mission_current(state))] if self._dialect.is_px4 else []
+
     def _mode_name(self, custom_mode: int) -> str | None:
         if self._dialect.is_px4:
             return super()._mode_name(custom_mode)

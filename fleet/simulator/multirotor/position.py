@@ -1,6 +1,7 @@
 """Position control of a simulated multirotor: reference to roll, pitch and throttle.
 
-    v_c = v_ref + square root control of the position error;   a_c = a_ref + P (v_c - v) + I int(v_c - v) - D v'
+    v_c = v_ref + square root control of the position error;   a_c = a_ref + P e + I int(e) + D e',
+    e = v_c - v, with PX4 - D v'
     horizontal a_c at most g tan(tilt limit)
     theta_c = atan(-a_forward / g_z), phi_c = atan(a_right cos(theta_c) / g_z)
     throttle = (hover (1 - ff a_down_c / g) - P_a e - I_a int(e)) / (cos(phi) cos(theta)),   e = a_down_c - a_down
@@ -88,7 +89,7 @@ class PositionController:
         """Clear the integrators."""
         self._integral = np.zeros(2)
         self._integral_z = 0.0
-        self._v_filtered: np.ndarray | None = None
+        self._filtered: np.ndarray | None = None
         self._acc_down = 0.0
         self._saturated = False
 
@@ -116,14 +117,15 @@ class PositionController:
         pull = square_root_control(distance, g.pos_p, g.acc) / max(distance, 1e-6)
         v_c = ref.v[:2] + offset * pull
         error = v_c - e.v[:2]
-        previous = self._v_filtered if self._v_filtered is not None else e.v[:2].copy()
-        self._v_filtered = previous + (e.v[:2] - previous) * dt / (dt + _D_FILTER_S)
+        signal = -e.v[:2] if g.thrust_vector else error  # PX4 has no derivative of the command
+        previous = self._filtered if self._filtered is not None else signal.copy()
+        self._filtered = previous + (signal - previous) * dt / (dt + _D_FILTER_S)
         P, I, D = g.vel
         if not self._saturated:
             self._integral += I * error * dt
             size = hypot(*self._integral)
             self._integral *= min(1.0, _MAX_ACC_INTEGRAL / max(size, 1e-6))
-        a = ref.a[:2] + P * error + self._integral - D * (self._v_filtered - previous) / dt
+        a = ref.a[:2] + P * error + self._integral + D * (self._filtered - previous) / dt
         return float(a[0]), float(a[1])
 
     def _vertical(self, ref: Reference, e: Estimate, dt: float) -> tuple[float, float]:

@@ -86,12 +86,12 @@ class TaskSequence:
         self._target = task.target
         return task
 
-    def following(self) -> Task | None:
-        """Return the task after the current one without moving on."""
-        step = self._find()
+    def following(self, *, with_position: bool = False) -> Task | None:
+        """Return the task after the current one, or the next one with a position, without moving on."""
+        step = self._find(with_position)
         return None if step is None else step[0]
 
-    def _find(self) -> tuple[Task, int, float, dict[int, int]] | None:
+    def _find(self, with_position: bool = False) -> tuple[Task, int, float, dict[int, int]] | None:
         seq, speed, jumps = self._seq, self._speed, dict(self._jumps)
         for _ in range(4 * len(self._items) + 4):
             item = self._items.get(seq)
@@ -106,7 +106,7 @@ class TaskSequence:
                 jumps.pop(seq, None)
             elif item.command == _SPEED:
                 speed = item.param2 if item.param2 > 0 else speed
-            elif item.command in _KINDS:
+            elif item.command in _KINDS and not (with_position and item.command in (_DELAY, _RETURN)):
                 return self._task(item, speed), seq + 1, speed, jumps
             seq += 1
         return None

@@ -95,6 +95,7 @@ _PX4: dict[str, float] = {
     "MPC_TILTMAX_AIR": 45.0,
     "MPC_YAWRAUTO_MAX": 60.0,
     "MPC_TKO_SPEED": 1.5,
+    "MPC_TKO_RAMP_T": 3.0,
     "MPC_LAND_SPEED": 0.7,
     "MPC_LAND_ALT1": 10.0,
     "MPC_LAND_ALT2": 5.0,

@@ -93,7 +93,7 @@ class SimulatedMultirotor:
         self.armed = False
         self._arm_t = float(rng.uniform(*_ARM_S))
         self._task: Task | None = None
-        self._mission_seq = 0 if is_px4 else 1
+        self._mission_seq, self._item_changed = 0 if is_px4 else 1, False
         self._command, self._throttle = (0.0, 0.0, float(self.estimate.euler[2])), 0.0
         self.reference = Reference(self.estimate.p.copy(), np.zeros(3), np.zeros(3))
         self.pulses, self._charge, self._down_s = motor_pulses(None, False, self.params), 1.0, 0.0
@@ -140,6 +140,7 @@ class SimulatedMultirotor:
         self._task = task
         self._guidance.start(task, self.estimate.p, self.estimate.v)
         if self.mode == self.mission_mode:
+            self._item_changed |= self._mission_seq != task.seq
             self._mission_seq = task.seq
 
     def _next_task(self) -> None:
@@ -152,6 +153,9 @@ class SimulatedMultirotor:
         self._control()
         state: Callable[[], Any] = self._telemetry_state  # of this vehicle class
         frames = [] if self.silent or self.link_lost else self._endpoint.telemetry(self.tick, state)
+        if self._item_changed and not (self.silent or self.link_lost):
+            frames += self._endpoint.item_changed(state())
+        self._item_changed = False
         self.vehicle.step()
         self._charge = max(self._charge - DT * self.vehicle.power / 0.3 / _ENDURANCE_S, 0.0)
         self.tick += 1
@@ -206,7 +210,9 @@ class SimulatedMultirotor:
         self._throttle = throttle
 
     def _following(self) -> Task | None:
-        return self._sequence.following() if self.mode == self.mission_mode else None
+        if self.mode != self.mission_mode:
+            return None
+        return self._sequence.following(with_position=isinstance(self._guidance, Px4Guidance))
 
     def _telemetry_state(self) -> MultirotorState:
         e = self.estimate

@@ -53,7 +53,7 @@ def test_a_wait_ends_by_the_flight_before_it_not_by_the_late_report_of_the_item(
     config = multirotor_config(Mission(uav=0, t=0.0, items=mission), {}, "ardupilot", 0.0, origin=HERE, flown=None)
     segments, _ = segments_from_mission(mission, 2, HERE, np.zeros(3), {}, arcs=True)
     segments = limit_speeds(segments, config.limit)
-    par = copter_rollout.parameters(config.limit, {})
+    par = copter_rollout.parameters(config.limit, {}, 0.2)
     states, flown = np.zeros((500, copter_legs.N_STATE)), np.zeros((500, 3, 3))
     copter_legs.simulated_states(segments, len(segments), par, STEP, states, flown)
     seq = segments[states[:, copter_legs.SEGMENT].astype(int), 10]

@@ -22,12 +22,14 @@ _ATTITUDE_LAG_S = 0.25
 _STATIONARY_SPEED = 0.8  # [m/s]
 _LONG_S = 1e4  # time after the end of any leg [s]
 _REPORT_DELAY_S = 0.5  # mean delay of MISSION_CURRENT at 1 Hz [s]
-_VELOCITY_ROWS, _ACCELERATION_ROWS = 3, 8
-_GAINS = (  # default and parameter names, horizontal and vertical
+_VELOCITY_ROWS, _ACCELERATION_ROWS, _DRAG_ROWS = 3, 8, 200
+_GAINS = (  # default and parameter names: horizontal P, vertical P, horizontal I and D of the velocity
     (1.0, ("PSC_NE_POS_P", "PSC_POSXY_P")),
     (2.0, ("PSC_NE_VEL_P", "PSC_VELXY_P")),
     (1.0, ("PSC_D_POS_P", "PSC_POSZ_P")),
     (5.0, ("PSC_D_VEL_P", "PSC_VELZ_P")),
+    (1.0, ("PSC_NE_VEL_I", "PSC_VELXY_I")),
+    (0.25, ("PSC_NE_VEL_D", "PSC_VELXY_D")),
 )
 
 
@@ -35,26 +37,39 @@ GainTable = tuple[tuple[float, tuple[str, ...]], ...]
 """Default and parameter names of each gain."""
 
 
-def parameters(limit: Limits, params: Mapping[str, float]) -> np.ndarray:
-    """Return the parameters of the navigation, (copter_legs.N_PAR,)."""
-    return gains(_GAINS, limit, params)
+def parameters(limit: Limits, params: Mapping[str, float], drag: float) -> np.ndarray:
+    """Return the parameters of the navigation, (copter_legs.N_PAR,); drag over mass and airspeed [1/s]."""
+    return gains(_GAINS, limit, params, (1.0, drag))
 
 
-def gains(table: GainTable, limit: Limits, params: Mapping[str, float]) -> np.ndarray:
-    """Return gains of the position loop and limits, (copter_legs.N_PAR,)."""
+def gains(table: GainTable, limit: Limits, params: Mapping[str, float], airframe: tuple[float, float]) -> np.ndarray:
+    """Return gains of the position loop and limits, (copter_legs.N_PAR,).
+
+    Args:
+        table: of the autopilot
+        limit, params: limits and autopilot parameters
+        airframe: 1 if the derivative is of the velocity error, 0 if of the velocity; drag over mass and airspeed [1/s]
+    """
     values = [
         next((params[name] for name in names if isfinite(params.get(name, np.nan)) and params[name] > 0), default)
         for default, names in table
     ]
     tilt = G * tan(min(limit.tilt, 1.2))
-    return np.array([*values, _ATTITUDE_LAG_S, limit.jerk, limit.radius, limit.acc_corner, tilt, limit.acc])
+    middle = (_ATTITUDE_LAG_S, limit.jerk, limit.radius, limit.acc_corner, tilt, limit.acc)
+    return np.array([*values[:4], *middle, *values[4:], *airframe])
 
 
-def present_motion(track: Track) -> np.ndarray:
-    """Return the newest position, velocity and acceleration, (3, 3)."""
+def present_motion(track: Track, par: np.ndarray) -> np.ndarray:
+    """Return the newest position, velocity, acceleration, and unbalanced drag, (4, 3).
+
+    The integrator balances a change of drag, b' = -k x'' - b I / P, at the velocity error -b / P of slow motion.
+    """
     rows = min(_ACCELERATION_ROWS, len(track) - 1)
     a = (track.v[-1] - track.v[-1 - rows]) / (STEP * rows) if rows else np.zeros(3)
-    return np.array([track.p[-1], track.v[-_VELOCITY_ROWS:].mean(axis=0), np.clip(a, -5.0, 5.0)])
+    b, recovery = np.zeros(3), par[copter_legs.VEL_I] / par[copter_legs.VEL_P] * STEP
+    for change in np.diff(track.v[-_DRAG_ROWS:, :2], axis=0):
+        b[:2] -= par[copter_legs.DRAG] * change + recovery * b[:2]
+    return np.array([track.p[-1], track.v[-_VELOCITY_ROWS:].mean(axis=0), np.clip(a, -5.0, 5.0), b])
 
 
 def fly(track: Track, segments: np.ndarray, item: tuple[int, float], par: np.ndarray, ahead: np.ndarray) -> np.ndarray:
@@ -67,7 +82,7 @@ def fly(track: Track, segments: np.ndarray, item: tuple[int, float], par: np.nda
         par: as of `parameters`
         ahead: look-ahead, (k,) [s]
     """
-    state, xva = _synchronise(track, segments, item, par), present_motion(track)
+    state, xva = _synchronise(track, segments, item, par), present_motion(track, par)
     out = np.empty((int(ahead[-1] / STEP) + 2, 3))
     copter_legs.follow(state, segments, xva, par, STEP, out)
     return np.column_stack([np.interp(ahead, STEP * np.arange(len(out)), column) for column in out.T])

@@ -7,19 +7,20 @@ Source: ArduCopter and PX4 limits as in `fleet.autopilots.copter`.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from math import isfinite
+from math import isfinite, tan
 
 import numpy as np
 
 from fleet.autopilots import copter, copter_legs, px4_multirotor
 from fleet.autopilots.copter import Limits
 from fleet.contract import Item, Mission
-from fleet.frames import Origin
+from fleet.frames import G, Origin
 from fleet.mission import SPEED, join_remarks, route_items
 from fleet.mission_jumps import JUMPS
 from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.prediction.multirotor import copter_rollout, px4_rollout
 from twin_worker.prediction.multirotor.route import (
+    home_position,
     limit_speeds,
     numbered_from_one,
     return_segments,
@@ -32,6 +33,7 @@ from twin_worker.telemetry.track import STEP, Track
 HOLD_MODES = ("LOITER", "POSHOLD", "BRAKE", "AUTO.LOITER", "QLOITER", "HOLD", "POSCTL")
 RETURN_MODES = ("RTL", "AUTO.RTL", "SMART_RTL")
 _ZETA = 0.9
+_DRAG = 0.2  # drag over mass and airspeed before it is identified [1/s]
 _TRANSITION_ACCEL = 4.0  # acceleration of a quadplane in transition [m/s2]
 _ITEM_MAX_AGE_S = 15.0  # maximum age of a reported item [s]
 _STATIONARY_SPEED = 0.8  # stationary below this speed [m/s]
@@ -260,6 +262,12 @@ class MultirotorTwin:
         )
 
     @property
+    def drag(self) -> float:
+        """Return drag over mass and airspeed [1/s]."""
+        drag = G * tan(min(self.config.limit.tilt, 1.2)) / self.model.max_tilt_airspeed
+        return drag if isfinite(drag) else _DRAG
+
+    @property
     def par(self) -> np.ndarray:
         """Return the parameters of the kernel."""
         return np.array([self.config.limit.jerk, self.model.wn, _ZETA, self.model.max_tilt_airspeed, *self.model.wind])
@@ -284,11 +292,13 @@ def fly_segments(
     segments[stops, copter.HOLD] += 0.0 if stops_by_law else twin.model.stop_delay_s
     segments[:, copter.SPEED] *= np.where(commanded[:, copter.SPEED] > 0, twin.model.speed_fraction, 1.0)
     if segments.shape[1] == copter_legs.N_COLUMNS:
-        par = copter_rollout.parameters(twin.limit, twin.config.params)
+        par = copter_rollout.parameters(twin.limit, twin.config.params, twin.drag)
         return copter_rollout.fly(track, segments, (seq, since), par, ahead)
     if twin.config.smooths_velocity:
-        segments = px4_rollout.limit_takeoff(segments, twin.config.items, twin.config.params)
-        par = px4_rollout.parameters(twin.limit, twin.config.params)
+        config, cruise = twin.config, (twin.limit.speed, twin.model.speed_fraction)
+        segments = px4_rollout.prepare(segments, commanded, config.items, cruise)
+        ground = float(home_position(config.items, config.origin)[2])
+        par = px4_rollout.parameters(twin.limit, config.params, twin.drag, ground)
         return px4_rollout.fly(track, segments, (seq, since), par, ahead)
     p, v = track.p[-1].copy(), track.v[-3:].mean(axis=0)
     ref = _initial_reference(track, segments, seq, twin.model.wn)

@@ -97,7 +97,7 @@ def segments_from_mission(
     returns = {item.seq for item in items if item.command == _RETURN}
     start = mission_route.start if np.isfinite(mission_route.start).all() else np.array(p, float)
     builder = _SegmentBuilder(start, [], arcs)
-    home = _home(items, origin)
+    home = home_position(items, origin)
     for leg in mission_route.legs:
         if leg[m.SEQ] < 0 or len(builder.rows) > _MAX_SEGMENTS:
             break  # a multirotor holds position after the last item
@@ -145,7 +145,8 @@ def _wait_item(item: Item, previous: Item | None) -> Item:
     return msgspec.structs.replace(item, command=16, frame=previous.frame, **place)
 
 
-def _home(items: Sequence[Item], origin: Origin) -> np.ndarray:
+def home_position(items: Sequence[Item], origin: Origin) -> np.ndarray:
+    """Return the position of home, NED, (3,) [m]."""
     return_route = m.unroll_route(
         [*(i for i in items if i.seq == 0), Item(seq=1, command=_RETURN)], seq=1, origin=origin, params={"RTL_ALT": 0}
     )
@@ -185,7 +186,7 @@ def _add_return(builder: _SegmentBuilder, home: np.ndarray, params: Mapping[str,
     height = min(height, 1e3) if height > 0 else 0.0
     top = min(home[2] - height, builder.end[2])
     builder.add(np.array([*builder.end[:2], top]), seq, STOP_WAIT_S if top < builder.end[2] - 0.3 else 0.0)
-    wait_s = params.get("RTL_LOIT_TIME", 0.0) * 1e-3
+    wait_s = params.get("RTL_LAND_DELAY", params.get("RTL_LOIT_TIME", 0.0) * 1e-3)
     builder.add(np.array([*home[:2], top]), seq, wait_s if STOP_WAIT_S < wait_s < 1e3 else STOP_WAIT_S)
     if not params.get("RTL_ALT_FINAL", 0.0) > 0:
         _add_descent(builder, home[2], seq)
@@ -223,7 +224,7 @@ def _add_arc(builder: _SegmentBuilder, leg: np.ndarray, radius: float, rate: flo
 
 def stop_position(items: Sequence[Item], seq: int, origin: Origin) -> np.ndarray | None:
     """Return where an aircraft waits after item `seq`, NED, (3,) [m]; None if the mission does not tell."""
-    home, place = _home(items, origin), None
+    home, place = home_position(items, origin), None
     for item in sorted(items, key=lambda i: i.seq):
         if 0 < item.seq <= seq and item.command in (16, 17, 19, 22, 82):
             down = -item.alt_m - origin.alt_mm * -1e-3 if item.frame in m.ABSOLUTE else home[2] - item.alt_m
@@ -240,7 +241,7 @@ def return_segments(
     """Return the segments of a return to launch from `p`, NED (3,) [m]; empty if home is unknown."""
     builder = _SegmentBuilder(np.array(p, float), [], arcs)
     if any(item.seq == 0 for item in items):
-        _add_return(builder, _home(items, origin), params, -1.0)
+        _add_return(builder, home_position(items, origin), params, -1.0)
     return builder.array
 
 
