@@ -1,6 +1,7 @@
 """ArduCopter's waypoint navigation: legs as jerk-limited profiles of time that overlap at corners, and circles.
 
-    s(t)            seven phases of constant jerk from rest to rest, within speed, acceleration and jerk of the leg
+    s(t)            seven phases of constant jerk from rest to rest, within speed, acceleration and jerk of the leg, that
+                    a jerk rising as a cosine over 2 ATC_INPUT_TC delays by half of this time
     r = sum of the present leg, the rest of the one before and the begin of the next
     t' = clip(0.05 + (v . d - P (r - x) . d) / |r'|, 0, 1), first-order lag WPNAV_ACCEL / WPNAV_JERK
     x''' = (r'' + Pv e + D e' + b - x'') / tau,   e = r' + P (r - x) - x',   b' = I e - k x''   position loop, attitude
@@ -31,11 +32,11 @@ SEGMENT, T, TAIL, LEAD, WAIT, SCALE, ANGLE, RATE, TURNED, START_N, START_E, STAR
 N_STATE = 12
 
 # parameters: gains [1/s], lag of the attitude [s], jerk [m/s3], WPNAV_RADIUS [m], corner and horizontal limit [m/s2],
-# integral and derivative of the horizontal velocity [1/s2, -], whether the derivative is of the error (1) or of the
+# integral and derivative of the horizontal velocity [1/s2, -], time in which the jerk rises [s], whether the derivative is of the error (1) or of the
 # velocity alone (0), drag over mass and airspeed [1/s]
 POS_P, VEL_P, POS_P_Z, VEL_P_Z, TAU, JERK, WP_RADIUS, ACC_CORNER, ACC_MAX, ACC_XY = range(10)
-VEL_I, VEL_D, D_OF_ERROR, DRAG = range(10, 14)
-N_PAR = 14
+VEL_I, VEL_D, JERK_TIME, D_OF_ERROR, DRAG = range(10, 15)
+N_PAR = 15
 
 _SUBSTEPS = 2
 _MIN_CIRCLE_ACC = radians(2.0)  # angular [rad/s2]
@@ -44,8 +45,9 @@ _TAU_Z = 0.1  # lag of the thrust [s]
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
-def _plan(segment: np.ndarray, start: np.ndarray, jerk: float, out: np.ndarray) -> None:
-    """Plan a leg: direction (3), length, jerk time, constant acceleration time, cruise time, duration."""
+def _plan(segment: np.ndarray, start: np.ndarray, par: np.ndarray, out: np.ndarray) -> None:
+    """Plan a leg: direction (3), length, jerk time, constant acceleration time, cruise time, duration, delay."""
+    jerk, rise = par[JERK], par[JERK_TIME]
     length = 0.0
     for i in range(3):
         out[i] = segment[B_N + i] - start[i]
@@ -55,14 +57,16 @@ def _plan(segment: np.ndarray, start: np.ndarray, jerk: float, out: np.ndarray) 
         out[i] = out[i] / length if length > 1e-6 else 0.0
     acc, speed = segment[ACC], segment[SPEED]
     if length >= 2.0 * acc**3 / jerk**2:
-        peak = 0.5 * acc * (sqrt((acc / jerk) ** 2 + 4.0 * length / acc) - acc / jerk)
+        ramps = acc / jerk + rise
+        peak = 0.5 * acc * (sqrt(ramps**2 + 4.0 * length / acc) - ramps)
     else:
         peak = jerk * (0.5 * length / jerk) ** (2.0 / 3.0)
     speed = max(min(speed, peak), 1e-6)
     ramp = min(acc / jerk, sqrt(speed / jerk))
     steady = max(speed / (ramp * jerk) - ramp, 0.0)
     cruise = max(length - speed * (2.0 * ramp + steady), 0.0) / speed
-    out[3], out[4], out[5], out[6], out[7] = length, ramp, steady, cruise, 4.0 * ramp + 2.0 * steady + cruise
+    out[3], out[4], out[5], out[6], out[8] = length, ramp, steady, cruise, 0.5 * rise
+    out[7] = 4.0 * ramp + 2.0 * steady + cruise + rise
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
@@ -71,7 +75,7 @@ def _at(plan: np.ndarray, jerk: float, t: float) -> tuple[float, float, float]:
     if t >= plan[7]:
         return plan[3], 0.0, 0.0
     backward = t > 0.5 * plan[7]  # the profile is symmetric
-    left = plan[7] - t if backward else t
+    left = max((plan[7] - t if backward else t) - plan[8], 0.0)
     s, v, a = 0.0, 0.0, 0.0
     for phase in range(4):
         h = min(left, plan[4] if phase % 2 == 0 else plan[5] if phase == 1 else plan[6])
@@ -122,15 +126,15 @@ def navigate(
     if segment[TURN] != 0.0:
         _circle(state, segments, xv, par, dt, r)
         return
-    plan, other = np.empty(8), np.empty(8)
-    _plan(segment, state[START_N : START_D + 1], par[JERK], plan)
+    plan, other = np.empty(9), np.empty(9)
+    _plan(segment, state[START_N : START_D + 1], par, plan)
     step = dt * state[SCALE]
     state[T] += step
     s, v, a = _at(plan, par[JERK], state[T])
     for i in range(3):
         r[0, i], r[1, i], r[2, i] = state[START_N + i] + plan[i] * s, plan[i] * v, plan[i] * a
     if state[TAIL] >= 0.0 and k > 0:
-        _plan(segments[k - 1], segments[k - 1, A_N : A_N + 3], par[JERK], other)
+        _plan(segments[k - 1], segments[k - 1, A_N : A_N + 3], par, other)
         state[TAIL] += step
         s, v, a = _at(other, par[JERK], state[TAIL])
         for i in range(3):
@@ -141,7 +145,7 @@ def navigate(
             state[TAIL] = -1.0
     more = k + 1 < len(segments)
     if segment[END] > 0.0 and more and segments[k + 1, TURN] == 0.0:
-        _plan(segments[k + 1], segments[k + 1, A_N : A_N + 3], par[JERK], other)
+        _plan(segments[k + 1], segments[k + 1, A_N : A_N + 3], par, other)
         if state[LEAD] < 0.0 and _may_begin(plan, state[T], other, par):
             state[LEAD] = 0.0
         if state[LEAD] >= 0.0:

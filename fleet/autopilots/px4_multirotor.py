@@ -31,9 +31,9 @@ N_COLUMNS = N_SEGMENT + 1
 # vertical speed limits up and down [m/s], MPC_XY_ERR_MAX [m], MPC_XY_TRAJ_P [-], take-off speed [m/s] and its ramp [s],
 # heights above ground where landing begins to slow down and is slow [m], landing speed [m/s], position of the ground
 # down [m]
-ACCEPT, ACCEPT_Z, ACC, ACC_UP, ACC_DOWN, UP, DOWN, MAX_LAG, TURN_GAIN = range(14, 23)
-TAKEOFF_SPEED, RAMP, HIGH, LOW, LAND_SPEED, GROUND = range(23, 29)
-N_PAR = 29
+ACCEPT, ACCEPT_Z, ACC, ACC_UP, ACC_DOWN, UP, DOWN, MAX_LAG, TURN_GAIN = range(15, 24)
+TAKEOFF_SPEED, RAMP, HIGH, LOW, LAND_SPEED, GROUND = range(24, 30)
+N_PAR = 30
 
 # state of the navigation: segment, time waited at its end [s], speed before the turn [m/s]; position, velocity and
 # acceleration of the trajectory, three each

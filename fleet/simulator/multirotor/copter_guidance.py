@@ -1,6 +1,7 @@
 """Guidance of ArduCopter: straight legs flown by jerk-limited profiles of time that overlap at corners, and circles.
 
-A leg is planned from rest to rest: seven phases of constant jerk. The next leg begins before the present one ends, so
+A leg is planned from rest to rest: seven phases of constant jerk or acceleration, with a jerk that rises and falls as a
+cosine over twice ATC_INPUT_TC. The next leg begins before the present one ends, so
 that its acceleration overlaps the deceleration, as soon as the corner cut by the sum of both stays within WPNAV_RADIUS
 and below the corner acceleration. Profile time runs slower while the aircraft lags behind the reference.
 
@@ -22,18 +23,28 @@ _MIN_CIRCLE_ACC = radians(2.0)  # smallest angular acceleration of a circle [rad
 
 
 class Profile:
-    """Distance over time from rest to rest, limited in speed, acceleration and jerk."""
+    """Distance over time from rest to rest, limited in speed, acceleration, jerk and rise of the jerk."""
 
-    def __init__(self, length: float, speed: float, acc: float, jerk: float):
-        """Plan over a length [m] with limits [m/s, m/s2, m/s3]."""
-        self.length = length
-        speed = min(speed, _peak_speed(length, acc, jerk))
-        ramp = min(acc / jerk, sqrt(speed / jerk))  # time of one jerk phase [s]
-        steady = max(speed / (ramp * jerk) - ramp, 0.0) if ramp > 0 else 0.0
-        cruise = max(length - speed * (2 * ramp + steady), 0.0) / speed if speed > 0 else 0.0
-        faster, slower = (ramp, jerk), (ramp, -jerk)
-        self._phases = (faster, (steady, 0.0), slower, (cruise, 0.0), slower, (steady, 0.0), faster)
-        self.duration = sum(time for time, _ in self._phases)
+    def __init__(self, length: float, speed: float, limits: tuple[float, float], rise: float = 0.0):
+        """Plan over a length [m].
+
+        Args:
+            length: [m]
+            speed: limit [m/s]
+            limits: of acceleration and jerk [m/s2, m/s3]
+            rise: time in which the jerk rises and falls [s]
+        """
+        self.length, self._rise = length, rise
+        acc, jerk = limits
+        acc, speed = _peak(length, speed, acc, (jerk, rise))
+        if acc < jerk * rise:  # the jerk is not reached
+            jerk = acc / rise
+        held = max(acc / jerk - rise, 0.0) if acc > 0 else 0.0
+        steady = max(speed / acc - acc / jerk - rise, 0.0) if acc > 0 else 0.0
+        cruise = max(length / speed - speed / acc - acc / jerk - rise, 0.0) if acc > 0 else 0.0
+        up, down = (_pulse(sign * jerk, rise, held) for sign in (1.0, -1.0))
+        self._phases = (*up, (steady, 0.0, 0), *down, (cruise, 0.0, 0), *down, (steady, 0.0, 0), *up)
+        self.duration = sum(time for time, _, _ in self._phases) if acc > 0 else 0.0
         self.speed = speed
 
     def at(self, t: float) -> tuple[float, float, float]:
@@ -41,22 +52,54 @@ class Profile:
         if t >= self.duration:
             return self.length, 0.0, 0.0
         s = v = a = 0.0
-        for duration, jerk in self._phases:
+        for duration, jerk, change in self._phases:
             h = min(t, duration)
-            s += h * (v + h * (a / 2 + h * jerk / 6))
-            v += h * (a + h * jerk / 2)
-            a += h * jerk
+            ds, dv, da = self._gain(h, jerk, change)
+            s += h * (v + h * a / 2) + ds
+            v += h * a + dv
+            a += da
             t -= h
             if t <= 0:
                 break
         return s, v, a
 
+    def _gain(self, t: float, jerk: float, change: int) -> tuple[float, float, float]:
+        """Return distance, speed and acceleration that a jerk gains in a time; change 1, -1, 0: rises, falls, constant."""
+        if not change:
+            return jerk * t**3 / 6, jerk * t**2 / 2, jerk * t
+        w = pi / self._rise
+        wave = change * sin(w * t) / w
+        return (
+            jerk / 2 * (t**3 / 6 + (wave - change * t) / w**2),
+            jerk / 2 * (t**2 / 2 + change * (cos(w * t) - 1) / w**2),
+            jerk / 2 * (t - wave),
+        )
 
-def _peak_speed(length: float, acc: float, jerk: float) -> float:
-    """Return the speed at which two ramps fill a length [m/s]."""
-    if length >= 2 * acc**3 / jerk**2:
-        return acc / 2 * (-acc / jerk + sqrt((acc / jerk) ** 2 + 4 * length / acc))
-    return jerk * (length / (2 * jerk)) ** (2 / 3)
+
+def _pulse(jerk: float, rise: float, held: float) -> tuple[tuple[float, float, int], ...]:
+    """Return the phases of a pulse of jerk: duration, jerk, and whether it rises or falls."""
+    return ((rise, jerk, 1), (held, jerk, 0), (rise, jerk, -1)) if rise > 0 else ((held, jerk, 0),)
+
+
+def _peak(length: float, speed: float, acc: float, jerk_rise: tuple[float, float]) -> tuple[float, float]:
+    """Return acceleration and speed that are reached on a length, within their limits [m/s2, m/s]."""
+    jerk, rise = jerk_rise
+
+    def ramps(a: float) -> float:
+        return max(a / jerk, rise) + rise
+
+    if length <= 1e-9 or speed <= 0:
+        return 0.0, 0.0
+    pause = ramps(acc)
+    speed = min(speed, acc / 2 * (sqrt(pause**2 + 4 * length / acc) - pause))
+    if speed >= acc * pause:
+        return acc, speed
+    low, high = 0.0, acc  # without constant acceleration
+    for _ in range(50):
+        a = (low + high) / 2
+        top = a * ramps(a)
+        low, high = (a, high) if top < speed and 2 * top * ramps(a) < length else (low, a)
+    return low, min(low * ramps(low), speed)
 
 
 class Leg:
@@ -84,7 +127,7 @@ class CopterGuidance:
         self._params = params
         self.finished = False
         self.touches_down = False  # the task ends on the ground
-        self._leg = Leg(np.zeros(3), np.full(3, 1e9), Profile(0.0, 1.0, 1.0, 1.0))
+        self._leg = Leg(np.zeros(3), np.full(3, 1e9), Profile(0.0, 1.0, (1.0, 1.0)))
         self._tail: Leg | None = None
         self._lead: Leg | None = None
         self._scale = 1.0
@@ -143,7 +186,7 @@ class CopterGuidance:
         horizontal = speed or get("WPNAV_SPEED") * _CM
         top = min(horizontal / max(across, 1e-3), vertical / max(abs(rise), 1e-3))
         acc = min(get("WPNAV_ACCEL") * _CM / max(across, 1e-3), get("WPNAV_ACCEL_Z") * _CM / max(abs(rise), 1e-3))
-        return Leg(a, b, Profile(length, top, acc, get("WPNAV_JERK")))
+        return Leg(a, b, Profile(length, top, (acc, get("WPNAV_JERK")), 2 * max(get("ATC_INPUT_TC"), 0.1)))
 
     def step(self, dt: float, p: np.ndarray, v: np.ndarray, following: Callable[[], Task | None]) -> Reference:
         """Advance by dt [s] and return the reference; `following` returns the task after this one."""

@@ -19,17 +19,20 @@ _MATCH_ROWS = range(0, 50, 5)  # rows of the track, before the newest one, that 
 _VELOCITY_S = 0.7  # weight of a velocity against a position [s]
 _MAX_OFFSET_M = 5.0  # from the leg; beyond it a new leg begins at the aircraft
 _ATTITUDE_LAG_S = 0.25
+_MIN_INPUT_TC_S = 0.1  # ArduCopter limits the rise of jerk to half of what this time permits [s]
 _STATIONARY_SPEED = 0.8  # [m/s]
 _LONG_S = 1e4  # time after the end of any leg [s]
 _REPORT_DELAY_S = 0.5  # mean delay of MISSION_CURRENT at 1 Hz [s]
 _VELOCITY_ROWS, _ACCELERATION_ROWS, _DRAG_ROWS = 3, 8, 200
-_GAINS = (  # default and parameter names: horizontal P, vertical P, horizontal I and D of the velocity
+_GAINS = (  # default and parameter names: horizontal P, vertical P, horizontal I and D of the velocity,
+    # time constant of the attitude commands
     (1.0, ("PSC_NE_POS_P", "PSC_POSXY_P")),
     (2.0, ("PSC_NE_VEL_P", "PSC_VELXY_P")),
     (1.0, ("PSC_D_POS_P", "PSC_POSZ_P")),
     (5.0, ("PSC_D_VEL_P", "PSC_VELZ_P")),
     (1.0, ("PSC_NE_VEL_I", "PSC_VELXY_I")),
     (0.25, ("PSC_NE_VEL_D", "PSC_VELXY_D")),
+    (0.15, ("ATC_INPUT_TC",)),
 )
 
 
@@ -39,7 +42,9 @@ GainTable = tuple[tuple[float, tuple[str, ...]], ...]
 
 def parameters(limit: Limits, params: Mapping[str, float], drag: float) -> np.ndarray:
     """Return the parameters of the navigation, (copter_legs.N_PAR,); drag over mass and airspeed [1/s]."""
-    return gains(_GAINS, limit, params, (1.0, drag))
+    par = gains(_GAINS, limit, params, (1.0, drag))
+    par[copter_legs.JERK_TIME] = 2.0 * max(par[copter_legs.JERK_TIME], _MIN_INPUT_TC_S)
+    return par
 
 
 def gains(table: GainTable, limit: Limits, params: Mapping[str, float], airframe: tuple[float, float]) -> np.ndarray:
@@ -149,7 +154,7 @@ def _new_leg(track: Track, segments: np.ndarray, k: int, par: np.ndarray) -> np.
     speed, acc, jerk = max(float(v @ direction), 0.0), segments[k, copter.ACC], par[copter_legs.JERK]
     ramp = min(acc / jerk, float(np.sqrt(speed / jerk)))  # time of each jerk phase of an acceleration to this speed
     time = 2 * ramp + max(speed / acc - ramp, 0.0) if speed > 0.3 else 0.0
-    state[copter_legs.T] = time
+    state[copter_legs.T] = time + 0.5 * par[copter_legs.JERK_TIME]
     state[copter_legs.START_N : copter_legs.START_D + 1] = p - direction * speed * time / 2
     return state
 

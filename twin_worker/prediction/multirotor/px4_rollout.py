@@ -21,6 +21,7 @@ _GAINS = (
     (4.0, ("MPC_Z_VEL_P_ACC",)),
     (0.4, ("MPC_XY_VEL_I_ACC",)),
     (0.2, ("MPC_XY_VEL_D_ACC",)),
+    (0.0, ()),  # the jerk is constant
 )
 _DEFAULTS = {
     "NAV_ACC_RAD": 10.0,

@@ -64,9 +64,10 @@ def test_the_midpoint_rule_agrees_with_rotorpys_own_solver() -> None:
     assert np.abs(vehicle._s[6:10] - state["q"]).max() < 1e-3
 
 
-@pytest.mark.parametrize(("length", "speed"), [(100.0, 8.0), (20.0, 8.0), (2.0, 8.0), (60.0, 1.0)])
-def test_a_profile_goes_from_rest_to_rest_within_its_limits(length: float, speed: float) -> None:
-    profile = Profile(length, speed, 2.5, 1.0)
+@pytest.mark.parametrize("rise", [0.0, 0.3])
+@pytest.mark.parametrize(("length", "speed"), [(100.0, 8.0), (20.0, 8.0), (2.0, 8.0), (60.0, 1.0), (0.1, 8.0)])
+def test_a_profile_goes_from_rest_to_rest_within_its_limits(length: float, speed: float, rise: float) -> None:
+    profile = Profile(length, speed, (2.5, 1.0), rise)
     t = np.linspace(0, profile.duration, 2_000)
     s, v, a = np.array([profile.at(x) for x in t]).T
     assert s[0] == 0 and s[-1] == pytest.approx(length) and abs(v[-1]) < 1e-6
