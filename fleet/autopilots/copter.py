@@ -76,7 +76,9 @@ TABLE = {
     "jerk": LimitSpec(1.0, (("WP_JERK", 1), ("WPNAV_JERK", 1), ("MPC_JERK_AUTO", 1))),
     "radius": LimitSpec(2.0, (("WP_RADIUS_M", 1), ("WPNAV_RADIUS", _CM), ("NAV_ACC_RAD", 1))),
     "land": LimitSpec(0.5, (("LAND_SPD_MS", 1), ("LAND_SPEED", _CM), ("LAND_FINAL_SPD", 1), ("MPC_LAND_SPEED", 1))),
-    "tilt": LimitSpec(radians(30.0), (("ATC_ANGLE_MAX", radians(1.0)), ("ANGLE_MAX", radians(_CM)), ("MPC_TILTMAX_AIR", radians(1.0)))),
+    "tilt": LimitSpec(
+        radians(30.0), (("ATC_ANGLE_MAX", radians(1.0)), ("ANGLE_MAX", radians(_CM)), ("MPC_TILTMAX_AIR", radians(1.0)))
+    ),
 }
 _MIN_LIMIT, MAX_LIMIT = 0.02, 60.0  # values outside are rejected
 

@@ -18,18 +18,21 @@ from math import atan2, cos, exp, radians, sin, sqrt
 import numba as nb
 import numpy as np
 
-from fleet.autopilots.copter import A_N, ACC, B_N, END, HOLD, N_SEGMENT, SPEED
+from fleet.autopilots.copter import A_N, ACC, B_N, HOLD, N_SEGMENT, SPEED
 
 LAW = "copter: jerk-limited legs that overlap at corners, behind the position loop"
 
 RADIUS, TURN, C_N, C_E = N_SEGMENT, N_SEGMENT + 1, N_SEGMENT + 2, N_SEGMENT + 3
 """Columns of a circle: radius [m], signed angle [rad], centre [m]; angle 0 is a straight leg."""
-N_COLUMNS = N_SEGMENT + 4
+SPEED_BEFORE, LEG_JERK = N_SEGMENT + 4, N_SEGMENT + 5
+"""Columns of a leg: speed with which it is planned before the corner [m/s], its jerk if it has its own [m/s3]; or 0."""
+N_COLUMNS = N_SEGMENT + 6
 
 # state of the navigation: segment; time on it, on the one before (-1: over) and on the next (-1: not begun) [s]; time
 # waited at its end [s]; time scale [-]; angle, rate and angle flown of a circle [rad, rad/s, rad]; start of the leg [m]
-SEGMENT, T, TAIL, LEAD, WAIT, SCALE, ANGLE, RATE, TURNED, START_N, START_E, START_D = range(12)
-N_STATE = 12
+# speed limit of the leg, if not that of the segment, and of the one before [m/s]
+SEGMENT, T, TAIL, LEAD, WAIT, SCALE, ANGLE, RATE, TURNED, START_N, START_E, START_D, TOP, TAIL_TOP = range(14)
+N_STATE = 14
 
 # parameters: gains [1/s], lag of the attitude [s], jerk [m/s3], WPNAV_RADIUS [m], corner and horizontal limit [m/s2],
 # integral and derivative of the horizontal velocity [1/s2, -], time in which the jerk rises [s], whether the derivative is of the error (1) or of the
@@ -45,9 +48,10 @@ _TAU_Z = 0.1  # lag of the thrust [s]
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
-def _plan(segment: np.ndarray, start: np.ndarray, par: np.ndarray, out: np.ndarray) -> None:
-    """Plan a leg: direction (3), length, jerk time, constant acceleration time, cruise time, duration, delay."""
-    jerk, rise = par[JERK], par[JERK_TIME]
+def _plan(segment: np.ndarray, top: float, start: np.ndarray, par: np.ndarray, out: np.ndarray) -> None:
+    """Plan a leg: direction (3), length, jerk time, constant acceleration time, cruise time, duration, delay, jerk."""
+    jerk, rise = segment[LEG_JERK] if segment[LEG_JERK] > 0.0 else par[JERK], par[JERK_TIME]
+    out[9] = jerk
     length = 0.0
     for i in range(3):
         out[i] = segment[B_N + i] - start[i]
@@ -55,7 +59,7 @@ def _plan(segment: np.ndarray, start: np.ndarray, par: np.ndarray, out: np.ndarr
     length = sqrt(length)
     for i in range(3):
         out[i] = out[i] / length if length > 1e-6 else 0.0
-    acc, speed = segment[ACC], segment[SPEED]
+    acc, speed = segment[ACC], top if top > 0.0 else segment[SPEED]
     if length >= 2.0 * acc**3 / jerk**2:
         ramps = acc / jerk + rise
         peak = 0.5 * acc * (sqrt(ramps**2 + 4.0 * length / acc) - ramps)
@@ -70,8 +74,9 @@ def _plan(segment: np.ndarray, start: np.ndarray, par: np.ndarray, out: np.ndarr
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
-def _at(plan: np.ndarray, jerk: float, t: float) -> tuple[float, float, float]:
+def _at(plan: np.ndarray, t: float) -> tuple[float, float, float]:
     """Return distance, speed and acceleration of a planned leg at a time."""
+    jerk = plan[9]
     if t >= plan[7]:
         return plan[3], 0.0, 0.0
     backward = t > 0.5 * plan[7]  # the profile is symmetric
@@ -95,16 +100,36 @@ def _may_begin(plan: np.ndarray, t: float, following: np.ndarray, par: np.ndarra
     left = plan[7] - t
     if left < 0.0 or left > _LOOK_S or left >= 0.5 * following[7]:
         return False
-    s0, v0, a0 = _at(plan, par[JERK], t + 0.5 * left)
-    s1, v1, a1 = _at(following, par[JERK], 0.5 * left)
+    s0, v0, a0 = _at(plan, t + 0.5 * left)
+    s1, v1, a1 = _at(following, 0.5 * left)
     deviation, speed, acceleration = 0.0, 0.0, 0.0
     for i in range(3):
         deviation += (plan[i] * (s0 - plan[3]) + following[i] * s1) ** 2
         if i < 2:
             speed += (plan[i] * v0 + following[i] * v1) ** 2
             acceleration += (plan[i] * a0 + following[i] * a1) ** 2
-    top = min(plan[4] * (plan[4] + plan[5]), following[4] * (following[4] + following[5])) * par[JERK]
+    top = min(plan[9] * plan[4] * (plan[4] + plan[5]), following[9] * following[4] * (following[4] + following[5]))
     return deviation < par[WP_RADIUS] ** 2 and speed < top**2 and acceleration < par[ACC_CORNER] ** 2
+
+
+@nb.njit(cache=True, error_model="numpy", nogil=True)
+def _speed_after_change(segment: np.ndarray, v: float, a: float, par: np.ndarray) -> float:
+    """Return the speed limit of a leg that has begun when the commanded speed changes; 0: that of the segment.
+
+    Acceleration ends as soon as its jerk permits; a leg that already decelerates is flown as planned.
+    """
+    before = segment[SPEED_BEFORE]
+    if not before > segment[SPEED]:
+        return 0.0
+    if a < 0.0:
+        return before
+    return min(max(segment[SPEED], v + 0.5 * a * (a / par[JERK] + par[JERK_TIME])), before)
+
+
+@nb.njit(cache=True, error_model="numpy", nogil=True)
+def stopping_time(speed: float, gain: float, acc: float) -> float:
+    """Return the distance in which the position loop stops, over the speed [s]."""
+    return 1.0 / gain if speed <= acc / gain else 0.5 * (speed / acc + acc / (gain * gain * speed))
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
@@ -126,17 +151,17 @@ def navigate(
     if segment[TURN] != 0.0:
         _circle(state, segments, xv, par, dt, r)
         return
-    plan, other = np.empty(9), np.empty(9)
-    _plan(segment, state[START_N : START_D + 1], par, plan)
+    plan, other = np.empty(10), np.empty(10)
+    _plan(segment, state[TOP], state[START_N : START_D + 1], par, plan)
     step = dt * state[SCALE]
     state[T] += step
-    s, v, a = _at(plan, par[JERK], state[T])
+    s, v, a = _at(plan, state[T])
     for i in range(3):
         r[0, i], r[1, i], r[2, i] = state[START_N + i] + plan[i] * s, plan[i] * v, plan[i] * a
     if state[TAIL] >= 0.0 and k > 0:
-        _plan(segments[k - 1], segments[k - 1, A_N : A_N + 3], par, other)
+        _plan(segments[k - 1], state[TAIL_TOP], segments[k - 1, A_N : A_N + 3], par, other)
         state[TAIL] += step
-        s, v, a = _at(other, par[JERK], state[TAIL])
+        s, v, a = _at(other, state[TAIL])
         for i in range(3):
             r[0, i] += other[i] * (s - other[3])
             r[1, i] += other[i] * v
@@ -144,13 +169,13 @@ def navigate(
         if state[TAIL] >= other[7]:
             state[TAIL] = -1.0
     more = k + 1 < len(segments)
-    if segment[END] > 0.0 and more and segments[k + 1, TURN] == 0.0:
-        _plan(segments[k + 1], segments[k + 1, A_N : A_N + 3], par, other)
+    if segment[HOLD] <= 0.0 and more and segments[k + 1, TURN] == 0.0:
+        _plan(segments[k + 1], segments[k + 1, SPEED_BEFORE], segments[k + 1, A_N : A_N + 3], par, other)
         if state[LEAD] < 0.0 and _may_begin(plan, state[T], other, par):
             state[LEAD] = 0.0
         if state[LEAD] >= 0.0:
             state[LEAD] += step
-            s, v, a = _at(other, par[JERK], state[LEAD])
+            s, v, a = _at(other, state[LEAD])
             for i in range(3):
                 r[0, i] += other[i] * s
                 r[1, i] += other[i] * v
@@ -158,6 +183,7 @@ def navigate(
             if state[LEAD] >= plan[7] - state[T]:
                 state[SEGMENT] += 1.0
                 state[TAIL], state[T], state[LEAD], state[WAIT] = state[T], state[LEAD], -1.0, 0.0
+                state[TAIL_TOP], state[TOP] = state[TOP], _speed_after_change(segments[k + 1], v, a, par)
                 state[START_N : START_D + 1] = segments[k + 1, A_N : A_N + 3]
                 return
     _scale(state, xv, par, dt, r)
@@ -170,7 +196,7 @@ def navigate(
         state[WAIT] += dt
         if state[WAIT] >= segment[HOLD] and more:
             state[SEGMENT] += 1.0
-            state[T], state[TAIL], state[LEAD], state[WAIT] = 0.0, -1.0, -1.0, 0.0
+            state[T], state[TAIL], state[LEAD], state[WAIT], state[TOP] = 0.0, -1.0, -1.0, 0.0, 0.0
             state[START_N : START_D + 1] = segments[k + 1, A_N : A_N + 3]
             if segments[k + 1, TURN] != 0.0:
                 begin_circle(state, segments[k + 1], xv[0], 0.0)
@@ -198,10 +224,10 @@ def _circle(state: np.ndarray, segments: np.ndarray, xv: np.ndarray, par: np.nda
     r[2, 0], r[2, 1], r[2, 2] = -(state[RATE] ** 2) * radius * c, -(state[RATE] ** 2) * radius * s, 0.0
     if state[TURNED] >= abs(segment[TURN]) and k + 1 < len(segments):
         state[SEGMENT] += 1.0
-        state[T], state[TAIL], state[LEAD], state[WAIT] = 0.0, -1.0, -1.0, 0.0
-        speed = sqrt(xv[1, 0] ** 2 + xv[1, 1] ** 2 + xv[1, 2] ** 2)
+        state[T], state[TAIL], state[LEAD], state[WAIT], state[TOP] = 0.0, -1.0, -1.0, 0.0, 0.0
+        stop_s = stopping_time(sqrt(xv[1, 0] ** 2 + xv[1, 1] ** 2 + xv[1, 2] ** 2), par[POS_P], par[ACC_XY])
         for i in range(3):
-            state[START_N + i] = xv[0, i] + xv[1, i] * speed / (2.0 * par[ACC_XY])
+            state[START_N + i] = xv[0, i] + xv[1, i] * stop_s
         if segments[k + 1, TURN] != 0.0:
             begin_circle(state, segments[k + 1], xv[0], 0.0)
 

@@ -4,13 +4,14 @@ The state of the navigation is that of an undisturbed simulated flight, from the
 that lies nearest to the newest positions and velocities.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import atan2, hypot, isfinite, pi, tan
 
 import numpy as np
 
 from fleet.autopilots import copter, copter_legs
 from fleet.autopilots.copter import Limits
+from fleet.contract import Item
 from fleet.frames import G
 from twin_worker.telemetry.track import STEP, Track
 
@@ -21,6 +22,7 @@ _MAX_OFFSET_M = 5.0  # from the leg; beyond it a new leg begins at the aircraft
 _ATTITUDE_LAG_S = 0.25
 _MIN_INPUT_TC_S = 0.1  # ArduCopter limits the rise of jerk to half of what this time permits [s]
 _STATIONARY_SPEED = 0.8  # [m/s]
+_TAKEOFF, _JERK_Z = 22, 5.0  # MAV_CMD; default of PSC_JERK_D [m/s3]
 _LONG_S = 1e4  # time after the end of any leg [s]
 _REPORT_DELAY_S = 0.5  # mean delay of MISSION_CURRENT at 1 Hz [s]
 _VELOCITY_ROWS, _ACCELERATION_ROWS, _DRAG_ROWS = 3, 8, 200
@@ -62,6 +64,34 @@ def gains(table: GainTable, limit: Limits, params: Mapping[str, float], airframe
     tilt = G * tan(min(limit.tilt, 1.2))
     middle = (_ATTITUDE_LAG_S, limit.jerk, limit.radius, limit.acc_corner, tilt, limit.acc)
     return np.array([*values[:4], *middle, *values[4:], *airframe])
+
+
+def prepare(
+    segments: np.ndarray, commanded: np.ndarray, items: Sequence[Item], params: Mapping[str, float]
+) -> np.ndarray:
+    """Set the speeds with which legs are planned before a commanded change, and the jerk of take-offs.
+
+    Args:
+        segments, commanded: with and without limits, (n, copter_legs.N_COLUMNS)
+        items: mission
+        params: autopilot parameters
+    """
+    for k in range(1, len(segments)):
+        before, own = commanded[k - 1, copter.SPEED], commanded[k, copter.SPEED]
+        if before != own and min(before, own) >= 0.0 and not segments[k, copter_legs.TURN]:
+            horizontal = segments[k, copter.B_N : copter.B_N + 2] - segments[k, copter.A_N : copter.A_N + 2]
+            share = float(np.hypot(*horizontal)) / max(_length(segments[k]), 1e-6)
+            segments[k, copter_legs.SPEED_BEFORE] = segments[k - 1, copter.SPEED] if share > 0.9 else 0.0
+    takeoff = np.isin(segments[:, copter.SEQ], [item.seq for item in items if item.command == _TAKEOFF])
+    jerk = params.get("PSC_JERK_D", params.get("PSC_JERK_Z", _JERK_Z))
+    segments[takeoff, copter_legs.LEG_JERK] = jerk if jerk > 0 else _JERK_Z
+    return segments
+
+
+def stopping_point(p: np.ndarray, v: np.ndarray, par: np.ndarray) -> np.ndarray:
+    """Return where the position loop stops an aircraft, NED, (3,) [m]."""
+    speed = float(np.linalg.norm(v))
+    return p + v * copter_legs.stopping_time(speed, par[copter_legs.POS_P], par[copter_legs.ACC_XY])
 
 
 def present_motion(track: Track, par: np.ndarray) -> np.ndarray:

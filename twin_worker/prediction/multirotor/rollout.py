@@ -90,6 +90,7 @@ class MultirotorConfig:
         plans_legs: flies jerk-limited legs as ArduCopter does
         smooths_velocity: flies a jerk-limited velocity as PX4 does; with neither, the general law of `copter`
         speed: commanded before the current item, for all but a return; 0 if none [m/s]
+        speed_before: the same before the item flown before
     """
 
     items: tuple[Item, ...]
@@ -102,6 +103,7 @@ class MultirotorConfig:
     plans_legs: bool = False
     smooths_velocity: bool = False
     speed: float = 0.0
+    speed_before: float = 0.0
 
     @property
     def law(self) -> str:
@@ -116,28 +118,28 @@ class MultirotorConfig:
             seq: reported mission item of each row
         """
         item = int(seq[-1]) + self.seq_offset
-        route, problems = self._segments_from(item, track)
+        route, problems = self._segments_from(item, track, self.speed)
         if not self.plans_legs or not len(route):
             return route, problems
         before = self._previous(item, seq)
         if before is None:
             return route, problems
         if before.command == _WAYPOINT and not before.param1 > 0 and before.seq < item:
-            longer, more = self._segments_from(before.seq, track)
+            longer, more = self._segments_from(before.seq, track, self.speed_before)
             k = np.flatnonzero(longer[:, copter.SEQ] == item)
             return (longer, more) if len(k) and k[0] <= 1 else (route, problems)
         changed = int(np.flatnonzero(seq != seq[-1])[-1]) if (seq != seq[-1]).any() else None
         if before.command == _TURNS and changed is not None:
-            v = track.v[changed]
-            start = track.p[changed] + v * float(np.linalg.norm(v)) / (2 * self.limit.acc)
+            par = copter_rollout.parameters(self.limit, self.params, 0.0)
+            start = copter_rollout.stopping_point(track.p[changed], track.v[changed], par)
         else:
             start = stop_position(self.items, before.seq, self.origin)
         if start is not None:
             route[0, copter.A_N : copter.A_N + 3] = start
         return route, problems
 
-    def _segments_from(self, item: int, track: Track) -> tuple[np.ndarray, tuple[str, ...]]:
-        p, arcs, speed = track.p[-1], self.plans_legs, self.speed
+    def _segments_from(self, item: int, track: Track, speed: float) -> tuple[np.ndarray, tuple[str, ...]]:
+        p, arcs = track.p[-1], self.plans_legs
         return segments_from_mission(self.items, item, self.origin, p, self.params, arcs=arcs, speed=speed)
 
     def _previous(self, item: int, seq: np.ndarray) -> Item | None:
@@ -168,10 +170,13 @@ def multirotor_config(
     if "speed" in absent and track is not None:
         limit = limit._replace(speed=_cruise_speed(track, limit.speed))
     items = numbered_from_one(items, origin) if seq_offset else items
-    speed = speed_in_force(items, options.get("reported", np.empty(0)) + seq_offset)
+    reported = options.get("reported", np.empty(0)) + seq_offset
+    other = np.flatnonzero(reported != reported[-1:])
+    earlier = reported[: int(other[-1]) + 1 if len(other) else 0]
+    speed, speed_before = speed_in_force(items, reported), speed_in_force(items, earlier)
     plans_legs, smooths_velocity = (autopilot == name and not prefix for name in ("ardupilot", "px4"))
     law = plans_legs, smooths_velocity
-    return MultirotorConfig(items, seq_offset, params, limit, absent, since, origin, *law, speed)
+    return MultirotorConfig(items, seq_offset, params, limit, absent, since, origin, *law, speed, speed_before)
 
 
 def speed_in_force(items: Sequence[Item], reported: np.ndarray) -> float:
@@ -292,6 +297,7 @@ def fly_segments(
     segments[stops, copter.HOLD] += 0.0 if stops_by_law else twin.model.stop_delay_s
     segments[:, copter.SPEED] *= np.where(commanded[:, copter.SPEED] > 0, twin.model.speed_fraction, 1.0)
     if segments.shape[1] == copter_legs.N_COLUMNS:
+        segments = copter_rollout.prepare(segments, commanded, twin.config.items, twin.config.params)
         par = copter_rollout.parameters(twin.limit, twin.config.params, twin.drag)
         return copter_rollout.fly(track, segments, (seq, since), par, ahead)
     if twin.config.smooths_velocity:
