@@ -1,7 +1,7 @@
 """ArduCopter's waypoint navigation: legs as jerk-limited profiles of time that overlap at corners, and circles.
 
-    s(t)            seven phases of constant jerk from rest to rest, within speed, acceleration and jerk of the leg, that
-                    a jerk rising as a cosine over 2 ATC_INPUT_TC delays by half of this time
+    s(t)            seven phases of constant jerk from rest to rest, within speed, acceleration and jerk of the leg,
+                    that a jerk rising as a cosine over 2 ATC_INPUT_TC delays by half of this time
     r = sum of the present leg, the rest of the one before and the begin of the next
     t' = clip(0.05 + (v . d - P (r - x) . d) / |r'|, 0, 1), first-order lag WPNAV_ACCEL / WPNAV_JERK
     x''' = (r'' + Pv e + D e' + b - x'') / tau,   e = r' + P (r - x) - x',   b' = I e - k x''   position loop, attitude
@@ -35,8 +35,8 @@ SEGMENT, T, TAIL, LEAD, WAIT, SCALE, ANGLE, RATE, TURNED, START_N, START_E, STAR
 N_STATE = 14
 
 # parameters: gains [1/s], lag of the attitude [s], jerk [m/s3], WPNAV_RADIUS [m], corner and horizontal limit [m/s2],
-# integral and derivative of the horizontal velocity [1/s2, -], time in which the jerk rises [s], whether the derivative is of the error (1) or of the
-# velocity alone (0), drag over mass and airspeed [1/s]
+# integral and derivative of the horizontal velocity [1/s2, -], time in which the jerk rises [s], whether the derivative
+# is of the error (1) or of the velocity alone (0), drag over mass and airspeed [1/s]
 POS_P, VEL_P, POS_P_Z, VEL_P_Z, TAU, JERK, WP_RADIUS, ACC_CORNER, ACC_MAX, ACC_XY = range(10)
 VEL_I, VEL_D, JERK_TIME, D_OF_ERROR, DRAG = range(10, 15)
 N_PAR = 15

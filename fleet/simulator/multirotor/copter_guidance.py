@@ -39,10 +39,10 @@ class Profile:
         acc, speed = _peak(length, speed, acc, (jerk, rise))
         if acc < jerk * rise:  # the jerk is not reached
             jerk = acc / rise
-        held = max(acc / jerk - rise, 0.0) if acc > 0 else 0.0
+        constant = max(acc / jerk - rise, 0.0) if acc > 0 else 0.0
         steady = max(speed / acc - acc / jerk - rise, 0.0) if acc > 0 else 0.0
         cruise = max(length / speed - speed / acc - acc / jerk - rise, 0.0) if acc > 0 else 0.0
-        up, down = (_pulse(sign * jerk, rise, held) for sign in (1.0, -1.0))
+        up, down = (_pulse(sign * jerk, rise, constant) for sign in (1.0, -1.0))
         self._phases = (*up, (steady, 0.0, 0), *down, (cruise, 0.0, 0), *down, (steady, 0.0, 0), *up)
         self.duration = sum(time for time, _, _ in self._phases) if acc > 0 else 0.0
         self.speed = speed
@@ -64,7 +64,7 @@ class Profile:
         return s, v, a
 
     def _gain(self, t: float, jerk: float, change: int) -> tuple[float, float, float]:
-        """Return distance, speed and acceleration that a jerk gains in a time; change 1, -1, 0: rises, falls, constant."""
+        """Return distance, speed and acceleration gained by a jerk that rises (1), falls (-1) or is constant (0)."""
         if not change:
             return jerk * t**3 / 6, jerk * t**2 / 2, jerk * t
         w = pi / self._rise
@@ -76,9 +76,9 @@ class Profile:
         )
 
 
-def _pulse(jerk: float, rise: float, held: float) -> tuple[tuple[float, float, int], ...]:
+def _pulse(jerk: float, rise: float, constant: float) -> tuple[tuple[float, float, int], ...]:
     """Return the phases of a pulse of jerk: duration, jerk, and whether it rises or falls."""
-    return ((rise, jerk, 1), (held, jerk, 0), (rise, jerk, -1)) if rise > 0 else ((held, jerk, 0),)
+    return ((rise, jerk, 1), (constant, jerk, 0), (rise, jerk, -1)) if rise > 0 else ((constant, jerk, 0),)
 
 
 def _peak(length: float, speed: float, acc: float, jerk_rise: tuple[float, float]) -> tuple[float, float]:

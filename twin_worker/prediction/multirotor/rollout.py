@@ -131,10 +131,10 @@ class MultirotorConfig:
         changed = int(np.flatnonzero(seq != seq[-1])[-1]) if (seq != seq[-1]).any() else None
         if before.command == _TURNS and changed is not None:
             par = copter_rollout.parameters(self.limit, self.params, 0.0)
-            start = copter_rollout.stopping_point(track.p[changed], track.v[changed], par)
-        else:
-            start = stop_position(self.items, before.seq, self.origin)
-        if start is not None:
+            route[0, copter.A_N : copter.A_N + 3] = copter_rollout.stopping_point(
+                track.p[changed], track.v[changed], par
+            )
+        elif (start := stop_position(self.items, before.seq, self.origin)) is not None:
             route[0, copter.A_N : copter.A_N + 3] = start
         return route, problems
 
