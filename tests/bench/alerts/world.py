@@ -15,8 +15,8 @@ from fleet.contract import Item
 from fleet.frames import Origin, to_geodetic, to_ned
 from fleet.mission import SEQ
 from fleet.simulator.flight.uav import SimulatedUav
-from fleet.simulator.vehicle.jsbsim import CRUISE
 from fleet.simulator.vehicle.missions import HOME, StartState, draw_mission
+from fleet.simulator.vehicle.types import CRUISE
 
 END_S = 152.0  # the twins hear so much of each flight [s]
 LOOK_S = 120.0  # what is never to happen does not happen for so long after it either [s]
