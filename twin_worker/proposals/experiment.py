@@ -1,0 +1,200 @@
+"""Computational experiment: predict one aircraft with a changed plan, as its twin would after the change.
+
+Each experiment flies a copy of the twin through the same closed loop as a prediction, with its ensemble. New items, an
+item number or a speed replace the route from the present position on. A new mode is entered now, as when the autopilot
+reports it.
+"""
+
+import copy
+from collections.abc import Iterable
+from dataclasses import dataclass
+from math import atan2
+
+import msgspec
+import numpy as np
+from scipy.special import ndtri
+
+from fleet.autopilots.modes import ModeEntry
+from fleet.contract import AlertKind, Change, Item, Mission, Prediction
+from fleet.frames import to_ned
+from fleet.mission import SPEED
+from twin_worker.alerts.gaussian_forecast import GaussianForecast, to_gaussian
+from twin_worker.alerts.geofence import height_above_home, read_geofence
+from twin_worker.alerts.hysteresis import RULES
+from twin_worker.prediction.autopilot_parameters import SPEED_PARAMETERS, RouteOverride
+from twin_worker.proposals.candidates import LAND_MODE, MODES, Candidate, Deficit, Plan, to_change
+from twin_worker.twin.state.events import invalidate_prediction
+from twin_worker.twin.state.state import Twin
+from twin_worker.twin.steps.alerts import limit_hazards, mission_feasibility, reach_s
+from twin_worker.twin.steps.predict_step import predict
+from twin_worker.whatif import active_seq
+
+LIMITS = (AlertKind.GROUND, AlertKind.GEOFENCE, AlertKind.NOT_ACHIEVABLE)
+"""Hazards of one aircraft alone that an experiment assesses."""
+_NO_ROUTE = "imm"  # method of a prediction from the turn rate alone: the change has no effect on it
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Prediction of one aircraft under a candidate change.
+
+    Attributes:
+        candidate: the change; None: the present plan
+        change: what is sent to the aircraft; None: nothing
+        forecast: its prediction on the common grid
+        hazards: probabilities of ground, geofence and an infeasible mission
+        margin_m: smallest distance to the minimum height and to the geofence within the look-ahead, by hazard [m]
+    """
+
+    candidate: Candidate | None
+    change: Change | None
+    forecast: GaussianForecast
+    hazards: dict[AlertKind, float]
+    margin_m: dict[AlertKind, float]
+
+    @property
+    def prediction(self) -> Prediction:
+        """Return the prediction."""
+        return self.forecast.prediction
+
+    @property
+    def uav(self) -> int:
+        """Return the aircraft."""
+        return self.prediction.uav
+
+
+def present(twin: Twin) -> Experiment | None:
+    """Predict the present plan of a twin now; None without a prediction on a route."""
+    return _fly(copy.deepcopy(twin), None, None)
+
+
+def run(plan: Plan, candidates: Iterable[Candidate]) -> list[Experiment]:
+    """Predict one aircraft under each candidate; omit candidates that its plan does not admit."""
+    flown = []
+    for candidate in candidates:
+        change = to_change(plan, candidate)
+        experiment = None if change is None else _fly(copy.deepcopy(plan.twin), candidate, change)
+        if experiment is not None:
+            flown.append(experiment)
+    return flown
+
+
+def _fly(twin: Twin, candidate: Candidate | None, change: Change | None) -> Experiment | None:
+    """Predict a copy of a twin, which is changed."""
+    twin.budget = None  # experiments are counted by their caller
+    if change is not None:
+        _apply(twin, change)
+    twin.prediction.forget_published()
+    messages = predict(twin, twin.telemetry.history.newest)
+    prediction = next((message for message in messages if isinstance(message, Prediction)), None)
+    forecast = None if prediction is None else to_gaussian(prediction)
+    if forecast is None or forecast.prediction.method == _NO_ROUTE:
+        return None
+    _report_change(twin)
+    hazards = [*limit_hazards(twin, forecast), mission_feasibility(twin, twin.telemetry.history.newest)]
+    probabilities = {hazard.kind: hazard.probability for hazard in hazards if hazard.kind in LIMITS}
+    return Experiment(candidate, change, forecast, probabilities, _margins(twin, forecast))
+
+
+def _apply(twin: Twin, change: Change) -> None:
+    """Change the plan of a copy."""
+    if change.mode and not _lands_by_mode(change):
+        _enter_mode(twin, MODES[change.mode])
+        return
+    items = twin.onboard.mission.items if twin.onboard.mission is not None else ()
+    present_seq = active_seq(twin)
+    items, seq = change.items or items, present_seq if change.seq is None else change.seq
+    jumps = twin.onboard.jumps_taken if change.items is None else {}
+    if _lands_by_mode(change):
+        items, seq = _landing_here(twin)
+    parameters = {} if change.speed is None else dict.fromkeys(SPEED_PARAMETERS, change.speed)
+    if change.speed is not None:  # in place of the speed commanded so far; later items of the mission command theirs
+        items = tuple(
+            msgspec.structs.replace(item, param2=change.speed) if item.command == SPEED and item.seq < seq else item
+            for item in items
+        )
+    restart = change.items is not None or change.seq is not None or _lands_by_mode(change)
+    twin.prediction.set_override(RouteOverride(items, seq, parameters, restart, None, twin.first_item, jumps))
+    twin.confidence.tracker.censor_open()  # earlier predictions flew another plan
+
+
+def _lands_by_mode(change: Change) -> bool:
+    return change.mode != "" and MODES[change.mode] == LAND_MODE
+
+
+def _landing_here(twin: Twin) -> tuple[tuple[Item, ...], int]:
+    """Return a mission that lands at the present position, and its item to fly to."""
+    lat, lon, _ = (int(x) for x in twin.telemetry.history.rows("position")[1][-1])
+    first, home = twin.first_item, twin.home
+    land = Item(seq=first, command=21, lat_e7=lat, lon_e7=lon)
+    at_home = () if home is None else (Item(seq=0, command=16, frame=0, lat_e7=home[0], lon_e7=home[1]),)
+    return (*(at_home if first else ()), land), first
+
+
+def _enter_mode(twin: Twin, mode: str) -> None:
+    """Enter a mode now, as when the autopilot reports it."""
+    now, status = twin.telemetry.history.newest, twin.onboard.status
+    _, positions = twin.telemetry.history.rows("position")
+    _, velocities = twin.telemetry.history.rows("velocity")
+    assert status is not None
+    twin.onboard.set_status(msgspec.structs.replace(status, mode=mode))
+    lat, lon, alt = (float(x) for x in positions[-1])
+    twin.onboard.enter_mode(ModeEntry(now, (lat, lon, alt), atan2(velocities[-1, 1], velocities[-1, 0])))
+    invalidate_prediction(twin, None, now)
+
+
+def _report_change(twin: Twin) -> None:
+    """Store mission and parameters of the override as reported, for the alerts that read them."""
+    override = twin.prediction.override
+    if override is None:
+        return
+    now = twin.telemetry.history.newest
+    mission = Mission(uav=twin.config.uav, t=now, items=override.items, seq=override.seq, complete=True)
+    twin.onboard.set_mission(mission, twin.first_item)
+    if twin.onboard.params is not None:
+        values = twin.onboard.params.values
+        changed = {name: value for name, value in override.parameters.items() if name in values}
+        twin.onboard.set_params(msgspec.structs.replace(twin.onboard.params, values=values | changed))
+
+
+def _margins(twin: Twin, forecast: GaussianForecast) -> dict[AlertKind, float]:
+    """Return the smallest distances of the mean path to the minimum height and to the geofence [m]."""
+    home = twin.home
+    if home is None:
+        return {}
+    height, radius = _extremes(twin, forecast)
+    fence = read_geofence(twin.received_params)
+    inside = min(fence.radius - radius[1], fence.ceiling - height[1], height[0] - fence.floor)
+    return {AlertKind.GROUND: float(height[0]), AlertKind.GEOFENCE: float(inside)}
+
+
+def _extremes(twin: Twin, forecast: GaussianForecast) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the lowest and highest height above home and the same of the distance from it, in the look-ahead [m]."""
+    assert twin.home is not None
+    until = forecast.prediction.t + reach_s(forecast.prediction)
+    k = max(int(np.searchsorted(forecast.t, until, side="right")), 1)
+    home = to_ned(forecast.prediction.ned_origin(), *(np.array([float(x)]) for x in twin.home))[0]
+    distance = np.hypot(*(forecast.path[:k] - home)[:, :2].T)
+    height = height_above_home(forecast, twin.home)[:k]
+    return (float(height.min()), float(height.max())), (float(distance.min()), float(distance.max()))
+
+
+def deficit(plan: Plan, experiment: Experiment, kind: AlertKind) -> Deficit:
+    """Return by how much the present plan violates the limits of an alert, with the uncertainty of the prediction.
+
+    The margin is such that the probability falls below that at which the alert is cleared.
+    """
+    if kind not in (AlertKind.GROUND, AlertKind.GEOFENCE) or plan.twin.home is None:
+        return Deficit()
+    forecast, twin = experiment.forecast, plan.twin
+    height, radius = _extremes(twin, forecast)
+    k = max(int(np.searchsorted(forecast.t, forecast.prediction.t + reach_s(forecast.prediction), side="right")), 1)
+    z = -float(ndtri(RULES[kind].clear_below))
+    vertical, horizontal = z * float(forecast.sigma[:k, 2].max()), z * float(forecast.sigma[:k, 1].max())
+    if kind is AlertKind.GROUND:
+        return Deficit(max(plan.min_height_m + vertical - height[0], 0.0))
+    fence = read_geofence(twin.received_params)
+    too_high = min(fence.ceiling - vertical - height[1], 0.0)
+    missing = max(fence.floor + vertical - height[0], 0.0)
+    overshoot = radius[1] - (fence.radius - horizontal)
+    return Deficit(missing or too_high, fence.radius - max(overshoot, 0.0) - horizontal if overshoot > 0 else np.inf)
