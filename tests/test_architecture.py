@@ -78,6 +78,7 @@ ORDER = (  # a folder, or a module in the root of a package, imports only from i
     ("twin_worker.twin.steps",),
     ("twin_worker.twin",),
     ("twin_worker.mismatch", "twin_worker.whatif", "twin_worker.ownership"),
+    ("twin_worker.proposals",),
     ("twin_worker.service",),
     ("twin_worker.evaluation.scoring", "twin_worker.evaluation.baselines"),
     ("twin_worker.evaluation",),

@@ -142,7 +142,9 @@ def is_positional(item: Item) -> bool:
     return item.command in m.KINDS and m.KINDS[item.command] != m.CHANGE_ALTITUDE and not m.is_zero_position(item)
 
 
-def candidates(plan: Plan, kind: AlertKind, separation_m: float, event: Origin | None, deficit: Deficit) -> list[Candidate]:
+def candidates(
+    plan: Plan, kind: AlertKind, separation_m: float, event: Origin | None, deficit: Deficit
+) -> list[Candidate]:
     """Return the changes to try against an event.
 
     Args:

@@ -65,7 +65,7 @@ class Experiment:
 
 def present(twin: Twin) -> Experiment | None:
     """Predict the present plan of a twin now; None without a prediction on a route."""
-    return _fly(copy.deepcopy(twin), None, None)
+    return _fly(_changeable(twin), None, None)
 
 
 def run(plan: Plan, candidates: Iterable[Candidate]) -> list[Experiment]:
@@ -73,15 +73,20 @@ def run(plan: Plan, candidates: Iterable[Candidate]) -> list[Experiment]:
     flown = []
     for candidate in candidates:
         change = to_change(plan, candidate)
-        experiment = None if change is None else _fly(copy.deepcopy(plan.twin), candidate, change)
+        experiment = None if change is None else _fly(_changeable(plan.twin), candidate, change)
         if experiment is not None:
             flown.append(experiment)
     return flown
 
 
+def _changeable(twin: Twin) -> Twin:
+    """Return a copy of a twin for one experiment; telemetry and models, which it only reads, are shared."""
+    parts = {name: copy.deepcopy(getattr(twin, name)) for name in ("onboard", "prediction", "confidence", "alerts")}
+    return msgspec.structs.replace(twin, budget=None, **parts)
+
+
 def _fly(twin: Twin, candidate: Candidate | None, change: Change | None) -> Experiment | None:
     """Predict a copy of a twin, which is changed."""
-    twin.budget = None  # experiments are counted by their caller
     if change is not None:
         _apply(twin, change)
     twin.prediction.forget_published()

@@ -3,6 +3,7 @@
 import secrets
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from math import inf
 
 import msgspec
 
@@ -88,6 +89,7 @@ class Proposer:
 
     def __post_init__(self) -> None:
         self._current: dict[tuple[int, AlertKey], Current] = {}
+        self._computed_t: dict[tuple[int, AlertKey], float] = {}  # data time of the last attempt [s since 1970]
 
     def current(self, uav: int) -> list[Proposal]:
         """Return the proposals of one aircraft that are in force."""
@@ -95,12 +97,15 @@ class Proposer:
 
     def discard(self, uav: int) -> None:
         """Forget the proposals of an aircraft that is no longer owned."""
-        for key in [key for key in tuple(self._current) if key[0] == uav]:
-            self._current.pop(key, None)
+        for stored in (self._current, self._computed_t):
+            for key in [key for key in tuple(stored) if key[0] == uav]:
+                stored.pop(key, None)  # type: ignore[attr-defined]
 
     def withdraw(self, uav: int, active: Iterable[Alert], now: float) -> list[Proposal]:
         """Withdraw the proposals of one aircraft whose alert was cleared, at data time `now` [s since 1970]."""
         raised, withdrawn = {alert.about for alert in active}, []
+        for key in [key for key in self._computed_t if key[0] == uav and key[1] not in raised]:
+            del self._computed_t[key]
         for key in [key for key in self._current if key[0] == uav and key[1] not in raised]:
             before = self._current.pop(key).proposal
             withdrawn.append(_without_options(before, now, "no longer predicted: the alert was cleared"))
@@ -108,23 +113,27 @@ class Proposer:
 
     def due(self, alert: Alert, now: float) -> bool:
         """Return whether the proposal against an active alert is to be computed at data time `now` [s since 1970]."""
-        current = self._current.get((alert.uav, alert.about))
-        return alert.kind in PROPOSED and (current is None or not 0.0 <= now - current.proposal.t < RENEW_S)
+        return alert.kind in PROPOSED and not 0.0 <= now - self.computed_t(alert) < RENEW_S
+
+    def computed_t(self, alert: Alert) -> float:
+        """Return when the proposal against an alert was last computed [s since 1970]; -inf: never."""
+        return self._computed_t.get((alert.uav, alert.about), -inf)
 
     def update(self, alert: Alert, now: float) -> Proposal | None:
-        """Compute or renew the proposal against an active alert; None if there is no twin or nothing to say anew.
+        """Compute or renew the proposal against an active alert; None if there is no twin, or again no option.
 
         A renewed proposal keeps its id while its options are of the same aircraft and kinds.
         """
         key = (alert.uav, alert.about)
-        previous = self._current.get(key)
+        previous, self._computed_t[key] = self._current.get(key), now
         computed = self.compute(Event.of(alert), now, () if previous is None else previous.choices)
         if computed is None:
             return None
-        if previous is not None and _same_kinds(previous.choices, computed.choices):
+        if previous is not None and (not computed.choices or _same_kinds(previous.choices, computed.choices)):
             computed = replace(computed, proposal=msgspec.structs.replace(computed.proposal, id=previous.proposal.id))
         self._current[key] = computed
-        return computed.proposal
+        is_news = bool(computed.choices) or previous is None or bool(previous.choices)
+        return computed.proposal if is_news else None
 
     def on_request(self, uav: int, now: float) -> Proposal | None:
         """Compute a proposal against the most probable event of an aircraft; None without its twin."""
@@ -145,9 +154,7 @@ class Proposer:
         computed = self.compute(replace(event, requested=True), now)
         return None if computed is None else computed.proposal
 
-    def compute(
-        self, event: Event, now: float, previous: tuple[tuple[Candidate, ...], ...] = ()
-    ) -> Current | None:
+    def compute(self, event: Event, now: float, previous: tuple[tuple[Candidate, ...], ...] = ()) -> Current | None:
         """Compute the options that avoid an event; None without the twin of its aircraft.
 
         Args:
@@ -265,9 +272,7 @@ def _count(n: int) -> str:
     return "one option avoids" if n == 1 else f"{n} options avoid"
 
 
-def _proposal(
-    event: Event, t: float, options: tuple[Option, ...], probability: float | None, text: str
-) -> Proposal:
+def _proposal(event: Event, t: float, options: tuple[Option, ...], probability: float | None, text: str) -> Proposal:
     chance = "" if probability is None else f"{probability:.0%} chance of "
     return Proposal(
         uav=event.uav,
