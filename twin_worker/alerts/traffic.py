@@ -132,16 +132,16 @@ class TrafficPicture:
         if not len(others):
             return
         scale, shift = self.frame_transform(slot, others)
-        found, limits = np.empty((len(others), 5)), np.array(separation, float)
-        screen(slot, others, self.first, self.rows, self.path, self.covariance, scale, shift, limits, found)
-        for j in np.flatnonzero(found[:, 0] >= 0):
-            steps = np.arange(int(found[j, 0]), int(found[j, 1]) + 1)
+        approaches, limits = np.empty((len(others), 5)), np.array(separation, float)
+        screen(slot, others, self.first, self.rows, self.path, self.covariance, scale, shift, limits, approaches)
+        for j in np.flatnonzero(approaches[:, 0] >= 0):
+            steps = np.arange(int(approaches[j, 0]), int(approaches[j, 1]) + 1)
             i, k = steps - self.first[slot], steps - self.first[others[j]]
             relative = self.path[others[j], k] * scale[j] + shift[j] - self.path[slot, i]
             covariance = self.covariance[slot, i] + self.covariance[others[j], k]
             probability = float(conflict_probability(relative, covariance, DRAWS, limits))
             if probability >= _MIN_PROBABILITY:
-                t, horizontal, vertical = (float(x) for x in found[j, 2:])
+                t, horizontal, vertical = (float(x) for x in approaches[j, 2:])
                 yield Encounter(int(self.uav[others[j]]), probability, t * STEP, horizontal, vertical)
 
 

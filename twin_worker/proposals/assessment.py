@@ -41,13 +41,12 @@ class Comparison:
         before, after = _on_grid(self.prediction), _on_grid(changed)
         after = _in_frame_of(self.prediction, changed, after)
         n = min(len(before), len(after))
-        distances = np.linalg.norm(after[:, None, :] - before[None, :, :], axis=2)
         delay = float(_STEP_S * (n - 1)) if interrupts else _delay(before[:n], after[:n])
         duration = _STEP_S * (n - 1)
         power = _mean_power(after[:n], self.wind, self._speed(before), self.has_wings)
         present = _mean_power(before[:n], self.wind, self._speed(before), self.has_wings)
         energy = power / present * (1.0 if interrupts else (duration + delay) / duration)
-        return Cost(delay, float(energy), float(distances.min(axis=1).max()))
+        return Cost(delay, float(energy), _deviation(before, after))
 
     def _speed(self, path: np.ndarray) -> float:
         """Return the mean airspeed of a path [m/s]."""
@@ -66,6 +65,13 @@ def _in_frame_of(prediction: Prediction, other: Prediction, path: np.ndarray) ->
     if prediction.origin == other.origin:
         return path
     return to_ned(prediction.ned_origin(), *to_geodetic(other.ned_origin(), path).T)
+
+
+def _deviation(before: np.ndarray, after: np.ndarray) -> float:
+    """Return the largest distance of the points of a path, (k, 3), from another path, (n, 3) [m]."""
+    step, offset = np.diff(before, axis=0), after[:, None, :] - before[None, :-1, :]
+    s = np.clip(np.einsum("kni,ni->kn", offset, step) / np.maximum(np.sum(step**2, axis=1), 1e-9), 0.0, 1.0)
+    return float(np.linalg.norm(offset - s[..., None] * step, axis=2).min(axis=1).max())
 
 
 def _delay(before: np.ndarray, after: np.ndarray) -> float:

@@ -154,17 +154,17 @@ def candidates(
         event: where it happens; None: no single position
         deficit: what is missing to the limits of the aircraft
     """
-    found = [Candidate(plan.uav, Kind.SPEED, speed) for speed in _speeds(plan)]
+    tried = [Candidate(plan.uav, Kind.SPEED, speed) for speed in _speeds(plan)]
     if plan.seq >= 0:
-        found += [Candidate(plan.uav, Kind.ALTITUDE, offset) for offset in _offsets(plan, kind, separation_m, deficit)]
+        tried += [Candidate(plan.uav, Kind.ALTITUDE, offset) for offset in _offsets(plan, kind, separation_m, deficit)]
         if kind is AlertKind.CONFLICT:
-            found += [Candidate(plan.uav, Kind.DELAY, seconds) for seconds in _DELAYS_S]
-        found += [Candidate(plan.uav, Kind.SKIP, float(seq)) for seq in _skipped(plan, kind, event)]
+            tried += [Candidate(plan.uav, Kind.DELAY, seconds) for seconds in _DELAYS_S]
+        tried += [Candidate(plan.uav, Kind.SKIP, float(seq)) for seq in _skipped(plan, kind, event)]
         if np.isfinite(deficit.radius):
             radii = (deficit.radius, deficit.radius - 30.0)
-            found += [Candidate(plan.uav, Kind.SHRINK, radius) for radius in radii if radius > 0.0]
+            tried += [Candidate(plan.uav, Kind.SHRINK, radius) for radius in radii if radius > 0.0]
     modes = ((Kind.HOLD, HOLD_MODE), (Kind.RETURN, RETURN_MODE), (Kind.LAND, LAND_MODE))
-    return found + [Candidate(plan.uav, interruption) for interruption, mode in modes if plan.twin.mode != mode]
+    return tried + [Candidate(plan.uav, interruption) for interruption, mode in modes if plan.twin.mode != mode]
 
 
 def to_change(plan: Plan, candidate: Candidate) -> Change | None:

@@ -9,6 +9,7 @@ import copy
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import atan2
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -35,7 +36,7 @@ _NO_ROUTE = "imm"  # method of a prediction from the turn rate alone: the change
 
 
 @dataclass(frozen=True)
-class Experiment:
+class PlanExperiment:
     """Prediction of one aircraft under a candidate change.
 
     Attributes:
@@ -63,20 +64,20 @@ class Experiment:
         return self.prediction.uav
 
 
-def present(twin: Twin) -> Experiment | None:
+def present(twin: Twin) -> PlanExperiment | None:
     """Predict the present plan of a twin now; None without a prediction on a route."""
     return _fly(_changeable(twin), None, None)
 
 
-def run(plan: Plan, candidates: Iterable[Candidate]) -> list[Experiment]:
+def run(plan: Plan, candidates: Iterable[Candidate]) -> list[PlanExperiment]:
     """Predict one aircraft under each candidate; omit candidates that its plan does not admit."""
-    flown = []
+    experiments = []
     for candidate in candidates:
         change = to_change(plan, candidate)
         experiment = None if change is None else _fly(_changeable(plan.twin), candidate, change)
         if experiment is not None:
-            flown.append(experiment)
-    return flown
+            experiments.append(experiment)
+    return experiments
 
 
 def _changeable(twin: Twin) -> Twin:
@@ -85,7 +86,7 @@ def _changeable(twin: Twin) -> Twin:
     return msgspec.structs.replace(twin, budget=None, **parts)
 
 
-def _fly(twin: Twin, candidate: Candidate | None, change: Change | None) -> Experiment | None:
+def _fly(twin: Twin, candidate: Candidate | None, change: Change | None) -> PlanExperiment | None:
     """Predict a copy of a twin, which is changed."""
     if change is not None:
         _apply(twin, change)
@@ -98,7 +99,7 @@ def _fly(twin: Twin, candidate: Candidate | None, change: Change | None) -> Expe
     _report_change(twin)
     hazards = [*limit_hazards(twin, forecast), mission_feasibility(twin, twin.telemetry.history.newest)]
     probabilities = {hazard.kind: hazard.probability for hazard in hazards if hazard.kind in LIMITS}
-    return Experiment(candidate, change, forecast, probabilities, _margins(twin, forecast))
+    return PlanExperiment(candidate, change, forecast, probabilities, _margins(twin, forecast))
 
 
 def _apply(twin: Twin, change: Change) -> None:
@@ -162,44 +163,52 @@ def _report_change(twin: Twin) -> None:
         twin.onboard.set_params(msgspec.structs.replace(twin.onboard.params, values=values | changed))
 
 
-def _margins(twin: Twin, forecast: GaussianForecast) -> dict[AlertKind, float]:
-    """Return the smallest distances of the mean path to the minimum height and to the geofence [m]."""
-    home = twin.home
-    if home is None:
-        return {}
-    height, radius = _extremes(twin, forecast)
-    fence = read_geofence(twin.received_params)
-    inside = min(fence.radius - radius[1], fence.ceiling - height[1], height[0] - fence.floor)
-    return {AlertKind.GROUND: float(height[0]), AlertKind.GEOFENCE: float(inside)}
+class _Extremes(NamedTuple):
+    """Lowest and highest mean height above home and largest distance from it, each with its standard deviation [m]."""
+
+    low: tuple[float, float]
+    high: tuple[float, float]
+    far: tuple[float, float]
 
 
-def _extremes(twin: Twin, forecast: GaussianForecast) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the lowest and highest height above home and the same of the distance from it, in the look-ahead [m]."""
+def _extremes(twin: Twin, forecast: GaussianForecast) -> _Extremes:
+    """Return the extremes of a forecast within the look-ahead of the ground and geofence alerts."""
     assert twin.home is not None
     until = forecast.prediction.t + reach_s(forecast.prediction)
     k = max(int(np.searchsorted(forecast.t, until, side="right")), 1)
     home = to_ned(forecast.prediction.ned_origin(), *(np.array([float(x)]) for x in twin.home))[0]
     distance = np.hypot(*(forecast.path[:k] - home)[:, :2].T)
-    height = height_above_home(forecast, twin.home)[:k]
-    return (float(height.min()), float(height.max())), (float(distance.min()), float(distance.max()))
+    height, sigma = height_above_home(forecast, twin.home)[:k], forecast.sigma
+    low, high, far = int(height.argmin()), int(height.argmax()), int(distance.argmax())
+    sigma_far = float(sigma[far, :2].max())
+    return _Extremes(
+        (float(height[low]), float(sigma[low, 2])),
+        (float(height[high]), float(sigma[high, 2])),
+        (float(distance[far]), sigma_far),
+    )
 
 
-def deficit(plan: Plan, experiment: Experiment, kind: AlertKind) -> Deficit:
+def _margins(twin: Twin, forecast: GaussianForecast) -> dict[AlertKind, float]:
+    """Return the lowest height above home of the mean path, and its smallest distance to the geofence [m]."""
+    if twin.home is None:
+        return {}
+    extremes, fence = _extremes(twin, forecast), read_geofence(twin.received_params)
+    inside = min(fence.radius - extremes.far[0], fence.ceiling - extremes.high[0], extremes.low[0] - fence.floor)
+    return {AlertKind.GROUND: extremes.low[0], AlertKind.GEOFENCE: inside}
+
+
+def deficit(plan: Plan, experiment: PlanExperiment, kind: AlertKind) -> Deficit:
     """Return by how much the present plan violates the limits of an alert, with the uncertainty of the prediction.
 
     The margin is such that the probability falls below that at which the alert is cleared.
     """
     if kind not in (AlertKind.GROUND, AlertKind.GEOFENCE) or plan.twin.home is None:
         return Deficit()
-    forecast, twin = experiment.forecast, plan.twin
-    height, radius = _extremes(twin, forecast)
-    k = max(int(np.searchsorted(forecast.t, forecast.prediction.t + reach_s(forecast.prediction), side="right")), 1)
-    z = -float(ndtri(RULES[kind].clear_below))
-    vertical, horizontal = z * float(forecast.sigma[:k, 2].max()), z * float(forecast.sigma[:k, 1].max())
+    extremes, z = _extremes(plan.twin, experiment.forecast), -float(ndtri(RULES[kind].clear_below))
+    (low, sigma_low), (high, sigma_high), (far, sigma_far) = extremes
     if kind is AlertKind.GROUND:
-        return Deficit(max(plan.min_height_m + vertical - height[0], 0.0))
-    fence = read_geofence(twin.received_params)
-    too_high = min(fence.ceiling - vertical - height[1], 0.0)
-    missing = max(fence.floor + vertical - height[0], 0.0)
-    overshoot = radius[1] - (fence.radius - horizontal)
-    return Deficit(missing or too_high, fence.radius - max(overshoot, 0.0) - horizontal if overshoot > 0 else np.inf)
+        return Deficit(max(plan.min_height_m + z * sigma_low - low, 0.0))
+    fence = read_geofence(plan.twin.received_params)
+    too_high, too_low = min(fence.ceiling - z * sigma_high - high, 0.0), max(fence.floor + z * sigma_low - low, 0.0)
+    overshoot = far - (fence.radius - z * sigma_far)
+    return Deficit(too_low or too_high, fence.radius - overshoot - z * sigma_far if overshoot > 0 else np.inf)

@@ -7,7 +7,7 @@ import numpy as np
 from fleet.contract import AlertKind, Array, Option, ProposedPath
 from twin_worker.proposals.assessment import Approach, closest_approach
 from twin_worker.proposals.candidates import Candidate, Kind, Plan, present_speed
-from twin_worker.proposals.experiment import Experiment
+from twin_worker.proposals.experiment import PlanExperiment
 from twin_worker.proposals.resolution import Problem, Solution
 
 _MAX_CLEARANCE_M = 1e5  # reported where nothing is near [m]
@@ -45,7 +45,7 @@ def to_option(problem: Problem, solution: Solution, advantage: str, plans: dict[
     )
 
 
-def to_path(experiment: Experiment, t: float) -> ProposedPath:
+def to_path(experiment: PlanExperiment, t: float) -> ProposedPath:
     """Return the predicted path of an experiment, with look-aheads from the time `t` of the proposal [s since 1970]."""
     prediction = experiment.prediction
     ahead = prediction.ahead.numpy() + np.float32(prediction.t - t)

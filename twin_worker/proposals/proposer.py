@@ -14,7 +14,7 @@ from twin_worker.alerts.gaussian_forecast import GaussianForecast
 from twin_worker.alerts.hysteresis import RULES
 from twin_worker.proposals.assessment import Comparison
 from twin_worker.proposals.candidates import Candidate, Plan, candidates
-from twin_worker.proposals.experiment import Experiment, deficit, present, run
+from twin_worker.proposals.experiment import PlanExperiment, deficit, present, run
 from twin_worker.proposals.options import to_option
 from twin_worker.proposals.resolution import Airspace, Problem, Solution, pareto, solve
 from twin_worker.twin.state.state import Twin
@@ -34,7 +34,7 @@ _EVENTS = {
 
 
 @dataclass(frozen=True)
-class Event:
+class AvoidedEvent:
     """What a proposal avoids.
 
     Attributes:
@@ -52,7 +52,7 @@ class Event:
     requested: bool = False
 
     @classmethod
-    def of(cls, alert: Alert) -> "Event":
+    def of(cls, alert: Alert) -> "AvoidedEvent":
         """Return the event of an alert."""
         place = None
         if alert.lat is not None and alert.lon is not None and alert.alt is not None:
@@ -126,7 +126,7 @@ class Proposer:
         """
         key = (alert.uav, alert.about)
         previous, self._computed_t[key] = self._current.get(key), now
-        computed = self.compute(Event.of(alert), now, () if previous is None else previous.choices)
+        computed = self.compute(AvoidedEvent.of(alert), now, () if previous is None else previous.choices)
         if computed is None:
             return None
         if previous is not None and (not computed.choices or _same_kinds(previous.choices, computed.choices)):
@@ -145,16 +145,20 @@ class Proposer:
             return _empty(uav, t, "no route is predicted: no change of plan can be tried")
         airspace = self._airspace(now)
         airspace.set_present(experiment)
-        found = [(p, Event(uav, AlertKind.CONFLICT, other)) for other, p in airspace.present_conflicts(uav).items()]
-        found += [(p, Event(uav, kind)) for kind, p in experiment.hazards.items()]
-        likely = [(p, event) for p, event in found if p >= RULES[event.kind].raise_at]
+        events = [
+            (p, AvoidedEvent(uav, AlertKind.CONFLICT, other)) for other, p in airspace.present_conflicts(uav).items()
+        ]
+        events += [(p, AvoidedEvent(uav, kind)) for kind, p in experiment.hazards.items()]
+        likely = [(p, event) for p, event in events if p >= RULES[event.kind].raise_at]
         if not likely:
             return _empty(uav, t, "nothing is predicted that a change of plan would avoid")
         _, event = max(likely, key=lambda one: one[0])
         computed = self.compute(replace(event, requested=True), now)
         return None if computed is None else computed.proposal
 
-    def compute(self, event: Event, now: float, previous: tuple[tuple[Candidate, ...], ...] = ()) -> Current | None:
+    def compute(
+        self, event: AvoidedEvent, now: float, previous: tuple[tuple[Candidate, ...], ...] = ()
+    ) -> Current | None:
         """Compute the options that avoid an event; None without the twin of its aircraft.
 
         Args:
@@ -169,18 +173,18 @@ class Proposer:
         probability = problem.probability()
         if probability < RULES[event.kind].clear_below:
             return Current(_proposal(event, t, (), probability, "not predicted with the present plan"), ())
-        kept = _kept(problem, plans, previous)
-        flown: dict[int, list[Experiment]] = {}
+        retained = _retained(problem, plans, previous)
+        experiments: dict[int, list[PlanExperiment]] = {}
 
-        def experiments_of(uav: int) -> list[Experiment]:
-            if uav not in flown:
+        def experiments_of(uav: int) -> list[PlanExperiment]:
+            if uav not in experiments:
                 short = deficit(plans[uav], problem.present[uav], event.kind)
                 place = event.place if uav == event.uav else None
                 vertical = self.separation.vertical
-                flown[uav] = run(plans[uav], candidates(plans[uav], event.kind, vertical, place, short))
-            return flown[uav]
+                experiments[uav] = run(plans[uav], candidates(plans[uav], event.kind, vertical, place, short))
+            return experiments[uav]
 
-        chosen = kept or pareto(solve(problem, experiments_of))
+        chosen = retained or pareto(solve(problem, experiments_of))
         options = tuple(to_option(problem, solution, advantage, plans, t) for solution, advantage in chosen)
         choices = tuple(_choice(solution) for solution, _ in chosen)
         text = f"{_count(len(options))} it" if options else "no change that was tried avoids it"
@@ -188,7 +192,7 @@ class Proposer:
 
     # --- inputs ------------------------------------------------------------------------------------------------------
 
-    def _present(self, uav: int) -> tuple[Plan | None, Experiment | None]:
+    def _present(self, uav: int) -> tuple[Plan | None, PlanExperiment | None]:
         """Return the present plan of an aircraft and its prediction."""
         twin = self.copy_of(uav)
         if twin is None or twin.telemetry.origin is None or twin.telemetry.link_lost:
@@ -200,10 +204,10 @@ class Proposer:
     def _airspace(self, now: float) -> Airspace:
         return Airspace({one.prediction.uav: one for one in self.forecasts(now)}, now, self.separation)
 
-    def _problem(self, event: Event, now: float) -> tuple[Problem | None, dict[int, Plan]]:
+    def _problem(self, event: AvoidedEvent, now: float) -> tuple[Problem | None, dict[int, Plan]]:
         """Return the problem and the plans that can be changed: the aircraft of the event first."""
         airspace, plans = self._airspace(now), dict[int, Plan]()
-        present_plans: dict[int, Experiment] = {}
+        present_plans: dict[int, PlanExperiment] = {}
         cluster = {event.uav} if event.other < 0 else {event.uav, event.other}
 
         def add(uav: int) -> None:
@@ -230,7 +234,7 @@ class Proposer:
         problem = Problem(event.kind, event.uav, event.other, airspace, present_plans, comparisons, cluster)
         return problem, plans
 
-    def _no_plan(self, event: Event, now: float) -> Current | None:
+    def _no_plan(self, event: AvoidedEvent, now: float) -> Current | None:
         """Return a proposal without options for an aircraft that is owned but follows no predicted route."""
         twin = self.copy_of(event.uav)
         if twin is None:
@@ -239,22 +243,22 @@ class Proposer:
         return Current(_proposal(event, now, (), None, reason), ())
 
 
-def _kept(
+def _retained(
     problem: Problem, plans: dict[int, Plan], previous: tuple[tuple[Candidate, ...], ...]
 ) -> list[tuple[Solution, str]]:
     """Return the options so far if each still avoids the event with the same changes; else none."""
-    kept: list[tuple[Solution, str]] = []
+    retained: list[tuple[Solution, str]] = []
     for choice in previous:
-        flown = tuple(one for c in choice if c.uav in plans for one in run(plans[c.uav], (c,)))
-        if len(flown) < len(choice) or not all(problem.is_admissible(one) for one in flown):
+        repeated = tuple(one for c in choice if c.uav in plans for one in run(plans[c.uav], (c,)))
+        if len(repeated) < len(choice) or not all(problem.is_admissible(one) for one in repeated):
             return []
-        remaining = problem.conflicts_after(flown)
-        solution = None if remaining is None else problem.solution(flown, remaining)
+        remaining = problem.conflicts_after(repeated)
+        solution = None if remaining is None else problem.solution(repeated, remaining)
         if solution is None:
             return []
-        kept.append((solution, ""))
-    ranked = {id(solution): advantage for solution, advantage in pareto([solution for solution, _ in kept])}
-    return [(solution, ranked.get(id(solution), "")) for solution, _ in kept]
+        retained.append((solution, ""))
+    ranked = {id(solution): advantage for solution, advantage in pareto([solution for solution, _ in retained])}
+    return [(solution, ranked.get(id(solution), "")) for solution, _ in retained]
 
 
 def _choice(solution: Solution) -> tuple[Candidate, ...]:
@@ -272,7 +276,9 @@ def _count(n: int) -> str:
     return "one option avoids" if n == 1 else f"{n} options avoid"
 
 
-def _proposal(event: Event, t: float, options: tuple[Option, ...], probability: float | None, text: str) -> Proposal:
+def _proposal(
+    event: AvoidedEvent, t: float, options: tuple[Option, ...], probability: float | None, text: str
+) -> Proposal:
     chance = "" if probability is None else f"{probability:.0%} chance of "
     return Proposal(
         uav=event.uav,

@@ -18,7 +18,7 @@ from twin_worker.alerts.hysteresis import RULES
 from twin_worker.alerts.traffic import TrafficPicture
 from twin_worker.proposals.assessment import Comparison, Cost
 from twin_worker.proposals.candidates import INTERRUPTING, Kind
-from twin_worker.proposals.experiment import LIMITS, Experiment
+from twin_worker.proposals.experiment import LIMITS, PlanExperiment
 
 Pair = frozenset[int]
 _CONFLICT = RULES[AlertKind.CONFLICT]
@@ -36,7 +36,7 @@ class Solution:
         costs: of each change
     """
 
-    experiments: tuple[Experiment, ...]
+    experiments: tuple[PlanExperiment, ...]
     probability: float
     costs: tuple[Cost, ...]
 
@@ -54,8 +54,8 @@ class Solution:
     @property
     def kinds(self) -> tuple[tuple[int, Kind], ...]:
         """Return aircraft and kind of each change, in the order of the ids."""
-        found = [experiment.candidate for experiment in self.experiments]
-        return tuple(sorted((one.uav, one.kind) for one in found if one is not None))
+        candidates = [experiment.candidate for experiment in self.experiments]
+        return tuple(sorted((one.uav, one.kind) for one in candidates if one is not None))
 
 
 @dataclass
@@ -79,7 +79,7 @@ class Airspace:
         for forecast in self.forecasts.values():
             self._picture.place(forecast)
 
-    def set_present(self, experiment: Experiment) -> None:
+    def set_present(self, experiment: PlanExperiment) -> None:
         """Replace the forecast of an aircraft by a newer one of its present plan."""
         self.forecasts[experiment.uav] = experiment.forecast
         self._picture.place(experiment.forecast)
@@ -91,12 +91,12 @@ class Airspace:
             self._present[uav] = self._conflicts(uav)
         return self._present[uav]
 
-    def conflicts(self, experiments: Iterable[Experiment]) -> dict[Pair, float]:
+    def conflicts(self, experiments: Iterable[PlanExperiment]) -> dict[Pair, float]:
         """Return the probabilities of conflict of the changed aircraft with each other and with all others."""
         changed = tuple(experiments)
         for experiment in changed:
             self._picture.place(experiment.forecast)
-        found = {
+        probabilities = {
             frozenset((experiment.uav, other)): probability
             for experiment in changed
             for other, probability in self._conflicts(experiment.uav).items()
@@ -104,20 +104,20 @@ class Airspace:
         for experiment in changed:
             if experiment.uav in self.forecasts:
                 self._picture.place(self.forecasts[experiment.uav])
-        return found
+        return probabilities
 
     def _conflicts(self, uav: int) -> dict[int, float]:
         return {one.other: one.probability for one in self._picture.encounters(uav, self.now, self.separation)}
 
     def cluster(self, pair: Iterable[int]) -> set[int]:
         """Return the aircraft connected to a pair by conflicts that are probable enough for an alert."""
-        found, waiting = set[int](), list(pair)
+        connected, waiting = set[int](), list(pair)
         while waiting:
             uav = waiting.pop()
-            found.add(uav)
+            connected.add(uav)
             conflicts = self.present_conflicts(uav).items()
-            waiting += [other for other, p in conflicts if p >= _CONFLICT.raise_at and other not in found]
-        return found
+            waiting += [other for other, p in conflicts if p >= _CONFLICT.raise_at and other not in connected]
+        return connected
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class Problem:
     uav: int
     other: int
     airspace: Airspace
-    present: dict[int, Experiment]
+    present: dict[int, PlanExperiment]
     comparisons: dict[int, Comparison]
     cluster: set[int]
 
@@ -147,7 +147,7 @@ class Problem:
             return self.airspace.present_conflicts(self.uav).get(self.other, 0.0)
         return self.present[self.uav].hazards.get(self.kind, 0.0)
 
-    def is_admissible(self, experiment: Experiment) -> bool:
+    def is_admissible(self, experiment: PlanExperiment) -> bool:
         """Return whether a change avoids the event of the aircraft, and creates no ground or geofence event."""
         before = self.present[experiment.uav].hazards
         for kind in LIMITS:
@@ -158,7 +158,7 @@ class Problem:
                 return False
         return True
 
-    def conflicts_after(self, experiments: tuple[Experiment, ...]) -> dict[Pair, float] | None:
+    def conflicts_after(self, experiments: tuple[PlanExperiment, ...]) -> dict[Pair, float] | None:
         """Return the conflicts of the cluster with some plans changed; None if they create a conflict."""
         after = self.airspace.conflicts(experiments)
         changed = {experiment.uav for experiment in experiments}
@@ -185,7 +185,7 @@ class Problem:
         one, other = sorted(pair)
         return self.airspace.present_conflicts(one).get(other, 0.0)
 
-    def solution(self, experiments: tuple[Experiment, ...], remaining: dict[Pair, float]) -> Solution | None:
+    def solution(self, experiments: tuple[PlanExperiment, ...], remaining: dict[Pair, float]) -> Solution | None:
         """Return a solution if every conflict of the cluster is avoided."""
         worst = max(remaining.values(), default=0.0)
         if worst >= _CONFLICT.clear_below:
@@ -201,7 +201,7 @@ class Problem:
         return Solution(experiments, worst, costs)
 
 
-def solve(problem: Problem, experiments_of: Callable[[int], list[Experiment]]) -> list[Solution]:
+def solve(problem: Problem, experiments_of: Callable[[int], list[PlanExperiment]]) -> list[Solution]:
     """Return the solutions of single changes, and joint ones where several conflicts or no single change remain.
 
     Args:
@@ -212,22 +212,22 @@ def solve(problem: Problem, experiments_of: Callable[[int], list[Experiment]]) -
         uav: [experiment for experiment in experiments_of(uav) if problem.is_admissible(experiment)]
         for uav in problem.present
     }
-    found: list[Solution] = []
-    partial: list[tuple[float, tuple[Experiment, ...], dict[Pair, float]]] = []
+    solutions: list[Solution] = []
+    partial: list[tuple[float, tuple[PlanExperiment, ...], dict[Pair, float]]] = []
     for experiment in chain.from_iterable(admissible.values()):
         remaining = problem.conflicts_after((experiment,))
         if remaining is None:
             continue
         if (solution := problem.solution((experiment,), remaining)) is not None:
-            found.append(solution)
+            solutions.append(solution)
         elif problem.kind is AlertKind.CONFLICT:
             partial.append((sum(remaining.values()), (experiment,), remaining))
-    if all(_interrupts(solution) for solution in found):
+    if all(_interrupts(solution) for solution in solutions):
         partial.sort(key=lambda one: one[0])
         for _, experiments, remaining in _distinct_seeds(partial):
             joint = _add_changes(problem, admissible, experiments, remaining)
-            found += [] if joint is None else [joint]
-    return found
+            solutions += [] if joint is None else [joint]
+    return solutions
 
 
 def _interrupts(solution: Solution) -> bool:
@@ -235,8 +235,8 @@ def _interrupts(solution: Solution) -> bool:
 
 
 def _distinct_seeds(
-    partial: list[tuple[float, tuple[Experiment, ...], dict[Pair, float]]],
-) -> Iterator[tuple[float, tuple[Experiment, ...], dict[Pair, float]]]:
+    partial: list[tuple[float, tuple[PlanExperiment, ...], dict[Pair, float]]],
+) -> Iterator[tuple[float, tuple[PlanExperiment, ...], dict[Pair, float]]]:
     """Yield the best partial solutions of different aircraft and kinds."""
     seen = set[tuple[int, Kind]]()
     for one in partial:
@@ -249,8 +249,8 @@ def _distinct_seeds(
 
 def _add_changes(
     problem: Problem,
-    admissible: dict[int, list[Experiment]],
-    experiments: tuple[Experiment, ...],
+    admissible: dict[int, list[PlanExperiment]],
+    experiments: tuple[PlanExperiment, ...],
     remaining: dict[Pair, float],
 ) -> Solution | None:
     """Add changes of further aircraft until no conflict of the cluster remains; None if that does not succeed."""

@@ -63,14 +63,14 @@ class QueryHandlers:
 
     def proposals(self, uav: int | None, proposer: Proposer) -> StampedMessages:
         """Return the proposals in force; for one aircraft without any, compute one on request."""
-        found = [
+        proposals = [
             (owned, proposal) for owned in self.select(uav) for proposal in proposer.current(owned.twin.config.uav)
         ]
-        if uav is not None and not found:
-            found = [
+        if uav is not None and not proposals:
+            proposals = [
                 (owned, proposal) for owned in self.select(uav) if (proposal := _propose(owned, proposer)) is not None
             ]
-        return self.with_stamps(found)
+        return self.with_stamps(proposals)
 
     def select(self, uav: int | None) -> list[OwnedTwin]:
         """Return the requested aircraft if owned; all for None."""
@@ -105,8 +105,8 @@ def _propose(owned: OwnedTwin, proposer: Proposer) -> Proposal | None:
         return proposer.on_request(owned.twin.config.uav, data_time(owned))
     except Exception as error:  # an error in one query must not stop the others
         _log.exception("%s: a requested proposal failed", owned.twin.name)
-        found = f"found an internal error ({error}), expected a proposal"
-        raise ValueError(f"{owned.twin.name}: {found}; report it") from None
+        reason = f"found an internal error ({error}), expected a proposal"
+        raise ValueError(f"{owned.twin.name}: {reason}; report it") from None
 
 
 def latest_prediction(owned: OwnedTwin) -> EncodedMessage | None:

@@ -27,8 +27,8 @@ from fleet.contract import (
 from viewer.store.forecast import PastPrediction, check_prediction
 from viewer.store.inbox import LARGE_FLEET, CoalescingQueue, Inbox, QueuedMessage, SampleSubset, decode_sample
 from viewer.store.place import OutOfRangeError, SceneFrame, checked_origin, first_fix
-from viewer.store.proposal import MAX_PROPOSALS, check_proposal
-from viewer.store.vehicle import ENDED_S, JUMP_S, Vehicle, stamp_of
+from viewer.store.proposal import MAX_PROPOSALS, SceneProposal, check_proposal
+from viewer.store.vehicle import ENDED_S, JUMP_S, ProposalKey, Vehicle, stamp_of
 from viewer.theme.events import MAX_ALERTS
 
 MAX_VEHICLES = 2_000  # ids are untrusted input: further UAVs are counted, not stored
@@ -367,7 +367,9 @@ class FleetStore:
         vehicle = self._vehicle(message.uav)
         if self._scene_frame is None or not self._accept(vehicle, stamp, now):
             return
-        others = {about: one for about, one in vehicle.proposals.items() if about in vehicle.alerts}
+        others: dict[ProposalKey, SceneProposal] = {
+            about: one for about, one in vehicle.proposals.items() if about in vehicle.alerts
+        }
         if len(others) < MAX_PROPOSALS or message.about in others:
             vehicle.proposals = {**others, message.about: check_proposal(message, self._scene_frame, now)}
 

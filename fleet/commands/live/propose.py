@@ -60,13 +60,13 @@ def query(bus: Bus, uavs: list[int]) -> list[Proposal]:
     """
     if not uavs:
         return [proposal for proposal, _ in bus.get(Proposal)]
-    found: list[Proposal] = []
+    proposals: list[Proposal] = []
     for uav in dict.fromkeys(uavs):
         replies = [proposal for proposal, _ in bus.get(Proposal, uav, _TIMEOUT_S)]
         if not replies and (reply := bus.get_one(Proposal, uav, b"", _TIMEOUT_S)) is not None:
             replies = [reply[0]]
-        found += replies
-    return found
+        proposals += replies
+    return proposals
 
 
 def format_text(proposal: Proposal) -> str:
