@@ -223,7 +223,7 @@ def solve(problem: Problem, experiments_of: Callable[[int], list[PlanExperiment]
         elif problem.kind is AlertKind.CONFLICT:
             partial.append((sum(remaining.values()), (experiment,), remaining))
     if all(_interrupts(solution) for solution in solutions):
-        partial.sort(key=lambda one: one[0])
+        partial.sort(key=lambda one: (_is_interruption(one[1][0]), one[0]))
         for _, experiments, remaining in _distinct_seeds(partial):
             joint = _add_changes(problem, admissible, experiments, remaining)
             solutions += [] if joint is None else [joint]
@@ -231,7 +231,18 @@ def solve(problem: Problem, experiments_of: Callable[[int], list[PlanExperiment]
 
 
 def _interrupts(solution: Solution) -> bool:
-    return any(kind in INTERRUPTING for _, kind in solution.kinds)
+    return any(_is_interruption(experiment) for experiment in solution.experiments)
+
+
+def _is_interruption(experiment: PlanExperiment) -> bool:
+    return experiment.candidate is not None and experiment.candidate.kind in INTERRUPTING
+
+
+def _preference(option: tuple[float, PlanExperiment, dict[Pair, float]]) -> tuple[bool, bool, float]:
+    """Return the order of additional changes: sufficient ones, those that continue the mission, the least conflict."""
+    total, experiment, remaining = option
+    insufficient = max(remaining.values(), default=0.0) >= _CONFLICT.clear_below
+    return insufficient, _is_interruption(experiment), total
 
 
 def _distinct_seeds(
@@ -264,7 +275,7 @@ def _add_changes(
                 options.append((sum(after.values()), experiment, after))
         if not options:
             return None
-        total, best, after = min(options, key=lambda one: one[0])
+        total, best, after = min(options, key=_preference)
         if total >= sum(remaining.values()):
             return None
         experiments, remaining = (*experiments, best), after

@@ -191,6 +191,20 @@ def test_each_kind_of_change_is_flown(twin):
 VALUES = ((Kind.SPEED, 18.0), (Kind.ALTITUDE, 40.0), (Kind.HOLD, 0.0), (Kind.RETURN, 0.0))
 
 
+def test_a_multirotor_flies_its_candidates(hovered):
+    experiment = present(hovered)
+    plan = Plan.of(hovered, experiment.prediction)
+    tried = changes.candidates(plan, AlertKind.CONFLICT, 20.0, None, Deficit())
+    by_kind = {one.candidate.kind: one for one in run(plan, tried)}
+    assert {Kind.SPEED, Kind.ALTITUDE, Kind.HOLD} <= by_kind.keys()
+    assert all(one.prediction.method == "copter" for one in by_kind.values())
+    before, slow = (one.prediction.path.numpy() for one in (experiment, by_kind[Kind.SPEED]))
+    length = [float(np.linalg.norm(np.diff(path[:30], axis=0), axis=1).sum()) for path in (before, slow)]
+    assert length[1] < 0.95 * length[0]
+    higher = max((one for one in run(plan, tried) if one.candidate.kind is Kind.ALTITUDE), key=lambda e: e.candidate.value)
+    assert higher.prediction.path.numpy()[-1, 2] < before[-1, 2] - 10.0
+
+
 def test_speeds_stay_within_the_limits_of_the_autopilot(twin):
     plan = Plan.of(twin, present(twin).prediction)
     low, high = changes.speed_limits(twin)
