@@ -15,13 +15,14 @@ from viewer.theme.palette import DARK
 
 UAV = 1
 AHEAD = np.arange(0.0, 61.0)
+ORIGIN = (474_000_000, 85_000_000, 500_000)
 
 
-def option(k: int, origin: tuple[int, int, int], sentence: str = "UAV 1 climbs 40 m: passes 62 m above UAV 2") -> Option:
+def option(k: int, sentence: str = "UAV 1 climbs 40 m: passes 62 m above UAV 2") -> Option:
     path = np.column_stack([20.0 * AHEAD, 0.0 * AHEAD, -100.0 - 30.0 * k + 0.0 * AHEAD])
     tube = np.tile([10.0, 5.0, 4.0], (len(AHEAD), 1))
     ghost = ProposedPath(
-        uav=UAV, origin=origin, ahead=Array.of(AHEAD), path=Array.of(path), prediction_region_half_axes=Array.of(tube)
+        uav=UAV, origin=ORIGIN, ahead=Array.of(AHEAD), path=Array.of(path), prediction_region_half_axes=Array.of(tube)
     )
     figures = {"probability": 0.01, "clearance_m": 62.0, "delay_s": 3.0, "energy": 1.04, "deviation_m": 43.0}
     return Option(sentence=sentence, changes=(Change(uav=UAV, seq=k),), paths=(ghost,), **figures)
@@ -53,12 +54,11 @@ def page():
 def publish(page, n: int = 2, **more) -> Proposal:
     feed, bus, clock = page
     vehicle = feed.get(UAV)
-    origin = vehicle.prediction.origin
     alert = Alert(uav=UAV, t=T, kind=AlertKind.CONFLICT, other=2, sentence="conflict", probability=0.3)
     bus.publish(alert, STAMP)
     given = {
         "uav": UAV, "t": T, "id": "5f2c", "kind": AlertKind.CONFLICT, "other": 2, "probability": 0.3,
-        "options": tuple(option(k, origin) for k in range(n)), "valid_until": vehicle.data_time(clock()) + 10.0,
+        "options": tuple(option(k) for k in range(n)), "valid_until": vehicle.data_time(clock()) + 10.0,
         "sentence": "uav-1: 30% chance of a conflict with uav-2; 2 options avoid it",
     }  # fmt: skip
     proposal = Proposal(**(given | more))
@@ -80,7 +80,7 @@ def test_each_option_is_shown_with_its_figures(page):
 
 
 def test_options_disappear_with_their_validity_their_withdrawal_and_their_alert(page):
-    feed, bus, clock = page
+    _, bus, clock = page
     proposal = publish(page)
     clock.now += 11.0
     assert "climbs" not in shown(page)
@@ -110,13 +110,12 @@ def test_ghost_lines_of_another_dash_and_colour_for_each_option(page):
 
 def test_a_hostile_proposal_is_text_or_rejected(page):
     feed, _, _ = page
-    origin = feed.get(UAV).prediction.origin
-    publish(page, sentence=HOSTILE, options=(option(0, origin, HOSTILE),), id=HOSTILE)
+    publish(page, sentence=HOSTILE, options=(option(0, sentence=HOSTILE),), id=HOSTILE)
     html = shown(page, "send('{}')")
     assert HOSTILE not in html and "&lt;img" in html and html.count("onclick") == 1
     before = feed.get(UAV).proposals
-    broken = msgspec.structs.replace(option(0, origin).paths[0], path=Array.of(np.full((61, 3), np.nan)))
-    publish(page, options=(msgspec.structs.replace(option(0, origin), paths=(broken,)),))
+    broken = msgspec.structs.replace(option(0).paths[0], path=Array.of(np.full((61, 3), np.nan)))
+    publish(page, options=(msgspec.structs.replace(option(0), paths=(broken,)),))
     assert feed.get(UAV).proposals == before and "not finite" in feed.get(UAV).refusal[1]
 
 

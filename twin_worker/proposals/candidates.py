@@ -30,11 +30,11 @@ MODES = {"hold": HOLD_MODE, "return": RETURN_MODE, "land": LAND_MODE}
 """Mode of each `Change.mode`."""
 OFFSETS = (-3.0, -2.0, -1.5, 1.5, 2.0, 3.0)
 """Altitude offsets that are tried against a conflict, in vertical separations [-]."""
-_SPEEDS = 5  # airspeeds tried, evenly spaced from the lowest to the highest
+_SPEEDS = 5  # airspeeds tried, evenly spaced between the lowest and the highest
 _ROTOR_SPEEDS = (0.4, 0.6, 0.8)  # speeds of a multirotor that are tried, of its present limit [-]
 _MIN_SPEED_STEP = 1.0  # a smaller change of speed is none [m/s]
 _DELAYS_S = (20.0, 40.0)  # circling or waiting times that are tried [s]
-_REACTION_S = 4.0  # an inserted item lies at least this far ahead: it is uploaded first [s]
+_REACTION_S = 4.0  # to read a proposal, and again to upload it; an inserted item lies farther ahead [s]
 _DEFAULT_CLIMB = 2.0  # climb and sink rate without received limits [m/s]
 _SKIPPED = 2  # items nearest to the event of which each is left out
 _AHEAD_ITEMS = 8  # navigation items ahead that are looked at
@@ -113,6 +113,13 @@ class Plan:
         """Return the navigation items with a position from the current one on."""
         return [item for item in self.items if item.seq >= self.seq >= 0 and is_positional(item)]
 
+    @property
+    def remaining(self) -> list[Item]:
+        """Return the same with those that jumps ahead lead back to."""
+        jumps = [item.param1 for item in self.items if item.seq >= self.seq >= 0 and item.command == JUMP]
+        first = min([float(self.seq), *(target for target in jumps if target >= self.twin.first_item)])
+        return [item for item in self.items if item.seq >= first >= 0 and is_positional(item)]
+
     def position(self, item: Item) -> np.ndarray:
         """Return the position of an item on the horizontal plane of the prediction's frame, (2,) [m]."""
         lat, lon = np.array([item.lat_e7], float), np.array([item.lon_e7], float)
@@ -154,7 +161,8 @@ def candidates(
         event: where it happens; None: no single position
         deficit: what is missing to the limits of the aircraft
     """
-    tried = [Candidate(plan.uav, Kind.SPEED, speed) for speed in _speeds(plan)]
+    is_limit = kind in (AlertKind.GROUND, AlertKind.GEOFENCE)  # another speed would only postpone them
+    tried = [Candidate(plan.uav, Kind.SPEED, speed) for speed in ([] if is_limit else _speeds(plan))]
     if plan.seq >= 0:
         tried += [Candidate(plan.uav, Kind.ALTITUDE, offset) for offset in _offsets(plan, kind, separation_m, deficit)]
         if kind is AlertKind.CONFLICT:
@@ -198,7 +206,7 @@ def _speeds(plan: Plan) -> list[float]:
     if not 0 < low < high:
         return []
     present = present_speed(plan.twin)
-    return [float(V) for V in np.linspace(low, high, _SPEEDS) if abs(V - present) >= _MIN_SPEED_STEP]
+    return [float(V) for V in np.linspace(low, high, _SPEEDS + 2)[1:-1] if abs(V - present) >= _MIN_SPEED_STEP]
 
 
 def _speed_change(plan: Plan, speed: float) -> Change:
@@ -247,19 +255,19 @@ def _offsets(plan: Plan, kind: AlertKind, separation_m: float, deficit: Deficit)
 
 
 def _with_offset(plan: Plan, offset: float) -> tuple[Item, ...] | None:
-    """Return the mission with all altitudes from the current item on changed by `offset` [m].
+    """Return the mission with the altitudes of all remaining items changed by `offset` [m].
 
     Autopilots change the altitude in proportion along a leg. A waypoint on the present leg makes it change sooner.
     """
-    changed = {item.seq for item in plan.ahead if m.KINDS[item.command] not in _NO_OFFSET}
-    lowered = [item for item in plan.ahead if item.seq in changed and item.frame in m.RELATIVE]
+    changed = {item.seq for item in plan.remaining if m.KINDS[item.command] not in _NO_OFFSET}
+    lowered = [item for item in plan.remaining if item.seq in changed and item.frame in m.RELATIVE]
     if not changed or (offset < 0 and any(item.alt_m + offset < plan.min_height_m for item in lowered)):
         return None
     items = [
         msgspec.structs.replace(item, alt_m=item.alt_m + offset) if item.seq in changed else item for item in plan.items
     ]
     rate = _climb_rate(plan.twin, offset)
-    seconds = max(abs(offset) / rate, _REACTION_S)
+    seconds = 2 * _REACTION_S + abs(offset) / rate
     if plan.reaches_current(seconds + _REACTION_S):
         return tuple(items)
     return insert(items, _item_on_path(plan, seconds, offset))
@@ -287,7 +295,7 @@ def _item_on_path(plan: Plan, seconds: float, offset: float = 0.0, **fields: flo
 
 def _with_wait(plan: Plan, seconds: float) -> tuple[Item, ...] | None:
     """Return the mission with a circle, of a multirotor a stop, on the present leg."""
-    ahead_s = 2 * _REACTION_S
+    ahead_s = 3 * _REACTION_S
     if plan.reaches_current(ahead_s):
         return None
     command = _WAYPOINT if is_hovering(plan.twin) else _LOITER_TIME
@@ -335,11 +343,11 @@ def _skip(plan: Plan, seq: int) -> Change | None:
 
 
 def _within(plan: Plan, radius: float) -> tuple[Item, ...] | None:
-    """Return the mission with all items ahead within `radius` of home [m]."""
+    """Return the mission with all remaining items within `radius` of home [m]."""
     home = plan.twin.home
     if home is None:
         return None
-    moved: Mapping[int, Item] = {item.seq: _move_within(item, home, radius) for item in plan.ahead}
+    moved: Mapping[int, Item] = {item.seq: _move_within(item, home, radius) for item in plan.remaining}
     items = tuple(moved.get(item.seq, item) for item in plan.items)
     return items if items != plan.items else None
 

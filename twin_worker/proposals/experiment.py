@@ -32,6 +32,7 @@ from twin_worker.whatif import active_seq
 
 LIMITS = (AlertKind.GROUND, AlertKind.GEOFENCE, AlertKind.NOT_ACHIEVABLE)
 """Hazards of one aircraft alone that an experiment assesses."""
+_MARGIN_SHARE = 0.1  # probability aimed at, of that at which an alert is cleared [-]
 _NO_ROUTE = "imm"  # method of a prediction from the turn rate alone: the change has no effect on it
 
 
@@ -200,11 +201,11 @@ def _margins(twin: Twin, forecast: GaussianForecast) -> dict[AlertKind, float]:
 def deficit(plan: Plan, experiment: PlanExperiment, kind: AlertKind) -> Deficit:
     """Return by how much the present plan violates the limits of an alert, with the uncertainty of the prediction.
 
-    The margin is such that the probability falls below that at which the alert is cleared.
+    The margin is such that the probability falls to a tenth of that at which the alert is cleared.
     """
     if kind not in (AlertKind.GROUND, AlertKind.GEOFENCE) or plan.twin.home is None:
         return Deficit()
-    extremes, z = _extremes(plan.twin, experiment.forecast), -float(ndtri(RULES[kind].clear_below))
+    extremes, z = _extremes(plan.twin, experiment.forecast), -float(ndtri(_MARGIN_SHARE * RULES[kind].clear_below))
     (low, sigma_low), (high, sigma_high), (far, sigma_far) = extremes
     if kind is AlertKind.GROUND:
         return Deficit(max(plan.min_height_m + z * sigma_low - low, 0.0))

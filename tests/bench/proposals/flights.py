@@ -33,6 +33,7 @@ from twin_worker.twin.state.state import Twin
 from twin_worker.twin.step import advance
 
 APPROVED_S = 5.0  # from the alert to the change on board: computing, reading, approving, uploading [s]
+KNOWN_S = 30.0  # alerts before the first model count as offered without need [s]
 UPLOAD_S = 1.0  # from the change on board to the new mission at the twin [s]
 END_S = 200.0  # end of a flight with a change [s]
 HEARD_S = 152.0  # end of a flight without one [s]
@@ -200,7 +201,7 @@ def _until_alert(case: Case, twins: Twins, path: Path, out: Outcome) -> tuple[Al
                 continue
             began = time.thread_time()
             proposal = twins.proposer.update(alert, twins.twins[alert.uav].telemetry.last_step_t)
-            if alert.kind is case.kind:
+            if alert.kind is case.kind and alert.t >= T_0 + KNOWN_S:
                 out.took_s = time.thread_time() - began
                 return alert, proposal
             out.unneeded += bool(proposal is not None and proposal.options)
@@ -227,17 +228,19 @@ def _fly_option(case: Case, seed: int, heard: tuple[Outcome, Twins | None], chos
 
 def _after(messages: Iterator[Message], twins: Twins, changes: tuple[Change, ...], at: float) -> Iterator[Message]:
     """Give the messages that the twins have not heard, and the uploaded missions at their time."""
-    waiting = {change.uav: change for change in changes}
+    uploads = {change.uav: change for change in changes if change.items is not None}
+    waiting = set(uploads)
     for k, message in enumerate(messages):
         if k < twins.received:
             continue
-        change = waiting.get(message.uav)
-        if change is not None and message.t > at:
-            del waiting[message.uav]
-            mission = twins.twins[message.uav].onboard.mission
-            if change.items is not None and mission is not None:
+        change = uploads.get(message.uav)
+        if change is not None and change.items is not None and message.t > at:
+            if message.uav in waiting:
+                waiting.discard(message.uav)
                 yield Mission(uav=message.uav, t=message.t, items=change.items, seq=change.seq or 0, complete=True)
                 twins.received -= 1
+            if isinstance(message, Mission):  # the recording repeats the items at its start
+                message = msgspec.structs.replace(message, items=change.items)
         yield message
 
 

@@ -201,7 +201,9 @@ def test_a_multirotor_flies_its_candidates(hovered):
     before, slow = (one.prediction.path.numpy() for one in (experiment, by_kind[Kind.SPEED]))
     length = [float(np.linalg.norm(np.diff(path[:30], axis=0), axis=1).sum()) for path in (before, slow)]
     assert length[1] < 0.95 * length[0]
-    higher = max((one for one in run(plan, tried) if one.candidate.kind is Kind.ALTITUDE), key=lambda e: e.candidate.value)
+    higher = max(
+        (one for one in run(plan, tried) if one.candidate.kind is Kind.ALTITUDE), key=lambda e: e.candidate.value
+    )
     assert higher.prediction.path.numpy()[-1, 2] < before[-1, 2] - 10.0
 
 
