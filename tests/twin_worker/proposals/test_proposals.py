@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from fleet.contract import Alert, AlertKind, Array, Prediction, Proposal
+from fleet.contract import Alert, AlertKind, Array, Change, Prediction, Proposal
 from tests.support.memory_bus import MemoryBus
 from twin_worker.alerts.conflict_probability import Separation
 from twin_worker.alerts.traffic import TrafficPicture
@@ -178,6 +178,7 @@ def test_each_kind_of_change_is_flown(twin):
     by_kind = {e.candidate.kind: e for e in run(plan, [Candidate(1, kind, value) for kind, value in values])}
     for kind, _ in values:
         assert kind in by_kind, kind
+        assert msgspec.msgpack.decode(msgspec.msgpack.encode(by_kind[kind].change), type=Change)
     end = {kind: e.prediction.path.numpy()[-1] for kind, e in by_kind.items()}
     middle = {kind: e.prediction.path.numpy()[60, 2] for kind, e in by_kind.items()}
     present_path = experiment.prediction.path.numpy()
