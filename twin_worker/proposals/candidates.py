@@ -286,7 +286,9 @@ def _climb_rate(twin: Twin, offset: float) -> float:
 def _item_on_path(plan: Plan, seconds: float, offset: float = 0.0, **fields: float) -> Item:
     """Return an item in place of the current one, on the predicted path `seconds` ahead, `offset` above it [m]."""
     lat, lon, alt = to_geodetic(plan.prediction.ned_origin(), plan.at(seconds) - [0.0, 0.0, offset])
-    item = Item(seq=plan.seq, command=_WAYPOINT, frame=0, lat_e7=int(lat), lon_e7=int(lon), alt_m=round(float(alt) * 1e-3, 2))
+    item = Item(
+        seq=plan.seq, command=_WAYPOINT, frame=0, lat_e7=int(lat), lon_e7=int(lon), alt_m=round(float(alt) * 1e-3, 2)
+    )
     return msgspec.structs.replace(item, **fields)
 
 

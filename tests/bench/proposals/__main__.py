@@ -22,7 +22,13 @@ from twin_worker.service.warm_up import warm_up
 from .flights import KINDS, Outcome, judged
 
 IN_TIME_S = 2.0
-ARGUMENTS = {"pair": "pairs", "triple": "triples", "ground": "ground", "geofence": "geofence", "clear": "clear"}
+ARGUMENTS = {
+    "pair": "--pairs",
+    "triple": "--triples",
+    "ground": "--ground",
+    "geofence": "--geofence",
+    "clear": "--clear",
+}
 
 
 def summary(rows: list[Outcome]) -> dict[str, Any]:
@@ -51,14 +57,14 @@ def main() -> None:
     form = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("python -m tests.bench.proposals", description=__doc__, formatter_class=form)
     for kind in KINDS:
-        parser.add_argument(f"--{ARGUMENTS[kind]}", type=int, default=0, metavar="N", help=f"cases of {kind} (0)")
+        parser.add_argument(ARGUMENTS[kind], type=int, default=0, metavar="N", help=f"cases of {kind} (0)")
     parser.add_argument("--seed", type=int, default=900, help="seed of the first case of each kind (900)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every case with its outcome")
     args = parser.parse_args()
     warm_up()
     outcomes: list[Outcome] = []
     for kind in KINDS:
-        for k in range(getattr(args, ARGUMENTS[kind])):
+        for k in range(getattr(args, ARGUMENTS[kind][2:])):
             outcomes.append(judged(kind, args.seed + k, lambda text: print(text, flush=True)))
             one = outcomes[-1]
             print(f"  kept {one.kept}, cleared {one.cleared}, new {one.new_alerts}, took {one.took_s}", flush=True)
