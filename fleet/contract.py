@@ -638,9 +638,17 @@ class Proposal(Message, frozen=True, kw_only=True):
     id: Annotated[str, about("unique identifier, which an approval repeats")]
     kind: Annotated[AlertKind | None, about("the alert that it answers; null: requested by a person")] = None
     other: Annotated[int, about("the other UAV of a conflict; -1 none")] = -1
+    probability: Annotated[
+        float | None, about("of the event with the present plans, 0..1; null: none is predicted")
+    ] = None
     options: tuple[Option, ...] = ()
     valid_until: Annotated[float, about("fleet time after which it must not be approved [s since 1970]")] = 0.0
     sentence: Annotated[str, about("the event, and what the options avoid; or why there is none")] = ""
+
+    @property
+    def about(self) -> tuple[AlertKind | None, int]:
+        """Return the identity of the event within its UAV; a newer proposal on it replaces the older one."""
+        return self.kind, self.other
 
 
 class FleetRow(msgspec.Struct, frozen=True, kw_only=True):

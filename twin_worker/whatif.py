@@ -191,15 +191,16 @@ def _override(twin: Twin, query: WhatIf) -> RouteOverride:
     if query.seq is not None:
         seq = query.seq
     elif query.items is None:
-        seq = _active_seq(twin)
+        seq = active_seq(twin)
     else:
         seq = min((item.seq for item in items if item.seq >= twin.first_item), default=twin.first_item)
-    restart = (query.seq is not None and query.seq != _active_seq(twin)) or query.start is not None
+    restart = (query.seq is not None and query.seq != active_seq(twin)) or query.start is not None
     speed, jumps = query.start.speed if query.start else None, twin.onboard.jumps_taken if query.items is None else {}
     return RouteOverride(items, seq, params, restart, speed, twin.first_item, jumps)
 
 
-def _active_seq(twin: Twin) -> int:
+def active_seq(twin: Twin) -> int:
+    """Return the current mission item: reported, else of the mission, else the first."""
     _, leg = twin.telemetry.history.rows("leg")
     seq = int(leg[-1, 0]) if len(leg) else twin.onboard.mission.seq if twin.onboard.mission else -1
     return seq if seq >= 0 else FIRST_ITEM.get(twin.autopilot, 1)

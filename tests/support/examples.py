@@ -234,6 +234,7 @@ MESSAGES = (
         id="1a2b3c4d5e6f7081",
         kind=AlertKind.CONFLICT,
         other=8,
+        probability=0.83,
         options=(
             Option(
                 sentence="UAV 7 flies at 18 m/s: it passes 80 m behind UAV 8",

@@ -39,6 +39,7 @@ from twin_worker.twin.state.state import Twin, ingest
 _log = logging.getLogger(__name__)
 INBOX_SIZE = 4096  # queued messages per UAV; the oldest are dropped and counted
 _PUBLISH_GRACE_S = 1.0  # after this time an acquired snapshot counts as published, with or without a prediction [s]
+SILENT_S = 1.0  # wall time without a sample after which data time follows the wall clock [s]
 _LOCK_TIMEOUT_S = 0.3  # wait for a busy twin; the requester tries again [s]
 
 
@@ -64,6 +65,13 @@ class OwnedTwin:
     encoded: tuple[Prediction, EncodedMessage] | None = (
         None  # newest prediction, and the same encoded with law and parameters
     )
+
+
+def data_time(owned: OwnedTwin) -> float:
+    """Return the UAV's current data time [s]: its newest sample, plus the wall time since it fell silent."""
+    silence_s = time.monotonic() - owned.last_arrival
+    newest = owned.twin.telemetry.history.newest
+    return newest + silence_s if silence_s > SILENT_S else newest
 
 
 class Companion(Protocol):

@@ -10,8 +10,10 @@ import msgspec
 from msgspec import Raw
 
 from fleet.bus.codec import EncodedMessage, Stamp, encode
-from fleet.contract import Prediction, Predictions, WhatIf
-from twin_worker.ownership.twin_store import OwnedTwin
+from fleet.contract import Prediction, Predictions, Proposal, WhatIf
+from twin_worker.ownership.twin_store import OwnedTwin, data_time
+from twin_worker.proposals.proposer import Proposer
+from twin_worker.twin.state.state import Twin
 from twin_worker.whatif import answer_query, read_grid, read_query, resample
 
 _log = logging.getLogger(__name__)
@@ -59,6 +61,17 @@ class QueryHandlers:
         predictions, epochs = (tuple(column) for column in zip(*encoded, strict=True)) if encoded else ((), ())
         return Predictions(t=time.time(), predictions=predictions, epochs=epochs)
 
+    def proposals(self, uav: int | None, proposer: Proposer) -> StampedMessages:
+        """Return the proposals in force; for one aircraft without any, compute one on request."""
+        proposals = [
+            (owned, proposal) for owned in self.select(uav) for proposal in proposer.current(owned.twin.config.uav)
+        ]
+        if uav is not None and not proposals:
+            proposals = [
+                (owned, proposal) for owned in self.select(uav) if (proposal := _propose(owned, proposer)) is not None
+            ]
+        return self.with_stamps(proposals)
+
     def select(self, uav: int | None) -> list[OwnedTwin]:
         """Return the requested aircraft if owned; all for None."""
         return [owned for owned in self._owned_twins() if uav in (None, owned.twin.config.uav)]
@@ -68,10 +81,15 @@ class QueryHandlers:
         return ((message, Stamp(owned.epoch, self._writer)) for owned, message in pairs if message is not None)
 
 
+def copy_twin(owned: OwnedTwin) -> Twin:
+    """Return a copy of a twin between two of its steps."""
+    with owned.lock:
+        return copy.deepcopy(owned.twin)
+
+
 def _run_what_if(owned: OwnedTwin, what_if: WhatIf) -> Prediction:
     """Run a what-if on a copy of the twin, on the caller's thread; an internal error becomes a `ValueError`."""
-    with owned.lock:
-        twin = copy.deepcopy(owned.twin)
+    twin = copy_twin(owned)
     try:
         return answer_query(twin, what_if)
     except ValueError:
@@ -79,6 +97,16 @@ def _run_what_if(owned: OwnedTwin, what_if: WhatIf) -> Prediction:
     except Exception as error:  # an error in one query must not stop the others
         _log.exception("%s: a what-if failed", twin.name)
         raise ValueError(f"{twin.name}: found an internal error ({error}), expected a prediction; report it") from None
+
+
+def _propose(owned: OwnedTwin, proposer: Proposer) -> Proposal | None:
+    """Compute a proposal on request, on the caller's thread; an internal error becomes a `ValueError`."""
+    try:
+        return proposer.on_request(owned.twin.config.uav, data_time(owned))
+    except Exception as error:  # an error in one query must not stop the others
+        _log.exception("%s: a requested proposal failed", owned.twin.name)
+        reason = f"found an internal error ({error}), expected a proposal"
+        raise ValueError(f"{owned.twin.name}: {reason}; report it") from None
 
 
 def latest_prediction(owned: OwnedTwin) -> EncodedMessage | None:

@@ -17,6 +17,7 @@ from fleet.contract import (
     Model,
     Prediction,
     Predictions,
+    Proposal,
     Sample,
     Status,
 )
@@ -28,7 +29,8 @@ from twin_worker.mismatch.job import summary
 from twin_worker.ownership.cold_start import LATCHED_TYPES
 from twin_worker.ownership.handover import Snapshot
 from twin_worker.ownership.protocol import OwnershipProtocol
-from twin_worker.ownership.twin_store import OwnedTwin, TwinStore
+from twin_worker.ownership.twin_store import SILENT_S, OwnedTwin, TwinStore, data_time
+from twin_worker.proposals.proposer import Proposer
 from twin_worker.service.busy_fallback import (
     CHECK_PERIOD_S,
     fallback_prediction,
@@ -37,14 +39,14 @@ from twin_worker.service.busy_fallback import (
     publish_fallbacks,
 )
 from twin_worker.service.identification_thread import CpuShareLimiter, IdentificationThread
-from twin_worker.service.queries import QueryHandlers
+from twin_worker.service.proposal_thread import ProposalThread
+from twin_worker.service.queries import QueryHandlers, copy_twin
 from twin_worker.service.work_rates import WorkRates
 from twin_worker.twin.state.budget import ComputeBudget, Schedule, Work
 from twin_worker.twin.state.state import AUTO, Twin, TwinConfig
 from twin_worker.twin.step import advance, catch_up, fleet_row, rollout_age_s
 
 _log = logging.getLogger(__name__)
-_SILENT_S = 1.0  # wall time without a sample after which data time follows the wall clock [s]
 _MAX_STALL_S = 1.0  # maximum silence counted between two sweeps, because a stalled worker receives nothing [s]
 _STATE_S = 1.0  # between fleet tables [s]
 _FOREIGN_PERIOD_S = 0.4  # between reads of other workers' predictions [s]
@@ -82,12 +84,14 @@ class Worker:
         self._diagnosis_resume_t = float("-inf")  # earliest next diagnosis [s, monotonic]
         self.rates = WorkRates()
         self.cpu_share = CpuShareLimiter()
-        self.identifier = IdentificationThread(self._with_history, self._publish, self.rates, self.cpu_share)
+        self.identifier = IdentificationThread(self._with_history, self.publish, self.rates, self.cpu_share)
         self._sweep_start = float("-inf")  # start of the last sweep [s, monotonic]
         self.traffic = TrafficMonitor(separation or Separation())
         self._twins = TwinStore(bus, uavs, self._create_twin, self)
         self._twins.run_paced = self.cpu_share.run
         self._owned = self._twins.by_uav
+        self.proposer = Proposer(self.traffic.separation, self._copy_of, self.traffic.picture.forecasts)
+        self.proposals = ProposalThread(self, self.proposer, self.cpu_share)
         self.ownership = OwnershipProtocol(bus, uavs, self._twins)
         self._wakeup = threading.Event()
         self._fallback_lock = threading.Lock()  # in use while fallback predictions are published; the sweep waits
@@ -116,6 +120,7 @@ class Worker:
         self.bus.declare_queryable(
             Mismatch, lambda uav, *_: handlers.with_stamps((h, self._mismatch(h)) for h in handlers.select(uav))
         )
+        self.bus.declare_queryable(Proposal, lambda uav, *_: handlers.proposals(uav, self.proposer))
         self.bus.declare_queryable(FleetState, lambda *_: [(self.state(), None)])
         for status, _ in self.bus.get(Status):
             self.ownership.on_aircraft(status.uav)
@@ -123,6 +128,10 @@ class Worker:
     def _create_twin(self, uav: int) -> Twin:
         config = TwinConfig(uav, self.omega, self.method, self.airframe, self.schedule)
         return Twin(config, budget=self.quota)
+
+    def _copy_of(self, uav: int) -> Twin | None:
+        owned = self._owned.get(uav)
+        return copy_twin(owned) if owned is not None and owned.ready else None
 
     def _is_owned(self, uav: int) -> bool:
         """Return whether an aircraft is owned or expected; a new one is registered first."""
@@ -171,6 +180,7 @@ class Worker:
     def discard(self, uav: int) -> None:
         """Discard the data of a twin that this worker no longer owns."""
         self.traffic.release(uav)
+        self.proposer.discard(uav)
         if self.diagnosis is not None:
             self.diagnosis.states.pop(uav, None)
 
@@ -193,16 +203,16 @@ class Worker:
             with self._fallback_lock:
                 waiting = len(owned.inbox)
             ingested += waiting
-            if not waiting and not started - owned.last_arrival > _SILENT_S and not owned.lock.locked():
+            if not waiting and not started - owned.last_arrival > SILENT_S and not owned.lock.locked():
                 continue  # the usual case
             if owned.lock.locked():  # in identification or copied
                 if (prediction := fallback_prediction(owned)) is not None:
-                    self._publish(prediction, owned)
+                    self.publish(prediction, owned)
                 continue
             try:
                 for result in _advance_all(owned, waiting, self.traffic):
                     if not is_superseded(result, owned):
-                        self._publish(result, owned)
+                        self.publish(result, owned)
                 self.quota.end_work()
             except Exception as error:  # an error in one aircraft must not stop the others
                 owned.defect = f"{owned.twin.name}: found an internal error ({error}), expected results; report it"
@@ -242,7 +252,7 @@ class Worker:
             if done := self.quota.done.pop(work, 0):
                 self.rates.record(work, now, done)
 
-    def _publish(self, result: Message, owned: OwnedTwin) -> None:
+    def publish(self, result: Message, owned: OwnedTwin) -> None:
         """Publish a result with its stamp; discard it without confirmed ownership."""
         if owned.ready and self.ownership.may_write():
             self.bus.publish(result, Stamp(owned.epoch, self.bus.writer))
@@ -256,7 +266,7 @@ class Worker:
         by_uav = {owned.twin.config.uav: owned for owned in self.owned_twins()}
         try:
             for mismatch in self.diagnosis.run_once([(one.twin, one.lock) for one in by_uav.values()]):
-                self._publish(mismatch, by_uav[mismatch.uav])
+                self.publish(mismatch, by_uav[mismatch.uav])
             self._diagnosis_defect = ""
         except Exception as error:  # an error in the diagnosis must not stop the predictions
             self._diagnosis_defect = (
@@ -298,7 +308,7 @@ class Worker:
         """Connect, sweep until `stop` is set, publish the fleet table once a second; then hand everything over."""
         self.ownership.threaded, self.quota.offloaded = True, frozenset({Work.IDENTIFY})
         self.connect()
-        loops = (self.ownership.run, self.identifier.run, self._publish_fallbacks)
+        loops = (self.ownership.run, self.identifier.run, self.proposals.run, self._publish_fallbacks)
         threads = [threading.Thread(target=run, args=(stop,), daemon=True) for run in loops]
         for thread in threads:
             thread.start()
@@ -314,7 +324,7 @@ class Worker:
         while not stop.wait(CHECK_PERIOD_S):
             try:
                 with self._fallback_lock:
-                    publish_fallbacks(self.owned_twins(), self._publish)
+                    publish_fallbacks(self.owned_twins(), self.publish)
             except ConnectionError:  # the session is closed: shutdown
                 return
             except Exception:  # an error must not stop the fallbacks
@@ -336,13 +346,6 @@ class Worker:
             if time.monotonic() >= publish_t:
                 publish_t = time.monotonic() + _STATE_S
                 self.bus.publish(self.state())
-
-
-def data_time(owned: OwnedTwin) -> float:
-    """Return the UAV's current data time [s]: its newest sample, plus the wall time since it fell silent."""
-    silence_s = time.monotonic() - owned.last_arrival
-    newest = owned.twin.telemetry.history.newest
-    return newest + silence_s if silence_s > _SILENT_S else newest
 
 
 def _advance_all(owned: OwnedTwin, waiting: int, traffic: TrafficMonitor) -> Iterator[Message]:

@@ -10,6 +10,7 @@ import viser
 from viewer.browser.http_server import Browser, parse_layout
 from viewer.panels.charts import Charts
 from viewer.panels.detail import figures_html, status_html
+from viewer.panels.proposals import Approve, parse_approval, proposals_html
 from viewer.store.inbox import date_text, time_of_day, timestamp
 from viewer.store.states import notices
 from viewer.store.store import FleetStore
@@ -97,6 +98,7 @@ class Panels:
         self._pulse = False
         self.ground_error = ""  # error of the terrain files
         self.seek = ""  # page code that seeks to the time of an event
+        self.approve: Approve | None = None  # approves an option of a proposal; None: the page shows no button
         self._gui.configure_theme(
             dark_mode=palette.dark, show_logo=False, show_share_button=False, brand_color=triple(palette.predicting)
         )
@@ -154,9 +156,12 @@ class Panels:
         panel = self._gui.add_panel()
         with panel.add_tab("Selected", viser.Icon.FOCUS_2):
             self._about = self._gui.add_html("")
+            self._proposals = self._gui.add_html("")
+            self._approved_input = self._gui.add_text("approved", "", visible=False)
             self.charts = Charts(self._gui, self._palette)
             self._events = self._gui.add_html("")
             self._facts = self._gui.add_html("")
+        self._approved_input.on_update(lambda _: self._approve(self._approved_input.value))
         panel.dock_right()
         self._right, self._widths = panel, (0, 0)
         self._fit_panels()
@@ -185,6 +190,11 @@ class Panels:
         if (click := parse_click(text)) is not None:
             self._choose(*click)
 
+    def _approve(self, text: str) -> None:
+        """Approve the option that a click wrote into the hidden input."""
+        if self.approve is not None and (approval := parse_approval(text)) is not None:
+            self.approve(*approval)
+
     def show_error(self, sentence: str) -> None:
         """Show a drawing error; an empty sentence removes it."""
         card = f'<div class="say" style="border-color:{self._palette.mismatch}">{escape(sentence)}</div>'
@@ -196,7 +206,7 @@ class Panels:
 
     def draw(self, fleet: list[Vehicle], store: FleetStore, now: float, selected: int | None) -> None:
         """Update all panels; call it about once per second and when the selection changes."""
-        self._pulse, palette, pick = not self._pulse, self._palette, self._handler()
+        self._pulse, palette, pick = not self._pulse, self._palette, self._handler(self._pick_input)
         selected_vehicle = next((vehicle for vehicle in fleet if vehicle.uav == selected), None)
         shown = [vehicle for vehicle in fleet if self._passes(vehicle, now, selected)]
         shown = sorted(shown, key=lambda vehicle: severity(vehicle, now))[:MAX_ROWS]
@@ -240,6 +250,9 @@ class Panels:
         _update(
             self._about, status_html(vehicle, self._palette, now, self.units) if vehicle is not None else placeholder
         )
+        code = self._handler(self._approved_input) if self.approve is not None else ""
+        proposals = "" if vehicle is None else proposals_html(vehicle, self._palette, now, self.units, code)
+        _update(self._proposals, f'<div class="uav">{proposals}</div>' if proposals else "")
 
     def _passes(self, vehicle: Vehicle, now: float, selected: int | None) -> bool:
         if self._filter == "Alerts" and not vehicle.alerts:
@@ -252,9 +265,9 @@ class Panels:
         text = f"{vehicle.name} {vehicle.uav} {state_style(vehicle.record(now))[2]} {mode}".lower()
         return all(term in text for term in terms)
 
-    def _handler(self) -> str:
-        """Return the click handler of a table row: it writes the id into the hidden input."""
-        message = f"{{{{type:'GuiUpdateMessage',uuid:'{self._pick_input._impl.uuid}',updates:{{{{value:'{{}}'}}}}}}}}"
+    def _handler(self, hidden: Any) -> str:
+        """Return the click handler that writes what is inserted at `{}` into a hidden input."""
+        message = f"{{{{type:'GuiUpdateMessage',uuid:'{hidden._impl.uuid}',updates:{{{{value:'{{}}'}}}}}}}}"
         return f"var m=window.__viserMutable;m&&m.sendMessage({message})"
 
 

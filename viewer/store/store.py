@@ -19,6 +19,7 @@ from fleet.contract import (
     Mission,
     Model,
     Prediction,
+    Proposal,
     Sample,
     Status,
     TwinState,
@@ -26,7 +27,8 @@ from fleet.contract import (
 from viewer.store.forecast import PastPrediction, check_prediction
 from viewer.store.inbox import LARGE_FLEET, CoalescingQueue, Inbox, QueuedMessage, SampleSubset, decode_sample
 from viewer.store.place import OutOfRangeError, SceneFrame, checked_origin, first_fix
-from viewer.store.vehicle import ENDED_S, JUMP_S, Vehicle, stamp_of
+from viewer.store.proposal import MAX_PROPOSALS, SceneProposal, check_proposal
+from viewer.store.vehicle import ENDED_S, JUMP_S, ProposalKey, Vehicle, stamp_of
 from viewer.theme.events import MAX_ALERTS
 
 MAX_VEHICLES = 2_000  # ids are untrusted input: further UAVs are counted, not stored
@@ -41,7 +43,7 @@ MAX_AWAY = 10_000  # rejected UAVs that are counted
 MAX_LINKS = 64  # links whose texts are stored
 MAX_WRITERS = 16  # workers whose texts are stored; a restarted worker counts as new
 # topics requested at the start, so that a late viewer is complete
-INITIAL_TOPICS = (Status, Mission, Model, Prediction, Alert, Mismatch, FleetState, GatewayCounters)
+INITIAL_TOPICS = (Status, Mission, Model, Prediction, Alert, Proposal, Mismatch, FleetState, GatewayCounters)
 
 
 class FleetStore:
@@ -67,6 +69,7 @@ class FleetStore:
             Model: self._model,
             Prediction: self._prediction,
             Alert: self._alert,
+            Proposal: self._proposal,
             Mismatch: self._mismatch,
             FleetState: self._fleet,
         }
@@ -359,6 +362,16 @@ class FleetStore:
         others = {about: raised for about, raised in vehicle.alerts.items() if about != alert.about}
         if len(others) < MAX_ALERTS or not alert.active:
             vehicle.alerts = {**others, alert.about: alert} if alert.active else others
+
+    def _proposal(self, message: Proposal, stamp: Stamp | None, now: float) -> None:
+        vehicle = self._vehicle(message.uav)
+        if self._scene_frame is None or not self._accept(vehicle, stamp, now):
+            return
+        others: dict[ProposalKey, SceneProposal] = {
+            about: one for about, one in vehicle.proposals.items() if about in vehicle.alerts
+        }
+        if len(others) < MAX_PROPOSALS or message.about in others:
+            vehicle.proposals = {**others, message.about: check_proposal(message, self._scene_frame, now)}
 
     def _fleet(self, fleet: FleetState, stamp: Stamp | None, now: float) -> None:
         self.sentences[stamp.writer if stamp else 0] = fleet.sentence

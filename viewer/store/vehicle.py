@@ -29,6 +29,7 @@ from viewer.store.event_detection import DetectorState, detect_events
 from viewer.store.forecast import PastPrediction, ScenePrediction
 from viewer.store.inbox import DataTime, SampleSubset, last_row, position_rows
 from viewer.store.place import UNIT_M, SceneFrame
+from viewer.store.proposal import SceneProposal
 from viewer.store.track import FlightTrack, Trail
 from viewer.theme.events import TimelineEvent, closed_at, merged
 
@@ -40,6 +41,10 @@ MIN_HORIZON_S = 0.5  # a shorter horizon counts as none [s]
 ENDED_S = 3.0  # a replay without messages for this long has ended [s]
 JUMP_S = 5.0  # a larger step back in time is another flight: reset [s]
 OTHER_FLIGHT_S = 86_400.0  # a status farther from the sample time belongs to another flight [s]
+
+
+ProposalKey = tuple[AlertKind | None, int]
+"""Identity of a proposal within one UAV, `Proposal.about`."""
 
 
 class StatusRecord(NamedTuple):
@@ -85,6 +90,7 @@ class Vehicle:
     detector_state: DetectorState = field(default_factory=DetectorState)
     events: tuple[TimelineEvent, ...] = ()  # oldest first; immutable, replaced as a whole
     alerts: dict[AlertKey, Alert] = field(default_factory=dict)  # replaced as a whole, never mutated
+    proposals: dict[ProposalKey, SceneProposal] = field(default_factory=dict)  # replaced as a whole, never mutated
     refusal: tuple[float, str] = (-np.inf, "")  # last rejected message: time, monotonic [s], and reason
     trail: Trail = field(default_factory=Trail)  # newest stretch of the flight, as received
     track: FlightTrack = field(default_factory=FlightTrack)  # the whole flight, thinned
@@ -192,6 +198,10 @@ class Vehicle:
         lag_s = self.data_time(now) - self.forecast.t if self.forecast is not None else 0.0
         return lag_s if lag_s > LATE_S * max(self.time.rate, 1.0) else 0.0
 
+    def open_proposals(self) -> list[SceneProposal]:
+        """Return the proposals against active alerts, those without options included."""
+        return [proposal for about, proposal in self.proposals.items() if about in self.alerts]
+
     def data_time(self, now: float) -> float:
         """Estimate the current data time [s] from the newest message; it stops at the end of a recording."""
         if self.ended:
@@ -257,7 +267,7 @@ class Vehicle:
 
     def reset(self) -> None:
         """Clear the state of a flight after a clock step back or a new scene origin."""
-        self.at, self.alerts, self.floor = None, {}, np.nan
+        self.at, self.alerts, self.proposals, self.floor = None, {}, {}, np.nan
         self.time, self.detector_state, self.events = DataTime(), DetectorState(), ()
         self.t, self.forecast, self.prediction, self.model, self.row = -np.inf, None, None, None, None
         self.controller = self.mismatch = self.last_updated_forecast = None

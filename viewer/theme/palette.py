@@ -56,6 +56,10 @@ class Palette:
         """Return the colours of the display statuses, (7, 3) [0..255]."""
         return np.array([rgb(getattr(self, name)) for name in STATUS_COLOURS])
 
+    def option(self, number: int) -> str:
+        """Return the colour of an option of a proposal by its number from 1 on; the fourth has that of the first."""
+        return (self.verified, self.identifying, self.plausible)[(number - 1) % 3]
+
     def event(self, kind: EventKind) -> str:
         """Return the colour of an event kind."""
         return getattr(self, kind.colour)

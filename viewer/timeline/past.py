@@ -106,6 +106,7 @@ def vehicle_at(vehicle: Vehicle, recording: UavRecording, shown_t: float, rate: 
     past.status, past.model, past.forecast = status, None, forecast
     past.prediction = forecast.message if forecast is not None else None
     past.mismatch, past.alerts, past.ended = record.mismatch, record.alerts, False
+    past.proposals = {}
     past.row = FleetRow(uav=vehicle.uav, state=record.state, verdict=record.verdict, fit=fit)
     return past
 

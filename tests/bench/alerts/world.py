@@ -15,8 +15,8 @@ from fleet.contract import Item
 from fleet.frames import Origin, to_geodetic, to_ned
 from fleet.mission import SEQ
 from fleet.simulator.flight.uav import SimulatedUav
-from fleet.simulator.vehicle.jsbsim import CRUISE
 from fleet.simulator.vehicle.missions import HOME, StartState, draw_mission
+from fleet.simulator.vehicle.types import CRUISE
 
 END_S = 152.0  # the twins hear so much of each flight [s]
 LOOK_S = 120.0  # what is never to happen does not happen for so long after it either [s]
@@ -190,12 +190,12 @@ def chain(count: int, seed: int, say: Callable[[str], None] = print) -> list[Fli
     for uav in range(count):
         may_leave = sum(one.leaves() for one in flights) < count // 2
         told = Told(uav, seed, None if uav == 0 else uav % 2 == 1, uav % 4 in (1, 2), may_leave)
-        flights.append(_arrange(told, rng, flights[-1].path if flights else None))
+        flights.append(arrange(told, rng, flights[-1].path if flights else None))
         say(f"arranged {uav + 1} of {count}")
     return flights
 
 
-def _arrange(told: Told, rng: np.random.Generator, before: np.ndarray | None) -> Flight:
+def arrange(told: Told, rng: np.random.Generator, before: np.ndarray | None) -> Flight:
     own = int(np.random.SeedSequence((told.seed, told.uav)).generate_state(1)[0])
     drawn = fly(told, Plan(*draw_mission(own, CRUISE, HOME), HOME), MEET_S[1] + 5)
     one = _heights(told, drawn, rng)

@@ -186,7 +186,7 @@ def test_a_first_prediction_is_what_ends_the_quiet(bus: MemoryBus, worker: Worke
     taker._twins._start(held, taker._create_twin(2), [])
     taker.ownership.state.unsynchronised = False
     assert taker.ownership.claim().owned == ()
-    taker._publish(prediction(2), held)
+    taker.publish(prediction(2), held)
     assert taker.ownership.claim().owned == ((2, 9),)
 
 

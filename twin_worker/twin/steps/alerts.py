@@ -57,12 +57,12 @@ def prediction_alerts(twin: Twin, now: float, prediction: Prediction | None) -> 
             and not twin.no_route_reason()
             and now - twin.alerts.turn_rate_only_since < _TURN_RATE_GRACE_S
         )
-        findings = [] if turn_rate_only else _ground_and_geofence(twin, gaussian)
+        findings = [] if turn_rate_only else limit_hazards(twin, gaussian)
     if not twin.telemetry.link_lost:
         findings.append(_short_horizon(prediction))
         if twin.alerts.feasibility_timer.due(now, _FEASIBILITY_PERIOD_S):
             twin.alerts.feasibility_timer.restart(now)
-            findings.append(_mission_feasibility(twin, now))
+            findings.append(mission_feasibility(twin, now))
     return [alert for finding in findings for alert in twin.alerts.alarms.update(twin.config.uav, now, finding)]
 
 
@@ -78,14 +78,14 @@ def _update_home_fallback(twin: Twin) -> None:
     twin.alerts.disarmed_at(Origin(*map(int, position[-1])) if len(position) else None)
 
 
-def _ground_and_geofence(twin: Twin, gaussian: GaussianForecast) -> list[HazardEstimate]:
+def limit_hazards(twin: Twin, gaussian: GaussianForecast) -> list[HazardEstimate]:
     """Evaluate ground clearance and geofence; neither without a home position."""
     home_origin, on_rotors = twin.home, is_hovering(twin)
     if home_origin is None:
         return [_not_predicted(AlertKind.GROUND), _not_predicted(AlertKind.GEOFENCE)]
     margin = MIN_HEIGHT_ROTORS_M if on_rotors else MIN_HEIGHT_WINGS_M
     twin.alerts.climbed_to(float(height_above_home(gaussian, home_origin)[0]))
-    until = gaussian.prediction.t + _reach_s(gaussian.prediction)
+    until = gaussian.prediction.t + reach_s(gaussian.prediction)
     findings = [_not_predicted(AlertKind.GROUND)]
     near_ground = twin.alerts.max_height_m <= margin or _is_landing(
         twin, on_rotors
@@ -103,7 +103,7 @@ def _ground_and_geofence(twin: Twin, gaussian: GaussianForecast) -> list[HazardE
     ]
 
 
-def _reach_s(prediction: Prediction) -> float:
+def reach_s(prediction: Prediction) -> float:
     """Return the look-ahead up to which a prediction is used for ground and geofence alerts [s]."""
     if prediction.method == "imm":
         return _TURN_RATE_REACH_S
@@ -139,7 +139,7 @@ def _short_horizon(prediction: Prediction | None) -> HazardEstimate:
     return HazardEstimate(AlertKind.SHORT_HORIZON, level, sentence, "confidence horizon recovered")
 
 
-def _mission_feasibility(twin: Twin, now: float) -> HazardEstimate:
+def mission_feasibility(twin: Twin, now: float) -> HazardEstimate:
     """Evaluate the feasibility of the legs ahead for a fixed wing that follows its mission."""
     no_alert = HazardEstimate(AlertKind.NOT_ACHIEVABLE, 0.0, "", "the mission is achievable")
     _, position = twin.telemetry.history.rows_since("position", twin.telemetry.history.newest - 3.0)

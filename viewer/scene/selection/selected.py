@@ -8,6 +8,7 @@ import numpy as np
 from fleet.contract import DiagnosisOutcome, Mismatch, TwinState
 from viewer.scene.labels import CameraView, Tag, overlap
 from viewer.scene.routes import NOTHING, RouteLines
+from viewer.scene.selection.ghosts import GhostPaths
 from viewer.scene.selection.pins import (
     EventMarkers,
     curtain,
@@ -101,6 +102,7 @@ class Selection:
         self._route = Strokes(scene, "/selected/route", 1.6)
         self._leg = Strokes(scene, "/selected/leg", 3.0)
         self._event_markers = EventMarkers(scene, palette)
+        self._ghosts = GhostPaths(scene, palette)
         self._trail_start = np.inf  # start of the bright newest stretch of the path [s since 1970]
         self._track_colour = mix(palette.actual, palette.ground, 0.5)
         self._ground, self._unit = 0.0, 1.0  # height of the ground, drawn span of an aircraft [10 m]
@@ -132,6 +134,7 @@ class Selection:
         for strokes in (self._thin, self._track, self._bold, self._horizon, self._mismatch):
             strokes.draw(NOTHING.legs)
         self._hide_tube()
+        self._ghosts.clear()
         self.tags, self.marks, self._drawn_route = [], [], None
 
     def draw(self, vehicle: Vehicle, store: FleetStore, now: float, *, ground: float, unit: float) -> None:
@@ -153,6 +156,7 @@ class Selection:
             bold.append((chain(path[:, 1:4])[normal], rgb(p.actual)))
         self._ground, self._unit = ground, unit
         self._draw_forecast(vehicle, vehicle.record(now), clock, (thin, bold))
+        self.tags += self._ghosts.draw(vehicle.open_proposals(), clock)
         lines, label = hindcast(store.past(vehicle), trail, clock)
         thin.append((lines, mix(p.horizon, p.ground, 0.85)))
         self.tags += [label] if label is not None else []

@@ -1,0 +1,1 @@
+"""Computational experiments with changed plans, and proposals that avoid a predicted event."""

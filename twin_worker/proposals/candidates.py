@@ -1,0 +1,371 @@
+"""Candidate changes of the plan of one aircraft, and the items, item number or mode that each of them uploads."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from math import ceil, hypot
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from fleet import mission_legs as m
+from fleet.autopilots import copter
+from fleet.contract import AlertKind, Change, Item, Prediction
+from fleet.frames import Origin, to_geodetic, to_ned
+from fleet.mission import SPEED
+from fleet.mission_jumps import JUMP, LAND_START
+from twin_worker.alerts.feasibility import read_limits
+from twin_worker.alerts.geofence import MIN_HEIGHT_ROTORS_M, MIN_HEIGHT_WINGS_M
+from twin_worker.prediction.autopilot_parameters import fixed_wing_controller
+from twin_worker.prediction.replay_window import AutopilotConfig
+from twin_worker.twin.state.routes import ROUTE_MODES
+from twin_worker.twin.state.state import Twin
+from twin_worker.twin.steps.kinematic_prediction import is_hovering
+from twin_worker.whatif import active_seq
+
+HOLD_MODE, RETURN_MODE, LAND_MODE = "LOITER", "RTL", "LAND"
+"""Modes of a hold, a return and a landing, as in `Status.mode`, of ArduPilot and PX4."""
+MODES = {"hold": HOLD_MODE, "return": RETURN_MODE, "land": LAND_MODE}
+"""Mode of each `Change.mode`."""
+OFFSETS = (-3.0, -2.0, -1.5, 1.5, 2.0, 3.0)
+"""Altitude offsets that are tried against a conflict, in vertical separations [-]."""
+_SPEEDS = 5  # airspeeds tried, evenly spaced between the lowest and the highest
+_ROTOR_SPEEDS = (0.4, 0.6, 0.8)  # speeds of a multirotor that are tried, of its present limit [-]
+_MIN_SPEED_STEP = 1.0  # a smaller change of speed is none [m/s]
+_DELAYS_S = (20.0, 40.0)  # circling or waiting times that are tried [s]
+_REACTION_S = 4.0  # to read a proposal, and again to upload it; an inserted item lies farther ahead [s]
+_DEFAULT_CLIMB = 2.0  # climb and sink rate without received limits [m/s]
+_SKIPPED = 2  # items nearest to the event of which each is left out
+_AHEAD_ITEMS = 8  # navigation items ahead that are looked at
+_LOITER_TIME, _WAYPOINT, _LAND, _VTOL_LAND = 19, 16, 21, 85  # MAV_CMD
+_NO_OFFSET = (m.LAND, m.TAKEOFF)  # legs whose altitude is not changed
+
+
+class Kind(StrEnum):
+    """Kinds of change."""
+
+    SPEED = "speed"
+    ALTITUDE = "altitude"
+    DELAY = "delay"
+    SKIP = "skip"
+    SHRINK = "shrink"
+    HOLD = "hold"
+    RETURN = "return"
+    LAND = "land"
+
+
+INTERRUPTING = (Kind.HOLD, Kind.RETURN, Kind.LAND)
+"""Kinds after which the mission is not continued."""
+
+
+class Candidate(NamedTuple):
+    """One change: kind, and its value.
+
+    The value is the airspeed [m/s], the altitude offset [m], the waiting time [s], the item that is left out, or the
+    distance from home within which all items ahead are moved [m].
+    """
+
+    uav: int
+    kind: Kind
+    value: float = 0.0
+
+
+class Deficit(NamedTuple):
+    """By how much the present plan violates a limit, with its uncertainty [m]."""
+
+    height: float = 0.0  # climb that is missing; negative: descent
+    radius: float = np.inf  # largest distance from home at which items may lie
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Present plan of one aircraft.
+
+    Attributes:
+        twin: a copy, which is not changed
+        prediction: of the present plan, made now
+        seq: current mission item; -1: it follows no mission
+        items: mission items, by number
+    """
+
+    twin: Twin
+    prediction: Prediction
+    seq: int
+    items: tuple[Item, ...]
+
+    @classmethod
+    def of(cls, twin: Twin, prediction: Prediction) -> "Plan":
+        """Return the plan of a twin with its newest prediction."""
+        mission = twin.onboard.mission
+        on_route = twin.mode in ROUTE_MODES and mission is not None and mission.complete
+        items = tuple(sorted(mission.items, key=lambda item: item.seq)) if mission is not None and on_route else ()
+        seq = active_seq(twin) if items else -1
+        return cls(twin, prediction, seq if any(item.seq == seq for item in items) else -1, items)
+
+    @property
+    def uav(self) -> int:
+        """Return the aircraft."""
+        return self.twin.config.uav
+
+    @property
+    def ahead(self) -> list[Item]:
+        """Return the navigation items with a position from the current one on."""
+        return [item for item in self.items if item.seq >= self.seq >= 0 and is_positional(item)]
+
+    @property
+    def remaining(self) -> list[Item]:
+        """Return the same with those that jumps ahead lead back to."""
+        jumps = [item.param1 for item in self.items if item.seq >= self.seq >= 0 and item.command == JUMP]
+        first = min([float(self.seq), *(target for target in jumps if target >= self.twin.first_item)])
+        return [item for item in self.items if item.seq >= first >= 0 and is_positional(item)]
+
+    def position(self, item: Item) -> np.ndarray:
+        """Return the position of an item on the horizontal plane of the prediction's frame, (2,) [m]."""
+        lat, lon = np.array([item.lat_e7], float), np.array([item.lon_e7], float)
+        return to_ned(self.prediction.ned_origin(), lat, lon, np.zeros(1))[0, :2]
+
+    def at(self, seconds: float) -> np.ndarray:
+        """Return the predicted position `seconds` ahead, NED, (3,) [m]."""
+        ahead = self.prediction.ahead.numpy()
+        return np.array([np.interp(seconds, ahead, column) for column in self.prediction.path.numpy().T])
+
+    def reaches_current(self, seconds: float) -> bool:
+        """Return whether the current item is passed within `seconds` at the present speed."""
+        current = next((item for item in self.ahead if item.seq == self.seq), None)
+        if current is None:
+            return True
+        speed = hypot(*(self.at(1.0) - self.at(0.0))[:2])
+        return bool(hypot(*(self.position(current) - self.at(0.0)[:2])) < speed * seconds)
+
+    @property
+    def min_height_m(self) -> float:
+        """Return the smallest height above home at which items may lie [m]."""
+        return MIN_HEIGHT_ROTORS_M if is_hovering(self.twin) else MIN_HEIGHT_WINGS_M
+
+
+def is_positional(item: Item) -> bool:
+    """Return whether an item is flown to: a waypoint or a circle with a position."""
+    return item.command in m.KINDS and m.KINDS[item.command] != m.CHANGE_ALTITUDE and not m.is_zero_position(item)
+
+
+def candidates(
+    plan: Plan, kind: AlertKind, separation_m: float, event: Origin | None, deficit: Deficit
+) -> list[Candidate]:
+    """Return the changes to try against an event.
+
+    Args:
+        plan: present plan
+        kind: of the event
+        separation_m: vertical separation minimum [m]
+        event: where it happens; None: no single position
+        deficit: what is missing to the limits of the aircraft
+    """
+    is_limit = kind in (AlertKind.GROUND, AlertKind.GEOFENCE)  # another speed would only postpone them
+    tried = [Candidate(plan.uav, Kind.SPEED, speed) for speed in ([] if is_limit else _speeds(plan))]
+    if plan.seq >= 0:
+        tried += [Candidate(plan.uav, Kind.ALTITUDE, offset) for offset in _offsets(plan, kind, separation_m, deficit)]
+        if kind is AlertKind.CONFLICT:
+            tried += [Candidate(plan.uav, Kind.DELAY, seconds) for seconds in _DELAYS_S]
+        tried += [Candidate(plan.uav, Kind.SKIP, float(seq)) for seq in _skipped(plan, kind, event)]
+        if np.isfinite(deficit.radius):
+            radii = (deficit.radius, deficit.radius - 30.0)
+            tried += [Candidate(plan.uav, Kind.SHRINK, radius) for radius in radii if radius > 0.0]
+    modes = ((Kind.HOLD, HOLD_MODE), (Kind.RETURN, RETURN_MODE), (Kind.LAND, LAND_MODE))
+    return tried + [Candidate(plan.uav, interruption) for interruption, mode in modes if plan.twin.mode != mode]
+
+
+def to_change(plan: Plan, candidate: Candidate) -> Change | None:
+    """Return what is sent to the aircraft for a candidate; None if the plan no longer admits it."""
+    if candidate.kind is Kind.SPEED:
+        return _speed_change(plan, round(candidate.value, 1))
+    if candidate.kind in (Kind.HOLD, Kind.RETURN):
+        return Change(uav=plan.uav, mode=candidate.kind.value)
+    if candidate.kind is Kind.LAND:
+        return _landing(plan)
+    if plan.seq < 0:
+        return None
+    if candidate.kind is Kind.SKIP:
+        return _skip(plan, int(candidate.value))
+    items = {
+        Kind.ALTITUDE: _with_offset,
+        Kind.DELAY: _with_wait,
+        Kind.SHRINK: _within,
+    }[candidate.kind](plan, candidate.value)
+    return None if items is None else Change(uav=plan.uav, items=items, seq=plan.seq)
+
+
+# --- speed -----------------------------------------------------------------------------------------------------------
+
+
+def _speeds(plan: Plan) -> list[float]:
+    """Return the speeds to try within the limits of the autopilot [m/s]."""
+    if is_hovering(plan.twin):
+        return [fraction * present_speed(plan.twin) for fraction in _ROTOR_SPEEDS]
+    low, high = speed_limits(plan.twin)
+    if not 0 < low < high:
+        return []
+    present = present_speed(plan.twin)
+    return [float(V) for V in np.linspace(low, high, _SPEEDS + 2)[1:-1] if abs(V - present) >= _MIN_SPEED_STEP]
+
+
+def _speed_change(plan: Plan, speed: float) -> Change:
+    """Command a speed, also in place of the speeds that the mission commands later [m/s]."""
+    items = tuple(
+        msgspec.structs.replace(item, param2=speed) if item.command == SPEED and item.seq > plan.seq else item
+        for item in plan.items
+    )
+    if plan.seq < 0 or items == plan.items:
+        return Change(uav=plan.uav, speed=speed)
+    return Change(uav=plan.uav, speed=speed, items=items, seq=plan.seq)
+
+
+def speed_limits(twin: Twin) -> tuple[float, float]:
+    """Return the lowest and highest airspeed that a fixed-wing autopilot accepts; nan: unknown [m/s]."""
+    law = _config(twin).law
+    names = {"arduplane": ("AIRSPEED_MIN", "AIRSPEED_MAX")}.get(law, ("FW_AIRSPD_MIN", "FW_AIRSPD_MAX"))
+    values = fixed_wing_controller(twin.received_params, law=law).values if law else {}
+    return float(values.get(names[0], np.nan)), float(values.get(names[1], np.nan))
+
+
+def present_speed(twin: Twin) -> float:
+    """Return the present speed: through the air, of a multirotor its limit over ground [m/s]."""
+    if is_hovering(twin):
+        return float(copter.limits(twin.received_params, twin.vehicle_class.rotor_prefix)[0].speed)
+    _, velocity = twin.telemetry.history.rows_since("velocity", twin.telemetry.history.newest - 3.0)
+    return float(np.linalg.norm(velocity.mean(axis=0) - twin.environment.wind.wind)) if len(velocity) else np.nan
+
+
+def _config(twin: Twin) -> AutopilotConfig:
+    window = twin.window(10.0)
+    assert window is not None
+    return twin.situation(window).onboard
+
+
+# --- altitude --------------------------------------------------------------------------------------------------------
+
+
+def _offsets(plan: Plan, kind: AlertKind, separation_m: float, deficit: Deficit) -> Iterator[float]:
+    """Yield the altitude offsets to try [m]."""
+    if deficit.height:
+        step = ceil(abs(deficit.height) / 5.0) * 5.0
+        yield from (float(np.copysign(offset, deficit.height)) for offset in (step, step + separation_m))
+    elif kind is AlertKind.CONFLICT:
+        yield from (factor * separation_m for factor in OFFSETS)
+
+
+def _with_offset(plan: Plan, offset: float) -> tuple[Item, ...] | None:
+    """Return the mission with the altitudes of all remaining items changed by `offset` [m].
+
+    Autopilots change the altitude in proportion along a leg. A waypoint on the present leg makes it change sooner.
+    """
+    changed = {item.seq for item in plan.remaining if m.KINDS[item.command] not in _NO_OFFSET}
+    lowered = [item for item in plan.remaining if item.seq in changed and item.frame in m.RELATIVE]
+    if not changed or (offset < 0 and any(item.alt_m + offset < plan.min_height_m for item in lowered)):
+        return None
+    items = [
+        msgspec.structs.replace(item, alt_m=item.alt_m + offset) if item.seq in changed else item for item in plan.items
+    ]
+    rate = _climb_rate(plan.twin, offset)
+    seconds = 2 * _REACTION_S + abs(offset) / rate
+    if plan.reaches_current(seconds + _REACTION_S):
+        return tuple(items)
+    return insert(items, _item_on_path(plan, seconds, offset))
+
+
+def _climb_rate(twin: Twin, offset: float) -> float:
+    """Return the rate at which the altitude can change by `offset` [m/s]."""
+    if is_hovering(twin):
+        limits = copter.limits(twin.received_params, twin.vehicle_class.rotor_prefix)[0]
+        return float(limits.up if offset > 0 else limits.down)
+    limit = read_limits(twin.received_params, 0.0)
+    rate = limit.climb if offset > 0 else limit.sink
+    return rate if np.isfinite(rate) and rate > 0 else _DEFAULT_CLIMB
+
+
+def _item_on_path(plan: Plan, seconds: float, offset: float = 0.0, **fields: float) -> Item:
+    """Return an item in place of the current one, on the predicted path `seconds` ahead, `offset` above it [m]."""
+    lat, lon, alt = to_geodetic(plan.prediction.ned_origin(), plan.at(seconds) - [0.0, 0.0, offset])
+    item = Item(
+        seq=plan.seq, command=_WAYPOINT, frame=0, lat_e7=int(lat), lon_e7=int(lon), alt_m=round(float(alt) * 1e-3, 2)
+    )
+    return msgspec.structs.replace(item, **fields)
+
+
+# --- items -----------------------------------------------------------------------------------------------------------
+
+
+def _with_wait(plan: Plan, seconds: float) -> tuple[Item, ...] | None:
+    """Return the mission with a circle, of a multirotor a stop, on the present leg."""
+    ahead_s = 3 * _REACTION_S
+    if plan.reaches_current(ahead_s):
+        return None
+    command = _WAYPOINT if is_hovering(plan.twin) else _LOITER_TIME
+    return insert(plan.items, _item_on_path(plan, ahead_s, command=command, param1=seconds))
+
+
+def insert(items: Sequence[Item], new: Item) -> tuple[Item, ...]:
+    """Insert an item before the one of the same number; those after it, and jumps to them, move up by one."""
+
+    def moved(item: Item) -> Item:
+        param1 = item.param1 + 1 if item.command == JUMP and item.param1 >= new.seq else item.param1
+        return msgspec.structs.replace(item, seq=item.seq + (item.seq >= new.seq), param1=param1)
+
+    return tuple(sorted((*map(moved, items), new), key=lambda item: item.seq))
+
+
+def remove(items: Sequence[Item], seq: int) -> tuple[Item, ...]:
+    """Leave out one item; those after it, and jumps to them, move down by one."""
+
+    def moved(item: Item) -> Item:
+        param1 = item.param1 - 1 if item.command == JUMP and item.param1 > seq else item.param1
+        return msgspec.structs.replace(item, seq=item.seq - (item.seq > seq), param1=param1)
+
+    return tuple(moved(item) for item in items if item.seq != seq)
+
+
+def _skipped(plan: Plan, kind: AlertKind, event: Origin | None) -> list[int]:
+    """Return the items of which each is left out: the current one, or those nearest to the event."""
+    ahead = plan.ahead[:_AHEAD_ITEMS]
+    if kind is AlertKind.CONFLICT or event is None:
+        return [item.seq for item in ahead[:1]]
+    here = to_ned(plan.prediction.ned_origin(), *(np.array([float(x)]) for x in event))[0, :2]
+    nearest = sorted(ahead, key=lambda item: hypot(*(plan.position(item) - here)))
+    return [item.seq for item in nearest[:_SKIPPED]]
+
+
+def _skip(plan: Plan, seq: int) -> Change | None:
+    """Leave out one item: fly to the next one, or upload the mission without it."""
+    following = [item for item in plan.ahead if item.seq > seq]
+    if seq < plan.seq or not following or not any(item.seq == seq for item in plan.items):
+        return None
+    if seq == plan.seq:
+        return Change(uav=plan.uav, seq=following[0].seq)
+    return Change(uav=plan.uav, items=remove(plan.items, seq), seq=plan.seq)
+
+
+def _within(plan: Plan, radius: float) -> tuple[Item, ...] | None:
+    """Return the mission with all remaining items within `radius` of home [m]."""
+    home = plan.twin.home
+    if home is None:
+        return None
+    moved: Mapping[int, Item] = {item.seq: _move_within(item, home, radius) for item in plan.remaining}
+    items = tuple(moved.get(item.seq, item) for item in plan.items)
+    return items if items != plan.items else None
+
+
+def _move_within(item: Item, home: Origin, radius: float) -> Item:
+    offset = to_ned(home, np.array([item.lat_e7], float), np.array([item.lon_e7], float), np.zeros(1))[0]
+    distance = hypot(*offset[:2])
+    if distance <= radius:
+        return item
+    lat, lon, _ = to_geodetic(home, np.array([*(offset[:2] * radius / distance), 0.0]))
+    return msgspec.structs.replace(item, lat_e7=int(lat), lon_e7=int(lon))
+
+
+def _landing(plan: Plan) -> Change | None:
+    """Return the landing: of a multirotor by mode, of a fixed wing the landing sequence of its mission."""
+    if plan.twin.vehicle_class.is_rotorcraft:
+        return Change(uav=plan.uav, mode=Kind.LAND.value)
+    starts = [item.seq for item in plan.items if item.command in (LAND_START, _LAND, _VTOL_LAND)]
+    return Change(uav=plan.uav, seq=min(starts)) if starts and plan.seq >= 0 and plan.seq < min(starts) else None

@@ -1,0 +1,215 @@
+"""Computational experiment: predict one aircraft with a changed plan, as its twin would after the change.
+
+Each experiment flies a copy of the twin through the same closed loop as a prediction, with its ensemble. New items, an
+item number or a speed replace the route from the present position on. A new mode is entered now, as when the autopilot
+reports it.
+"""
+
+import copy
+from collections.abc import Iterable
+from dataclasses import dataclass
+from math import atan2
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from scipy.special import ndtri
+
+from fleet.autopilots.modes import ModeEntry
+from fleet.contract import AlertKind, Change, Item, Mission, Prediction
+from fleet.frames import to_ned
+from fleet.mission import SPEED
+from twin_worker.alerts.gaussian_forecast import GaussianForecast, to_gaussian
+from twin_worker.alerts.geofence import height_above_home, read_geofence
+from twin_worker.alerts.hysteresis import RULES
+from twin_worker.prediction.autopilot_parameters import SPEED_PARAMETERS, RouteOverride
+from twin_worker.proposals.candidates import LAND_MODE, MODES, Candidate, Deficit, Plan, to_change
+from twin_worker.twin.state.events import invalidate_prediction
+from twin_worker.twin.state.state import Twin
+from twin_worker.twin.steps.alerts import limit_hazards, mission_feasibility, reach_s
+from twin_worker.twin.steps.predict_step import predict
+from twin_worker.whatif import active_seq
+
+LIMITS = (AlertKind.GROUND, AlertKind.GEOFENCE, AlertKind.NOT_ACHIEVABLE)
+"""Hazards of one aircraft alone that an experiment assesses."""
+_MARGIN_SHARE = 0.1  # probability aimed at, of that at which an alert is cleared [-]
+_NO_ROUTE = "imm"  # method of a prediction from the turn rate alone: the change has no effect on it
+
+
+@dataclass(frozen=True)
+class PlanExperiment:
+    """Prediction of one aircraft under a candidate change.
+
+    Attributes:
+        candidate: the change; None: the present plan
+        change: what is sent to the aircraft; None: nothing
+        forecast: its prediction on the common grid
+        hazards: probabilities of ground, geofence and an infeasible mission
+        margin_m: smallest distance to the minimum height and to the geofence within the look-ahead, by hazard [m]
+    """
+
+    candidate: Candidate | None
+    change: Change | None
+    forecast: GaussianForecast
+    hazards: dict[AlertKind, float]
+    margin_m: dict[AlertKind, float]
+
+    @property
+    def prediction(self) -> Prediction:
+        """Return the prediction."""
+        return self.forecast.prediction
+
+    @property
+    def uav(self) -> int:
+        """Return the aircraft."""
+        return self.prediction.uav
+
+
+def present(twin: Twin) -> PlanExperiment | None:
+    """Predict the present plan of a twin now; None without a prediction on a route."""
+    return _fly(_changeable(twin), None, None)
+
+
+def run(plan: Plan, candidates: Iterable[Candidate]) -> list[PlanExperiment]:
+    """Predict one aircraft under each candidate; omit candidates that its plan does not admit."""
+    experiments = []
+    for candidate in candidates:
+        change = to_change(plan, candidate)
+        experiment = None if change is None else _fly(_changeable(plan.twin), candidate, change)
+        if experiment is not None:
+            experiments.append(experiment)
+    return experiments
+
+
+def _changeable(twin: Twin) -> Twin:
+    """Return a copy of a twin for one experiment; telemetry and models, which it only reads, are shared."""
+    parts = {name: copy.deepcopy(getattr(twin, name)) for name in ("onboard", "prediction", "confidence", "alerts")}
+    return msgspec.structs.replace(twin, budget=None, **parts)
+
+
+def _fly(twin: Twin, candidate: Candidate | None, change: Change | None) -> PlanExperiment | None:
+    """Predict a copy of a twin, which is changed."""
+    if change is not None:
+        _apply(twin, change)
+    twin.prediction.forget_published()
+    messages = predict(twin, twin.telemetry.history.newest)
+    prediction = next((message for message in messages if isinstance(message, Prediction)), None)
+    forecast = None if prediction is None else to_gaussian(prediction)
+    if forecast is None or forecast.prediction.method == _NO_ROUTE:
+        return None
+    _report_change(twin)
+    hazards = [*limit_hazards(twin, forecast), mission_feasibility(twin, twin.telemetry.history.newest)]
+    probabilities = {hazard.kind: hazard.probability for hazard in hazards if hazard.kind in LIMITS}
+    return PlanExperiment(candidate, change, forecast, probabilities, _margins(twin, forecast))
+
+
+def _apply(twin: Twin, change: Change) -> None:
+    """Change the plan of a copy."""
+    if change.mode and not _lands_by_mode(change):
+        _enter_mode(twin, MODES[change.mode])
+        return
+    items = twin.onboard.mission.items if twin.onboard.mission is not None else ()
+    present_seq = active_seq(twin)
+    items, seq = change.items or items, present_seq if change.seq is None else change.seq
+    jumps = twin.onboard.jumps_taken if change.items is None else {}
+    if _lands_by_mode(change):
+        items, seq = _landing_here(twin)
+    parameters = {} if change.speed is None else dict.fromkeys(SPEED_PARAMETERS, change.speed)
+    if change.speed is not None:  # in place of the speed commanded so far; later items of the mission command theirs
+        items = tuple(
+            msgspec.structs.replace(item, param2=change.speed) if item.command == SPEED and item.seq < seq else item
+            for item in items
+        )
+    restart = change.items is not None or change.seq is not None or _lands_by_mode(change)
+    twin.prediction.set_override(RouteOverride(items, seq, parameters, restart, None, twin.first_item, jumps))
+    twin.confidence.tracker.censor_open()  # earlier predictions flew another plan
+
+
+def _lands_by_mode(change: Change) -> bool:
+    return change.mode != "" and MODES[change.mode] == LAND_MODE
+
+
+def _landing_here(twin: Twin) -> tuple[tuple[Item, ...], int]:
+    """Return a mission that lands at the present position, and its item to fly to."""
+    lat, lon, _ = (int(x) for x in twin.telemetry.history.rows("position")[1][-1])
+    first, home = twin.first_item, twin.home
+    land = Item(seq=first, command=21, lat_e7=lat, lon_e7=lon)
+    at_home = () if home is None else (Item(seq=0, command=16, frame=0, lat_e7=home[0], lon_e7=home[1]),)
+    return (*(at_home if first else ()), land), first
+
+
+def _enter_mode(twin: Twin, mode: str) -> None:
+    """Enter a mode now, as when the autopilot reports it."""
+    now, status = twin.telemetry.history.newest, twin.onboard.status
+    _, positions = twin.telemetry.history.rows("position")
+    _, velocities = twin.telemetry.history.rows("velocity")
+    assert status is not None
+    twin.onboard.set_status(msgspec.structs.replace(status, mode=mode))
+    lat, lon, alt = (float(x) for x in positions[-1])
+    twin.onboard.enter_mode(ModeEntry(now, (lat, lon, alt), atan2(velocities[-1, 1], velocities[-1, 0])))
+    invalidate_prediction(twin, None, now)
+
+
+def _report_change(twin: Twin) -> None:
+    """Store mission and parameters of the override as reported, for the alerts that read them."""
+    override = twin.prediction.override
+    if override is None:
+        return
+    now = twin.telemetry.history.newest
+    mission = Mission(uav=twin.config.uav, t=now, items=override.items, seq=override.seq, complete=True)
+    twin.onboard.set_mission(mission, twin.first_item)
+    if twin.onboard.params is not None:
+        values = twin.onboard.params.values
+        changed = {name: value for name, value in override.parameters.items() if name in values}
+        twin.onboard.set_params(msgspec.structs.replace(twin.onboard.params, values=values | changed))
+
+
+class _Extremes(NamedTuple):
+    """Lowest and highest mean height above home and largest distance from it, each with its standard deviation [m]."""
+
+    low: tuple[float, float]
+    high: tuple[float, float]
+    far: tuple[float, float]
+
+
+def _extremes(twin: Twin, forecast: GaussianForecast) -> _Extremes:
+    """Return the extremes of a forecast within the look-ahead of the ground and geofence alerts."""
+    assert twin.home is not None
+    until = forecast.prediction.t + reach_s(forecast.prediction)
+    k = max(int(np.searchsorted(forecast.t, until, side="right")), 1)
+    home = to_ned(forecast.prediction.ned_origin(), *(np.array([float(x)]) for x in twin.home))[0]
+    distance = np.hypot(*(forecast.path[:k] - home)[:, :2].T)
+    height, sigma = height_above_home(forecast, twin.home)[:k], forecast.sigma
+    low, high, far = int(height.argmin()), int(height.argmax()), int(distance.argmax())
+    sigma_far = float(sigma[far, :2].max())
+    return _Extremes(
+        (float(height[low]), float(sigma[low, 2])),
+        (float(height[high]), float(sigma[high, 2])),
+        (float(distance[far]), sigma_far),
+    )
+
+
+def _margins(twin: Twin, forecast: GaussianForecast) -> dict[AlertKind, float]:
+    """Return the lowest height above home of the mean path, and its smallest distance to the geofence [m]."""
+    if twin.home is None:
+        return {}
+    extremes, fence = _extremes(twin, forecast), read_geofence(twin.received_params)
+    inside = min(fence.radius - extremes.far[0], fence.ceiling - extremes.high[0], extremes.low[0] - fence.floor)
+    return {AlertKind.GROUND: extremes.low[0], AlertKind.GEOFENCE: inside}
+
+
+def deficit(plan: Plan, experiment: PlanExperiment, kind: AlertKind) -> Deficit:
+    """Return by how much the present plan violates the limits of an alert, with the uncertainty of the prediction.
+
+    The margin is such that the probability falls to a tenth of that at which the alert is cleared.
+    """
+    if kind not in (AlertKind.GROUND, AlertKind.GEOFENCE) or plan.twin.home is None:
+        return Deficit()
+    extremes, z = _extremes(plan.twin, experiment.forecast), -float(ndtri(_MARGIN_SHARE * RULES[kind].clear_below))
+    (low, sigma_low), (high, sigma_high), (far, sigma_far) = extremes
+    if kind is AlertKind.GROUND:
+        return Deficit(max(plan.min_height_m + z * sigma_low - low, 0.0))
+    fence = read_geofence(plan.twin.received_params)
+    too_high, too_low = min(fence.ceiling - z * sigma_high - high, 0.0), max(fence.floor + z * sigma_low - low, 0.0)
+    overshoot = far - (fence.radius - z * sigma_far)
+    return Deficit(too_low or too_high, fence.radius - overshoot - z * sigma_far if overshoot > 0 else np.inf)
