@@ -1,5 +1,6 @@
 """Encode and decode messages: msgpack maps, a version in the encoding, an attachment of epoch and writer."""
 
+import hashlib
 import math
 import struct
 import time
@@ -8,7 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 
 from fleet.access.roles import TOPIC_RULES
-from fleet.contract import PER_UAV, TOPICS
+from fleet.contract import PER_UAV, TOPICS, Option
 
 M = TypeVar("M")
 MAX_EPOCH_AHEAD_MS = 300_000  # an epoch further ahead of the local clock is forged or of a wrong clock
@@ -55,6 +56,11 @@ class EncodedMessage(NamedTuple):
 def encode(message: Any) -> bytes:
     """Encode one message as a msgpack map; return the payload of an encoded message unchanged."""
     return message.payload if isinstance(message, EncodedMessage) else _PACK.encode(message)
+
+
+def digest_of(option: Option) -> str:
+    """Return the SHA-256 of the changes of an option, 64 hex digits: what an approval is for, without its forecast."""
+    return hashlib.sha256(_PACK.encode(option.changes)).hexdigest()
 
 
 def encoding(kind: type) -> str:
