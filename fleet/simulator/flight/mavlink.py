@@ -215,11 +215,12 @@ class MavlinkEndpoint:
             custom, sub = int(message.param2), int(message.param3)
             mode = self._mode_name((sub << 24 | custom << 16) if self._dialect.is_px4 else custom)
             accepted = self._request_mode(mode)
-        elif message.command == mav.MAV_CMD_DO_CHANGE_SPEED:
-            accepted = self._request_speed(message.param2)
+        rejection = mav.MAV_RESULT_UNSUPPORTED
+        if message.command == mav.MAV_CMD_DO_CHANGE_SPEED:
+            accepted, rejection = self._request_speed(message.param2), mav.MAV_RESULT_DENIED
         elif message.command == mav.MAV_CMD_DO_SET_MISSION_CURRENT and not self._dialect.is_px4:
-            accepted = self._request_item(message.param1)
-        result = mav.MAV_RESULT_ACCEPTED if accepted else mav.MAV_RESULT_UNSUPPORTED
+            accepted, rejection = self._request_item(message.param1), mav.MAV_RESULT_DENIED
+        result = mav.MAV_RESULT_ACCEPTED if accepted else rejection
         ack = mav.MAVLink_command_ack_message(message.command, result, 0, 0, *_sender(message))
         if not is_version_request:
             return [ack]
