@@ -699,6 +699,7 @@ class Execution(Message, frozen=True, kw_only=True):
     option: int = 0
     state: ExecutionState
     who: Annotated[str, about("the person who approved it")] = ""
+    digest: Annotated[str, about("that of the approval; an undo repeats it")] = ""
     approved_t: Annotated[float, about("`t` of the approval [s since 1970]")] = 0.0
     undo: Annotated[bool, about("true: this approval asked for the undo")] = False
     steps: tuple[ExecutionStep, ...] = ()

@@ -9,7 +9,7 @@ Source: MAVLink services, "Mission Protocol"; ArduPilot `MissionItemProtocol`; P
 
 from collections import deque
 from collections.abc import Sequence
-from math import isfinite, isnan
+from math import isnan
 from typing import Any, NamedTuple
 
 import msgspec
@@ -26,6 +26,7 @@ FINAL_S = 4.0  # wait for the acknowledgement of a completely sent mission; the 
 _FRAMES = {5: 0, 6: 3, 11: 10}  # MAV_FRAME: with integer coordinates -> the same frame
 _ALTITUDE_STEP_M = 0.011  # ArduPilot stores altitudes in whole centimetres [m]
 _PARAM_STEP = 0.5  # ArduPilot stores several parameters as whole numbers
+_MAX_NUMBER = 1e9  # largest parameter or altitude; larger ones, and those that are not finite, are errors
 _RESULT_NAMES = {
     value: entry.name.removeprefix("MAV_MISSION_").lower().replace("_", " ")
     for value, entry in dialect.enums["MAV_MISSION_RESULT"].items()
@@ -198,7 +199,7 @@ def check_items(items: Sequence[Item]) -> str:
     for seq, item in enumerate(items):
         numbers = (item.param1, item.param2, item.param3, item.param4, item.alt_m)
         in_range = abs(item.lat_e7) <= 900_000_000 and abs(item.lon_e7) <= 1_800_000_000
-        if item.seq != seq or not in_range or not all(map(isfinite, numbers)):
+        if item.seq != seq or not in_range or not all(abs(x) <= _MAX_NUMBER for x in numbers):
             return f"found item {item.seq} at place {seq} of the mission, expected it numbered, finite and on earth"
         if not (0 <= item.command <= 0xFFFF and 0 <= item.frame <= 0xFF):
             return f"found command {item.command} in frame {item.frame} of item {seq}, expected a command of MAVLink"

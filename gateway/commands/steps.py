@@ -76,7 +76,7 @@ class AcknowledgedCommand(CommandStep):
 
     def __init__(self, target: Target, sentence: str, command: int, params: Sequence[float]) -> None:
         super().__init__(target, sentence)
-        self.command, self._params = command, (*params, *(0.0,) * (7 - len(params)))
+        self.command, self.params = command, (*params, *(0.0,) * (7 - len(params)))
         self.sent = 0  # messages sent
         self._sent_t = float("-inf")
 
@@ -107,7 +107,7 @@ class AcknowledgedCommand(CommandStep):
         return [self._message(0)]
 
     def _message(self, confirmation: int) -> Any:
-        return dialect.MAVLink_command_long_message(*self.target, self.command, confirmation, *self._params)
+        return dialect.MAVLink_command_long_message(*self.target, self.command, confirmation, *self.params)
 
     def _acknowledge(self) -> None:
         self._end(True, self.sentence)
@@ -197,7 +197,6 @@ class MissionCommand(CommandStep):
         expected: the mission to send as far as it is known before
         current: item to fly to
         has_home: item 0 is home, which an upload does not change
-        now: fleet time [s since 1970]
     """
 
     transfers_mission = True
@@ -210,20 +209,21 @@ class MissionCommand(CommandStep):
         *,
         current: int,
         has_home: bool,
-        now: float,
     ) -> None:
         super().__init__(target, f"mission of {len(expected)} items")
         self._plan, self._expected, self._current, self._has_home = plan, tuple(expected), current, has_home
         self.former: tuple[RawItem, ...] = ()  # the mission on board before
         self.items: tuple[RawItem, ...] = ()  # the mission sent
-        self.has_written = False  # whether a write has begun
-        self._transfer: MissionRead | MissionWrite = MissionRead(target, now)
+        self.stored: tuple[RawItem, ...] | None = ()  # the mission on board; None: unknown, a write has begun
+        self._transfer: MissionRead | MissionWrite | None = None
         self._advance: Callable[[float], None] = self._after_first_read
         self._attempts = 0
         self._error = ""  # of the last transfer
 
     def messages(self, now: float) -> list[Any]:
         """Return the messages of the present transfer."""
+        if self._transfer is None:
+            self._transfer = MissionRead(self.target, now)
         out = self._transfer.messages(now)
         if not out and self.result is None and self._transfer.result is not None:
             self._error = self._transfer.result or self._error
@@ -233,7 +233,8 @@ class MissionCommand(CommandStep):
 
     def receive(self, message: Any, now: float) -> None:
         """Process one message of the autopilot."""
-        self._transfer.receive(message, now)
+        if self._transfer is not None:
+            self._transfer.receive(message, now)
 
     def planned(self) -> list[Any]:
         """Return the messages of the step without loss; the replies of the autopilot lie between them."""
@@ -244,7 +245,7 @@ class MissionCommand(CommandStep):
         return [read, count, *sent, read]
 
     def _write(self, items: tuple[RawItem, ...], now: float, then: Callable[[float], None]) -> None:
-        self.has_written = True
+        self.stored = None
         self._transfer, self._advance = MissionWrite(self.target, items, self._current, now), self._read_back(then)
 
     def _read_back(self, then: Callable[[float], None]) -> Callable[[float], None]:
@@ -253,18 +254,20 @@ class MissionCommand(CommandStep):
 
         return begin
 
-    def _stored(self, items: Sequence[RawItem]) -> bool:
+    def _is_stored(self, items: tuple[RawItem, ...]) -> bool:
         """Return whether the mission just read is this one."""
         transfer = self._transfer
         complete = isinstance(transfer, MissionRead) and transfer.result == ""
-        return complete and same_missions(items, transfer.items, self._has_home)  # type: ignore[union-attr]
+        is_stored = complete and same_missions(items, transfer.items, self._has_home)  # type: ignore[union-attr]
+        self.stored = items if is_stored else self.stored
+        return is_stored
 
     def _after_first_read(self, now: float) -> None:
         assert isinstance(self._transfer, MissionRead)
         if self._transfer.result:
             self._end(False, f"{self.sentence}: {self._error}; nothing was changed")
             return
-        self.former = self._transfer.items
+        self.former = self.stored = self._transfer.items
         try:
             self.items = self._plan(self.former)
         except ValueError as error:
@@ -274,11 +277,11 @@ class MissionCommand(CommandStep):
 
     def _after_write(self, now: float) -> None:
         self._attempts += 1
-        if self._stored(self.items):
+        if self._is_stored(self.items):
             self._end(True, f"{self.sentence}, read back and compared")
         elif self._attempts < TRANSFERS:
             self._write(self.items, now, self._after_write)
-        elif self._stored(self.former):
+        elif self._is_stored(self.former):
             self._end(False, f"{self.sentence}: {self._error or 'not stored'}; the former mission is on board")
         else:
             self._attempts = 0
@@ -286,7 +289,7 @@ class MissionCommand(CommandStep):
 
     def _after_restore(self, now: float) -> None:
         self._attempts += 1
-        if self._stored(self.former):
+        if self._is_stored(self.former):
             self._end(False, f"{self.sentence}: {self._error or 'not stored'}; the former mission was restored")
         elif self._attempts < TRANSFERS:
             self._write(self.former, now, self._after_restore)

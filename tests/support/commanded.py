@@ -1,17 +1,24 @@
 """An aircraft that answers commands as ArduPlane or PX4 does, without physics, over a radio that loses frames."""
 
+import json
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from fleet.contract import Item
+from fleet.bus.codec import digest_of
+from fleet.contract import Approval, Array, Change, Execution, Item, Option, Proposal, ProposedPath
 from fleet.frames import Origin, to_geodetic
 from fleet.simulator.flight.mavlink import ItemRequest, MavlinkEndpoint, ModeRequest, SpeedRequest
 from fleet.simulator.flight.mavlink_messages import ARDUPLANE_MODES, DIALECTS, PX4_AUTO, PX4_MODES
+from fleet.telemetry.mavlink.intake import MavlinkReceiver
+from gateway.commands.audit import AuditLog
+from gateway.commands.executor import CommandExecutor
 from gateway.onboard import COMPONENT, SYSTEM
+from tests.support.memory_bus import MemoryBus
 
 HOME = Origin(474_000_000, 85_000_000, 450_000)
 SPEED = 20.0  # northwards [m/s]
@@ -134,3 +141,85 @@ class StepDriver:
     def _heard(self, frames: list[bytes]) -> Iterator[Any]:
         for frame in frames:
             yield from self._ear.parse_buffer(frame) or []
+
+
+T0 = 1_700_000_000.0  # fleet time at the start [s since 1970]
+
+
+class CommandSite:
+    """A gateway that executes approved proposals, its bus and one aircraft, in virtual time."""
+
+    def __init__(self, folder: Path, aircraft: CommandedAircraft, *, allowed: range = range(9), dry: bool = False):
+        self.bus, self.aircraft, self.t = MemoryBus(), aircraft, 0.0
+        self.lines: list[str] = []  # of a dry run
+        self.executions: list[Execution] = []
+        self.bus.subscribe(Execution, lambda message, _: self.executions.append(message))
+        self.audit = AuditLog(folder / "commands.jsonl")
+        self.receiver = MavlinkReceiver()
+        by_uav = self.receiver._id_owners
+        report = self.lines.append if dry else None
+        self.executor = CommandExecutor(self.bus, by_uav, allowed.__contains__, self.audit, report)
+        self._mav = mav.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
+        self._uplink: list[bytes] = []
+        self.run(1.0)
+        self.download()
+        self.run(1.0)
+        known = self.receiver.aircraft[1]
+        for name, value in PARAMS.items():
+            known.params.set_value(name, value)
+        assert known.mission.complete
+
+    @property
+    def now(self) -> float:
+        """Fleet time [s since 1970]."""
+        return T0 + self.t
+
+    def download(self) -> None:
+        """Let the gateway know the mission on board; nothing of it is counted."""
+        requests = [mav.MAVLink_mission_request_list_message(1, 1)]
+        requests += [mav.MAVLink_mission_request_int_message(1, 1, k) for k in range(len(self.aircraft.items))]
+        for request in requests:
+            for frame in self.aircraft.endpoint.receive(bytes(request.pack(self._mav)), self.t):
+                self.receiver.receive(self.now, frame, "radio")
+
+    def run(self, seconds: float) -> list[Execution]:
+        """Run for a while; return what was published about executions meanwhile."""
+        before = len(self.executions)
+        for _ in range(round(seconds * 10)):
+            self.t = round(self.t + 0.1, 1)
+            for frame in self.aircraft.tick(self.t, self._uplink):
+                self.receiver.receive(self.now, frame, "radio")
+            self.executor.observe(self.receiver.flush_packed(self.now))
+            self._uplink = [bytes(message.pack(self._mav)) for _, message in self.executor.tick(self.now)]
+        return self.executions[before:]
+
+    def option(self, **changes: Any) -> Option:
+        """An option of the aircraft, with the path that it flies."""
+        ahead = np.arange(0.0, 121.0, 2.0)
+        path = np.column_stack([SPEED * ahead, np.zeros(len(ahead)), np.zeros(len(ahead))]) + self.aircraft.ned(self.t)
+        half_axes = np.column_stack([8.0 + 0.5 * ahead, 8.0 + 0.2 * ahead, 6.0 + 0.1 * ahead])
+        arrays = {"ahead": Array.of(ahead), "path": Array.of(path), "prediction_region_half_axes": Array.of(half_axes)}
+        proposed = ProposedPath(uav=1, origin=(HOME.lat_e7, HOME.lon_e7, HOME.alt_mm), **arrays)
+        paths, change = (proposed,), Change(uav=1, **changes)
+        return Option(sentence="", changes=(change,), paths=paths, probability=0.01, clearance_m=90.0)
+
+    def propose(self, *options: Option, name: str = "p1", valid_s: float = 15.0) -> Proposal:
+        """Publish a proposal as a worker does; the positions of its aircraft are observed from then on."""
+        proposal = Proposal(uav=1, t=self.now, id=name, options=options, valid_until=self.now + valid_s)
+        self.bus.publish(proposal)
+        self.run(0.2)
+        return proposal
+
+    def approval(self, shown: Proposal, **fields: Any) -> Approval:
+        """The approval of the first option of a proposal; fields replace its own."""
+        digest = digest_of(shown.options[0])
+        own = {"uav": 1, "t": self.now, "proposal": shown.id, "digest": digest, "who": "kim"}
+        return Approval(**(own | fields))
+
+    def entries(self) -> list[dict[str, Any]]:
+        """The lines of the audit."""
+        return [json.loads(line) for line in self.audit.path.read_text().splitlines()]
+
+    def events(self) -> list[str]:
+        """The events of the audit."""
+        return [entry["event"] for entry in self.entries()]

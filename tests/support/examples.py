@@ -269,6 +269,7 @@ MESSAGES = (
         option=0,
         state=ExecutionState.ACCEPTED,
         who="kim",
+        digest="ab" * 32,
         approved_t=T + 4.0,
         undo=True,
         steps=(ExecutionStep(uav=UAV, sentence="speed 18 m/s", accepted=True, t=T + 6.0),),

@@ -26,9 +26,9 @@ def raw(items) -> tuple[RawItem, ...]:
     return tuple(RawItem.from_item(item, item.param4) for item in items)
 
 
-def upload(aircraft: CommandedAircraft, items, current: int = 2, now: float = 0.0) -> MissionCommand:
+def upload(aircraft: CommandedAircraft, items, current: int = 2) -> MissionCommand:
     plan = partial(planned_items, items, reported=mission(len(aircraft.items)), is_px4=aircraft.is_px4)
-    return MissionCommand(TARGET, plan, raw(items), current=current, has_home=not aircraft.is_px4, now=now)
+    return MissionCommand(TARGET, plan, raw(items), current=current, has_home=not aircraft.is_px4)
 
 
 def names(aircraft: CommandedAircraft) -> list[str]:
@@ -112,9 +112,9 @@ def test_a_mission_that_must_not_be_sent_is_not_written() -> None:
     def refuse(former: tuple[RawItem, ...]) -> tuple[RawItem, ...]:
         raise ValueError("it changed")
 
-    step = MissionCommand(TARGET, refuse, (), current=1, has_home=True, now=0.0)
+    step = MissionCommand(TARGET, refuse, (), current=1, has_home=True)
     assert StepDriver(aircraft).run(step).sentence.endswith("it changed; nothing was changed")
-    assert not step.has_written and "MISSION_COUNT" not in names(aircraft)
+    assert step.stored == step.former and "MISSION_COUNT" not in names(aircraft)
 
 
 def test_items_on_board_go_back_as_they_were_read_and_others_keep_the_heading() -> None:
