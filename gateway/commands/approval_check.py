@@ -137,11 +137,11 @@ def situation_refusal(option: Option, received: ReceivedProposal, fleet: Fleet, 
         if uav not in paths:
             return f"uav-{uav}: the option has no predicted path of it"
         try:
-            found = deviation(paths[uav], t - received.proposal.t, position)
+            offset = deviation(paths[uav], t - received.proposal.t, position)
         except ValueError as error:
             return str(error)
-        if found is None:
+        if offset is None:
             return f"uav-{uav}: the predicted path of the option has no point for now"
-        if not found.is_inside:
-            return f"uav-{uav} is outside of the option's predicted region: {found}; the situation has changed"
+        if not offset.is_inside:
+            return f"uav-{uav} is outside of the option's predicted region: {offset}; the situation has changed"
     return ""

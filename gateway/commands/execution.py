@@ -84,8 +84,8 @@ class RunningExecution:
         """Compare the flight with the predicted paths of the option; at their end the execution is done."""
         self.compared_t = now
         paths = {path.uav: path for path in self.option.paths if path.uav in self.former}  # checked at the approval
-        found = {uav: self._deviation(path, positions) for uav, path in paths.items()}
-        compared = {uav: one for uav, one in found.items() if one is not None}
+        deviations = {uav: self._deviation(path, positions) for uav, path in paths.items()}
+        compared = {uav: one for uav, one in deviations.items() if one is not None}
         if now - self.proposal.t > max((float(path.ahead.numpy()[-1]) for path in paths.values()), default=0.0):
             self.state = ExecutionState.DONE
             self.sentence = f"the predicted path has ended; last: {self.sentence}"
