@@ -17,10 +17,11 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from fleet.contract import MAX_ITEMS, Item
 from gateway.onboard import SYSTEM
+from gateway.onboard.questions import RETRY_S as ITEM_RETRY_S
 
 Target = tuple[int, int]
 """MAVLink system and component id of an autopilot."""
-RETRY_S = 1.0  # between two equal messages [s]
+RETRY_S = 1.0  # between two equal commands [s]
 STALLED_S = 10.0  # silence after which a transfer has failed; ArduPilot waits 8 s, PX4 5 s [s]
 FINAL_S = 4.0  # wait for the acknowledgement of a completely sent mission; the autopilot may request an item again [s]
 _FRAMES = {5: 0, 6: 3, 11: 10}  # MAV_FRAME: with integer coordinates -> the same frame
@@ -133,7 +134,7 @@ class MissionRead:
             return [dialect.MAVLink_mission_ack_message(*self._target, dialect.MAV_MISSION_ACCEPTED)]
         if self.result is None and now - self._progress_t > STALLED_S:
             self.result = f"no answer to a request for the mission for {STALLED_S:.0f} s"
-        if self.result is not None or now - self._sent_t < RETRY_S:
+        if self.result is not None or now - self._sent_t < ITEM_RETRY_S:
             return []
         self._sent_t = now
         if self._count < 0:

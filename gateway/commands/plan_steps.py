@@ -67,17 +67,14 @@ def change_steps(aircraft: AircraftLink, change: Change, situation: Situation) -
     target, is_px4 = (aircraft.system, aircraft.component), aircraft.autopilot == "px4"
     steps: list[CommandStep] = []
     if change.items is not None:
-        seq = change.seq
-        if seq is None:
-            seq = _same_item(change.items, situation.published_items, max(aircraft.mission.seq, 0))
         expected = planned_items(change.items, (), (), is_px4)
         plan = partial(_proposed_mission, change.items, situation, is_px4)
-        steps.append(MissionCommand(target, plan, expected, current=seq, has_home=not is_px4))
-        old, new = situation.published_items[aircraft.mission.seq : aircraft.mission.seq + 1], change.items[seq]
-        reload = not is_px4 and old != (msgspec.structs.replace(new, seq=aircraft.mission.seq),)
-        steps.append(CurrentItemCommand(target, seq, is_px4=is_px4, reload=reload))
+        flown = max(aircraft.mission.seq, 0)
+        current = partial(_proposed_item, change, situation.published_items, flown)
+        step = MissionCommand(target, plan, expected, current=current, flown=flown, has_home=not is_px4)
+        steps += [step, CurrentItemCommand(target, partial(_item_to_command, step, is_px4), is_px4=is_px4)]
     elif change.seq is not None:
-        steps.append(CurrentItemCommand(target, change.seq, is_px4=is_px4))
+        steps.append(CurrentItemCommand(target, partial(_unless_current, change.seq), is_px4=is_px4))
     if change.speed is not None:
         steps.append(_speed_command(aircraft, change.speed))
     if change.mode:
@@ -96,15 +93,17 @@ def _undo(
     step: CommandStep, aircraft: AircraftLink, former: FormerPlan, target: Target, is_px4: bool
 ) -> Iterator[CommandStep]:
     if isinstance(step, MissionCommand):
-        seq = _same_raw_item(step.former, step.items, max(aircraft.mission.seq, 0), former.seq)
         plan = partial(_former_mission, step, not is_px4)
-        yield MissionCommand(target, plan, step.former, current=seq, has_home=not is_px4)
-        yield CurrentItemCommand(target, seq, is_px4=is_px4, reload=not is_px4)
+        current = partial(_same_raw_item, step.former, step.items, former.seq)
+        flown = max(aircraft.mission.seq, 0)
+        again = MissionCommand(target, plan, step.former, current=current, flown=flown, has_home=not is_px4)
+        yield again
+        yield CurrentItemCommand(target, partial(_item_to_command, again, is_px4), is_px4=is_px4)
     elif isinstance(step, ModeCommand):
         yield ModeCommand(target, former.mode, former.custom_mode, is_px4)
     elif isinstance(step, CurrentItemCommand):
         if not any(isinstance(one, MissionCommand) for one in former.changed):
-            yield CurrentItemCommand(target, former.seq, is_px4=is_px4)
+            yield CurrentItemCommand(target, partial(_unless_current, former.seq), is_px4=is_px4)
     elif former.speed is not None:
         yield _speed_command(aircraft, former.speed)
 
@@ -147,15 +146,57 @@ def _former_mission(step: MissionCommand, has_home: bool, on_board: tuple[RawIte
     return step.former
 
 
-def _same_item(items: tuple[Item, ...], present: tuple[Item, ...], seq: int) -> int:
-    """Return the number in a proposed mission of the item that is flown now; where it is left out, its old number."""
-    current = present[seq : seq + 1]
-    numbers = [item.seq for item in items if (msgspec.structs.replace(item, seq=seq),) == current]
-    return min(numbers, key=lambda number: abs(number - seq), default=min(seq, len(items) - 1))
+def _unless_current(seq: int, reported: int) -> int | None:
+    return None if reported == seq else seq
 
 
-def _same_raw_item(former: tuple[RawItem, ...], sent: tuple[RawItem, ...], seq: int, former_seq: int) -> int:
-    """Return the number in the former mission of the item that is flown now; where it is new, that from before."""
-    current = sent[seq : seq + 1]
+def _item_to_command(step: MissionCommand, is_px4: bool, reported: int) -> int | None:
+    """Return the item to command after an upload; None where the aircraft flies the right one by itself.
+
+    PX4 begins at the marked item. ArduPilot goes on at the same number, with the item as it was before the upload: it
+    loads an item when it becomes current. Where another item is reported, the aircraft has gone on in the new mission.
+    """
+    if reported != (step.marked if is_px4 else step.flown):
+        return None
+    seq = step.current(step.flown)
+    if seq != reported:
+        return seq
+    before, now = step.former[step.flown : step.flown + 1], step.items[seq]
+    is_same = bool(before) and before[0].is_stored_as(now)
+    return None if is_px4 or is_same else seq
+
+
+def _proposed_item(change: Change, present: tuple[Item, ...], approved: int, flown: int) -> int:
+    """Return the item of a proposed mission to fly to, for the item that is flown on board.
+
+    It is the one that the proposal names, or a later one where the aircraft has gone on since the approval.
+
+    Args:
+        change: proposed mission, and the item that it names
+        present: mission on board
+        approved: item on board that was flown at the approval
+        flown: item on board that is flown
+    """
+    items = change.items or ()
+    if change.seq is None:
+        return _same_item(items, present, flown)
+    has_gone_on = flown != approved and change.seq >= _same_item(items, present, approved)
+    return max(change.seq, _same_item(items, present, flown)) if has_gone_on else change.seq
+
+
+def _same_item(items: tuple[Item, ...], present: tuple[Item, ...], flown: int) -> int:
+    """Return the number in a proposed mission of the item that is flown; where that is changed, its old number."""
+    current = present[flown : flown + 1]
+    numbers = [item.seq for item in items if (msgspec.structs.replace(item, seq=flown),) == current]
+    return min(numbers, key=lambda number: abs(number - flown), default=min(flown, len(items) - 1))
+
+
+def _same_raw_item(former: tuple[RawItem, ...], sent: tuple[RawItem, ...], former_seq: int, flown: int) -> int:
+    """Return the number in the former mission of the item that is flown.
+
+    Where that was changed, the same number, or where there is none, the number of the item flown before the upload.
+    """
+    current = sent[flown : flown + 1]
     numbers = [number for number, item in enumerate(former) if current and item.is_stored_as(current[0])]
-    return min(numbers, key=lambda number: abs(number - seq), default=min(former_seq, max(len(former) - 1, 0)))
+    default = flown if len(sent) == len(former) else min(former_seq, max(len(former) - 1, 0))
+    return min(numbers, key=lambda number: abs(number - flown), default=default)

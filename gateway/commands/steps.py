@@ -147,45 +147,62 @@ class ModeCommand(AcknowledgedCommand):
 
 
 class CurrentItemCommand(AcknowledgedCommand):
-    """Change of the current mission item, verified by MISSION_CURRENT.
+    """Change of the current mission item, verified by COMMAND_ACK or MISSION_CURRENT.
+
+    The item is chosen when the current one has been reported. It is not sent again once another item is reported: the
+    aircraft has gone on, and must not be sent back.
 
     Args:
         target: the autopilot
-        seq: the item
+        choose: returns the item to fly to for the reported one; None: the reported one
         is_px4: send MISSION_SET_CURRENT, as PX4 has no such command
-        reload: send it also where the item is the current one, as ArduPilot loads an item when it becomes current
     """
 
-    def __init__(self, target: Target, seq: int, *, is_px4: bool, reload: bool = False) -> None:
-        super().__init__(target, f"current item {seq}", dialect.MAV_CMD_DO_SET_MISSION_CURRENT, (float(seq),))
-        self._seq, self._is_px4, self._reload = seq, is_px4, reload
-        self._reported: int | None = None  # since the step began
+    def __init__(self, target: Target, choose: Callable[[int], int | None], *, is_px4: bool) -> None:
+        super().__init__(target, "current item", dialect.MAV_CMD_DO_SET_MISSION_CURRENT, ())
+        self._choose, self._is_px4 = choose, is_px4
+        self._before: int | None = None  # the reported item before the command
+        self._seq = -1
+        self._begun_t: float | None = None
 
     def messages(self, now: float) -> list[Any]:
-        """Return the command when it is due; none before the current item is reported, unless it is loaded again."""
-        if self._reported is None and not self._reload and self._sent_t == float("-inf"):
-            self._sent_t = now  # wait for one report
-            return []
-        return super().messages(now)
+        """Return the command when it is due; none before the current item is reported."""
+        self._begun_t = now if self._begun_t is None else self._begun_t
+        if self._before is not None:
+            return super().messages(now)
+        if now - self._begun_t > TRIES * RETRY_S:
+            self._end(False, f"{self.sentence}: not reported for {TRIES * RETRY_S:.0f} s")
+        return []
 
     def receive(self, message: Any, now: float) -> None:
         """Process COMMAND_ACK and MISSION_CURRENT."""
         super().receive(message, now)
-        if message.get_type() == "MISSION_CURRENT" and self.result is None:
-            self._reported = message.seq
-            if message.seq == self._seq and (self.sent or not self._reload):
-                self._end(True, self.sentence)
+        if message.get_type() != "MISSION_CURRENT" or self.result is not None or self._begun_t is None:
+            return
+        if self._before is not None:
+            has_changed = message.seq != self._before
+            if self.sent and has_changed:
+                self._end(True, f"{self.sentence}, now {message.seq}")
+            return
+        seq, self._before = self._choose(message.seq), message.seq
+        if seq is None:
+            self._end(True, f"current item {message.seq}, not changed")
+            return
+        self._seq, self.params = seq, (float(seq), *(0.0,) * 6)
+        self.sentence = f"current item {seq}"
+
+    def planned(self) -> list[Any]:
+        """Return the command for item 0, as the item is chosen later."""
+        self._seq = max(self._seq, 0)
+        return super().planned()
 
     def _message(self, confirmation: int) -> Any:
         if self._is_px4:
             return dialect.MAVLink_mission_set_current_message(*self.target, self._seq)
         return super()._message(confirmation)
 
-    def _acknowledge(self) -> None:
-        """Wait for MISSION_CURRENT."""
-
     def _missing(self) -> str:
-        return f"no report of it after {TRIES} messages"
+        return f"no acknowledgement or change of it after {TRIES} messages"
 
 
 class MissionCommand(CommandStep):
@@ -195,7 +212,8 @@ class MissionCommand(CommandStep):
         target: the autopilot
         plan: returns the mission to send for the mission on board; raises ValueError where it must not be sent
         expected: the mission to send as far as it is known before
-        current: item to fly to
+        current: returns the item of the sent mission to fly to, for the item that is flown on board
+        flown: the item that is flown on board
         has_home: item 0 is home, which an upload does not change
     """
 
@@ -207,11 +225,14 @@ class MissionCommand(CommandStep):
         plan: Callable[[tuple[RawItem, ...]], tuple[RawItem, ...]],
         expected: Sequence[RawItem],
         *,
-        current: int,
+        current: Callable[[int], int],
+        flown: int,
         has_home: bool,
     ) -> None:
         super().__init__(target, f"mission of {len(expected)} items")
-        self._plan, self._expected, self._current, self._has_home = plan, tuple(expected), current, has_home
+        self._plan, self._expected, self.current, self._has_home = plan, tuple(expected), current, has_home
+        self.flown = flown  # the item on board that was reported last before the mission was stored
+        self.marked = current(flown)  # the item marked as the current one, to which PX4 goes
         self.former: tuple[RawItem, ...] = ()  # the mission on board before
         self.items: tuple[RawItem, ...] = ()  # the mission sent
         self.stored: tuple[RawItem, ...] | None = ()  # the mission on board; None: unknown, a write has begun
@@ -233,20 +254,27 @@ class MissionCommand(CommandStep):
 
     def receive(self, message: Any, now: float) -> None:
         """Process one message of the autopilot."""
+        if message.get_type() == "MISSION_CURRENT" and (self.stored is not None or self._is_writing):
+            self.flown = message.seq
         if self._transfer is not None:
             self._transfer.receive(message, now)
+
+    @property
+    def _is_writing(self) -> bool:
+        return isinstance(self._transfer, MissionWrite) and self._transfer.result is None
 
     def planned(self) -> list[Any]:
         """Return the messages of the step without loss; the replies of the autopilot lie between them."""
         target, items = self.target, self._expected
         count = dialect.MAVLink_mission_count_message(*target, len(items))
         read = dialect.MAVLink_mission_request_list_message(*target)
-        sent = [item.to_message(target, seq, seq == self._current) for seq, item in enumerate(items)]
+        sent = [item.to_message(target, seq, seq == self.marked) for seq, item in enumerate(items)]
         return [read, count, *sent, read]
 
     def _write(self, items: tuple[RawItem, ...], now: float, then: Callable[[float], None]) -> None:
         self.stored = None
-        self._transfer, self._advance = MissionWrite(self.target, items, self._current, now), self._read_back(then)
+        self.marked = self.current(self.flown) if items is self.items else self.flown
+        self._transfer, self._advance = MissionWrite(self.target, items, self.marked, now), self._read_back(then)
 
     def _read_back(self, then: Callable[[float], None]) -> Callable[[float], None]:
         def begin(now: float) -> None:

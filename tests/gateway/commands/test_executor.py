@@ -70,7 +70,20 @@ def test_each_kind_of_change_alone(autopilot: str, tmp_path: Path) -> None:
         site.bus.publish(site.approval(site.propose(site.option(**changes)), undo=True))
         assert site.run(8.0)[-1].state == S.UNDONE
         a = site.aircraft
-        assert (a.speed, a.seq, a.mode, a.items) == (20.0, 2, "MISSION" if a.is_px4 else "AUTO", mission()), changes
+        seq = 5 if "items" in changes else 2  # with a mission, the item of the same number goes on
+        assert (a.speed, a.seq, a.mode, a.items) == (20.0, seq, "MISSION" if a.is_px4 else "AUTO", mission()), changes
+
+
+@AUTOPILOTS
+@pytest.mark.parametrize("seq", [None, 2])
+def test_an_aircraft_that_reaches_the_next_item_during_the_upload_goes_on(autopilot: str, seq, tmp_path: Path) -> None:
+    site = CommandSite(tmp_path, CommandedAircraft(autopilot))
+    items = raised(mission())
+    site.bus.publish(site.approval(site.propose(site.option(items=items, seq=seq))))
+    site.run(3.0)
+    assert site.executor.transferring and site.aircraft.items != items
+    site.aircraft.seq = 3
+    assert site.run(8.0)[-1].state == S.ACCEPTED and site.aircraft.seq == 3
 
 
 def test_nothing_is_sent_without_approval(site: CommandSite) -> None:
