@@ -80,7 +80,8 @@ def test_an_aircraft_that_reaches_the_next_item_during_the_upload_goes_on(autopi
     site = CommandSite(tmp_path, CommandedAircraft(autopilot))
     items = raised(mission())
     site.bus.publish(site.approval(site.propose(site.option(items=items, seq=seq))))
-    site.run(3.0)
+    while "MISSION_ITEM_INT" not in [message.get_type() for message in site.aircraft.received]:
+        site.run(0.1)
     assert site.executor.transferring and site.aircraft.items != items
     site.aircraft.seq = 3
     assert site.run(8.0)[-1].state == S.ACCEPTED and site.aircraft.seq == 3
