@@ -69,9 +69,9 @@ def change_steps(aircraft: AircraftLink, change: Change, situation: Situation) -
     if change.items is not None:
         expected = planned_items(change.items, (), (), is_px4)
         plan = partial(_proposed_mission, change.items, situation, is_px4)
-        flown = max(aircraft.mission.seq, 0)
-        current = partial(_proposed_item, change, situation.published_items, flown)
-        step = MissionCommand(target, plan, expected, current=current, flown=flown, has_home=not is_px4)
+        active_seq = max(aircraft.mission.seq, 0)
+        current = partial(_proposed_item, change, situation.published_items, active_seq)
+        step = MissionCommand(target, plan, expected, current=current, active_seq=active_seq, has_home=not is_px4)
         steps += [step, CurrentItemCommand(target, partial(_item_to_command, step, is_px4), is_px4=is_px4)]
     elif change.seq is not None:
         steps.append(CurrentItemCommand(target, partial(_unless_current, change.seq), is_px4=is_px4))
@@ -95,8 +95,8 @@ def _undo(
     if isinstance(step, MissionCommand):
         plan = partial(_former_mission, step, not is_px4)
         current = partial(_same_raw_item, step.former, step.items, former.seq)
-        flown = max(aircraft.mission.seq, 0)
-        again = MissionCommand(target, plan, step.former, current=current, flown=flown, has_home=not is_px4)
+        active_seq = max(aircraft.mission.seq, 0)
+        again = MissionCommand(target, plan, step.former, current=current, active_seq=active_seq, has_home=not is_px4)
         yield again
         yield CurrentItemCommand(target, partial(_item_to_command, again, is_px4), is_px4=is_px4)
     elif isinstance(step, ModeCommand):
@@ -156,17 +156,17 @@ def _item_to_command(step: MissionCommand, is_px4: bool, reported: int) -> int |
     PX4 begins at the marked item. ArduPilot goes on at the same number, with the item as it was before the upload: it
     loads an item when it becomes current. Where another item is reported, the aircraft has gone on in the new mission.
     """
-    if reported != (step.marked if is_px4 else step.flown):
+    if reported != (step.marked if is_px4 else step.active_seq):
         return None
-    seq = step.current(step.flown)
+    seq = step.current(step.active_seq)
     if seq != reported:
         return seq
-    before, now = step.former[step.flown : step.flown + 1], step.items[seq]
+    before, now = step.former[step.active_seq : step.active_seq + 1], step.items[seq]
     is_same = bool(before) and before[0].is_stored_as(now)
     return None if is_px4 or is_same else seq
 
 
-def _proposed_item(change: Change, present: tuple[Item, ...], approved: int, flown: int) -> int:
+def _proposed_item(change: Change, present: tuple[Item, ...], approved: int, active_seq: int) -> int:
     """Return the item of a proposed mission to fly to, for the item that is flown on board.
 
     It is the one that the proposal names, or a later one where the aircraft has gone on since the approval.
@@ -175,28 +175,28 @@ def _proposed_item(change: Change, present: tuple[Item, ...], approved: int, flo
         change: proposed mission, and the item that it names
         present: mission on board
         approved: item on board that was flown at the approval
-        flown: item on board that is flown
+        active_seq: item on board that is flown
     """
     items = change.items or ()
     if change.seq is None:
-        return _same_item(items, present, flown)
-    has_gone_on = flown != approved and change.seq >= _same_item(items, present, approved)
-    return max(change.seq, _same_item(items, present, flown)) if has_gone_on else change.seq
+        return _same_item(items, present, active_seq)
+    has_advanced = active_seq != approved and change.seq >= _same_item(items, present, approved)
+    return max(change.seq, _same_item(items, present, active_seq)) if has_advanced else change.seq
 
 
-def _same_item(items: tuple[Item, ...], present: tuple[Item, ...], flown: int) -> int:
+def _same_item(items: tuple[Item, ...], present: tuple[Item, ...], active_seq: int) -> int:
     """Return the number in a proposed mission of the item that is flown; where that is changed, its old number."""
-    current = present[flown : flown + 1]
-    numbers = [item.seq for item in items if (msgspec.structs.replace(item, seq=flown),) == current]
-    return min(numbers, key=lambda number: abs(number - flown), default=min(flown, len(items) - 1))
+    current = present[active_seq : active_seq + 1]
+    numbers = [item.seq for item in items if (msgspec.structs.replace(item, seq=active_seq),) == current]
+    return min(numbers, key=lambda number: abs(number - active_seq), default=min(active_seq, len(items) - 1))
 
 
-def _same_raw_item(former: tuple[RawItem, ...], sent: tuple[RawItem, ...], former_seq: int, flown: int) -> int:
+def _same_raw_item(former: tuple[RawItem, ...], sent: tuple[RawItem, ...], former_seq: int, active_seq: int) -> int:
     """Return the number in the former mission of the item that is flown.
 
     Where that was changed, the same number, or where there is none, the number of the item flown before the upload.
     """
-    current = sent[flown : flown + 1]
+    current = sent[active_seq : active_seq + 1]
     numbers = [number for number, item in enumerate(former) if current and item.is_stored_as(current[0])]
-    default = flown if len(sent) == len(former) else min(former_seq, max(len(former) - 1, 0))
-    return min(numbers, key=lambda number: abs(number - flown), default=default)
+    default = active_seq if len(sent) == len(former) else min(former_seq, max(len(former) - 1, 0))
+    return min(numbers, key=lambda number: abs(number - active_seq), default=default)

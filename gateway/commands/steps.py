@@ -213,7 +213,7 @@ class MissionCommand(CommandStep):
         plan: returns the mission to send for the mission on board; raises ValueError where it must not be sent
         expected: the mission to send as far as it is known before
         current: returns the item of the sent mission to fly to, for the item that is flown on board
-        flown: the item that is flown on board
+        active_seq: the item that is flown on board
         has_home: item 0 is home, which an upload does not change
     """
 
@@ -226,13 +226,13 @@ class MissionCommand(CommandStep):
         expected: Sequence[RawItem],
         *,
         current: Callable[[int], int],
-        flown: int,
+        active_seq: int,
         has_home: bool,
     ) -> None:
         super().__init__(target, f"mission of {len(expected)} items")
         self._plan, self._expected, self.current, self._has_home = plan, tuple(expected), current, has_home
-        self.flown = flown  # the item on board that was reported last before the mission was stored
-        self.marked = current(flown)  # the item marked as the current one, to which PX4 goes
+        self.active_seq = active_seq  # the item on board that was reported last before the mission was stored
+        self.marked = current(active_seq)  # the item marked as the current one, to which PX4 goes
         self.former: tuple[RawItem, ...] = ()  # the mission on board before
         self.items: tuple[RawItem, ...] = ()  # the mission sent
         self.stored: tuple[RawItem, ...] | None = ()  # the mission on board; None: unknown, a write has begun
@@ -255,7 +255,7 @@ class MissionCommand(CommandStep):
     def receive(self, message: Any, now: float) -> None:
         """Process one message of the autopilot."""
         if message.get_type() == "MISSION_CURRENT" and (self.stored is not None or self._is_writing):
-            self.flown = message.seq
+            self.active_seq = message.seq
         if self._transfer is not None:
             self._transfer.receive(message, now)
 
@@ -273,7 +273,7 @@ class MissionCommand(CommandStep):
 
     def _write(self, items: tuple[RawItem, ...], now: float, then: Callable[[float], None]) -> None:
         self.stored = None
-        self.marked = self.current(self.flown) if items is self.items else self.flown
+        self.marked = self.current(self.active_seq) if items is self.items else self.active_seq
         self._transfer, self._advance = MissionWrite(self.target, items, self.marked, now), self._read_back(then)
 
     def _read_back(self, then: Callable[[float], None]) -> Callable[[float], None]:

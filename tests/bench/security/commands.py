@@ -22,6 +22,7 @@ from .trying import Admitted
 
 ROUNDS = 40  # attempts of each kind: 200 in all
 UPLOADS = 50  # of each autopilot
+EXECUTIONS = 20
 LOSS = 0.1  # of the frames in each direction
 AUTOPILOTS = ("ardupilot", "px4")
 
@@ -36,7 +37,7 @@ def lossy_uploads() -> str:
             plan = partial(planned_items, items, reported=before, is_px4=aircraft.is_px4)
             expected = [RawItem.from_item(item, item.param4) for item in items]
             has_home = not aircraft.is_px4
-            step = MissionCommand((1, 1), plan, expected, current=lambda _: 2, flown=2, has_home=has_home)
+            step = MissionCommand((1, 1), plan, expected, current=lambda _: 2, active_seq=2, has_home=has_home)
             driver = StepDriver(aircraft)
             result = driver.run(step)
             slowest = max(slowest, driver.t)
@@ -161,7 +162,7 @@ def outdated_approvals() -> str:
 def audited_and_undone() -> str:
     """Executions over 10 % loss: the audit has every message that arrived, and the undo restores everything."""
     messages = 0
-    for k in range(20):
+    for k in range(EXECUTIONS):
         with tempfile.TemporaryDirectory() as folder:
             aircraft = CommandedAircraft(AUTOPILOTS[k % 2], loss=LOSS, seed=2_000 + k)
             site = CommandSite(Path(folder), aircraft)
@@ -184,7 +185,7 @@ def audited_and_undone() -> str:
             if not all(message.get_type() in arrived for message in aircraft.received):
                 raise Admitted(f"round {k}: a message arrived that the audit does not have")
             messages += len(sent)
-    return f"20 of 20 undone, {messages} messages sent, all in the audit"
+    return f"{EXECUTIONS} of {EXECUTIONS} undone, {messages} messages sent, all in the audit"
 
 
 BY_COMMAND: tuple[Callable[[], str], ...] = (

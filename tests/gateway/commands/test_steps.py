@@ -29,7 +29,7 @@ def raw(items) -> tuple[RawItem, ...]:
 def upload(aircraft: CommandedAircraft, items, current: int = 2) -> MissionCommand:
     plan = partial(planned_items, items, reported=mission(len(aircraft.items)), is_px4=aircraft.is_px4)
     has_home = not aircraft.is_px4
-    return MissionCommand(TARGET, plan, raw(items), current=lambda _: current, flown=2, has_home=has_home)
+    return MissionCommand(TARGET, plan, raw(items), current=lambda _: current, active_seq=2, has_home=has_home)
 
 
 def item(seq: int, is_px4: bool) -> CurrentItemCommand:
@@ -117,7 +117,7 @@ def test_a_mission_that_must_not_be_sent_is_not_written() -> None:
     def refuse(former: tuple[RawItem, ...]) -> tuple[RawItem, ...]:
         raise ValueError("it changed")
 
-    step = MissionCommand(TARGET, refuse, (), current=lambda _: 1, flown=1, has_home=True)
+    step = MissionCommand(TARGET, refuse, (), current=lambda _: 1, active_seq=1, has_home=True)
     assert StepDriver(aircraft).run(step).sentence.endswith("it changed; nothing was changed")
     assert step.stored == step.former and "MISSION_COUNT" not in names(aircraft)
 
