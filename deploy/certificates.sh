@@ -9,7 +9,7 @@ usage: certificates.sh COMMAND FOLDER [...]     FOLDER contains ca.key: store it
   all FOLDER NAME...       all files of a new site; NAME: host names or addresses of the router
   ca FOLDER                only the authority (distribute ca.pem, never ca.key)
   router FOLDER NAME...    certificate of the router for these names, or its renewal
-  role FOLDER ROLE...      certificates of roles (gateway worker viewer tools), or their renewal
+  role FOLDER ROLE...      certificates of roles (gateway worker viewer tools operator), or their renewal
   next-ca FOLDER           a new authority; ca.pem contains both until drop-ca
   drop-ca FOLDER           remove the old authority from ca.pem
   show FOLDER              subject and expiry of all certificates
@@ -70,15 +70,15 @@ router() {
 roles() {
     folder=$1; shift
     for role; do
-        case $role in gateway|worker|viewer|tools) sign "$folder" "$role" clientAuth ;;
-        *) fail "found role '$role', expected gateway, worker, viewer or tools; correct it" ;; esac
+        case $role in gateway|worker|viewer|tools|operator) sign "$folder" "$role" clientAuth ;;
+        *) fail "found role '$role', expected gateway, worker, viewer, tools or operator; correct it" ;; esac
     done
 }
 
 [ $# -ge 2 ] || usage
 command=$1 folder=$2; shift 2
 case $command in
-all) ca "$folder"; router "$folder" "$@"; roles "$folder" gateway worker viewer tools ;;
+all) ca "$folder"; router "$folder" "$@"; roles "$folder" gateway worker viewer tools operator ;;
 ca) ca "$folder" ;;
 router) router "$folder" "$@" ;;
 role) [ $# -gt 0 ] || usage; roles "$folder" "$@" ;;

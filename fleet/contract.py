@@ -12,6 +12,8 @@
     parauav/{uav}/alert                  Alert        worker   predicted conflict, geofence, ground, …; also queryable
                                                       gateway  a second sender with the same id; also queryable
     parauav/{uav}/proposal               Proposal     worker   changes of plan against an alert; also queryable
+    parauav/{uav}/approval               Approval     operator a person approves an option, or its undo
+    parauav/{uav}/execution              Execution    gateway  what was sent for it, and how it is flown; also queryable
     parauav/@fleet/state/{writer}        FleetState   worker   one row per UAV; also queryable
     parauav/@fleet/prediction/{writer}   Predictions  worker   query only: the newest prediction of all its aircraft
     parauav/@gateway/{writer}            GatewayCounters gateway counters of one gateway; also queryable
@@ -651,6 +653,70 @@ class Proposal(Message, frozen=True, kw_only=True):
         return self.kind, self.other
 
 
+class Approval(Message, frozen=True, kw_only=True):
+    """Approval of one option of a proposal by a person, or of the undo of its execution.
+
+    It is published under the aircraft of the proposal. The router lets the role `operator` alone publish it.
+    """
+
+    topic: ClassVar[str] = "approval"
+
+    proposal: Annotated[str, about("id of the proposal")]
+    option: Annotated[int, about("index of the option, from 0")] = 0
+    digest: Annotated[str, about("SHA-256 of the msgpack of the option's `changes`, 64 hex digits: what was shown")]
+    who: Annotated[str, about("the person who approves")]
+    undo: Annotated[bool, about("true: restore mission, item, speed and mode from before the execution")] = False
+
+
+class ExecutionState(StrEnum):
+    """State of an execution.
+
+    APPROVED: every check passed, nothing sent yet.
+    SENDING: commands are sent and acknowledged one after the other.
+    ACCEPTED: every step is acknowledged; the flight is compared with the predicted path.
+    REFUSED: a check failed; nothing was sent.
+    FAILED: a step was not acknowledged; later steps were not sent.
+    DONE: the predicted path has ended.
+    UNDONE: the plan from before the execution is restored.
+    """
+
+    APPROVED = "approved"
+    SENDING = "sending"
+    ACCEPTED = "accepted"
+    REFUSED = "refused"
+    FAILED = "failed"
+    DONE = "done"
+    UNDONE = "undone"
+
+
+class ExecutionStep(msgspec.Struct, frozen=True, kw_only=True):
+    """One step of an execution."""
+
+    uav: int
+    sentence: Annotated[str, about("what is sent, or what was acknowledged")]
+    accepted: Annotated[bool | None, about("acknowledged and verified; null: not yet")] = None
+    t: Annotated[float | None, about("time of the result [s since 1970]")] = None
+
+
+class Execution(Message, frozen=True, kw_only=True):
+    """Execution of an approved proposal, published on every change."""
+
+    topic: ClassVar[str] = "execution"
+
+    proposal: Annotated[str, about("id of the proposal")]
+    option: int = 0
+    state: ExecutionState
+    who: Annotated[str, about("the person who approved it")] = ""
+    digest: Annotated[str, about("that of the approval; an undo repeats it")] = ""
+    approved_t: Annotated[float, about("`t` of the approval [s since 1970]")] = 0.0
+    undo: Annotated[bool, about("true: this approval asked for the undo")] = False
+    steps: tuple[ExecutionStep, ...] = ()
+    follows: Annotated[bool | None, about("the flight is within the predicted region; null: not compared")] = None
+    can_undo: Annotated[bool, about("an undo can be approved")] = False
+    dry_run: Annotated[bool, about("true: the messages were printed, not sent")] = False
+    sentence: Annotated[str, about("why it was refused or failed, or how the flight follows the predicted path")] = ""
+
+
 class FleetRow(msgspec.Struct, frozen=True, kw_only=True):
     """One row of the fleet table."""
 
@@ -792,7 +858,7 @@ class HandoverRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
 PER_UAV: tuple[type[Message], ...] = (
     *(Sample, Status, Mission, Params, History),
-    *(Model, Prediction, Mismatch, Alert, Proposal),
+    *(Model, Prediction, Mismatch, Alert, Proposal, Approval, Execution),
 )
 CONTROL: tuple[type, ...] = (FleetState, Predictions, GatewayCounters, Claim, Handover)
 QUERIES: dict[type, type] = {Prediction: WhatIf, Handover: HandoverRequest}  # optional payload of a query on a key

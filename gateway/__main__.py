@@ -8,11 +8,13 @@ import sys
 import threading
 from pathlib import Path
 
+from fleet.access.entry import BusConfig, parse_endpoint
 from fleet.access.roles import GATEWAY
-from fleet.cli import make_parser, run_command, stop_on_signal
+from fleet.cli import id_range, make_parser, run_command, stop_on_signal
 from fleet.config import MAX_UAVS, bus_config_from, router_arguments
 from fleet.process.logs import log_arguments, report_status
 from fleet.process.malloc_trim import enable_malloc_trim
+from fleet.process.private_files import state_folder
 from gateway import DEFAULT_BUDGET
 
 SWITCH_S = 5e-4  # longest wait of a receiving thread for the interpreter [s]
@@ -20,6 +22,7 @@ COLD_S = 2.0  # compilation that takes longer is logged [s]
 COMPILING = "compiling the decoder for this machine, once; links open when that is done"
 GC_THRESHOLD = 50_000  # allocations between cycle collections; a tick allocates thousands of objects without cycles
 TRIM_BYTES = 1 << 20  # larger allocations are returned to the system: batches of a flood, not of every tick [bytes]
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
 DEFAULT_LINK = "udpin:127.0.0.1:14550"
 EXAMPLES = """
   gateway                                              listen on loopback, port 14550
@@ -35,6 +38,8 @@ EXAMPLES = """
   gateway --listen-only                                send nothing to any aircraft
   gateway --metrics 127.0.0.1:9100                     counters for Prometheus, at http://127.0.0.1:9100/metrics
   gateway --record flights --record-budget 20G         also record what is received, with or without a router
+  gateway --config fleet.toml --allow commands:0-9     execute proposals that an operator approves, of UAVs 0 to 9
+  gateway --allow commands --dry-run                   print what an approved proposal would send
 
 links:
   udpin:HOST:PORT   udpout:HOST:PORT   udpbcast:HOST:PORT   tcpin:HOST:PORT   tcp:HOST:PORT   serial:PATH[:BAUD]
@@ -51,6 +56,44 @@ A file of keys has lines of NAME and 64 hex digits; only its owner may have read
 _log = logging.getLogger(__name__)
 
 
+COMMANDS = "commands"
+"""What `--allow` allows."""
+
+
+def allowed_uavs(text: str) -> range:
+    """Parse `commands` or `commands:0-9` as the ids of the aircraft that may be commanded.
+
+    Raises:
+        ArgumentTypeError: when it is neither; argparse shows the text.
+    """
+    what, colon, ids = text.partition(":")
+    if what != COMMANDS:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected {COMMANDS} or e.g. {COMMANDS}:0-9; correct it")
+    return id_range(ids) if colon else range(1_000_000)
+
+
+def check_commands(args: argparse.Namespace, bus_config: BusConfig) -> None:
+    """Check the options of approved execution.
+
+    Raises:
+        ValueError: when they disagree, or other machines could approve without the certificate of an operator.
+    """
+    if args.allow is None:
+        if args.dry_run or args.audit is not None:
+            raise ValueError("--dry-run, --audit: found no --allow commands, expected it; add it or leave these out")
+        return
+    if args.listen_only:
+        raise ValueError("--allow commands: found --listen-only as well, expected one of both; leave one out")
+    if bus_config.identifies_roles:
+        return
+    if parse_endpoint(bus_config.endpoint)[0] not in LOOPBACK:
+        raise ValueError(
+            f"--allow commands: found router {bus_config.endpoint} without certificates or passwords, expected them: "
+            "only an operator may approve; name them in the file of --config, see deploy/README.md"
+        )
+    _log.warning("commands are allowed on a router without roles: every process of this machine can approve them")
+
+
 def run(args: argparse.Namespace) -> int:
     """Open the links, connect to the bus, and run until a stop signal or the end of all recordings."""
     from rich.console import Console  # here, as --help and --version need none of these
@@ -60,6 +103,7 @@ def run(args: argparse.Namespace) -> int:
     from fleet.report.progress import show_progress
     from fleet.telemetry.recording.ids import IdAllocator
     from gateway.admission import make_admissions
+    from gateway.commands.audit import AuditLog
     from gateway.link_spec import read_forward, read_spec
     from gateway.links.opening import open_link
     from gateway.links.recorded import ReplayLink, replay_process, split_replays
@@ -75,6 +119,8 @@ def run(args: argparse.Namespace) -> int:
     if args.most_uavs < 1:
         raise ValueError(f"--most-uavs: found {args.most_uavs}, expected at least 1; write e.g. 250")
     gates = make_admissions(specs, len(args.forward), args.keys)
+    bus_config = bus_config_from(args, GATEWAY)
+    check_commands(args, bus_config)
     disk = DiskBudget(args.record, read_size(args.record_budget, "--record-budget")) if args.record else None
     stop = stop_on_signal()
     sys.setswitchinterval(SWITCH_S)
@@ -82,7 +128,7 @@ def run(args: argparse.Namespace) -> int:
     gc.freeze()
     gc.set_threshold(GC_THRESHOLD, *gc.get_threshold()[1:])
     enable_malloc_trim(TRIM_BYTES)
-    with connect(bus_config_from(args, GATEWAY), retry=disk is not None) as bus, contextlib.ExitStack() as stack:
+    with connect(bus_config, retry=disk is not None) as bus, contextlib.ExitStack() as stack:
         stack.enter_context(replay_process(files, args))
         links, ids = [], IdAllocator()
         for spec in specs:
@@ -108,6 +154,11 @@ def run(args: argparse.Namespace) -> int:
                 budget=args.budget,
                 cache=None if args.listen_only else Cache(),
             )
+            if args.allow is not None:
+                audit = AuditLog(args.audit or state_folder() / "commands.jsonl")
+                stack.callback(audit.close)
+                pipeline.enable_commands(bus, args.allow.__contains__, audit, dry_run=args.dry_run)
+                _report(f"approved proposals are {'printed' if args.dry_run else 'executed'}; audit: {audit.path}")
             if len(replays) < len(links):
                 console = Console() if sys.stdout.isatty() and not replays else None
                 stack.enter_context(status_display(pipeline.publisher.snapshot, _report, console))
@@ -150,6 +201,16 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--keys", type=Path, metavar="FILE", help="keys of signed links, readable only by the owner")
     router_arguments(parser)
     parser.add_argument("--listen-only", action="store_true", help="send nothing to the aircraft")
+    parser.add_argument(
+        "--allow",
+        type=allowed_uavs,
+        metavar="commands[:IDS]",
+        help="execute proposals that an operator approves, of these UAVs (off)",
+    )
+    parser.add_argument("--dry-run", action="store_true", help="print the messages of approved proposals, send none")
+    parser.add_argument(
+        "--audit", type=Path, metavar="FILE", help="audit of all commands (~/.local/state/parauav/commands.jsonl)"
+    )
     parser.add_argument(
         "--budget",
         default="",

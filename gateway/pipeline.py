@@ -4,7 +4,8 @@ import gc
 import queue
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
+from functools import partial
 
 import msgspec
 
@@ -12,10 +13,13 @@ from fleet.bus.codec import EncodedMessage
 from fleet.bus.session import Bus
 from fleet.config import MAX_UAVS
 from fleet.contract import Message
+from fleet.process.logs import report_status
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
 from gateway.admission import Admission, make_admissions
+from gateway.commands.audit import AuditLog
+from gateway.commands.executor import CommandExecutor
 from gateway.forwarding import FrameForwarder
 from gateway.links.link import QUEUE, Batch, Endpoint, wall
 from gateway.onboard import RequestSender
@@ -74,6 +78,7 @@ class Pipeline:
         ]
         self._requesters = [RequestSender(budget_of(link.spec, budget), cache) for link in links]
         self._listen_only = listen_only
+        self.executor: CommandExecutor | None = None  # sends approved commands
         self._recorder = recorder
         self._queue: queue.Queue[Batch] = RecordedQueue(QUEUE, recorder)
         self._open = set(range(len(links)))
@@ -152,20 +157,49 @@ class Pipeline:
         for number in self._live:
             intake, now = self.intakes[number], wall()
             messages = intake.flush_packed(now)
+            if self.executor is not None:
+                self.executor.observe(messages)
             self.publisher.put([message for message in messages if isinstance(message, EncodedMessage)])
             self.publisher.publish([one for one in messages if not isinstance(one, EncodedMessage)])
             if not self._listen_only:
                 self._send_requests(number, now)
+        if self.executor is not None and not self._listen_only:
+            self._send_commands(self.executor, wall())
         self.publisher.repeat(mono)
+
+    def enable_commands(
+        self, bus: Bus, is_allowed: Callable[[int], bool], audit: AuditLog, *, dry_run: bool = False
+    ) -> None:
+        """Execute approved proposals.
+
+        Args:
+            bus: source of proposals and approvals
+            is_allowed: whether a UAV may be commanded
+            audit: audit of all commands
+            dry_run: print the messages instead of sending them
+        """
+        report = partial(report_status, "gateway") if dry_run else None
+        self.executor = CommandExecutor(bus, self._aircraft_by_uav, is_allowed, audit, report)
 
     def _send_requests(self, number: int, now: float) -> None:
         link, aircraft = self.links[number], self.intakes[number].aircraft.values()
+        self._requesters[number].suspended = self.executor.transferring if self.executor is not None else ()
         for where, unsigned in self._requesters[number].tick(now, aircraft, link.known_peers):
-            data = self._admissions[number].sign(unsigned)
-            link.send(where, data)
-            self.statistics.sent(number, len(data))
-            if self._recorder is not None:
-                self._recorder.add(number, ReceivedBytes.from_pieces([(wall(), ("sent", where), data)]))
+            self._send(number, where, unsigned)
+
+    def _send_commands(self, executor: CommandExecutor, now: float) -> None:
+        """Send the messages of approved proposals; live links only."""
+        for aircraft, message in executor.tick(now):
+            for number in self._live:
+                if self.intakes[number].aircraft.get(aircraft.system) is aircraft and aircraft.source is not None:
+                    self._send(number, aircraft.source, self._requesters[number].pack(message))
+
+    def _send(self, number: int, where: Hashable, unsigned: bytes) -> None:
+        data = self._admissions[number].sign(unsigned)
+        self.links[number].send(where, data)
+        self.statistics.sent(number, len(data))
+        if self._recorder is not None:
+            self._recorder.add(number, ReceivedBytes.from_pieces([(wall(), ("sent", where), data)]))
 
     def _remove_silent(self, now: float) -> None:
         """Remove silent aircraft of live links; `now` is fleet time [s since 1970]."""

@@ -140,6 +140,11 @@ class BusConfig:
         """Return whether a certificate identifies the role."""
         return self.certificates is not None and self.passwords is None
 
+    @property
+    def identifies_roles(self) -> bool:
+        """Return whether the router knows the role of every client, and lets it do what the role may."""
+        return self.mutual_tls or self.passwords is not None
+
     def certificate_pair(self) -> tuple[Path, Path] | None:
         """Find certificate and key of this role; None where the role uses a password or nothing.
 
@@ -196,7 +201,7 @@ class BusConfig:
             if peers:
                 password = read_password(self.passwords, ROUTER_ROLE)
                 out |= {f"{_AUTH}/user": ROUTER_ROLE, f"{_AUTH}/password": password}
-        if self.mutual_tls or self.passwords is not None:
+        if self.identifies_roles:
             out["access_control"] = access_control(CERTIFICATE if self.mutual_tls else PASSWORD)
         return out
 

@@ -3,10 +3,13 @@
 from typing import NamedTuple
 
 ROOT = "parauav"
-GATEWAY, WORKER, VIEWER, TOOLS = "gateway", "worker", "viewer", "tools"
+GATEWAY, WORKER, VIEWER, TOOLS, OPERATOR = "gateway", "worker", "viewer", "tools", "operator"
 ROUTER_ROLE = "router"
-ROLES = (GATEWAY, WORKER, VIEWER, TOOLS)
-"""Roles that a certificate or a password proves; the commands of `fleet` have the role `tools`."""
+ROLES = (GATEWAY, WORKER, VIEWER, TOOLS, OPERATOR)
+"""Roles that a certificate or a password proves.
+
+The commands of `fleet` have the role `tools`, except `fleet approve` and `fleet undo`: only an operator may approve.
+"""
 
 KB, MB = 1 << 10, 1 << 20
 MAX_QUERY_BYTES = 512 * KB  # payload of a query: a mission of 1,000 items, or 1,000 ids [bytes]
@@ -38,6 +41,8 @@ TOPIC_RULES: dict[str, TopicRule] = {
     "mismatch": TopicRule((WORKER,), 256 * KB),
     "alert": TopicRule((GATEWAY, WORKER), 64 * KB),  # from the gateway: a second sender
     "proposal": TopicRule((WORKER,), MB),
+    "approval": TopicRule((OPERATOR,), 64 * KB),
+    "execution": TopicRule((GATEWAY,), 256 * KB),
     "@fleet/state": TopicRule((WORKER,), MB),
     "@fleet/prediction": TopicRule((WORKER,), 32 * MB),  # 4 KB for each of its aircraft
     "@gateway": TopicRule((GATEWAY,), MB),

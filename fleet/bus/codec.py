@@ -1,5 +1,6 @@
 """Encode and decode messages: msgpack maps, a version in the encoding, an attachment of epoch and writer."""
 
+import hashlib
 import math
 import struct
 import time
@@ -8,12 +9,13 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 
 from fleet.access.roles import TOPIC_RULES
-from fleet.contract import PER_UAV, TOPICS
+from fleet.contract import PER_UAV, TOPICS, Change, Option
 
 M = TypeVar("M")
 MAX_EPOCH_AHEAD_MS = 300_000  # an epoch further ahead of the local clock is forged or of a wrong clock
 _STAMP = struct.Struct("<QQ")
 _PACK = msgspec.msgpack.Encoder()
+_CHANGES = msgspec.msgpack.Decoder(tuple[Change, ...])
 _UNPACK: dict[str, Any] = {topic: msgspec.msgpack.Decoder(kind) for topic, kind in TOPICS.items()}
 
 _ENCODINGS = {
@@ -55,6 +57,15 @@ class EncodedMessage(NamedTuple):
 def encode(message: Any) -> bytes:
     """Encode one message as a msgpack map; return the payload of an encoded message unchanged."""
     return message.payload if isinstance(message, EncodedMessage) else _PACK.encode(message)
+
+
+def digest_of(option: Option) -> str:
+    """Return the SHA-256 of the changes of an option, 64 hex digits: what an approval is for, without its forecast.
+
+    It is of the changes as received from the bus, where every number of a float field is a float.
+    """
+    received = _CHANGES.decode(_PACK.encode(option.changes))
+    return hashlib.sha256(_PACK.encode(received)).hexdigest()
 
 
 def encoding(kind: type) -> str:

@@ -47,6 +47,19 @@ def cache_folder() -> Path:
     return cache_root / "parauav"
 
 
+def state_folder() -> Path:
+    """Return this user's folder of records that must outlast a restart.
+
+    Raises:
+        RuntimeError: when the user has no home.
+    """
+    base = os.environ.get("XDG_STATE_HOME", "")
+    root = Path(base) if os.path.isabs(base) else Path.home() / ".local" / "state"
+    if not root.is_absolute():
+        raise RuntimeError(f"found HOME {str(root.parent.parent)!r}, expected an absolute path")
+    return root / "parauav"
+
+
 def onboard_folder() -> Path:
     """Return the folder of cached onboard data of aircraft: PARAUAV_ONBOARD, or a folder in this user's cache.
 

@@ -1,6 +1,6 @@
 """Requests to the aircraft of one link, limited to the capacity of the link."""
 
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Collection, Hashable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,7 @@ class RequestSender:
         self.share = 1.0  # of the wanted rates that fits the link, the same for all of its aircraft
         self.diagnosis_share = 0.0  # the same of the rates for diagnosis, which are the first to be reduced
         self.sentence = ""  # note for the operator if not all of them fit
+        self.suspended: Collection[int] = ()  # ids of aircraft whose mission must not be requested now
         self._budget, self._cache = budget, cache
         self._mav = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
         self._schedulers: dict[int, RequestScheduler] = {}
@@ -58,7 +59,7 @@ class RequestSender:
             kind, none = dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID
             beat = dialect.MAVLink_heartbeat_message(kind, none, 0, 0, dialect.MAV_STATE_ACTIVE, 3)
             out += [
-                (source, self._pack(beat))
+                (source, self.pack(beat))
                 for source in dict.fromkeys([*known_peers, *(recipient.source for recipient in live)])
             ]
         self._update_shares(live)
@@ -67,7 +68,8 @@ class RequestSender:
             scheduler = self._schedulers.get(craft.system)
             if scheduler is None or scheduler.aircraft is not craft:
                 scheduler = self._schedulers[craft.system] = RequestScheduler(craft, now, self._cache)
-            out += [(craft.source, self._pack(message)) for message in scheduler.requests(now, *shares)]
+            requests = scheduler.requests(now, *shares, mission=craft.uav not in self.suspended)
+            out += [(craft.source, self.pack(message)) for message in requests]
         return out
 
     def _update_shares(self, live: Sequence[AircraftLink]) -> None:
@@ -92,7 +94,8 @@ class RequestSender:
                 "wanted rates are requested; raise --budget if the link has more capacity"
             )
 
-    def _pack(self, message: Any) -> bytes:
+    def pack(self, message: Any) -> bytes:
+        """Return the bytes of a message of this gateway, with the next sequence number."""
         packed = bytes(message.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256
         return packed

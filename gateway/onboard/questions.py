@@ -103,12 +103,25 @@ class RequestScheduler:
         self._items_left: int | None = None
         self._item_tries = 0  # since the last item received
 
-    def requests(self, now: float, share: float = 1.0, diagnosis_share: float = 0.0) -> list[Any]:
-        """Return the messages to send now; these shares of the wanted rates and of those for diagnosis fit the link."""
+    def requests(
+        self, now: float, share: float = 1.0, diagnosis_share: float = 0.0, *, mission: bool = True
+    ) -> list[Any]:
+        """Return the messages to send now.
+
+        Args:
+            now: fleet time [s since 1970]
+            share, diagnosis_share: of the wanted rates, and of those for diagnosis, that fit the link
+            mission: the mission may be requested; false while it is uploaded
+        """
         if self._cache_check is not None and now - self._store_t >= STORE_S:
             self._store_t = now
             self._cache_check.store()
-        requests = self._mission(now) + self._home(now) + self._params(now) + self._rates(now, share, diagnosis_share)
+        requests = (
+            (self._mission(now) if mission else [])
+            + self._home(now)
+            + self._params(now)
+            + self._rates(now, share, diagnosis_share)
+        )
         if now - self._timesync_t >= TIMESYNC_S:  # to measure the round-trip time
             self._timesync_t = now
             requests.append(dialect.MAVLink_timesync_message(0, round(now * 1e9)))

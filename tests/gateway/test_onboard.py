@@ -47,7 +47,7 @@ def test_a_mission_that_became_shorter_meanwhile_is_asked_for_again():
 
     def shorten(t):
         if any(name == "MISSION_REQUEST_INT" for name in aircraft.names()):
-            aircraft.voice._items = ITEMS[:5]
+            aircraft.voice.missions.items = ITEMS[:5]
 
     news, _ = fly(aircraft, 60.0, every_tick=shorten)
     mission = of(Mission, news)[-1]
@@ -61,7 +61,7 @@ def test_after_a_restart_the_mission_is_asked_for_again():
     for step in range(600):
         t = T0 + 0.1 * step
         if step == 300:
-            aircraft.voice._items = ITEMS[:5]
+            aircraft.voice.missions.items = ITEMS[:5]
         boot = 500 + 0.1 * step if step < 300 else 0.1 * (step - 300)
         intake.receive(t, aircraft.talker.heartbeat() + aircraft.talker.attitude(boot), "air")
         for _, data in onboard.tick(t, intake.aircraft.values()):
@@ -120,7 +120,7 @@ def test_a_mission_over_another_radio_is_asked_for_within_a_second(sign):
         total = len(ITEMS) - 1
         if step >= 300:
             total = 4
-            aircraft.voice._items = ITEMS[:5]
+            aircraft.voice.missions.items = ITEMS[:5]
         if sign == "count" and step % 5 == 0:
             data += aircraft.talker.pack(mav.MAVLink_mission_current_message(1, total))
         if sign == "text" and step == 301:

@@ -125,7 +125,7 @@ def test_an_item_changed_unseen_is_found_by_looking_now_and_then(tmp_path):
 
     def upload_elsewhere(t):
         if t > 30:
-            aircraft.voice._items = other
+            aircraft.voice.missions.items = other
 
     _, mission, names = fly(aircraft, None, 30 + 15 * len(ITEMS) + 20, upload_elsewhere)
     assert mission.items == other and names.count("MISSION_REQUEST_LIST") == 2

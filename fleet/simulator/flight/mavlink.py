@@ -1,4 +1,4 @@
-"""MAVLink 2 interface of a simulated aircraft (ArduPlane or PX4): telemetry and replies to requests.
+"""MAVLink 2 interface of a simulated aircraft (ArduPlane or PX4): telemetry, replies to requests, received commands.
 
 `mavlink_messages` defines the telemetry streams.
 Source: MAVLink common and ardupilotmega dialects.
@@ -21,6 +21,7 @@ from fleet.simulator.flight.mavlink_messages import (
     TelemetryState,
     param_value_message,
 )
+from fleet.simulator.flight.mission_server import MissionServer, UploadedMission
 
 TICK_HZ = 100
 COMPONENT = mav.MAV_COMP_ID_AUTOPILOT1
@@ -41,6 +42,18 @@ class ModeRequest(NamedTuple):
 
     mode: str
     target: tuple[int, int, float] | None = None
+
+
+class SpeedRequest(NamedTuple):
+    """A commanded speed, airspeed of a fixed wing and ground speed of a multirotor; 0: the default [m/s]."""
+
+    speed: float
+
+
+class ItemRequest(NamedTuple):
+    """A commanded mission item."""
+
+    seq: int
 
 
 class MavlinkEndpoint:
@@ -64,11 +77,12 @@ class MavlinkEndpoint:
         self._out = mav.MAVLink(None, srcSystem=system, srcComponent=COMPONENT)
         self._in = mav.MAVLink(None)
         self._in.robust_parsing = True
-        self._items = items
+        self.missions = MissionServer(items, dialect.is_px4)
+        self._poll_t = 0.0  # time of the simulation [s]
         self._names = sorted(params)
         self._params, self._dialect = params, dialect
         self._pending_params: deque[int] = deque()  # indices of parameters to send
-        self.mode_requests: deque[ModeRequest] = deque()  # received, not yet executed
+        self.requests: deque[ModeRequest | SpeedRequest | ItemRequest | UploadedMission] = deque()  # not yet executed
         schedule = [(round(TICK_HZ / rate), phase, build) for rate, phase, build in dialect.telemetry]
         self._due = [  # message functions of each tick, repeated
             [build for period, phase, build in schedule if (tick - phase) % period == 0]
@@ -86,7 +100,12 @@ class MavlinkEndpoint:
         snapshot = state() if due else None
         messages = [make(snapshot) for make in due if snapshot is not None]
         frames = [self._pack(message) for message in messages if message is not None]
-        return frames + self.stream_parameters(_PARAMS_PER_TICK)
+        return frames + self.stream_parameters(_PARAMS_PER_TICK) + self.poll(tick / TICK_HZ)
+
+    def poll(self, t: float) -> list[bytes]:
+        """Return the repeated requests of an upload at `t` since the start of the simulation [s]."""
+        self._poll_t = t
+        return [self._pack(message) for message in self.missions.poll(t)]
 
     def stream_parameters(self, limit: int) -> list[bytes]:
         """Return up to `limit` requested parameters as frames."""
@@ -121,25 +140,48 @@ class MavlinkEndpoint:
         name = message.param_id
         return [self._param(self._names.index(name), by_name=True)] if name in self._params else []
 
-    def _mission_list(self, message: Any, t: float) -> list[Any]:
-        count = len(self._items) if message.mission_type == 0 else 0  # neither geofence nor rally points
-        return [mav.MAVLink_mission_count_message(*_sender(message), count, message.mission_type)]
+    def _mission(self, message: Any, t: float) -> list[Any]:
+        replies = self.missions.receive(message, self._poll_t)
+        if (uploaded := self.missions.take_upload()) is not None:
+            self.requests.append(uploaded)
+        return replies
 
-    def _mission_item(self, message: Any, t: float) -> list[Any]:
-        if message.mission_type != 0 or message.seq >= len(self._items):
-            result = mav.MAV_MISSION_INVALID_SEQUENCE
-            return [mav.MAVLink_mission_ack_message(*_sender(message), result, message.mission_type)]
-        item = self._items[message.seq]
-        params = (item.param1, item.param2, item.param3, item.param4)
-        head = (*_sender(message), item.seq, item.frame, item.command, 0, 1, *params)
-        if message.get_type() == "MISSION_REQUEST_INT":
-            return [mav.MAVLink_mission_item_int_message(*head, item.lat_e7, item.lon_e7, item.alt_m)]
-        return [mav.MAVLink_mission_item_message(*head, item.lat_e7 * 1e-7, item.lon_e7 * 1e-7, item.alt_m)]
+    def _set_current(self, message: Any, t: float) -> list[Any]:
+        """Process MISSION_SET_CURRENT; MISSION_CURRENT follows with the telemetry."""
+        self._request_item(message.seq)
+        return []
+
+    def _request_item(self, seq: float) -> bool:
+        """Store a commanded mission item; return whether it exists."""
+        exists = isfinite(seq) and 0 <= seq < len(self.missions.items)
+        if exists:
+            self.requests.append(ItemRequest(int(seq)))
+        return exists
+
+    def _request_speed(self, speed: float) -> bool:
+        """Store a commanded speed; return whether the autopilot accepts it.
+
+        ArduPlane: airspeeds within its limits, -2 for the default; ArduCopter: positive speeds; PX4: any, the default
+        where it is not positive. Source: MAV_CMD_DO_CHANGE_SPEED; ArduPlane, ArduCopter, PX4 Navigator.
+        """
+        low, high = self._speed_limits()
+        is_default = (self._dialect.is_px4 and not speed > 0) or (speed == -2.0 and isfinite(high))
+        accepted = is_default or (isfinite(speed) and low <= speed <= high and speed > 0)
+        if accepted:
+            self.requests.append(SpeedRequest(0.0 if is_default else float(speed)))
+        return accepted
+
+    def _speed_limits(self) -> tuple[float, float]:
+        """Return the range of commanded speeds that the autopilot accepts [m/s]."""
+        if self._dialect.is_px4:
+            return 0.0, float("inf")
+        get = self._params.get
+        return get("AIRSPEED_MIN", get("ARSPD_FBW_MIN", 9.0)), get("AIRSPEED_MAX", get("ARSPD_FBW_MAX", 22.0))
 
     def _request_mode(self, mode: str | None, target: tuple[int, int, float] | None = None) -> bool:
         """Store a commanded mode; return whether it is one that is simulated."""
         if mode is not None:
-            self.mode_requests.append(ModeRequest(mode, target))
+            self.requests.append(ModeRequest(mode, target))
         return mode is not None
 
     def _set_mode(self, message: Any, t: float) -> list[Any]:
@@ -173,7 +215,12 @@ class MavlinkEndpoint:
             custom, sub = int(message.param2), int(message.param3)
             mode = self._mode_name((sub << 24 | custom << 16) if self._dialect.is_px4 else custom)
             accepted = self._request_mode(mode)
-        result = mav.MAV_RESULT_ACCEPTED if accepted else mav.MAV_RESULT_UNSUPPORTED
+        rejection = mav.MAV_RESULT_UNSUPPORTED
+        if message.command == mav.MAV_CMD_DO_CHANGE_SPEED:
+            accepted, rejection = self._request_speed(message.param2), mav.MAV_RESULT_DENIED
+        elif message.command == mav.MAV_CMD_DO_SET_MISSION_CURRENT and not self._dialect.is_px4:
+            accepted, rejection = self._request_item(message.param1), mav.MAV_RESULT_DENIED
+        result = mav.MAV_RESULT_ACCEPTED if accepted else rejection
         ack = mav.MAVLink_command_ack_message(message.command, result, 0, 0, *_sender(message))
         if not is_version_request:
             return [ack]
@@ -195,9 +242,12 @@ def _sender(message: Any) -> tuple[int, int]:
 _HANDLERS: dict[str, Callable[[MavlinkEndpoint, Any, float], list[Any]]] = {
     "PARAM_REQUEST_LIST": MavlinkEndpoint._param_list,
     "PARAM_REQUEST_READ": MavlinkEndpoint._param_read,
-    "MISSION_REQUEST_LIST": MavlinkEndpoint._mission_list,
-    "MISSION_REQUEST_INT": MavlinkEndpoint._mission_item,
-    "MISSION_REQUEST": MavlinkEndpoint._mission_item,
+    **dict.fromkeys(
+        ("MISSION_REQUEST_LIST", "MISSION_REQUEST_INT", "MISSION_REQUEST", "MISSION_COUNT", "MISSION_ITEM_INT"),
+        MavlinkEndpoint._mission,
+    ),
+    "MISSION_ITEM": MavlinkEndpoint._mission,
+    "MISSION_SET_CURRENT": MavlinkEndpoint._set_current,
     "COMMAND_LONG": MavlinkEndpoint._command,
     "COMMAND_INT": MavlinkEndpoint._command_int,
     "SET_MODE": MavlinkEndpoint._set_mode,

@@ -16,7 +16,15 @@ from fleet.contract import Item
 from fleet.frames import G, Origin, to_geodetic, to_ned
 from fleet.simulator.faults.carried import FaultSet
 from fleet.simulator.faults.physics import Fault
-from fleet.simulator.flight.mavlink import MAX_AIRCRAFT, TICK_HZ, MavlinkEndpoint, ground_requests
+from fleet.simulator.flight.mavlink import (
+    MAX_AIRCRAFT,
+    TICK_HZ,
+    ItemRequest,
+    MavlinkEndpoint,
+    ModeRequest,
+    SpeedRequest,
+    ground_requests,
+)
 from fleet.simulator.flight.mavlink_messages import DIALECTS, ONBOARD_DIALECT, TelemetryState
 from fleet.simulator.flight.modes import FlightMode
 from fleet.simulator.flight.tuning import tuned_parameters
@@ -97,6 +105,7 @@ class SimulatedUav:
         self.mode = FlightMode(autopilot, self.params)
         self._mission_seq = start.seq  # current mission item
         self._target: np.ndarray | None = None  # commanded point, NED, (3,) [m]
+        self._speed: tuple[float, float] | None = None  # commanded airspeed, and that of the mission then [m/s]
         self._wind = setup.weather.wind(rng, DT * _OUTER)
         scale_rng = altitude_rng = self._jitter = None
         dialect = DIALECTS[autopilot]
@@ -147,12 +156,47 @@ class SimulatedUav:
         if self.link_lost:
             return []
         replies = self._endpoint.receive(data, self.boot_s + self.tick * DT)
-        while self._endpoint.mode_requests:
-            request = self._endpoint.mode_requests.popleft()
-            self._target = None if request.target is None else self._commanded_point(request.target)
-            self.mode.command(request.mode)
-            self._enter_mode()
+        while self._endpoint.requests:
+            request = self._endpoint.requests.popleft()
+            if isinstance(request, ModeRequest):
+                self._target = None if request.target is None else self._commanded_point(request.target)
+                self.mode.command(request.mode)
+                self._enter_mode()
+            elif isinstance(request, SpeedRequest):
+                self._speed = (request.speed, float(self.leg[legs_of.VA_C]))
+                self._override_speed()
+            elif isinstance(request, ItemRequest):
+                self._begin_item(request.seq)
+            else:
+                self.items = request.items
+                if self._first_item == 0:  # PX4 goes to the marked item
+                    self._begin_item(request.seq or 0)
+                elif self.mode.follows_mission:  # ArduPlane stays at its item
+                    self._legs, start = self._route(self._mission_seq)
+                    self._begin_legs(start if np.isfinite(start).all() else self.estimate.p)
         return replies
+
+    def _begin_legs(self, start: np.ndarray) -> None:
+        """Start the route at its first leg, from a point, NED, (3,) [m]."""
+        self._ctl[memory.LEG] = 0
+        laws.begin(self._ctl, self._par, self._legs, 0, start)
+        self._override_speed()
+
+    def _begin_item(self, seq: int) -> None:
+        """Fly to mission item `seq` from here, now or when the mission mode is entered."""
+        self._mission_seq = seq
+        if self.mode.follows_mission:
+            self._enter_mode()
+
+    def _override_speed(self) -> None:
+        """Apply a commanded airspeed to the legs before the next change of speed in the mission."""
+        if self._speed is None or not self.mode.follows_mission:
+            return
+        k = int(self._ctl[memory.LEG])
+        changes = np.flatnonzero(self._legs[k:, legs_of.VA_C] != self._speed[1])
+        self._legs[k : k + int(changes[0]) if len(changes) else None, legs_of.VA_C] = self._speed[0]
+        if len(changes):
+            self._speed = None  # the mission changes it
 
     def _commanded_point(self, target: tuple[int, int, float]) -> np.ndarray:
         """Return a commanded point, latitude, longitude [1e-7 deg] and height above home [m], NED, (3,) [m]."""
@@ -172,8 +216,7 @@ class SimulatedUav:
             if route is None:
                 raise ValueError(f"uav-{self.uav_id}: mode {self.mode.name} is not simulated; choose another failsafe")
             self._legs = route.legs
-        self._ctl[memory.LEG] = 0
-        laws.begin(self._ctl, self._par, self._legs, 0, p)
+        self._begin_legs(p)
 
     def initial_frames(self) -> list[bytes]:
         """Return the frames for the start of a recording: version, mission, parameters."""
@@ -239,6 +282,7 @@ class SimulatedUav:
                 if self._ctl[memory.LEG] >= len(self._legs) - 2:
                     self._legs, _ = self._route(self._mission_seq)  # the mission is endless
                     self._ctl[memory.LEG] = 0
+                    self._override_speed()
         delta_a, delta_e, delta_r = laws.stabilise(
             self._ctl, self._par, self._phi_c, self._theta_c, e.euler, e.rates, e.Va, DT * _INNER
         )

@@ -138,3 +138,6 @@ class MultirotorEndpoint(MavlinkEndpoint):
         if self._dialect.is_px4:
             return super()._mode_name(custom_mode)
         return {number: name for name, number in COPTER_MODES.items() if name != "STABILIZE"}.get(custom_mode)
+
+    def _speed_limits(self) -> tuple[float, float]:
+        return 0.0, float("inf")

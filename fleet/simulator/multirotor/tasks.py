@@ -77,6 +77,18 @@ class TaskSequence:
         self._seq, self._speed, self._jumps = self._first, 0.0, {}  # type: tuple[int, float, dict[int, int]]
         self._target = np.zeros(3)
 
+    def set_items(self, items: Sequence[Item]) -> None:
+        """Replace the mission; the next item to fly keeps its number."""
+        self._items, self._jumps = {item.seq: item for item in items}, {}
+
+    def set_current(self, seq: int) -> None:
+        """Continue with item `seq`."""
+        self._seq, self._jumps = seq, {}
+
+    def set_speed(self, speed: float) -> None:
+        """Fly at a commanded speed until the mission changes it; 0: the default [m/s]."""
+        self._speed = speed
+
     def advance(self) -> Task | None:
         """Move on to the next task; None: the mission is complete."""
         step = self._find()

@@ -4,6 +4,7 @@ It arms a few seconds after the start, flies its mission, lands, disarms, and st
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from math import hypot, pi
 from types import MappingProxyType
 from typing import Any
@@ -11,7 +12,14 @@ from typing import Any
 import numpy as np
 
 from fleet.frames import Origin, to_geodetic, to_ned
-from fleet.simulator.flight.mavlink import MAX_AIRCRAFT, TICK_HZ, ground_requests
+from fleet.simulator.flight.mavlink import (
+    MAX_AIRCRAFT,
+    TICK_HZ,
+    ItemRequest,
+    ModeRequest,
+    SpeedRequest,
+    ground_requests,
+)
 from fleet.simulator.multirotor import tasks
 from fleet.simulator.multirotor.airframes import TYPES, draw_airframe
 from fleet.simulator.multirotor.attitude import AttitudeController, attitude_gains
@@ -110,10 +118,29 @@ class SimulatedMultirotor:
         if self.link_lost:
             return []
         replies = self._endpoint.receive(data, self.boot_s + self.tick * DT)
-        while self._endpoint.mode_requests:
-            request = self._endpoint.mode_requests.popleft()
-            self._enter_mode(request.mode, request.target)
+        while self._endpoint.requests:
+            request = self._endpoint.requests.popleft()
+            if isinstance(request, ModeRequest):
+                self._enter_mode(request.mode, request.target)
+            elif isinstance(request, SpeedRequest):
+                self._sequence.set_speed(request.speed)
+                if self._task is not None and self.armed:
+                    self._begin(replace(self._task, speed=request.speed))
+            elif isinstance(request, ItemRequest):
+                self._begin_item(request.seq)
+            else:
+                self.items = request.items
+                self._sequence.set_items(self.items)
+                if self.mission_mode == "MISSION":  # PX4 goes to the marked item; ArduCopter stays at its item
+                    self._begin_item(request.seq or 0)
         return replies
+
+    def _begin_item(self, seq: int) -> None:
+        """Fly to mission item `seq` from here, now or when the mission mode is entered."""
+        self._sequence.set_current(seq)
+        self._mission_seq = seq
+        if self.armed and self.mode == self.mission_mode:
+            self._next_task()
 
     def initial_frames(self) -> list[bytes]:
         """Return the frames for the start of a recording: version, mission, parameters."""

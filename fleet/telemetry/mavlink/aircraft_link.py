@@ -58,6 +58,8 @@ class AircraftLink:
         self.number = arrays.add_aircraft(uav) if number is None else number
         self.link = Link.LIVE
         self.autopilot, self.mode, self.armed = "generic", "", False
+        self.custom_mode = 0  # of the last heartbeat
+        self.observer: Callable[[Any, float], None] | None = None  # receives each processed message, and its arrival
         self.vehicle_type = vehicles.UNKNOWN  # vehicle type from the heartbeat
         self.firmware = ""
         self.board_id = ""  # hardware id and firmware version of the autopilot, or empty
@@ -130,7 +132,7 @@ class AircraftLink:
         name = message.get_type()
         if name == "HEARTBEAT":
             self.update_identity(message)
-            self.mode = heartbeat.mode(message)
+            self.mode, self.custom_mode = heartbeat.mode(message), message.custom_mode
             self.armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
         elif name == "PARAM_VALUE":
             self.params.process(message, self.autopilot, now)
@@ -144,6 +146,8 @@ class AircraftLink:
             self.board_id = heartbeat.board_id(message)
             if message.flight_sw_version:
                 self.firmware = self.firmware or heartbeat.firmware(message)
+        if self.observer is not None:
+            self.observer(message, now)
 
     def _process_home(self, message: Any) -> None:
         """Process HOME_POSITION: item 0 of an ArduPilot mission, the reference of relative altitudes of PX4."""

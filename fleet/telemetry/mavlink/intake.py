@@ -43,6 +43,7 @@ TelemetryMessage = Sample | Status | Mission | Params | Alert
 EARLY_MESSAGES = MISSION_MESSAGES | {"PARAM_VALUE", "HOME_POSITION"}  # sent once, therefore buffered; rows are repeated
 IS_SINGLE = np.zeros(len(EXTRA), bool)  # by message id: processed individually, not as table rows
 IS_SINGLE[[IDS[name] for name in (*EARLY_MESSAGES, "HEARTBEAT", "STATUSTEXT", "AUTOPILOT_VERSION")]] = True
+IS_SINGLE[[IDS[name] for name in ("COMMAND_ACK", "MISSION_REQUEST", "MISSION_REQUEST_INT")]] = True
 IS_SINGLE[IDS["MISSION_CURRENT"]] = True  # also a table row
 
 

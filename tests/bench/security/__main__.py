@@ -18,6 +18,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from .commands import BY_COMMAND
 from .door import BY_CERTIFICATE, BY_PASSWORD, ends_while_joined, renewed_while_joined
 from .forged import BY_FORGING
 from .hostile_files import BY_FILE
@@ -38,7 +39,8 @@ def main() -> int:
     if REAL not in kinds:
         print("no zenohd found (PARAUAV_ZENOHD, the path, ~/.cargo/bin): only our own router is tried", file=sys.stderr)
     found = [row for kind in kinds for row in _tried(kind)]
-    for what, attempts in (("caches", BY_PLANTING), ("epochs", BY_FORGING), ("files", BY_FILE), ("limits", BY_LIMIT)):
+    kinds_alone = {"caches": BY_PLANTING, "epochs": BY_FORGING, "files": BY_FILE, "limits": BY_LIMIT}
+    for what, attempts in {**kinds_alone, "commands": BY_COMMAND}.items():
         found += [_row(("-", what, one.__name__, one.__doc__ or ""), one) for one in attempts]
     held = sum(row["held"] for row in found)
     print(f"{held} of {len(found)} held")

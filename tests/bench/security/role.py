@@ -136,5 +136,7 @@ BY_ROLE: tuple[Attempt, ...] = (
     _publishing("sample", "worker"),
     _publishing("@gateway", "tools"),
     _publishing("@claim", "viewer"),
+    *(_publishing("approval", role) for role in ("viewer", "tools", "worker", "gateway")),
+    *(_publishing(topic, "operator") for topic in ("proposal", "execution")),
     *(forged_token, twin_asked_for, forged_answer, withdrawn, strange_key, router_reconfigured),
 )

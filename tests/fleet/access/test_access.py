@@ -139,7 +139,7 @@ def test_papers_are_found_private_and_in_time(papers: Path, tmp_path: Path) -> N
 
 def test_a_password_is_a_line_of_a_private_file(tmp_path: Path) -> None:
     file = make_passwords(tmp_path)
-    assert len({read_password(file, role) for role in (*ROLES, ROUTER_ROLE)}) == 5
+    assert len({read_password(file, role) for role in (*ROLES, ROUTER_ROLE)}) == 6
     with pytest.raises(ValueError, match="found none for the role pilot"):
         read_password(file, "pilot")
     file.chmod(0o604)

@@ -173,10 +173,17 @@ class MissionCollector:
             return None
         self._changed = False
         sentence = f"uav-{self.uav}: {self._text}" if self._text else ""
+        return Mission(
+            uav=self.uav, t=now, items=self.published_items, seq=self.seq, complete=self.complete, sentence=sentence
+        )
+
+    @property
+    def published_items(self) -> tuple[Item, ...]:
+        """Return the items as published: above sea level where home is known, item 0 of ArduPilot replaced by home."""
         items = self.items if self._home_m is None else tuple(_absolute(item, self._home_m) for item in self.items)
         if self._home is not None and items and items[0].seq == 0:
             items = (self._home, *items[1:])
-        return Mission(uav=self.uav, t=now, items=items, seq=self.seq, complete=self.complete, sentence=sentence)
+        return items
 
     def _set_current(self, seq: int) -> None:
         seq = -1 if seq == 65535 else seq

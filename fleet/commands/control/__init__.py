@@ -1,0 +1,1 @@
+"""Commands with which a person acts on aircraft."""
