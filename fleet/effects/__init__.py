@@ -41,6 +41,7 @@ INCREMENTS: dict[str, str] = {
     "C_D": "drag coefficient added [-]",
     "C_Y": "side force coefficient added [-]",
     "C_l": "rolling moment coefficient added [-]",
+    "C_l_p": "part of C_l that is proportional to p, as derivative [1/rad]",
     "C_m": "pitching moment coefficient added [-]",
     "C_n": "yawing moment coefficient added [-]",
     "L": "rolling moment added [N m]",

@@ -7,7 +7,7 @@ from fleet.effects import Effect, Flow, Parameter, Stage
 
 def act(flow: Flow, dC_l_p: Any) -> dict[str, Any]:
     """Add a rolling moment proportional to the rolling rate."""
-    return {"C_l": dC_l_p * flow.p * flow.body.b / (2.0 * flow.Va)}
+    return {"C_l": dC_l_p * flow.p * flow.body.b / (2.0 * flow.Va), "C_l_p": dC_l_p}
 
 
 EFFECT = Effect(

@@ -107,7 +107,7 @@ def test_the_tail_does_more_in_the_slipstream_and_windmilling_takes_at_most_half
 
 def test_damping_follows_its_own_rate_made_dimensionless_by_span_or_chord() -> None:
     moving = flow(Va=50.0, p=0.5, q=0.3, r=0.2)
-    assert ALL["roll_damping"].act(moving, 0.2) == pytest.approx({"C_l": 0.2 * 0.5 * CARD.b / 100.0})
+    assert ALL["roll_damping"].act(moving, 0.2) == pytest.approx({"C_l": 0.2 * 0.5 * CARD.b / 100.0, "C_l_p": 0.2})
     assert ALL["pitch_damping"].act(moving, -4.0) == pytest.approx({"C_m": -4.0 * 0.3 * CARD.c / 100.0})
     assert ALL["yaw_damping"].act(moving, 0.05) == pytest.approx({"C_n": 0.05 * 0.2 * CARD.b / 100.0})
 

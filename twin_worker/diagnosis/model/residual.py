@@ -20,6 +20,7 @@ from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline
 RHO_0 = 1.225  # [kg/m3]
 _DIFFERENTIATED = ("v_n", "v_e", "v_d", "phi", "theta", "psi", "p", "q", "r")
 _FLOW_STAGES = (Stage.SENSOR, Stage.DELTA, Stage.AIR)
+_ROLL_DAMPING = eq.LATERAL.index("p")
 _N_RECENT = 6  # results stored for repeated evaluations
 Signals = dict[str, np.ndarray]
 Value = TypeVar("Value")
@@ -218,12 +219,11 @@ class ModelledFlight:
             flow.T = base.coef["T"] @ thrust
             flow.C_m_elevator, flow.C_n_rudder = base.coef["M"][3] * d_e, base.coef["N"][5] * d_r
         flow.C_L = -body.mass * f[2] / q_S
-        J_x, J_y, J_z, _ = base.card.inertia
-        coupled = base.card.known
+        L, M, N = eq.moments((s["p_dot"], s["q_dot"], s["r_dot"]), (flow.p, flow.q, flow.r), base.card)
         measured = {
-            "L": J_x * s["p_dot"] + coupled * (J_z - J_y) * flow.q * flow.r,
-            "M": J_y * s["q_dot"] + coupled * (J_x - J_z) * flow.p * flow.r,
-            "N": J_z * s["r_dot"] + coupled * (J_y - J_x) * flow.p * flow.q,
+            "L": L,
+            "M": M,
+            "N": N,
             "alpha": flow.alpha,
             "beta": flow.beta,
             "airspeed": s.get("Va", np.zeros_like(Va)),
@@ -293,6 +293,8 @@ class ModelledFlight:
         out[:, 3] = (measured["L"] - L) / J_x
         out[:, 4] = (measured["M"] - M) / J_y
         out[:, 5] = (measured["N"] - N) / J_z
+        if "C_l_p" in add:
+            out[:, 3] = self._with_nominal_gusts(out[:, 3], add["C_l_p"], terms)
         if "Va" in self.flight.readings:
             out[:, 6] = measured["airspeed"] / base.airspeed - flow.Va * np.sqrt(flow.rho / RHO_0)
             out[:, 6] /= terms.intermediate["Va_share"]  # in units of the faulty sensor
@@ -301,6 +303,34 @@ class ModelledFlight:
             out[:, 13] = terms.intermediate["baro"] - self.baro_offset - add.get("baro", 0.0)
         out.flags.writeable = False
         return out
+
+    def _with_nominal_gusts(self, residual: np.ndarray, change: Any, terms: EquationTerms) -> np.ndarray:
+        """Return the rolling residual under changed roll damping, with the noise that it has in nominal flight, (n,).
+
+        Gusts p_g in roll, unlike those of the flow angles, are not measured. They turn the aircraft, p' = a (p_g - p):
+        with the damping a the residual is p' + a p = a p_g, and a' p_g with the damping a'. The aircraft follows slow
+        gusts either way, p = p_g, so that this is no evidence for either. The filter (s + a) / (s + a'), of unit gain
+        at high frequency, gives the residual p' + a p of such gusts with any damping.
+
+        Args:
+            residual: measured less simulated, (n,) [rad/s2]
+            change: of C_l_p, (n,) [1/rad]
+            terms: terms of the equations
+        """
+        base, body = self.base, self.base.card.body
+        per_derivative = terms.scale["L"] * body.b / (2 * terms.flow.Va) / base.card.inertia[0]
+        a = np.maximum(-base.coef["L"][_ROLL_DAMPING] * per_derivative, 0.0)
+        changed = np.maximum(a - change * per_derivative, 1e-3)
+        pole = np.exp(-changed * STEP_S)
+        new = (1.0 - (1.0 - pole) / (changed * STEP_S)) / changed  # share of the newest value, between two: a line
+        old = (1.0 - pole) / changed - new
+        lag, last, out = 0.0, float(residual[0]), []
+        series = (x.tolist() for x in (residual, pole, old, new))
+        for x, pole_k, old_k, new_k in zip(*series, strict=True):
+            lag = pole_k * lag + old_k * last + new_k * x
+            last = x
+            out.append(lag)
+        return residual - (changed - a) * np.array(out)
 
 
 def evaluate_equation(base: Baseline, add: Signals, equation: str, terms: np.ndarray) -> np.ndarray:

@@ -208,17 +208,13 @@ class Simulation:
         return rates, f, flow.Va, flow.rho
 
     def _rotation_derivatives(self, x: np.ndarray, moments: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
-        (L, M, N), (p, q, r), phi = moments, x[3:6], x[6]
+        (p, q, r), phi = x[3:6], x[6]
         theta = np.clip(x[7], -_MAX_PITCH, _MAX_PITCH)
-        J_x, J_y, J_z, _ = self.base.card.inertia
-        known = float(self.base.card.known)
         sf, cf = np.sin(phi), np.cos(phi)
         turn = (q * sf + r * cf) / np.cos(theta)
         return np.stack(
             [
-                (L - known * (J_z - J_y) * q * r) / J_x,
-                (M - known * (J_x - J_z) * p * r) / J_y,
-                (N - known * (J_y - J_x) * p * q) / J_z,
+                *eq.angular_accelerations(moments, (p, q, r), self.base.card),
                 p + np.sin(theta) * turn,
                 q * cf - r * sf,
                 turn,

@@ -18,7 +18,7 @@ _SHOWS_IN = {"roll": "L", "pitch": "M", "yaw": "N", "thrust": "X", "drag": "X", 
 _EDGE_S = 15.0, 20.0  # no onset closer to the start and the end of the flight [s]
 _ONSET_STRIDE = 5  # rows between two tested onsets, unless the onset is resolved to the row
 _RAMPS_S = (20.0, 40.0, 60.0, 90.0, 130.0)
-_BUMPS_S = (3.0, 5.0, 8.0, 14.0, 25.0, 45.0)
+BUMPS_S = (3.0, 5.0, 8.0, 14.0, 25.0, 45.0)
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ def onset_gates(t: np.ndarray, kind: Onset, stride: int = _ONSET_STRIDE) -> tupl
     if kind is Onset.STEP:
         onset_rows = np.flatnonzero((t > first) & (t < last))[::stride]
         return onset_rows, [OnsetProfile(kind, float(t[i])) for i in onset_rows]
-    lengths = _RAMPS_S if kind is Onset.RAMP else _BUMPS_S
+    lengths = _RAMPS_S if kind is Onset.RAMP else BUMPS_S
     onsets = []
     for T in lengths:
         spacing = 10.0 if kind is Onset.RAMP else max(T / 6, 1.0)

@@ -6,7 +6,7 @@ import numpy as np
 
 from fleet.effects import Onset, Stage
 from twin_worker.diagnosis.data.card import FaultHypothesis, OnsetProfile
-from twin_worker.diagnosis.inference.isolation.isolate import ScoredHypothesis
+from twin_worker.diagnosis.inference.isolation.isolate import BUMPS_S, ScoredHypothesis
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals, project
 
 _ITERATIONS = 5
@@ -74,6 +74,11 @@ def normal_at(whitened: WhitenedResiduals, hypothesis: FaultHypothesis) -> tuple
     return A, b
 
 
+def _is_scanned(onset: OnsetProfile, t: np.ndarray) -> bool:
+    """Return whether a profile could come from the scan: a bump begins in the flight and passes in it."""
+    return onset.kind is not Onset.BUMP or (onset.t0 >= t[0] and onset.T <= BUMPS_S[-1])
+
+
 def _search_onset(
     whitened: WhitenedResiduals, hypothesis: FaultHypothesis, best_cost: float
 ) -> tuple[FaultHypothesis, float]:
@@ -99,6 +104,8 @@ def _search_onset(
         changes += [partial(OnsetProfile.stretched, by=by) for by in factors]
     for change in changes:
         trial = best.with_parameters(np.array(best.par), change(best.onset))
+        if not _is_scanned(trial.onset, whitened.modelled.t):
+            continue
         cost = whitened.cost((trial,))
         if cost < best_cost - 1e-9:
             best, best_cost = trial, cost

@@ -22,6 +22,7 @@ from twin_worker.diagnosis.model.residual import ModelledFlight
 CLIP = 6.0  # clipping limit of whitened residuals [-]
 _BARO_CLIP = 100.0  # for the barometer: its noise drifts, so that a lasting jump is one large whitened residual
 _SCATTER_CLIP = 3.0  # the limit is at least this multiple of the channel's scatter on this flight
+_MAX_RELEASED = 6  # nuisances that may be beyond their spread
 _FIXED_PRECISION = 1e14  # precision of a nuisance that is fixed at zero
 _MIN_SCATTER = 0.45  # least scatter relative to nominal flights
 _MAX_AXIAL_SCATTER = 1.3  # largest scatter of the axial force where wind is nominal
@@ -138,15 +139,17 @@ class WhitenedResiduals:
         limits += [limits[mode.nuisance_index] for mode in self.drift_modes] + len(extra) * [RELEASE_SIGMAS]
         flat = self.Jn.reshape(-1, self.Jn.shape[2])
         G, self.bn = flat.T @ flat, -flat.T @ self.e.ravel()
-        for _ in range(6):
-            self.Ann = G + np.diag(self.precision)
-            self.xn = np.linalg.solve(self.Ann, self.bn)
+        self.Ann = G + np.diag(self.precision)
+        self.xn = np.linalg.solve(self.Ann, self.bn)
+        for _ in range(_MAX_RELEASED):
             unreleased = self.precision < 0.1 * _FIXED_PRECISION
             excess = np.abs(self.xn) * np.sqrt(self.precision) * unreleased * ~free / np.array(limits)
             worst = int(np.argmax(excess))
             if excess[worst] < 1.0:
                 break
             self.precision[worst] = _FIXED_PRECISION
+            self.Ann = G + np.diag(self.precision)
+            self.xn = np.linalg.solve(self.Ann, self.bn)
 
     def with_nuisance_priors(self) -> "WhitenedResiduals":
         """Return a copy in which every nuisance has its prior spread and none is fixed at zero."""
