@@ -76,7 +76,7 @@ def normal_at(whitened: WhitenedResiduals, hypothesis: FaultHypothesis) -> tuple
 
 def _is_scanned(onset: OnsetProfile, t: np.ndarray) -> bool:
     """Return whether a profile could come from the scan: a bump begins in the flight and passes in it."""
-    return onset.kind is not Onset.BUMP or (onset.t0 >= t[0] and onset.T <= max(BUMPS_S))
+    return onset.kind is not Onset.BUMP or (onset.t0 >= t[0] and max(BUMPS_S) >= onset.T)
 
 
 def _search_onset(
