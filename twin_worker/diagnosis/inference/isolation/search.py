@@ -318,31 +318,27 @@ def own_share(whitened: WhitenedResiduals, hypothesis: FaultHypothesis) -> float
     return (own_cost - full_cost) / max(base_cost - full_cost, 1e-9)
 
 
-_GUST_RATIOS = 1.2, 1.5  # variance ratio of sideslip and lift in turbulence: least, mean
+_GUST_RATIOS = 1.2, 1.5  # variance ratio of the air channels in turbulence: least, median
 
 
 def turbulence_evidence(whitened: WhitenedResiduals) -> tuple[np.ndarray, float, float | None]:
     """Return gain by channel, (c + 1,), variance ratio of gusts, and their onset [s]; None if it is before the flight.
 
-    Sideslip and lift, which gusts change directly, scatter more; the sensor channels do not. Forces, moments and
-    airspeed scatter more where gusts outweigh their other noise. The onset is the change point of the variance of
-    sideslip and lift, r_1 before and r_2 after it:  G = -sum n_i ln r_i, against n (r - 1 - ln r) of one variance
-    throughout.
+    Sideslip, lift and airspeed scatter more, the sensor channels do not. The onset is the change point of the variance,
+    r_1 before and r_2 after it:  G = -sum n_i ln r_i, against n (r - 1 - ln r) of one variance throughout.
     """
-    gust_channels = [CHANNELS.index(name) for name in ("side", "lift")]
-    air_channels = [CHANNELS.index(name) for name in ("force_x", "side", "lift", "roll", "pitch", "yaw", "airspeed")]
+    air_channels = [CHANNELS.index(name) for name in ("side", "lift", "airspeed")]
     sensor_channels = [k for k, name in enumerate(CHANNELS) if name.startswith(("gps", "gyro"))]
     gain = np.zeros(len(CHANNELS) + 1)
     square = ((whitened.e + whitened.Jn @ whitened.xn) ** 2 / whitened.base.usual)[whitened.ok]
     t = whitened.modelled.t[whitened.ok]
-    onset = _variance_onset(t, square[:, gust_channels], load_table().weights.rows_per_sample)
+    onset = _variance_onset(t, square[:, air_channels], load_table().weights.rows_per_sample)
     after = square if onset is None else square[t >= onset]
-    gusts, sensor_ratio = after[:, gust_channels].mean(axis=0), after[:, sensor_channels].mean()
-    if gusts.min() < _GUST_RATIOS[0] or gusts.mean() < _GUST_RATIOS[1] or sensor_ratio > _GUST_RATIOS[1]:
+    ratio, sensor_ratio = after[:, air_channels].mean(axis=0), after[:, sensor_channels].mean()
+    if ratio.min() < _GUST_RATIOS[0] or np.median(ratio) < _GUST_RATIOS[1] or sensor_ratio > _GUST_RATIOS[1]:
         return gain, 1.0, None
-    ratio = np.maximum(after[:, air_channels].mean(axis=0), 1.0)
     gain[air_channels] = len(after) * (ratio - 1 - np.log(ratio))
-    return gain, float(gusts.mean()), onset
+    return gain, float(np.median(ratio)), onset
 
 
 def _variance_onset(t: np.ndarray, square: np.ndarray, rows_per_sample: float) -> float | None:
