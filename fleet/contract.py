@@ -644,6 +644,10 @@ class Proposal(Message, frozen=True, kw_only=True):
         float | None, about("of the event with the present plans, 0..1; null: none is predicted")
     ] = None
     options: tuple[Option, ...] = ()
+    present: Annotated[
+        tuple[ProposedPath, ...],
+        about("predicted paths of the aircraft that an option changes, with their present plans"),
+    ] = ()
     valid_until: Annotated[float, about("fleet time after which it must not be approved [s since 1970]")] = 0.0
     sentence: Annotated[str, about("the event, and what the options avoid; or why there is none")] = ""
 

@@ -5,7 +5,7 @@ Every check returns why the approval is refused, or an empty text. An approval o
     it is new, at most 30 s old, and names a person
     the gateway has received the proposal itself, and its newest version is valid and has this option unchanged
     every changed aircraft may be commanded, is received, armed, flown automatically and not being commanded
-    its mission and mode are those of the proposal, and it is within the predicted region of the option for this time
+    its mission and mode are those of the proposal, and it is within the region predicted for this time with it
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -117,11 +117,15 @@ def change_refusal(change: Change, fleet: Fleet) -> str:
 
 
 def situation_refusal(option: Option, received: ReceivedProposal, fleet: Fleet, now: float) -> str:
-    """Return why the situation is no longer that of the proposal."""
+    """Return why the situation is no longer that of the proposal.
+
+    Until the approval an aircraft flies its present plan: it is compared with the path predicted for that plan, or
+    with that of the option where the proposal has none.
+    """
     uavs = [change.uav for change in option.changes]
     if not uavs or len(set(uavs)) < len(uavs):
         return "the option changes no aircraft, or one twice"
-    paths = {path.uav: path for path in option.paths}
+    paths = {path.uav: path for path in option.paths} | {path.uav: path for path in received.proposal.present}
     for change in option.changes:
         uav, aircraft = change.uav, fleet.aircraft[change.uav]
         before, present = received.situations.get(uav), situation_of(aircraft)
@@ -135,13 +139,13 @@ def situation_refusal(option: Option, received: ReceivedProposal, fleet: Fleet, 
         if now - t > MAX_POSITION_AGE_S:
             return f"uav-{uav}: no position for {MAX_POSITION_AGE_S:.0f} s"
         if uav not in paths:
-            return f"uav-{uav}: the option has no predicted path of it"
+            return f"uav-{uav}: the proposal has no predicted path of it"
         try:
             offset = deviation(paths[uav], t - received.proposal.t, position)
         except ValueError as error:
             return str(error)
         if offset is None:
-            return f"uav-{uav}: the predicted path of the option has no point for now"
+            return f"uav-{uav}: the predicted path of the proposal has no point for now"
         if not offset.is_inside:
-            return f"uav-{uav} is outside of the option's predicted region: {offset}; the situation has changed"
+            return f"uav-{uav} is outside of the region predicted for now: {offset}; the situation has changed"
     return ""

@@ -203,9 +203,12 @@ class CommandSite:
         paths, change = (proposed,), Change(uav=1, **changes)
         return Option(sentence="", changes=(change,), paths=paths, probability=0.01, clearance_m=90.0)
 
-    def propose(self, *options: Option, name: str = "p1", valid_s: float = 15.0) -> Proposal:
+    def propose(
+        self, *options: Option, name: str = "p1", valid_s: float = 15.0, present: tuple[ProposedPath, ...] = ()
+    ) -> Proposal:
         """Publish a proposal as a worker does; the positions of its aircraft are observed from then on."""
-        proposal = Proposal(uav=1, t=self.now, id=name, options=options, valid_until=self.now + valid_s)
+        valid_until = self.now + valid_s
+        proposal = Proposal(uav=1, t=self.now, id=name, options=options, present=present, valid_until=valid_until)
         self.bus.publish(proposal)
         self.run(0.2)
         return proposal

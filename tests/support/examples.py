@@ -259,6 +259,15 @@ MESSAGES = (
                 deviation_m=4.0,
             ),
         ),
+        present=(
+            ProposedPath(
+                uav=UAV,
+                origin=(474_000_000, 85_000_000, 500_000),
+                ahead=Array.of([0.0, 1.0]),
+                path=Array.of([[0.0, 0.0, -50.0], [20.0, 0.0, -50.0]]),
+                prediction_region_half_axes=Array.of([[1.0, 1.0, 1.0], [2.0, 1.0, 1.0]]),
+            ),
+        ),
         valid_until=T + 20.0,
         sentence="UAV 8 is predicted within 30 m in 12 s",
     ),

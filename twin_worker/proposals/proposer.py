@@ -15,7 +15,7 @@ from twin_worker.alerts.hysteresis import RULES
 from twin_worker.proposals.assessment import Comparison
 from twin_worker.proposals.candidates import Candidate, Plan, candidates
 from twin_worker.proposals.experiment import PlanExperiment, deficit, present, run
-from twin_worker.proposals.options import to_option
+from twin_worker.proposals.options import to_option, to_path
 from twin_worker.proposals.resolution import Airspace, Problem, Solution, pareto, solve
 from twin_worker.twin.state.state import Twin
 
@@ -188,7 +188,10 @@ class Proposer:
         options = tuple(to_option(problem, solution, advantage, plans, t) for solution, advantage in chosen)
         choices = tuple(_choice(solution) for solution, _ in chosen)
         text = f"{_count(len(options))} it" if options else "no change that was tried avoids it"
-        return Current(_proposal(event, t, options, probability, text), choices)
+        proposal = _proposal(event, t, options, probability, text)
+        changed = sorted({change.uav for option in options for change in option.changes})
+        paths = tuple(to_path(problem.present[uav], t) for uav in changed)
+        return Current(msgspec.structs.replace(proposal, present=paths), choices)
 
     # --- inputs ------------------------------------------------------------------------------------------------------
 

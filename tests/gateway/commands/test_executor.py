@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fleet.bus.codec import digest_of
-from fleet.contract import Change, ExecutionState, Option
+from fleet.contract import Array, Change, ExecutionState, Option
 from gateway.commands.audit import AuditLog
 from tests.support.commanded import CommandedAircraft, CommandSite, mission, raised
 
@@ -207,13 +207,26 @@ def test_the_newest_version_of_a_proposal_counts_wherever_its_option_stands(site
     assert last.state == S.ACCEPTED and last.option == 1 and site.aircraft.speed == 17.0
 
 
+def test_until_its_approval_an_aircraft_is_compared_with_its_present_plan(site: CommandSite) -> None:
+    def aside(option: Option) -> Option:
+        (path,) = option.paths
+        moved = Array.of(path.path.numpy() + np.float32([500.0, 0.0, 0.0]))
+        return msgspec.structs.replace(option, paths=(msgspec.structs.replace(path, path=moved),))
+
+    site.bus.publish(site.approval(site.propose(aside(site.option(speed=17.0)))))
+    assert "outside of the region predicted for now" in reason(site.run(1.0))
+    option = site.option(speed=17.0)
+    site.bus.publish(site.approval(site.propose(aside(option), name="p2", present=option.paths)))
+    assert site.run(5.0)[-1].state == S.ACCEPTED and site.aircraft.speed == 17.0
+
+
 @pytest.mark.parametrize("offset", [(40.0, 0.0, 0.0), (0.0, 30.0, 0.0), (0.0, 0.0, -20.0)])
 def test_an_aircraft_outside_of_the_region_is_refused(site: CommandSite, offset: tuple) -> None:
     proposal = site.propose(site.option(speed=17.0))
     site.aircraft.offset = np.array(offset)
     site.run(1.0)
     site.bus.publish(site.approval(proposal))
-    assert "outside of the option's predicted region" in reason(site.run(1.0))
+    assert "outside of the region predicted for now" in reason(site.run(1.0))
     assert site.aircraft.uplink_bytes == 0
 
 
