@@ -157,7 +157,7 @@ def test_a_card_that_is_none_is_refused(text: str, expected: str, tmp_path: Path
         read_card(path)
 
 
-@pytest.mark.parametrize("text", ["nothing", "[]", '{"format": "other"}', '{"format": "parauav.simulation.1"}'])
+@pytest.mark.parametrize("text", ["nothing", "[]", '{"format": "other"}', '{"format": "parauav.simulation.2"}'])
 def test_a_model_that_is_none_is_refused(text: str, tmp_path: Path) -> None:
     path = tmp_path / "model.json"
     path.write_text(text)

@@ -16,7 +16,7 @@ from twin_worker.diagnosis.inference.report import DiagnosisFinding, Report, Rep
 from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline
 from twin_worker.diagnosis.model.equations import TERMS
 
-FORMAT = "parauav.simulation.1"
+FORMAT = "parauav.simulation.2"
 _OPTIONAL = ("envelope", "block_sigma", "block_chance")  # fields that earlier models lack
 
 
