@@ -251,16 +251,19 @@ def track_reference(xva: np.ndarray, r: np.ndarray, par: np.ndarray, dt: float) 
 
     `xva` (4, 3) has position, velocity, acceleration, and the integrator less the drag that it has to balance [m/s2].
     """
-    a = np.empty(3)
+    a, error = np.empty(3), np.empty(3)
     for i in range(3):
         pos_p, vel_p = (par[POS_P], par[VEL_P]) if i < 2 else (par[POS_P_Z], par[VEL_P_Z])
-        error = r[1, i] + pos_p * (r[0, i] - xva[0, i]) - xva[1, i]
-        a[i] = r[2, i] + vel_p * error
+        error[i] = r[1, i] + pos_p * (r[0, i] - xva[0, i]) - xva[1, i]
+        a[i] = r[2, i] + vel_p * error[i]
         if i < 2:
             target = par[D_OF_ERROR] * (r[2, i] + pos_p * (r[1, i] - xva[1, i]))
             a[i] += xva[3, i] + par[VEL_D] * (target - xva[2, i])
-            xva[3, i] += dt * (par[VEL_I] * error - par[DRAG] * xva[2, i])
     excess = max(sqrt(a[0] ** 2 + a[1] ** 2) / par[ACC_MAX], 1.0)
+    # beyond the limit the integrator only decreases
+    integrates = excess == 1.0 or error[0] * a[0] + error[1] * a[1] < 0.0
+    for i in range(2):
+        xva[3, i] += dt * (par[VEL_I] * error[i] * integrates - par[DRAG] * xva[2, i])
     for i in range(3):
         limited = a[i] / excess if i < 2 else min(max(a[2], -5.0), 5.0)
         change = (limited - xva[2, i]) * (1.0 - exp(-dt / (par[TAU] if i < 2 else _TAU_Z)))

@@ -20,8 +20,8 @@ from viewer import __main__ as viewer
 ROOT = Path(__file__).resolve().parents[2]
 MAINS = {"fleet": cli.main, "gateway": gateway.main, "twin_worker": twin_worker.main, "viewer": viewer.main}
 ANSWERS = {  # command line -> part of the last line
-    "fleet": "found no verb, expected assess, calibrate",
-    "fleet statsu": "found no verb 'statsu', expected assess, calibrate",
+    "fleet": "found no verb, expected approve, assess, calibrate",
+    "fleet statsu": "found no verb 'statsu', expected approve, assess, calibrate",
     "fleet STATUS": "did you mean status?",
     "fleet --verison": "found no option '--verison', expected one of the usage above; did you mean --version?",
     "fleet status --routr x": "found no option '--routr', expected one of the usage above; did you mean --router?",

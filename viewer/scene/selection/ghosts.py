@@ -18,16 +18,16 @@ Parts = list[tuple[np.ndarray, np.ndarray]]  # segments (n, 2, 3) [10 m] and the
 
 
 class GhostPaths:
-    """Nodes of the options on one page: thin lines, of another dash and colour for each option."""
+    """Node of the options on one page, made for the first: thin lines, of another dash and colour for each option."""
 
     def __init__(self, scene: Any, palette: Palette) -> None:
-        self._palette = palette
-        self._lines = Strokes(scene, "/selected/options", 1.6)
+        self._scene, self._palette = scene, palette
+        self._lines: Strokes | None = None
         self._is_empty = True
 
     def clear(self) -> None:
         """Hide all options."""
-        if not self._is_empty:
+        if self._lines is not None and not self._is_empty:
             self._is_empty = True
             self._lines.draw(np.zeros((0, 2, 3)))
 
@@ -49,6 +49,7 @@ class GhostPaths:
             self.clear()
             return []
         self._is_empty = False
+        self._lines = self._lines or Strokes(self._scene, "/selected/options", 1.6)
         self._lines.draw_parts(parts)
         return tags
 
