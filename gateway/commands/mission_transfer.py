@@ -28,10 +28,15 @@ _FRAMES = {5: 0, 6: 3, 11: 10}  # MAV_FRAME: with integer coordinates -> the sam
 _ALTITUDE_STEP_M = 0.011  # ArduPilot stores altitudes in whole centimetres [m]
 _PARAM_STEP = 0.5  # ArduPilot stores several parameters as whole numbers
 _MAX_NUMBER = 1e9  # largest parameter or altitude; larger ones, and those that are not finite, are errors
-_RESULT_NAMES = {
-    value: entry.name.removeprefix("MAV_MISSION_").lower().replace("_", " ")
-    for value, entry in dialect.enums["MAV_MISSION_RESULT"].items()
-}
+
+
+def enum_words(enum: str, prefix: str) -> dict[int, str]:
+    """Return the values of a MAVLink enum as words, without the prefix of their names."""
+    entries = dialect.enums[enum].items()
+    return {value: entry.name.removeprefix(prefix).lower().replace("_", " ") for value, entry in entries}
+
+
+_RESULT_NAMES = enum_words("MAV_MISSION_RESULT", "MAV_MISSION_")
 
 
 class RawItem(NamedTuple):
@@ -143,7 +148,7 @@ class MissionRead:
 
 
 class MissionWrite:
-    """Write a mission; only a read afterwards tells what the autopilot has stored.
+    """Write a mission; only a read afterwards shows what the autopilot has stored.
 
     Args:
         target: the autopilot

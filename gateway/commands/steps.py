@@ -14,6 +14,7 @@ from gateway.commands.mission_transfer import (
     MissionWrite,
     RawItem,
     Target,
+    enum_words,
     is_for_us,
     same_missions,
 )
@@ -21,10 +22,7 @@ from gateway.commands.mission_transfer import (
 TRIES = 8  # equal commands sent before a step has failed
 TRANSFERS = 3  # complete transfers of a mission before it has failed
 _WAIT = (dialect.MAV_RESULT_TEMPORARILY_REJECTED, dialect.MAV_RESULT_IN_PROGRESS)
-_RESULT_NAMES = {
-    value: entry.name.removeprefix("MAV_RESULT_").lower().replace("_", " ")
-    for value, entry in dialect.enums["MAV_RESULT"].items()
-}
+_RESULT_NAMES = enum_words("MAV_RESULT", "MAV_RESULT_")
 
 
 class StepResult(NamedTuple):

@@ -1,4 +1,4 @@
-"""`fleet propose`: a table of options, JSON, and what is said without a proposal or without a worker."""
+"""`fleet propose`: a table of options, JSON, and the messages without a proposal or without a worker."""
 
 import json
 from contextlib import nullcontext

@@ -5,8 +5,8 @@
 Aircraft are simulated by JSBSim. In `pairs` and `triples` the second and third aircraft meet the first; in `ground` it
 sinks below 30 m above home, in `geofence` it leaves its circle, in `clear` two pass each other at a distance. At the
 first alert of the expected kind the options are computed (CPU time). Each option is flown by the simulator from 5 s
-after the alert on: `kept` tells that neither the event nor any loss of separation happens up to 200 s. With the first
-option the twins hear the flight: `cleared` tells that the alert was cleared, and new alerts are listed.
+after the alert on: `without_event` is true if neither the event nor a loss of separation happens up to 200 s. With the
+first option the twins follow the flight: `cleared` is true if the alert was cleared, and new alerts are listed.
 """
 
 import argparse
@@ -36,7 +36,7 @@ def summary(rows: list[Outcome]) -> dict[str, Any]:
     raised = [one for one in rows if one.alert_s is not None]
     offered = [one for one in raised if one.offered]
     took = [one.took_s for one in raised if one.took_s is not None]
-    flown = [kept for one in offered for kept in one.kept]
+    flown = [ok for one in offered for ok in one.without_event]
     return {
         "cases": len(rows),
         "alerts": len(raised),
@@ -46,7 +46,7 @@ def summary(rows: list[Outcome]) -> dict[str, Any]:
         "computed_s_max": round(max(took), 2) if took else None,
         "options": sum(one.offered for one in offered),
         "options_flown_without_event": sum(flown),
-        "first_option_without_event": sum(one.kept[0] for one in offered),
+        "first_option_without_event": sum(one.without_event[0] for one in offered),
         "first_option_cleared_alert": sum(bool(one.cleared) for one in offered),
         "first_option_new_alerts": sum(bool(one.new_alerts) for one in offered),
         "offered_without_need": sum(one.unneeded for one in rows),
@@ -67,14 +67,17 @@ def main() -> None:
         for k in range(getattr(args, ARGUMENTS[kind][2:])):
             outcomes.append(judged(kind, args.seed + k, lambda text: print(text, flush=True)))
             one = outcomes[-1]
-            print(f"  kept {one.kept}, cleared {one.cleared}, new {one.new_alerts}, took {one.took_s}", flush=True)
-            told = {
+            print(
+                f"  without event {one.without_event}, cleared {one.cleared}, new {one.new_alerts}, took {one.took_s}",
+                flush=True,
+            )
+            figures = {
                 "seed": args.seed,
                 "summary": {name: summary([o for o in outcomes if o.name == name]) for name in KINDS},
                 "cases": [asdict(one) for one in outcomes],
             }
             if args.json:
-                args.json.write_text(json.dumps(told, indent=1) + "\n")
+                args.json.write_text(json.dumps(figures, indent=1) + "\n")
     print(json.dumps({name: summary([o for o in outcomes if o.name == name]) for name in KINDS}, indent=1))
 
 

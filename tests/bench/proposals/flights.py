@@ -1,4 +1,4 @@
-"""Cases, and their flights with and without the proposed change: simulated aircraft (JSBSim) heard by offline twins.
+"""Cases, and their flights with and without the proposed change: aircraft simulated by JSBSim, offline twins.
 
 The change is made in the simulated autopilot, as after an upload: new items and current item, a speed, or a mode.
 """
@@ -67,7 +67,7 @@ class Outcome:
     offered: int = 0
     took_s: float | None = None  # to compute the options, this thread's CPU
     sentences: list[str] = field(default_factory=list)
-    kept: list[bool] = field(default_factory=list)  # of each option: the event did not happen
+    without_event: list[bool] = field(default_factory=list)  # of each option: the event did not happen
     cleared: bool | None = None  # by the twins, with the first option
     new_alerts: list[str] = field(default_factory=list)  # raised after the change, with the first option
     unneeded: int = 0  # proposals with options where nothing happens
@@ -208,13 +208,13 @@ def _until_alert(case: Case, twins: Twins, path: Path, out: Outcome) -> tuple[Al
     return None, None
 
 
-def _fly_option(case: Case, seed: int, heard: tuple[Outcome, Twins | None], chosen: tuple[Alert, Option]) -> None:
+def _fly_option(case: Case, seed: int, simulated: tuple[Outcome, Twins | None], chosen: tuple[Alert, Option]) -> None:
     """Fly an option; let the twins hear it from the alert on."""
-    (out, twins), (alert, option) = heard, chosen
+    (out, twins), (alert, option) = simulated, chosen
     at_s = alert.t - T_0 + APPROVED_S
     folder, path, paths = recording(case, END_S, seed, option.changes, at_s)
     with folder:
-        out.kept.append(not happens(case, paths, int(at_s / 0.5)))
+        out.without_event.append(not happens(case, paths, int(at_s / 0.5)))
         if twins is None:
             return
         out.cleared = False
@@ -227,7 +227,7 @@ def _fly_option(case: Case, seed: int, heard: tuple[Outcome, Twins | None], chos
 
 
 def _after(messages: Iterator[Message], twins: Twins, changes: tuple[Change, ...], at: float) -> Iterator[Message]:
-    """Give the messages that the twins have not heard, and the uploaded missions at their time."""
+    """Return the messages that the twins have not received, and the uploaded missions at their time."""
     uploads = {change.uav: change for change in changes if change.items is not None}
     waiting = set(uploads)
     for k, message in enumerate(messages):

@@ -132,7 +132,7 @@ def test_options_end_when_the_conflict_does(twin, path):
     fleet.others = (crossing(path, above=200.0),)
     ended = fleet.proposer.update(fleet.alert(), fleet.now)
     assert ended.id == first.id and ended.options == () and "not predicted" in ended.sentence
-    assert fleet.proposer.update(fleet.alert(), fleet.now) is None  # said once
+    assert fleet.proposer.update(fleet.alert(), fleet.now) is None  # published once
 
 
 def test_a_lost_link_leaves_nothing_to_propose(twin, path):
