@@ -53,8 +53,8 @@ def test_a_wait_ends_by_the_flight_before_it_not_by_the_late_report_of_the_item(
     config = multirotor_config(Mission(uav=0, t=0.0, items=mission), {}, "ardupilot", 0.0, origin=HERE, flown=None)
     segments, _ = segments_from_mission(mission, 2, HERE, np.zeros(3), {}, arcs=True)
     segments = limit_speeds(segments, config.limit)
-    par = copter_rollout.parameters(config.limit, {}, 0.2)
-    states, flown = np.zeros((500, copter_legs.N_STATE)), np.zeros((500, 3, 3))
+    par = copter_rollout.parameters(config.limit, {}, (0.25, 0.01, 0.0, 0.0))
+    states, flown = np.zeros((500, copter_legs.N_STATE)), np.zeros((500, 4, 3))
     copter_legs.simulated_states(segments, len(segments), par, STEP, states, flown)
     seq = segments[states[:, copter_legs.SEGMENT].astype(int), 10]
     reported = np.concatenate([np.full(9, 2.0), seq[:-9]])
@@ -65,7 +65,7 @@ def test_a_wait_ends_by_the_flight_before_it_not_by_the_late_report_of_the_item(
             STEP * np.arange(k + 1),
             flown[: k + 1, 0],
             flown[: k + 1, 1],
-            np.zeros((k + 1, 3)),
+            np.full((k + 1, 3), np.nan),
             np.ones(k + 1, bool),
             "",
         )

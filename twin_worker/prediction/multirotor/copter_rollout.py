@@ -88,9 +88,10 @@ def prepare(
     for k in range(1, len(segments)):
         before, own = commanded[k - 1, copter.SPEED], commanded[k, copter.SPEED]
         if before != own and min(before, own) >= 0.0 and not segments[k, copter_legs.TURN]:
-            horizontal = segments[k, copter.B_N : copter.B_N + 2] - segments[k, copter.A_N : copter.A_N + 2]
-            share = float(np.hypot(*horizontal)) / max(_length(segments[k]), 1e-6)
-            segments[k, copter_legs.SPEED_BEFORE] = segments[k - 1, copter.SPEED] if share > 0.9 else 0.0
+            t = segments[k, copter.B_N : copter.B_N + 3] - segments[k, copter.A_N : copter.A_N + 3]
+            t = t / max(float(np.linalg.norm(t)), 1e-6)
+            speed = copter.limit_along(before or limit.speed, limit.up, limit.down, t)
+            segments[k, copter_legs.SPEED_BEFORE] = min(speed, 100.0)
     for row, wanted in zip(segments, commanded, strict=True):
         if row[copter_legs.TURN]:
             row[copter_legs.SPEED_BEFORE] = wanted[copter_legs.SPEED_BEFORE] or limit.speed
@@ -160,7 +161,9 @@ def fly(track: Track, segments: np.ndarray, item: tuple[int, float], par: np.nda
     return np.column_stack([np.interp(ahead, STEP * np.arange(len(out)), column) for column in out.T])
 
 
-def _synchronise(track: Track, segments: np.ndarray, item: tuple[int, float], par: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+def _synchronise(
+    track: Track, segments: np.ndarray, item: tuple[int, float], par: np.ndarray
+) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the state of the navigation now, (copter_legs.N_STATE,), and the integrator if it is simulated, (3,)."""
     seq, since = item
     own = np.flatnonzero(segments[:, copter.SEQ] == seq)

@@ -45,9 +45,7 @@ _MAX_REPLAY, _MAX_OFFSET_M = 80, 3.0  # rows after the begin of an item; deviati
 _LEVEL_M = 0.3  # shorter horizontal legs are vertical [m]
 
 
-def parameters(
-    limit: Limits, params: Mapping[str, float], airframe: Sequence[float], ground: float
-) -> np.ndarray:
+def parameters(limit: Limits, params: Mapping[str, float], airframe: Sequence[float], ground: float) -> np.ndarray:
     """Return the parameters of the trajectory, (px4_multirotor.N_PAR,).
 
     Args:
