@@ -167,6 +167,7 @@ def _synchronise(
     """Return the state of the navigation now, (copter_legs.N_STATE,), and the integrator if it is simulated, (3,)."""
     seq, since = item
     own = np.flatnonzero(segments[:, copter.SEQ] == seq)
+    own = own[np.cumprod(np.diff(own, prepend=own[:1] - 1) == 1).astype(bool)]  # not those after a jump back
     first = int(own[0]) if len(own) else 0
     circle = own[segments[own, copter_legs.TURN] != 0.0]
     if len(circle) and (state := _on_circle(track, segments, int(circle[0]), par)) is not None:
