@@ -6,11 +6,10 @@
     t' = clip(0.05 + (v . d - P (r - x) . d) / |r'|, 0, 1), first-order lag WPNAV_ACCEL / WPNAV_JERK
 
 The next leg begins in the deceleration of the present one, when it still accelerates at the end of that, the path
-between both deviates from the corner by less than WPNAV_RADIUS and its acceleration stays below the corner limit half-way
-to the end of the present one. A circle begins at the stopping point. A point on it, from rest with angular acceleration
-max(a / R, 2 deg/s2) to a speed of at most sqrt(a R / 2), is the target of `shape_position`. The leg after it begins at
-rest at the stopping point; at both begins the integrator gets the present tilt. The landing descends at
-sq(height - LAND_ALT_LOW) between LAND_SPEED and the speed limit.
+between both deviates from the corner by less than WPNAV_RADIUS and its acceleration stays below the corner limit
+half-way. On a circle a point, from rest with angular acceleration max(a / R, 2 deg/s2) to at most sqrt(a R / 2), is the
+target of `shape_position`. Circle and leg after it begin at rest at the stopping point; the integrator gets the present
+tilt. The landing descends at sq(height - LAND_ALT_LOW) between LAND_SPEED and the limit.
 
 Source: ArduCopter 4.7 documentation and behaviour of waypoint navigation (S-curves), circle mode, land mode.
 """
@@ -314,7 +313,6 @@ def _circle(
 def _descend(
     state: np.ndarray, segment: np.ndarray, xva: np.ndarray, par: np.ndarray, dt: float, r: np.ndarray
 ) -> None:
-    """Descend to the end of a landing."""
     low = segment[B_N + 2] - segment[LOW] - xva[0, 2]  # above the slow part [m]
     speed = square_root_control(max(low, 0.0), par[POS_P_Z], par[ACC_Z])
     speed = min(max(speed, segment[SPEED]), segment[DESCENT])

@@ -16,8 +16,8 @@ import numpy as np
 
 # parameters: gains [1/s], lag of the attitude [s], jerk [m/s3], WPNAV_RADIUS [m], corner and horizontal limit [m/s2],
 # integral and derivative of the horizontal velocity [1/s2, -], time in which the jerk rises [s], whether the law is
-# ArduCopter's (1) or PX4's (0), linear and quadratic drag over mass [1/s, 1/m], wind [m/s], jerk of shaping [m/s3], vertical
-# acceleration [m/s2]
+# ArduCopter's (1) or PX4's (0), linear and quadratic drag over mass [1/s, 1/m], wind [m/s], jerk of shaping [m/s3],
+# vertical acceleration [m/s2]
 POS_P, VEL_P, POS_P_Z, VEL_P_Z, TAU, JERK, WP_RADIUS, ACC_CORNER, ACC_MAX, ACC_XY = range(10)
 VEL_I, VEL_D, JERK_TIME, ARDUCOPTER, DRAG, DRAG_2, W_N, W_E, SHAPING_JERK, ACC_Z = range(10, 20)
 N_PAR = 20

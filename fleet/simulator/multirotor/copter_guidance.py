@@ -1,9 +1,9 @@
 """Guidance of ArduCopter: straight legs flown by jerk-limited profiles of time that overlap at corners, and circles.
 
 A leg is planned from rest to rest: seven phases of constant jerk or acceleration, with a jerk that rises and falls as a
-cosine over twice ATC_INPUT_TC. The next leg begins before the present one ends, in its deceleration, as soon as the
-corner cut by the sum of both stays within WPNAV_RADIUS and below the corner acceleration. A commanded speed changes a leg that has begun after its acceleration. Profile time
-runs slower while the aircraft lags behind the reference. The target on a circle is shaped.
+cosine over twice ATC_INPUT_TC. The next leg begins in its deceleration, as soon as the corner cut by the sum of both
+stays within WPNAV_RADIUS and below the corner acceleration. A commanded speed changes a leg that has begun after its
+acceleration. Profile time runs slower while the aircraft lags behind. The target on a circle is shaped.
 
 Source: ArduCopter documentation (S-curve navigation, circle, RTL and land modes), its parameter names and defaults.
 """
@@ -243,14 +243,12 @@ class CopterGuidance:
         """
         leg, new = self._leg, self._plan(self._leg.a, self._leg.b, speed).profile
         _, v, a = leg.profile.at(leg.t)
-        get = self._params.__getitem__
-        acc, jerk, rise = get("WPNAV_ACCEL") * _CM, get("WPNAV_JERK"), 2 * max(get("ATC_INPUT_TC"), 0.1)
+        jerk, rise = self._params["WPNAV_JERK"], 2 * max(self._params["ATC_INPUT_TC"], 0.1)
         if abs(new.limit - leg.profile.limit) < 1e-3:
             return
         top = leg.profile.speed
         if new.limit < leg.profile.limit and a >= 0.0:
-            acc = min(acc, new.acc)
-            begun = max(acc / jerk - rise, 0.0) + 2 * rise
+            begun = max(new.acc / jerk - rise, 0.0) + 2 * rise
             v_full, a_full = (v, a) if leg.t > begun else leg.profile.at(begun)[1:]
             top = min(max(new.limit, v_full + 0.5 * a_full * (a_full / jerk + rise)), top)
         profile = Profile(leg.profile.length, top, (new.acc, jerk), rise, new.limit)

@@ -122,7 +122,7 @@ def present_motion(track: Track, par: np.ndarray) -> np.ndarray:
     rows = min(_ACCELERATION_ROWS, len(track) - 1)
     v = track.v[-_VELOCITY_ROWS:].mean(axis=0)
     a = (track.v[-1] - track.v[-1 - rows]) / (STEP * rows) if rows else np.zeros(3)
-    drag = np.array([position_loop.drag(*velocity, par) for velocity in track.v[-_DRAG_ROWS:, :2]])
+    drag = np.array([position_loop.drag(v_n, v_e, par) for v_n, v_e in track.v[-_DRAG_ROWS:, :2]])
     tilt = tilt_acceleration(track.euler[-_DRAG_ROWS:])
     recovery = par[position_loop.VEL_I] / par[position_loop.VEL_P] * STEP
     integrator = drag[0].copy()
