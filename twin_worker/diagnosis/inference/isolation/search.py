@@ -223,10 +223,15 @@ class Search:
 
     def _add_anomaly(self, beside: Explanation, anomaly: Anomaly) -> None:
         gain, channel = beside.channel_gain.copy(), CHANNELS.index(anomaly.channel)
-        gain[channel] += max(anomaly.net_gain, 0.0)
         block_gain = beside.block_gain
+        hypotheses = [member.hypothesis for member in beside.members]
+        if anomaly.hypothesis is not None:
+            hypotheses.append(anomaly.hypothesis)
+            gain = self._no_effect - self._costs(hypotheses)
+            block_gain = self._no_effect_blocks - self.blocks.cost(hypotheses)
+        else:
+            gain[channel] += max(anomaly.net_gain, 0.0)
         if anomaly.series is not None:
-            hypotheses = [member.hypothesis for member in beside.members]
             block_gain = self._no_effect_blocks - self.blocks.cost(hypotheses, (channel, anomaly.series))
         chance = beside.chance + self.whitened.base.chance.get(anomaly.kind, 0.0)
         key = (*sorted(member.kind for member in beside.members), anomaly.kind)
