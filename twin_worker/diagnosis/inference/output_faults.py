@@ -266,14 +266,15 @@ class _ModelledThrottle(_ModelledOutput):
     def _evidence(self, first: int, end: int) -> float:
         """Return the log likelihood ratio of a run, from its prediction by the output before it.
 
-        The variance of the prediction is that of the law's error, as large as in trusted flight or before the run,
-        growing as of a random walk, and that of the regression coefficients.
+        The variance of the prediction is that of the law's error over `_LAG_S`, as large as in trusted flight or, by its
+        median, in the seconds before the run, growing as of a random walk, and that of the regression coefficients.
         """
         recent, t = self._recent(first), self._outputs.t
         if recent.stop - recent.start < 2:
             return 0.0
-        error = (self._y - self._predicted)[recent]
-        scale = max(self._scale, float(np.median(np.abs(error - np.median(error)))) / _MEDIAN_SIGMAS)
+        error = self._y - self._predicted
+        earlier = np.searchsorted(t, t[recent] - _LAG_S)
+        scale = max(self._scale, float(np.median(np.abs(error[recent] - error[earlier]))) / _MEDIAN_SIGMAS)
         change = self._x[first:end] - self._x[recent].mean(axis=0)
         growth = np.maximum(t[first:end] - t[first - 1], _LAG_S) / _LAG_S
         sigmas = self._misfit(first, end) / (
