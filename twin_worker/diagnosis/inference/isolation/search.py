@@ -252,8 +252,8 @@ def chance_gain(
 ) -> float:
     """Return the gain that an effect reaches on nominal flights, from `Baseline.chance` or `Baseline.block_chance`.
 
-    That of the same kind of onset: with a fast accelerometer the largest of the same effect or surface; else of the same
-    effect, and where constants differ between flights, beyond that without an onset.
+    That of the same kind of onset: with a fast accelerometer the largest of the same effect or surface; else that of
+    the effect, and where constants differ between flights, beyond that without an onset.
     """
     if vane:
         return max((x for kind, x in chance.items() if _is_related(kind, hypothesis)), default=0.0)
@@ -329,9 +329,9 @@ def turbulence_evidence(whitened: WhitenedResiduals) -> tuple[np.ndarray, float,
     """Return gain by channel, (c + 1,), variance ratio of gusts, and their onset [s]; None if it is before the flight.
 
     Sideslip, lift and airspeed scatter more, the sensor channels do not. The onset is the change point of the variance,
-    r_1 before and r_2 after it:  G = -sum n_i ln r_i, against n (r - 1 - ln r) of one variance throughout. The reference
-    is the variance of nominal flights; without a fast accelerometer, where it follows the weather of each flight, that
-    of this flight's own noise.
+    r_1 before and r_2 after it:  G = -sum n_i ln r_i, against n (r - 1 - ln r) of one variance throughout. Reference is
+    the variance of nominal flights; without a fast accelerometer, where it follows the weather of each flight, that of
+    the noise of this flight.
     """
     air_channels = [CHANNELS.index(name) for name in ("side", "lift", "airspeed")]
     sensor_channels = [k for k, name in enumerate(CHANNELS) if name.startswith(("gps", "gyro"))]
