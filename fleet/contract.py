@@ -457,6 +457,7 @@ class Prediction(Message, frozen=True, kw_only=True):
         0.0
     )
     horizon_open: Annotated[bool, about("true: still below 10 % at the end of `ahead`")] = False
+    early_exceedance: Annotated[float, about("probability that the error exceeds 10 % within 10 s, 0..1")] = 0.0
     coverage: Annotated[
         float, about("empirical coverage of the prediction region, 0..1; nan before any evaluation")
     ] = float("nan")

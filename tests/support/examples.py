@@ -177,6 +177,7 @@ MESSAGES = (
         quantile=0.9,
         horizon_s=2.0,
         horizon_open=True,
+        early_exceedance=0.125,
         coverage=0.875,
         coverage_n=8,
         calibration="calibrated on 288 predictions of 16 flights",
