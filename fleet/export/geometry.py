@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fleet.contract import Prediction, Rows, Sample
-from fleet.frames import Origin, to_geodetic
+from fleet.frames import Origin, to_geodetic, to_ned
 
 MAX_REACH_M = 200_000.0  # a path that reaches farther from its origin is invalid [m]
 MAX_ELLIPSES = 24  # ellipses of one prediction region
@@ -65,6 +65,12 @@ def predicted_path(message: Prediction) -> PredictedPath | None:
 def coordinates(origin: Origin, ned: np.ndarray) -> list[list[float]]:
     """Map NED positions (n, 3) [m] to longitude, latitude [deg], altitude above mean sea level [m], rounded."""
     return rounded(to_geodetic(origin, ned))
+
+
+def enu(path: PredictedPath, ned: np.ndarray, origin: Origin) -> np.ndarray:
+    """Map NED positions of a prediction, (n, 3) [m], to east, north, up from another origin, (n, 3) [m]."""
+    moved = to_ned(origin, *to_geodetic(path.origin, ned).astype(float).T)
+    return moved[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
 
 
 def rounded(lat_lon_alt: np.ndarray) -> list[list[float]]:

@@ -58,7 +58,7 @@ ANSWERS = {  # command line -> part of the last line
     "fleet assess folder": "FILE: found a folder 'folder', expected a recording; name a file in it",
     "fleet calibrate text.txt": "--out: found none, expected one; add it",
     "fleet export": "FILE: found none, expected one; add it",
-    "fleet export x.txt": "FILE: found 'x.txt', expected a name that ends in .geojson, .kml, .mcap; rename it",
+    "fleet export x.txt": "FILE: found 'x.txt', expected a name that ends in .geojson, .kml, .mcap, .rrd; rename it",
     "fleet export nosuch/x.kml": "FILE: found no folder 'nosuch', expected one; create it first",
     "fleet export x.kml --for -1": "--for: found -1 s, expected 0 (until Ctrl-C) or more; change it",
     "fleet export x.kml --from nosuch.parauav": "--from: found no file 'nosuch.parauav', expected a recording",
