@@ -15,7 +15,7 @@ import numpy as np
 
 from fleet.contract import Alert, Message, Prediction, Sample
 from fleet.export.foxglove import alert_text
-from fleet.export.geometry import coordinates, enu, position_rows, predicted_path
+from fleet.export.geometry import coordinates, cut_line, enu, position_rows, predicted_path
 from fleet.frames import Origin, to_ned
 
 _COLOUR = (43, 196, 154)  # of a verified model on the viewer
@@ -106,13 +106,13 @@ class RerunExport(AbstractContextManager):
         ahead = np.unique(np.append(path.ahead[path.ahead < path.horizon_s], path.horizon_s))
         marks = path.marks()
         ned, (centres, half_axes) = path.at(ahead)[0], path.at(marks)
-        lat_lon = [[lat, lon] for lon, lat, _ in coordinates(path.origin, ned)]
+        on_map = [[[lat, lon] for lon, lat, _ in part] for part in cut_line(coordinates(path.origin, ned))]
         turns = [
             rerun.RotationAxisAngle(axis=[0, 0, 1], radians=math.pi / 2 - heading) for heading in path.headings(marks)
         ]
         prefix = f"uav/{uav}/prediction"
         line = {"radii": _LINE_PX, "colors": [_COLOUR]}
-        self._log(t, f"{prefix}/map", rerun.GeoLineStrings(lat_lon=[lat_lon], **line))
+        self._log(t, f"{prefix}/map", rerun.GeoLineStrings(lat_lon=on_map, **line))
         self._log(t, f"{prefix}/path", rerun.LineStrips3D([enu(path, ned, self._origin)], **line))
         if len(marks):
             region = rerun.Ellipsoids3D(
