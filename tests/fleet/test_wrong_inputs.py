@@ -71,9 +71,9 @@ ANSWERS = {  # command line -> part of the last line
     "fleet export x.kml --from text.txt --for 3": "--for: found --from too, expected only one",
     "fleet export x.kml --uavs 9-3": "--uavs: found '9-3', expected a range of ids such as 0-49",
     "fleet whatif seven": "uav: found 'seven', expected a whole number; correct it",
-    "fleet whatif 7 --wind=nan,2": "--wind: found (nan, 2.0), expected two finite numbers; write e.g. --wind=6,-2",
+    "fleet whatif 7 --wind=nan,2": "--wind: found 'nan,2', expected two numbers, north and east; write e.g.",
     "fleet whatif 7 --param WP_RADIUS=nan": "--param: found 'WP_RADIUS=nan', expected NAME=VALUE",
-    "fleet whatif 7 --wind 3": "--wind: found 1 numbers, expected north and east; write e.g. --wind=6,-2",
+    "fleet whatif 7 --wind 3": "--wind: found '3', expected two numbers, north and east; write e.g. --wind=6,-2",
     "fleet schema predictoin": "did you mean prediction?",
     "fleet effects nosuch": "found 'nosuch', expected an effect such as actuator_stuck",
     "fleet completion tcsh": "shell: found 'tcsh', expected bash, zsh, fish",
@@ -83,7 +83,7 @@ ANSWERS = {  # command line -> part of the last line
     "gateway --link serial:/dev/ttyUSB0:x7:0": "expected serial:PATH:BAUD; write e.g. serial:/dev/ttyUSB0:57600",
     "gateway --record text.txt": "--record: 'text.txt' cannot be created (File exists); name another folder",
     "gateway --record-budget lots --record r": "--record-budget: found 'lots', expected a size such as 500M or 10G",
-    "gateway --keys folder": "found a folder 'folder', expected a file; name a file in it",
+    "gateway --keys folder": "--keys: found a folder 'folder', expected a file of keys; name a file in it",
     "gateway --most-uavs 0": "--most-uavs: found 0, expected at least 1; write e.g. 250",
     "twin_worker --uavs 9-3": "--uavs: found '9-3', expected a range of ids such as 0-49; write the lower one first",
     "twin_worker --separation 5": "--separation: found '5', expected two distances in m, e.g. 50,20; correct it",
@@ -131,6 +131,13 @@ def test_a_wrong_input_is_answered_in_one_line(line: str, folder: None, capsys: 
     assert not ARGPARSE.search(said) and "Traceback" not in said and len(last) < 1000
     if "usage" in said.partition("\n")[0]:  # that of the verb
         assert said.startswith(f"usage: {verb} ")
+
+
+def test_the_page_of_wrong_inputs_has_every_answer() -> None:
+    """Made by `python -m tests.bench.wrong_inputs > docs/wrong-inputs.md`."""
+    rows = dict(re.findall(r"^\| `(.*?)` \| (.*) \| 2 \|$", (ROOT / "docs" / "wrong-inputs.md").read_text(), re.M))
+    assert list(rows) == list(ANSWERS)
+    assert [line for line, answer in ANSWERS.items() if answer not in rows[line].replace("\\|", "|")] == []
 
 
 def test_version_and_help_of_all_commands_and_verbs_import_nothing_heavy() -> None:
