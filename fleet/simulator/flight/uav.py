@@ -1,7 +1,7 @@
 """One simulated aircraft: flight dynamics, sensors, autopilot and MAVLink interface."""
 
 from collections.abc import Mapping, Sequence
-from math import atan2, pi, sin
+from math import atan2, sin
 from types import MappingProxyType
 
 import numpy as np

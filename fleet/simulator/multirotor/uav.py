@@ -5,7 +5,7 @@ It arms a few seconds after the start, flies its mission, lands, disarms, and st
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from math import hypot, pi
+from math import hypot
 from types import MappingProxyType
 from typing import Any
 

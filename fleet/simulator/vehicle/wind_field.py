@@ -66,9 +66,7 @@ class CoherentWind:
         """Draw the field of the fleet of a seed; arguments as of the constructor."""
         return cls(mean, fleet_wind_direction(seed), origin, np.random.default_rng((seed, 13)))
 
-    def _draw(
-        self, mean: float, spectrum: tuple[float, float], decay: np.ndarray, rng: np.random.Generator
-    ) -> _Modes:
+    def _draw(self, mean: float, spectrum: tuple[float, float], decay: np.ndarray, rng: np.random.Generator) -> _Modes:
         """Draw the modes of one component; the spectrum below f has the variance 1.5 a/b (1 - (1 + b n)^(-2/3))."""
         a, b = spectrum
         below = 1.0 - (1.0 + b * CUTOFF_HZ * REFERENCE_M / mean) ** (-2 / 3)

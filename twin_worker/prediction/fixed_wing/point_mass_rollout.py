@@ -10,6 +10,7 @@ from fleet.window import Window
 from twin_worker.estimation.wind_filter import DRIFT_S, GUST, GUST_S
 from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel, airspeed_of
 from twin_worker.prediction.closed_loop import InitialCondition, sample_rollout
+from twin_worker.prediction.fixed_wing.path_wind import drift_draws, surer_field, with_drift
 from twin_worker.prediction.replay_window import PredictionContext, Rollout
 from twin_worker.telemetry.velocity import present_velocity
 
@@ -104,7 +105,12 @@ def fly_point_mass(
     """
     ctl, par, legs = initial.synchronised
     state, air = start_and_air(context, initial.window)
-    out = np.empty((int(ahead[-1] / H.STEP) + 2, 3))
+    out, draws = np.empty((int(ahead[-1] / H.STEP) + 2, 3)), _NO_NOISE
+    wind = surer_field(context, initial, model, state, air, float(ahead[-1]))
+    if wind is not None:
+        air = with_drift(air, wind.mean[0])
+        draws = np.zeros((int(ahead[-1]) + 2, 4))
+        draws[:, :2] = drift_draws(wind, wind.mean, air, len(draws))
     ctl = ctl.copy()
-    n_rows = H.simulate_route(ctl, par, legs, model.parameters, air, state, _NO_NOISE, H.STEP, out)
+    n_rows = H.simulate_route(ctl, par, legs, model.parameters, air, state, draws, H.STEP, out)
     return sample_rollout(out[:n_rows], H.STEP, initial, ctl, ahead)
