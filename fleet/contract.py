@@ -726,9 +726,7 @@ class WindEstimate(msgspec.Struct, frozen=True, kw_only=True):
     """Wind without gusts that a twin estimates where its aircraft is."""
 
     t: Annotated[float, about("fleet time [s since 1970]")]
-    position: Annotated[
-        tuple[int, int, int], about("latitude, longitude [1e-7 deg], altitude above mean sea level [mm]")
-    ]
+    position: Annotated[tuple[int, int, int], about("lat, lon [1e-7 deg], altitude above mean sea level [mm]")]
     height_m: Annotated[float, about("above home [m]")]
     wind: Annotated[tuple[float, float], about("north and east, the direction it blows to [m/s]")]
     sigma: Annotated[float, about("standard deviation of one component [m/s]")]
@@ -753,7 +751,7 @@ class FleetRow(msgspec.Struct, frozen=True, kw_only=True):
     epoch: Annotated[int, about("claim epoch of the writer")] = 0
     alerts: Annotated[tuple[str, ...], about("texts of the active alerts")] = ()
     mismatch: Annotated[str, about("outcome and causes, e.g. named thrust_loss; empty: none")] = ""
-    wind: Annotated[WindEstimate | None, about("its own estimate; null without a recent airspeed")] = None
+    wind: Annotated[WindEstimate | None, about("wind by its own filter; null without a recent airspeed")] = None
 
 
 class FleetState(msgspec.Struct, frozen=True, kw_only=True):

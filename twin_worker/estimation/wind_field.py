@@ -139,8 +139,8 @@ class WindFieldEstimator:
         return self._krige(used, max(rows[-1].t for rows in used.values()))
 
     def _krige(self, used: dict[int, list[WindEstimate]], t: float) -> WindField:
-        rows = [(i, one) for i, one in enumerate(used.values()) for one in one]
-        data = _Estimates.of(np.array([i for i, _ in rows]), [one for _, one in rows], t)
+        index = np.repeat(np.arange(len(used)), [len(rows) for rows in used.values()])
+        data = _Estimates.of(index, [one for rows in used.values() for one in rows], t)
         if not 0.0 <= t - self._kernel_t < _EVIDENCE_PERIOD_S:
             self._kernel, self._kernel_t = _likely_kernel(data), t
         s_f, s_a, length = self._kernel
@@ -244,7 +244,8 @@ def _choose_nodes(data: _Estimates, length: float) -> np.ndarray:
 
     Source: Harbrecht, Peters and Schneider 2012, algorithm 1.
     """
-    rest, rows, chosen = np.ones(len(data.moved)), np.empty((0, len(data.moved))), []
+    rest, rows = np.ones(len(data.moved)), np.empty((0, len(data.moved)))
+    chosen: list[int] = []
     while len(chosen) < _MAX_NODES and rest.max() > _NODE_GAIN:
         k = int(rest.argmax())
         correlation = np.exp(-_distance(data.moved[[k]], data.moved)[0] / length)
