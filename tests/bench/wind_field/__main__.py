@@ -1,6 +1,6 @@
 """`python -m tests.bench.wind_field`: predictions of 20 aircraft with and without the shared wind field.
 
-Each seed is one fleet of simulated aircraft, recorded once; ten of them are predicted twice on the same telemetry: alone,
+Each seed is one fleet of simulated aircraft, recorded once. Ten are predicted twice on the same telemetry: alone,
 and with the field estimated from the wind of all twenty. Some fleets fly through one field coherent in space and
 time, the others each through a drift of its own, where only the mean can be shared.
 """
@@ -38,8 +38,8 @@ EXAMPLES = """
 """
 UAVS, PREDICTED, SECONDS, TURBULENCE = 20, 10, 280.0, 2
 FIRST_S, EVERY_S, LOOK_AHEADS = 120.0, 10.0, (16, 30, 60)
-SCHEDULE = Schedule(predict=5.0, renew=5.0, identify=10.0)
-WIND_ONLY = Schedule(predict=1e9, renew=1e9, identify=1e9)
+SCHEDULE = Schedule(predict=5.0, identify=10.0)
+WIND_ONLY = Schedule(predict=1e9, identify=1e9)
 PERIOD_S = 5.0  # between estimates of the field [s]
 
 

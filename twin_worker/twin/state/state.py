@@ -227,7 +227,7 @@ class Twin(msgspec.Struct):
         k = int(np.abs(t - wind.t).argmin())
         lat_e7, lon_e7, alt_mm = (int(x) for x in position[k])
         return WindEstimate(
-            t=wind.t,
+            t=float(wind.t),
             position=(lat_e7, lon_e7, alt_mm),
             height_m=1e-3 * (alt_mm - self.home.alt_mm),
             wind=(float(wind.wind[0]), float(wind.wind[1])),
