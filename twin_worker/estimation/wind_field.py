@@ -3,12 +3,12 @@
     w(p, t) = g(h) beta + f(p, t),      g(h) = [(h / h_0)^(1/7), (h - h_0) / h_0],      beta ~ N(0, diag(15^2, 0.5^2))
     cov f = s_f^2 exp(-|p - p' - U (t - t')| / L) exp(-|t - t'| / T)
     cov a = s_a^2 exp(-|t - t'| / T_a) of one aircraft,  0 between two
-    estimate of an aircraft = w(p, t) + a(t) + noise of its filter's variance
+    estimate of an aircraft = w(p, t) + a(t) + gust + noise of its filter's variance,      var gust = s_g^2
 
 Both horizontal components have these covariances. f drifts with the mean wind U; vertical distances count twice. a is
 what an aircraft does not share with the others: wind of its own, and slow errors of its filter. The joint posterior of
 beta, f at some nodes, and each a contains every estimate once; it replaces an aircraft's own estimate where it is surer
-and is never multiplied with it. s_f, s_a and L are posterior means over hypotheses, weighted by their likelihood.
+and is never multiplied with it. s_f, s_a, s_g and L are posterior means over hypotheses, weighted by their likelihood.
 
 Source: Cressie 1993, sec. 3.4 (universal kriging with covariance of the errors); Rasmussen and Williams 2006, eq. 2.42
 (trend with a prior), sec. 8.3.1 (posterior at nodes); Taylor 1938 (advection).
@@ -34,16 +34,17 @@ _WINDOW_S = 240.0  # estimates used [s]
 _MAX_ESTIMATES = 600  # of all aircraft; more are thinned, since the work grows with the third power
 _MAX_NODES = 100
 _NODE_GAIN = 0.05  # share of the variance of f that another node must add
-_HYPOTHESES = tuple(product((0.05, 0.25, 0.5, 1.0, 2.0), (0.1, 0.25, 0.5, 1.0), (150.0, 300.0, 600.0)))
-"""s_f, s_a [m/s] and L [m]."""
-_EVIDENCE_ROWS = 200  # estimates in their likelihood
+_HYPOTHESES = tuple(
+    product((0.05, 0.25, 0.5, 1.0, 2.0), (0.1, 0.25, 0.5, 1.0), (0.1, 0.4, 0.7, 1.2), (150.0, 300.0, 600.0))
+)
+"""s_f, s_a, s_g [m/s] and L [m]."""
+_EVIDENCE_ROWS = 150  # estimates in their likelihood
 _EVIDENCE_PERIOD_S = 30.0  # between its evaluations [s]
 _REFERENCE_M, _MIN_HEIGHT_M, _MAX_HEIGHT_M = 100.0, 5.0, 1_000.0  # h_0, bounds of h [m]
 _PROFILE_SIGMA = np.array([15.0, 0.5])
 _VERTICAL = 2.0  # weight of vertical distances: eddies are flat
 _MAX_CLOCK_OFFSET_S = 30.0  # from the median: aircraft of another recording [s]
 _MAX_WIND, _MAX_SIGMA, _MAX_ALTITUDE_M = 150.0, 20.0, 20_000.0  # of plausible estimates [m/s, m/s, m]
-_FLOOR = 1e-9  # on diagonals [m2/s2]
 
 
 def estimate_defect(estimate: WindEstimate) -> str:
@@ -108,7 +109,7 @@ class WindFieldEstimator:
     """
 
     estimates: dict[int, list[WindEstimate]] = field(default_factory=dict)
-    _kernel: tuple[float, float, float] = (0.5, 0.25, 300.0)  # s_f, s_a, L
+    _kernel: tuple[float, float, float, float] = (0.5, 0.25, 0.5, 300.0)  # s_f, s_a, s_g, L
     _kernel_t: float = -inf
 
     def add(self, uav: int, estimate: WindEstimate) -> None:
@@ -143,8 +144,8 @@ class WindFieldEstimator:
         data = _Estimates.of(index, [one for rows in used.values() for one in rows], t)
         if not 0.0 <= t - self._kernel_t < _EVIDENCE_PERIOD_S:
             self._kernel, self._kernel_t = _likely_kernel(data), t
-        s_f, s_a, length = self._kernel
-        factor = cho_factor(_covariance(data, s_f, s_a, length), lower=True, check_finite=False)
+        s_f, s_a, _, length = self._kernel
+        factor = cho_factor(_covariance(data, *self._kernel), lower=True, check_finite=False)
         nodes = _choose_nodes(data, length)
         shared = s_f**2 * np.exp(-_distance(nodes, data.moved) / length - data.age / PERSISTENCE_S)
         prior = np.zeros((2 + len(nodes),) * 2)
@@ -216,27 +217,27 @@ class _Estimates:
         return _Estimates(self.origin, *(column[k] for column in columns))
 
 
-def _covariance(data: _Estimates, s_f: float, s_a: float, length: float) -> np.ndarray:
+def _covariance(data: _Estimates, s_f: float, s_a: float, s_g: float, length: float) -> np.ndarray:
     """Return the covariance of the estimates of one component, (n, n) [m2/s2]."""
     lag, same = np.abs(data.age[:, None] - data.age), data.aircraft[:, None] == data.aircraft
     out = s_f**2 * np.exp(-_distance(data.moved, data.moved) / length - lag / PERSISTENCE_S)
     out += s_a**2 * np.exp(-lag / DRIFT_S) * same
     out += (data.basis * _PROFILE_SIGMA**2) @ data.basis.T
-    out[np.diag_indices_from(out)] += data.variance + _FLOOR
+    out[np.diag_indices_from(out)] += data.variance + s_g**2
     return np.asarray(out)
 
 
-def _likely_kernel(data: _Estimates) -> tuple[float, float, float]:
-    """Return the posterior root mean squares of s_f and s_a and mean of L over the hypotheses."""
+def _likely_kernel(data: _Estimates) -> tuple[float, float, float, float]:
+    """Return the posterior root mean squares of s_f, s_a and s_g and mean of L over the hypotheses."""
     few, log_likelihood = data.thinned(_EVIDENCE_ROWS), np.empty(len(_HYPOTHESES))
     for k, hypothesis in enumerate(_HYPOTHESES):
         L = np.linalg.cholesky(_covariance(few, *hypothesis))
         white = np.linalg.solve(L, few.wind)
         log_likelihood[k] = -0.5 * (white**2).sum() - 2.0 * np.log(np.diag(L)).sum()
     weight = np.exp(log_likelihood - log_likelihood.max())
-    s_f, s_a, length = np.array(_HYPOTHESES).T
-    mean = np.array([s_f**2, s_a**2, length]) @ weight / weight.sum()
-    return float(np.sqrt(mean[0])), float(np.sqrt(mean[1])), float(mean[2])
+    *deviations, length = np.array(_HYPOTHESES).T
+    s_f, s_a, s_g = np.sqrt(np.square(deviations) @ weight / weight.sum()).tolist()
+    return s_f, s_a, s_g, float(length @ weight / weight.sum())
 
 
 def _choose_nodes(data: _Estimates, length: float) -> np.ndarray:

@@ -1,7 +1,7 @@
 """State of one twin: telemetry, active model, past predictions; and the ingestion of messages."""
 
 from collections.abc import Mapping
-from math import isfinite
+from math import isfinite, sqrt
 from typing import Any
 
 import msgspec
@@ -217,7 +217,7 @@ class Twin(msgspec.Struct):
 
     @property
     def wind_estimate(self) -> WindEstimate | None:
-        """Return the wind of the aircraft's own filter; None without recent airspeed, position or home."""
+        """Return the wind with gusts by the aircraft's own filter; None without recent airspeed, position or home."""
         now, wind = self.telemetry.history.newest, self.environment.wind
         if self.home is None or not self.environment.has_own_wind(now):
             return None
@@ -226,12 +226,13 @@ class Twin(msgspec.Struct):
             return None
         k = int(np.abs(t - wind.t).argmin())
         lat_e7, lon_e7, alt_mm = (int(x) for x in position[k])
+        present, variance = wind.present_wind
         return WindEstimate(
             t=float(wind.t),
             position=(lat_e7, lon_e7, alt_mm),
             height_m=1e-3 * (alt_mm - self.home.alt_mm),
-            wind=(float(wind.wind[0]), float(wind.wind[1])),
-            sigma=wind.sigma,
+            wind=(float(present[0]), float(present[1])),
+            sigma=sqrt(max(variance, 0.0)),
         )
 
     @property
