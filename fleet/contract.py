@@ -723,10 +723,10 @@ class Execution(Message, frozen=True, kw_only=True):
 
 
 class WindEstimate(msgspec.Struct, frozen=True, kw_only=True):
-    """Wind without gusts that a twin estimates where its aircraft is."""
+    """Wind, gusts included, that a twin estimates where its aircraft is."""
 
     t: Annotated[float, about("fleet time [s since 1970]")]
-    position: Annotated[tuple[int, int, int], about("lat, lon [1e-7 deg], altitude above mean sea level [mm]")]
+    position: Annotated[tuple[int, int, int], about("lat, lon [1e-7 deg], altitude above sea level [mm]")]
     height_m: Annotated[float, about("above home [m]")]
     wind: Annotated[tuple[float, float], about("north and east, the direction it blows to [m/s]")]
     sigma: Annotated[float, about("standard deviation of one component [m/s]")]
@@ -751,7 +751,7 @@ class FleetRow(msgspec.Struct, frozen=True, kw_only=True):
     epoch: Annotated[int, about("claim epoch of the writer")] = 0
     alerts: Annotated[tuple[str, ...], about("texts of the active alerts")] = ()
     mismatch: Annotated[str, about("outcome and causes, e.g. named thrust_loss; empty: none")] = ""
-    wind: Annotated[WindEstimate | None, about("wind by its own filter; null without a recent airspeed")] = None
+    wind: Annotated[WindEstimate | None, about("by its own filter [m/s]; null without airspeed")] = None
 
 
 class FleetState(msgspec.Struct, frozen=True, kw_only=True):
@@ -768,7 +768,7 @@ class FleetState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class WindField(msgspec.Struct, frozen=True, kw_only=True):
-    """Wind in space and time, estimated from the estimates of all aircraft by one worker at a time.
+    """Wind in space and time, estimated from all aircraft by one worker at a time.
 
     w = g(h) profile + f + drift, with g(h) = [(h / 100 m)^(1/7), (h - 100 m) / 100 m] at the height h above ground.
     f drifts with `wind`: its covariance is sigma^2 exp(-d / length_m) exp(-lag / persistence_s), with d the distance
@@ -779,9 +779,9 @@ class WindField(msgspec.Struct, frozen=True, kw_only=True):
     version: ClassVar[int] = 1
 
     t: Annotated[float, about("time of the estimate [s since 1970]")]
-    origin: Annotated[tuple[int, int, int], about("of `nodes`: 1e-7 deg, 1e-7 deg, altitude of the ground [mm]")]
+    origin: Annotated[tuple[int, int, int], about("of `nodes` [1e-7 deg, 1e-7 deg, mm], at the ground")]
     uavs: Annotated[tuple[int, ...], about("aircraft whose estimates it contains")]
-    wind: Annotated[tuple[float, float], about("mean wind at 100 m, north and east, the direction it blows to [m/s]")]
+    wind: Annotated[tuple[float, float], about("mean at 100 m, north and east, where it blows to [m/s]")]
     wind_sigma: Annotated[float, about("standard deviation of its components [m/s]")]
     sigma: Annotated[float, about("standard deviation of f [m/s]")]
     length_m: Annotated[float, about("correlation length of f [m]")]
@@ -791,8 +791,8 @@ class WindField(msgspec.Struct, frozen=True, kw_only=True):
     profile: Annotated[Array, about("factors of g for north and east, (2, 2) [m/s]")]
     nodes: Annotated[Array, about("positions of the nodes of f at t, NED, (b, 3) [m]")]
     values: Annotated[Array, about("f there, north and east, (b, 2) [m/s]")]
-    covariance: Annotated[Array, about("of the factors and f for one component, (b + 2, b + 2) [m2/s2]")]
-    drifts: Annotated[Array, about("drift of each aircraft, north and east, and its variance, (n, 3) [m/s, m2/s2]")]
+    covariance: Annotated[Array, about("of factors and f, one component, (b + 2, b + 2) [m2/s2]")]
+    drifts: Annotated[Array, about("of each aircraft, north, east, variance, (n, 3) [m/s, m2/s2]")]
 
 
 class Predictions(msgspec.Struct, frozen=True, kw_only=True):

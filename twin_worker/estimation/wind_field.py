@@ -2,8 +2,8 @@
 
     w(p, t) = g(h) beta + f(p, t),      g(h) = [(h / h_0)^(1/7), (h - h_0) / h_0],      beta ~ N(0, diag(15^2, 0.5^2))
     cov f = s_f^2 exp(-|p - p' - U (t - t')| / L) exp(-|t - t'| / T)
-    cov a = s_a^2 exp(-|t - t'| / T_a) of one aircraft,  0 between two
-    estimate of an aircraft = w(p, t) + a(t) + gust + noise of its filter's variance,      var gust = s_g^2
+    cov a = s_a^2 exp(-|t - t'| / T_a),  cov gust = s_g^2 exp(-|t - t'| / T_g) of one aircraft,  0 between two
+    estimate of an aircraft = w(p, t) + a(t) + gust(t) + noise of its filter's variance
 
 Both horizontal components have these covariances. f drifts with the mean wind U; vertical distances count twice. a is
 what an aircraft does not share with the others: wind of its own, and slow errors of its filter. The joint posterior of
@@ -24,7 +24,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from fleet.contract import Array, WindEstimate, WindField
 from fleet.frames import Origin, to_ned
-from twin_worker.estimation.wind_filter import DRIFT_S, WindFilter
+from twin_worker.estimation.wind_filter import DRIFT_S, GUST_S, WindFilter
 
 MIN_AIRCRAFT = 3  # a field of fewer aircraft tells nothing that they do not know themselves
 MAX_AGE_S = 60.0  # an older field is not used [s]
@@ -35,7 +35,7 @@ _MAX_ESTIMATES = 600  # of all aircraft; more are thinned, since the work grows 
 _MAX_NODES = 100
 _NODE_GAIN = 0.05  # share of the variance of f that another node must add
 _HYPOTHESES = tuple(
-    product((0.05, 0.25, 0.5, 1.0, 2.0), (0.1, 0.25, 0.5, 1.0), (0.1, 0.4, 0.7, 1.2), (150.0, 300.0, 600.0))
+    product((0.05, 0.25, 0.5, 1.0, 2.0), (0.1, 0.25, 0.5, 1.0, 2.0), (0.1, 0.4, 0.7, 1.2), (150.0, 300.0, 600.0))
 )
 """s_f, s_a, s_g [m/s] and L [m]."""
 _EVIDENCE_ROWS = 150  # estimates in their likelihood
@@ -221,9 +221,9 @@ def _covariance(data: _Estimates, s_f: float, s_a: float, s_g: float, length: fl
     """Return the covariance of the estimates of one component, (n, n) [m2/s2]."""
     lag, same = np.abs(data.age[:, None] - data.age), data.aircraft[:, None] == data.aircraft
     out = s_f**2 * np.exp(-_distance(data.moved, data.moved) / length - lag / PERSISTENCE_S)
-    out += s_a**2 * np.exp(-lag / DRIFT_S) * same
+    out += (s_a**2 * np.exp(-lag / DRIFT_S) + s_g**2 * np.exp(-lag / GUST_S)) * same
     out += (data.basis * _PROFILE_SIGMA**2) @ data.basis.T
-    out[np.diag_indices_from(out)] += data.variance + s_g**2
+    out[np.diag_indices_from(out)] += data.variance
     return np.asarray(out)
 
 

@@ -49,7 +49,7 @@ class WindSharing:
         self._bus.declare_queryable(WindField, lambda *_: [(self.latest, self._stamp)] if self.latest else [])
 
     def apply(self, owned: OwnedTwin) -> None:
-        """Give the newest field to a twin of this worker, for its next prediction; forget one that is too old."""
+        """Set the newest field of a twin of this worker, for its next prediction; forget one that is too old."""
         if self.latest is not None and time.monotonic() - self._received_t > MAX_AGE_S:
             self.latest = None
         if owned.twin.environment.wind_field is not self.latest:

@@ -23,8 +23,7 @@ def surer_field(
     context: PredictionContext,
     initial: InitialCondition,
     model: PointMassModel,
-    state: np.ndarray,
-    air: np.ndarray,
+    start: tuple[np.ndarray, np.ndarray],
     span_s: float,
 ) -> PathWind | None:
     """Return the wind of the shared field along the path flown with the aircraft's own, NED, or None.
@@ -33,12 +32,12 @@ def surer_field(
 
     Args:
         context, initial, model: as for `fly_point_mass`
-        state, air: start of the rollout, (N_START,), and its air, (N_AIR,)
+        start: state at the start, (N_START,), and air, (N_AIR,)
         span_s: length of the rollout [s]
     """
     if context.shared_wind is None:
         return None
-    ctl, par, legs = initial.synchronised
+    (ctl, par, legs), (state, air) = initial.synchronised, start
     path = np.empty((int(span_s / H.COARSE_STEP) + 2, 3))
     n_rows = H.simulate_route(
         ctl.copy(), par, legs, model.parameters, air, state, np.empty((0, 4)), H.COARSE_STEP, path

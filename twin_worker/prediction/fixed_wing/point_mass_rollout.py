@@ -106,7 +106,7 @@ def fly_point_mass(
     ctl, par, legs = initial.synchronised
     state, air = start_and_air(context, initial.window)
     out, draws = np.empty((int(ahead[-1] / H.STEP) + 2, 3)), _NO_NOISE
-    wind = surer_field(context, initial, model, state, air, float(ahead[-1]))
+    wind = surer_field(context, initial, model, (state, air), float(ahead[-1]))
     if wind is not None:
         air = with_drift(air, wind.mean[0])
         draws = np.zeros((int(ahead[-1]) + 2, 4))
