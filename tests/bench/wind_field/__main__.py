@@ -36,7 +36,7 @@ EXAMPLES = """
   python -m tests.bench.wind_field
   python -m tests.bench.wind_field --set untouched --json wind_field.json
 """
-UAVS, PREDICTED, SECONDS, TURBULENCE = 20, 20, 400.0, 2
+UAVS, PREDICTED, SECONDS, TURBULENCE = 20, 10, 400.0, 1
 FIRST_S, EVERY_S, LOOK_AHEADS = 120.0, 10.0, (16, 30, 60)
 SCHEDULE = Schedule(predict=5.0, identify=10.0)
 WIND_ONLY = Schedule(predict=1e9, identify=1e9)

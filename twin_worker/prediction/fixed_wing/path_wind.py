@@ -7,15 +7,18 @@ they are never averaged: this is covariance intersection of two isotropic estima
 Source: Julier and Uhlmann 1997 (covariance intersection).
 """
 
+from dataclasses import replace
+
 import numpy as np
 
+from fleet.frames import rotation
 from fleet.physics import point_mass as H
 from twin_worker.estimation.wind_field import PathWind, own_wind
 from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel
 from twin_worker.prediction.closed_loop import InitialCondition
 from twin_worker.prediction.replay_window import PredictionContext
 
-_COMPARED_S = 60.0  # of the path on which both are compared [s]
+FIELD_SPAN_S = 60.0  # of the path on which both are compared [s]
 _STEP_S = 5.0  # between points of the path [s]
 
 
@@ -25,10 +28,10 @@ def surer_field(
     model: PointMassModel,
     start: tuple[np.ndarray, np.ndarray],
     span_s: float,
-) -> PathWind | None:
-    """Return the wind of the shared field along the path flown with the aircraft's own, NED, or None.
+) -> tuple[PathWind, np.ndarray] | None:
+    """Return the wind of the shared field along the path that is flown with the aircraft's own; None if that is surer.
 
-    The wind is less that of the profile from W_N, W_E: it is the drift of `fleet.physics.point_mass`.
+    The second value is its mean less the profile from W_N, W_E: the drift of `fleet.physics.point_mass`, (k, 2) [m/s].
 
     Args:
         context, initial, model: as for `fly_point_mass`
@@ -48,18 +51,32 @@ def surer_field(
     if len(points) < 2:
         return None
     field = context.shared_wind.along(context.uav, t_0, ahead, points, context.origin)
-    k = int(np.searchsorted(ahead, _COMPARED_S, side="right"))
+    k = int(np.searchsorted(ahead, FIELD_SPAN_S, side="right"))
     if field is None or not _sigma(field, k) < _sigma(own_wind(context.wind_filter, ahead[:k]), k):
         return None
     shear = np.ones(len(points))
     if air[H.H_0] > 0.0:
         height = np.maximum(air[H.GROUND] - points[:, 2], H.MIN_SHEAR_HEIGHT)
         shear = (height / air[H.H_0]) ** H.SHEAR
-    return PathWind(ahead, field.mean - shear[:, None] * air[[H.W_N, H.W_E]], field.cov)
+    return field, field.mean - shear[:, None] * air[[H.W_N, H.W_E]]
 
 
 def _sigma(wind: PathWind, k: int) -> float:
     return PathWind(wind.t[:k], wind.mean[:k], wind.cov[:k, :k]).path_sigma
+
+
+def with_mean_wind(initial: InitialCondition, wind: PathWind) -> InitialCondition:
+    """Return the start of `fleet.physics.simulate` in the mean wind of the first minute, with the same ground velocity.
+
+    The reported airspeed is the same, too: its difference is a gust.
+    """
+    state, command, air = initial.state
+    mean = wind.mean[wind.t <= FIELD_SPAN_S].mean(axis=0)
+    R = rotation(*state[9:12])
+    through_air = state[3:6] + R.T @ np.append(air[:2] - mean, 0.0)
+    gust = air[3] + np.linalg.norm(state[3:6]) - np.linalg.norm(through_air)
+    moved = np.concatenate([state[:3], through_air, state[6:]])
+    return replace(initial, state=(moved, command, np.array([*mean, air[2], gust])))
 
 
 def with_drift(air: np.ndarray, drift: np.ndarray) -> np.ndarray:
