@@ -7,6 +7,7 @@ import pytest
 from msgspec.structs import replace
 
 from fleet.bus.codec import Stamp
+from fleet.commands.live.status import wind_text
 from fleet.contract import FleetRow, FleetState, TwinState, WindField
 from tests.support.examples import EXAMPLES
 from tests.support.memory_bus import MemoryBus
@@ -107,3 +108,12 @@ def test_a_field_that_is_not_renewed_is_forgotten(seen) -> None:
     sharing[0]._received_t -= 61.0
     sharing[0].apply(owned)
     assert owned.twin.environment.wind_field is None and sharing[0].latest is None
+
+
+def test_fleet_status_states_the_wind_and_its_aircraft(seen) -> None:
+    bus, sharing, _ = seen
+    assert wind_text(bus) == ""
+    for one in sharing:
+        one.step()
+    assert wind_text(bus).startswith("wind field: 4.") and wind_text(bus).endswith("estimated from 6 aircraft")
+    assert "m/s from 15" in wind_text(bus)  # it blows to (4, -2)
