@@ -52,9 +52,9 @@ def draw_members(
         np.arctan2(wind_state[:, 1], wind_state[:, 0]),
     )
     airs[:, H.W_N : H.DRIFT_E + 1] = wind_state[:, 2:6]
-    found = surer_field(context, initial, model, (state, air), float(noise.shape[1] - 1))
-    if found is not None:
-        wind, mean_drift = found
+    shared = surer_field(context, initial, model, (state, air), float(noise.shape[1] - 1))
+    if shared is not None:
+        wind, mean_drift = shared
         drift = mean_drift + _correlated_draws(wind.cov, members, rng)
         airs[:, H.W_N : H.DRIFT_N], airs[:, H.DRIFT_N : H.DRIFT_E + 1] = air[H.W_N : H.DRIFT_N], drift[:, 0]
         noise[..., :2] = drift_draws(wind, drift, air, noise.shape[1])

@@ -103,8 +103,8 @@ def in_field_wind(context: PredictionContext, initial: InitialCondition, model: 
     """Return the start of `fly_from` in the shared wind field where it is surer than the aircraft's own wind."""
     if context.shared_wind is None:
         return initial
-    found = surer_field(context, initial, model, start_and_air(context, initial.window), FIELD_SPAN_S)
-    return initial if found is None else with_mean_wind(initial, found[0])
+    shared = surer_field(context, initial, model, start_and_air(context, initial.window), FIELD_SPAN_S)
+    return initial if shared is None else with_mean_wind(initial, shared[0])
 
 
 def fly_point_mass(
@@ -120,9 +120,9 @@ def fly_point_mass(
     ctl, par, legs = initial.synchronised
     state, air = start_and_air(context, initial.window)
     out, draws = np.empty((int(ahead[-1] / H.STEP) + 2, 3)), _NO_NOISE
-    found = surer_field(context, initial, model, (state, air), float(ahead[-1]))
-    if found is not None:
-        wind, drift = found
+    shared = surer_field(context, initial, model, (state, air), float(ahead[-1]))
+    if shared is not None:
+        wind, drift = shared
         air = with_drift(air, drift[0])
         draws = np.zeros((int(ahead[-1]) + 2, 4))
         draws[:, :2] = drift_draws(wind, drift, air, len(draws))
