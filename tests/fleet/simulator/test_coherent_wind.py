@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from fleet.frames import Origin, to_geodetic
+from fleet.simulator.flight.uav import SimulatedUav
+from fleet.simulator.multirotor.uav import SimulatedMultirotor
 from fleet.simulator.vehicle.missions import HOME
 from fleet.simulator.vehicle.wind_field import CoherentWind, LocalWind
 
@@ -67,3 +69,13 @@ def test_aircraft_of_different_homes_see_the_same_wind_at_the_same_place() -> No
     np.testing.assert_allclose(here.step(place), there.step(place - [300.0, -200.0, 0.0]), atol=1e-3)
     assert CoherentWind.of_fleet(U, 3, HOME).at(9.0, place) == field.at(9.0, place)
     assert CoherentWind.of_fleet(U, 4, HOME).at(9.0, place) != field.at(9.0, place)
+
+
+@pytest.mark.parametrize("kind", [SimulatedUav, SimulatedMultirotor])
+def test_every_kind_of_aircraft_flies_in_the_field(kind: type) -> None:
+    field = CoherentWind.of_fleet(U, 3, HOME)
+    in_field, alone = (kind(1, 3, wind=U, turbulence=0, wind_field=shared) for shared in (field, None))
+    place = np.array([50.0, 20.0, -60.0])
+    offset = in_field._wind._offset
+    expected = field.at(in_field._wind._t + in_field._wind._dt, place + offset)
+    assert in_field._wind.step(place) == expected != alone._wind.step(place)
