@@ -128,3 +128,23 @@ def test_drag_and_wind_are_found_from_the_tilt() -> None:
     assert model.wind == pytest.approx(wind, abs=0.5)
     short = Track(t[:20], p[:20], v[:20], track.euler[:20], track.ok[:20], "")
     assert fit_drag_and_wind(short, config, MultirotorModel()) == MultirotorModel()
+
+
+def test_the_target_of_a_circle_is_shaped_and_the_aircraft_behind_it() -> None:
+    mission = (item(0), item(1, north=40.0, alt_m=100.0), item(2, 18, north=40.0, param1=2.0, param3=25.0))
+    config = multirotor_config(Mission(uav=0, t=0.0, items=mission), {}, "ardupilot", 0.0, origin=HERE, flown=None)
+    rows, _ = segments_from_mission(mission, 2, HERE, np.array([15.0, 0.0, -100.0]), {}, arcs=True, speed=4.0)
+    segments = copter_rollout.prepare(limit_speeds(rows, config.limit), rows, mission, {}, config.limit)
+    par = copter_rollout.parameters(config.limit, {}, (0.3, 0.0, 0.0, 0.0))
+    circle = segments[segments[:, copter_legs.TURN] != 0.0]
+    assert len(circle) == 1
+    states, xva = np.zeros((300, copter_legs.N_STATE)), np.zeros((300, 4, 3))
+    copter_legs.simulated_states(circle, 0, par, STEP, states, xva)
+    shaped = states[-1, copter_legs.SHAPED : copter_legs.SHAPED + 2]
+    target = circle[0, copter_legs.C_N : copter_legs.C_E + 1] + 25.0 * np.array([
+        np.cos(states[-1, copter_legs.ANGLE]), np.sin(states[-1, copter_legs.ANGLE])
+    ])  # fmt: skip
+    # steady lag of the square root control: v = sq - a v / (k sq), e = sq^2 / 2a + a / 2k^2
+    root = (4.0 + np.sqrt(16.0 + 4.0 * 4.0 * 2.5 / 2.0)) / 2.0
+    assert np.linalg.norm(target - shaped) == pytest.approx(root**2 / 5.0 + 2.5 / 8.0, rel=0.1)
+    assert np.linalg.norm(xva[-1, 0, :2] - shaped) < 1.0
