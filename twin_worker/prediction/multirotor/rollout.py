@@ -279,7 +279,9 @@ class MultirotorTwin:
 
     @property
     def max_tilt_airspeed(self) -> float:
-        """Return the airspeed at the largest tilt, k1 v + k2 v^2 = g tan(tilt) [m/s]."""
+        """Return the airspeed at the largest tilt, k1 v + k2 v^2 = g tan(tilt) [m/s]; nan before the first fit."""
+        if self.model.drag_std == MultirotorModel.drag_std:
+            return float("nan")
         linear, quadratic = self.model.drag
         return 2 * (a := G * tan(min(self.limit.tilt, 1.2))) / (linear + sqrt(linear**2 + 4 * quadratic * a))
 
