@@ -3,7 +3,7 @@
 Every check returns why the approval is refused, or an empty text. An approval of an execution passes only if
 
     it is new, at most 30 s old, and names a person
-    the gateway has received the proposal itself, a version that is valid has this option, and none was withdrawn since
+    the gateway has received the proposal itself, a valid version of it has this option, and so has the newest
     every changed aircraft may be commanded, is received, armed, flown automatically and not being commanded
     its mission and mode are those of the proposal, and it is within the region predicted for this time with it
 """
@@ -88,7 +88,7 @@ def approved_version(
     """Return the version of a proposal that a person has approved and its option, or why there is none.
 
     A proposal is renewed while a person decides. What was shown may be approved while it is valid, and as long as the
-    newest version still has options: the same changes, e.g. with items farther ahead.
+    newest version has the same option, or renewed with its inserted item farther ahead.
     """
     if received is None or received.proposal.uav != approval.uav:
         return "no worker has published this proposal"
@@ -101,9 +101,25 @@ def approved_version(
         return "the proposal is from the future; synchronise the clocks"
     for version in received.valid_versions(now):
         option = next((one for one in version.proposal.options if digest_of(one) == approval.digest), None)
-        if option is not None:
+        if option is not None and any(is_renewal(option, newer) for newer in proposal.options):
             return version, option
     return "the proposal has no option with the changes that were approved; look at its newest version"
+
+
+def is_renewal(option: Option, newer: Option) -> bool:
+    """Return whether two options have the same changes, except for one item of a mission and for the current item."""
+    if [change.uav for change in option.changes] != [change.uav for change in newer.changes]:
+        return False
+    return all(map(_is_same_change, option.changes, newer.changes))
+
+
+def _is_same_change(one: Change, other: Change) -> bool:
+    if (one.speed, one.mode) != (other.speed, other.mode):
+        return False
+    if one.items is None or other.items is None:
+        return one == other
+    different = [a for a, b in zip(one.items, other.items, strict=False) if a != b]
+    return len(one.items) == len(other.items) and len(different) <= 1
 
 
 def change_refusal(change: Change, fleet: Fleet) -> str:

@@ -134,11 +134,19 @@ class Plan:
         return np.array([np.interp(seconds, ahead, column) for column in self.prediction.path.numpy().T])
 
     def passes(self, item: Item, seconds: float) -> bool:
-        """Return whether the predicted path passes an item before `seconds` ahead."""
+        """Return whether the predicted path passes an item before `seconds` ahead; a circle, whether it leaves it."""
         ahead, path = self.prediction.ahead.numpy(), self.prediction.path.numpy()
         distance = np.hypot(*(path[ahead <= seconds, :2] - self.position(item)).T)
-        nearest = int(distance.argmin())
-        return bool(distance[nearest] < _PASSING_M and nearest < len(distance) - 1)
+        nearest, far = int(distance.argmin()), 2 * _PASSING_M if is_circle(item) else 0.0
+        return bool(distance[nearest] < _PASSING_M and nearest < len(distance) - 1 and distance[-1] > far)
+
+    def is_circling(self, seconds: float) -> bool:
+        """Return whether the aircraft flies a circle of its mission `seconds` ahead, or is about to."""
+        seq = self.seq_after(Change(uav=self.uav), seconds)
+        item = next((item for item in self.items if item.seq == seq), None)
+        if item is None or not is_circle(item):
+            return False
+        return bool(np.hypot(*(self.at(seconds)[:2] - self.position(item))) < 2 * _PASSING_M)
 
     def seq_after(self, change: Change, seconds: float) -> int:
         """Return the item of a changed mission that is flown to `seconds` ahead, after the present plan until then."""
@@ -160,6 +168,11 @@ class Plan:
     def min_height_m(self) -> float:
         """Return the smallest height above home at which items may lie [m]."""
         return MIN_HEIGHT_ROTORS_M if is_hovering(self.twin) else MIN_HEIGHT_WINGS_M
+
+
+def is_circle(item: Item) -> bool:
+    """Return whether an item is a circle."""
+    return m.KINDS.get(item.command) in m.CIRCLES
 
 
 def is_positional(item: Item) -> bool:

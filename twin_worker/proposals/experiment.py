@@ -90,6 +90,10 @@ def run_change(
     A change that begins at 0 was executed: the current item and the mode are those that the aircraft reports.
     """
     twin = _changeable(plan.twin)
+    if after_s and plan.is_circling(after_s) and not change.mode:
+        if change.items is not None:
+            return None  # the upload may begin the circle anew
+        after_s = after_s if change.seq is not None else 0.0  # a speed alone does not
     _apply(twin, change, None if twin.vehicle_class.is_rotorcraft or not after_s else _Start(plan, after_s))
     return _fly(twin, candidate, change)
 

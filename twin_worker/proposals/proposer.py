@@ -133,14 +133,15 @@ class Proposer:
     def update(self, alert: Alert, now: float) -> Proposal | None:
         """Compute or renew the proposal against an active alert; None if there is no twin, or again no option.
 
-        A renewed proposal keeps its id while its options are of the same aircraft and kinds.
+        A proposal keeps its id while its alert lasts and nothing is executed. Options that still avoid the event are
+        kept; new ones are computed when none does.
         """
         key = (alert.uav, alert.about)
         previous, self._computed_t[key] = self._current.get(key), now
         computed = self.compute(AvoidedEvent.of(alert), now, () if previous is None else previous.choices)
         if computed is None:
             return None
-        if previous is not None and (not computed.choices or _same_kinds(previous.choices, computed.choices)):
+        if previous is not None:
             computed = replace(computed, proposal=msgspec.structs.replace(computed.proposal, id=previous.proposal.id))
         self._current[key] = computed
         for option in computed.proposal.options:
@@ -310,17 +311,16 @@ class Proposer:
 def _retained(
     problem: Problem, plans: dict[int, Plan], previous: tuple[tuple[Candidate, ...], ...]
 ) -> list[tuple[Solution, str]]:
-    """Return the options so far if each still avoids the event with the same changes; else none."""
+    """Return the options so far that still avoid the event with the same changes."""
     retained: list[tuple[Solution, str]] = []
     for choice in previous:
         repeated = tuple(one for c in choice if c.uav in plans for one in run(plans[c.uav], (c,)))
         if len(repeated) < len(choice) or not all(problem.is_admissible(one) for one in repeated):
-            return []
+            continue
         remaining = problem.conflicts_after(repeated)
         solution = None if remaining is None else problem.solution(repeated, remaining)
-        if solution is None:
-            return []
-        retained.append((solution, ""))
+        if solution is not None:
+            retained.append((solution, ""))
     ranked = {id(solution): advantage for solution, advantage in pareto([solution for solution, _ in retained])}
     return [(solution, ranked.get(id(solution), "")) for solution, _ in retained]
 
@@ -355,13 +355,6 @@ def _avoids_early(problem: Problem, plans: dict[int, Plan], solution: Solution) 
 
 def _choice(solution: Solution) -> tuple[Candidate, ...]:
     return tuple(one.candidate for one in solution.experiments if one.candidate is not None)
-
-
-def _same_kinds(one: tuple[tuple[Candidate, ...], ...], other: tuple[tuple[Candidate, ...], ...]) -> bool:
-    def kinds(choices: tuple[tuple[Candidate, ...], ...]) -> list[list[tuple[int, str]]]:
-        return [[(candidate.uav, candidate.kind) for candidate in choice] for choice in choices]
-
-    return kinds(one) == kinds(other)
 
 
 def _count(n: int) -> str:

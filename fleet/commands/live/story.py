@@ -32,6 +32,7 @@ class ConflictStory:
         self.sentences: list[str] = []
         self._alert: Alert | None = None
         self._ids: set[str] = set()  # proposals announced
+        self._offered: tuple[str, ...] = ()  # changes announced last
         self._states: set[tuple[float, object]] = set()  # of executions announced
         self._executed = False
         self._positions: dict[int, list[tuple[np.ndarray, np.ndarray]]] = defaultdict(list)
@@ -64,9 +65,11 @@ class ConflictStory:
 
     def on_proposal(self, proposal: Proposal) -> None:
         """Announce a proposal with its options, and how to approve one."""
-        if not proposal.options or proposal.id in self._ids or self._executed:
+        changes = tuple(option.sentence.partition(":")[0] for option in proposal.options)
+        if not changes or changes == self._offered or self._executed:
             return
         self._ids.add(proposal.id)
+        self._offered = changes
         name = printable(proposal.id[:_ID_LETTERS])
         self._add(f"step 3 of 5, proposal {name}: {printable(proposal.sentence)}")
         for number, option in enumerate(proposal.options, 1):
@@ -107,8 +110,7 @@ class ConflictStory:
     def _end(self) -> None:
         """Announce the closest approach."""
         self.ended = True
-        horizontal, vertical = self.closest_approach()
-        lost = horizontal < HORIZONTAL_M and vertical < VERTICAL_M
+        horizontal, vertical, lost = self.closest_approach()
         distances = f"{horizontal:.0f} m apart horizontally and {vertical:.0f} m vertically"
         if lost:
             result = f"the conflict was not avoided: UAV 0 and UAV 1 were {distances}. Start again and approve sooner."
@@ -120,8 +122,11 @@ class ConflictStory:
         undo = f". To restore the former plan: fleet undo 0{self._router}" if self._executed else ""
         self._add(f"step 5 of 5: {result} {limits}{undo}. Ctrl-C ends the scene.")
 
-    def closest_approach(self) -> tuple[float, float]:
-        """Return horizontal and vertical distance where separation was smallest since the alert [m]."""
+    def closest_approach(self) -> tuple[float, float, bool]:
+        """Return horizontal and vertical distance at the closest approach since the alert [m], and a lost separation.
+
+        The closest approach is where sqrt((d_horizontal / 50 m)^2 + (d_vertical / 20 m)^2) is smallest.
+        """
         tracks = [[np.concatenate(part) for part in zip(*self._positions[uav], strict=True)] for uav in PAIR]
         start, stop = max(t[0] for t, _ in tracks), min(t[-1] for t, _ in tracks)
         at, origin = np.arange(start, stop, _STEP_S), Origin(*(int(x) for x in tracks[0][1][0]))
@@ -131,8 +136,9 @@ class ConflictStory:
             paths.append(np.column_stack([np.interp(at, t, column) for column in ned.T]))
         offset = paths[0] - paths[1]
         horizontal, vertical = np.hypot(offset[:, 0], offset[:, 1]), np.abs(offset[:, 2])
-        k = int(np.maximum(horizontal / HORIZONTAL_M, vertical / VERTICAL_M).argmin())
-        return float(horizontal[k]), float(vertical[k])
+        lost = (horizontal < HORIZONTAL_M) & (vertical < VERTICAL_M)
+        k = int(np.hypot(horizontal / HORIZONTAL_M, vertical / VERTICAL_M).argmin())
+        return float(horizontal[k]), float(vertical[k]), bool(lost.any())
 
     def _add(self, sentence: str) -> None:
         self.sentences.append(sentence)

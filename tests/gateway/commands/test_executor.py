@@ -325,7 +325,7 @@ def test_a_mission_that_somebody_else_changed_is_neither_overwritten_nor_undone(
 
 
 def test_a_flight_that_leaves_the_region_is_reported(site: CommandSite) -> None:
-    approve(site, site.option(speed=17.0), 5.0)
+    approve(site, site.option(speed=17.0), 12.0)  # no worker predicts anew: its own path is taken
     site.aircraft.offset[1] = -45.0
     published = site.run(4.0)
     assert published[-1].follows is False and published[-1].can_undo
@@ -337,6 +337,45 @@ def test_a_flight_that_leaves_the_region_is_reported(site: CommandSite) -> None:
     site.t += 105.0
     published = site.run(15.0)
     assert published[-1].state == S.DONE and "has ended" in published[-1].sentence
+
+
+def test_a_flight_is_compared_with_the_path_predicted_after_the_execution(site: CommandSite) -> None:
+    """The path of the proposal is 300 m aside from the moment on at which the change begins."""
+    option = site.option(speed=17.0)
+    (path,) = option.paths
+    aside = path.path.numpy() + np.float32([0.0, 300.0, 0.0])
+    late = msgspec.structs.replace(option, paths=(msgspec.structs.replace(path, path=Array.of(aside)),))
+    site.bus.publish(site.approval(site.propose(late, present=option.paths)))
+    assert site.run(3.0)[-1].state == S.ACCEPTED
+    other = msgspec.structs.replace(option, changes=(Change(uav=1, speed=15.0),))
+    for wrong in (other, msgspec.structs.replace(option, paths=(msgspec.structs.replace(path, path=path.ahead),))):
+        site.propose(wrong, valid_s=0.0)
+    assert site.run(2.0)[-1].follows is None
+    site.propose(site.option(speed=17.0), valid_s=0.0)
+    assert site.run(3.0)[-1].sentence == "follows within its region"
+
+
+def test_a_version_that_was_shown_may_be_approved_while_it_is_renewed(site: CommandSite) -> None:
+    def inserted(ahead: int) -> Option:
+        items = mission()
+        moved = msgspec.structs.replace(items[3], lat_e7=items[3].lat_e7 + 100 * ahead)
+        return site.option(items=(*items[:3], moved, *items[4:]))
+
+    shown = site.propose(inserted(1), valid_s=15.0)
+    site.run(5.0)
+    site.propose(inserted(2), valid_s=15.0)
+    site.run(5.0)
+    site.bus.publish(site.approval(shown))
+    assert site.run(8.0)[-1].state == S.ACCEPTED
+    assert site.aircraft.items[3].lat_e7 == mission()[3].lat_e7 + 100, "what was shown"
+
+    shown = site.propose(site.option(speed=17.0), name="p2", valid_s=15.0)
+    site.run(16.0)
+    site.propose(site.option(speed=17.0), name="p2", valid_s=15.0)
+    site.run(1.0)
+    site.propose(name="p2")
+    site.bus.publish(site.approval(shown))
+    assert "withdrawn" in reason([one for one in site.run(1.0) if one.state == S.REFUSED])
 
 
 # --- the audit -------------------------------------------------------------------------------------------------------
