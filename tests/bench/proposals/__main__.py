@@ -3,7 +3,7 @@
     python -m tests.bench.proposals --pairs 4 --triples 2 --ground 2 --geofence 2 --clear 2 --seed 900 --json FILE
 
 Aircraft are simulated by JSBSim. In `pairs` and `triples` the second and third aircraft meet the first; in `ground` it
-sinks below 30 m above home, in `geofence` it leaves its circle, in `leg` a waypoint is 220 m higher than the one before,
+sinks below 30 m above home, in `geofence` it leaves its circle, in `leg` a waypoint is 220 m above the one before,
 in `clear` two pass each other at a distance. While the expected alert is active the options are computed as by a worker
 (CPU time). Each option is flown by the simulator from 3 to 18 s after the proposal on (drawn): `without_event` is true
 if neither the event nor a loss of separation happens up to 200 s. With the first option the twins follow the flight:
