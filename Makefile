@@ -7,6 +7,7 @@ BIN := .venv/bin
 LOCK := requirements.lock
 BENCH_LOCK := requirements-bench.lock
 DOCS_LOCK := requirements-docs.lock
+RERUN_LOCK := requirements-rerun.lock
 STAMP := .venv/setup-done
 # The main path: contract, bus, gateway, twin, worker and page, a fleet of processes, a recorded flight, a diagnosis.
 QUICK := tests/test_architecture.py tests/fleet/test_contract.py tests/fleet/test_bus.py \
@@ -91,7 +92,8 @@ lock:
 	@sed -n '/^rotorpy==/,/[^\\]$$/p' .venv-lock/rotorpy.lock >> $(LOCK)
 	@.venv-lock/bin/python -c "import tomllib; extras = tomllib.load(open('pyproject.toml', 'rb'))['project']; \
 	  print(*extras['optional-dependencies']['docs'], sep='\n')" | $(COMPILE) - --output-file $(DOCS_LOCK)
-	@sed -i -e '/^#/d' -e '1i $(LOCK_HEAD)' $(LOCK) $(BENCH_LOCK) $(DOCS_LOCK)
+	@echo rerun-sdk | $(COMPILE) - --constraint $(LOCK) --output-file $(RERUN_LOCK)  # the same numpy and pillow
+	@sed -i -e '/^#/d' -e '1i $(LOCK_HEAD)' $(LOCK) $(BENCH_LOCK) $(DOCS_LOCK) $(RERUN_LOCK)
 	@rm -rf .venv-lock
 
 clean:

@@ -22,6 +22,9 @@ from fleet.process.children import run_until
 from fleet.process.interrupt import INTERRUPTED, PARENT, run_interruptible, set_exit_code
 from fleet.process.logs import configure_logging, report_failure, report_progress
 
+NETWORK_LINKS = ("udpin", "udpout", "udpbcast", "tcpin", "tcp")
+LINK_KINDS = (*NETWORK_LINKS, "serial", "replay")
+LISTENING = ("udpin", "tcpin")  # kinds of links whose host is optional: loopback
 ORPHAN_GRACE_S = 30.0  # time for an orphan process to shut down in order [s]
 
 Command = Callable[[argparse.Namespace], int]
@@ -231,6 +234,24 @@ def host_and_port(option: str, text: str) -> tuple[str, int]:
     if not host or not port.isdecimal() or not 0 < int(port) < 65_536:
         raise ValueError(f"{option}: found {text!r}, expected HOST:PORT such as 127.0.0.1:14550; correct {option}")
     return host, int(port)
+
+
+def check_link(option: str, text: str) -> None:
+    """Check kind and address of a link to aircraft, e.g. `udpin:HOST:PORT`; settings are checked by the gateway.
+
+    Raises:
+        ValueError: when the kind is unknown or the address malformed; the text names the option.
+    """
+    kind, _, rest = text.partition("#")[0].partition(":")
+    if kind not in LINK_KINDS:
+        near = did_you_mean(kind, LINK_KINDS) if kind != "udp" else "; did you mean udpin:0.0.0.0:14550?"
+        kinds = ", ".join(LINK_KINDS)
+        raise ValueError(f"{option}: found {text!r}, expected {kinds}, each with an address behind a :{near}")
+    host, _, port = rest.rpartition(":")
+    if kind in NETWORK_LINKS and not (port.isdecimal() and 0 < int(port) < 65_536 and (host or kind in LISTENING)):
+        raise ValueError(f"{option}: found {text!r}, expected {kind}:HOST:PORT; write e.g. {kind}:127.0.0.1:14550")
+    if kind == "serial" and not (host if port.isdecimal() else rest):
+        raise ValueError(f"{option}: found {text!r}, expected serial:PATH:BAUD; write e.g. serial:/dev/ttyUSB0:57600")
 
 
 def id_range(text: str) -> range:

@@ -60,6 +60,12 @@ def router_options(args: argparse.Namespace) -> list[str]:
 
 def _read_router_table(path: Path) -> dict[str, str]:
     """Read the table `router` of a file; reject any other content."""
+    if path.is_dir():
+        raise ValueError(f"--config: found a folder {str(path)!r}, expected a TOML file; name a file in it")
+    if not path.exists():
+        raise ValueError(
+            f"--config: found no file {str(path)!r}, expected one such as deploy/fleet.toml; check the path"
+        )
     try:
         document = tomllib.loads(path.read_text())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -16,6 +16,7 @@
     parauav/{uav}/execution              Execution    gateway  what was sent for it, and how it is flown; also queryable
     parauav/@fleet/state/{writer}        FleetState   worker   one row per UAV; also queryable
     parauav/@fleet/prediction/{writer}   Predictions  worker   query only: the newest prediction of all its aircraft
+    parauav/@world/wind/{writer}         WindField    worker   one wind field from all aircraft; also queryable
     parauav/@gateway/{writer}            GatewayCounters gateway counters of one gateway; also queryable
     parauav/@claim/{writer}              Claim        worker   aircraft it writes for; every 0.25 s; also queryable
     parauav/@handover/{writer}           Handover     worker   query only, with a `HandoverRequest`: copies of twins
@@ -457,6 +458,7 @@ class Prediction(Message, frozen=True, kw_only=True):
         0.0
     )
     horizon_open: Annotated[bool, about("true: still below 10 % at the end of `ahead`")] = False
+    early_exceedance: Annotated[float, about("probability that the error exceeds 10 % within 10 s, 0..1")] = 0.0
     coverage: Annotated[
         float, about("empirical coverage of the prediction region, 0..1; nan before any evaluation")
     ] = float("nan")
@@ -721,6 +723,16 @@ class Execution(Message, frozen=True, kw_only=True):
     sentence: Annotated[str, about("why it was refused or failed, or how the flight follows the predicted path")] = ""
 
 
+class WindEstimate(msgspec.Struct, frozen=True, kw_only=True):
+    """Wind, gusts included, that a twin estimates where its aircraft is."""
+
+    t: Annotated[float, about("fleet time [s since 1970]")]
+    position: Annotated[tuple[int, int, int], about("lat, lon [1e-7 deg], altitude above sea level [mm]")]
+    height_m: Annotated[float, about("above home [m]")]
+    wind: Annotated[tuple[float, float], about("north and east, the direction it blows to [m/s]")]
+    sigma: Annotated[float, about("standard deviation of one component [m/s]")]
+
+
 class FleetRow(msgspec.Struct, frozen=True, kw_only=True):
     """One row of the fleet table."""
 
@@ -740,6 +752,7 @@ class FleetRow(msgspec.Struct, frozen=True, kw_only=True):
     epoch: Annotated[int, about("claim epoch of the writer")] = 0
     alerts: Annotated[tuple[str, ...], about("texts of the active alerts")] = ()
     mismatch: Annotated[str, about("outcome and causes, e.g. named thrust_loss; empty: none")] = ""
+    wind: Annotated[WindEstimate | None, about("by its own filter [m/s]; null without airspeed")] = None
 
 
 class FleetState(msgspec.Struct, frozen=True, kw_only=True):
@@ -753,6 +766,34 @@ class FleetState(msgspec.Struct, frozen=True, kw_only=True):
     sentence: Annotated[str, about("e.g. compiling the twin's physics, once")] = ""
     tasks: Annotated[dict[str, int], about("tasks completed since start: predict, identify, ensemble")] = {}
     dropped_messages: Annotated[int, about("messages of its current aircraft dropped because a queue was full")] = 0
+
+
+class WindField(msgspec.Struct, frozen=True, kw_only=True):
+    """Wind in space and time, estimated from all aircraft by one worker at a time.
+
+    w = g(h) profile + f + drift, with g(h) = [(h / 100 m)^(1/7), (h - 100 m) / 100 m] at the height h above ground.
+    f drifts with `wind`: its covariance is sigma^2 exp(-d / length_m) exp(-lag / persistence_s), with d the distance
+    of the positions moved back with the wind, vertical distances twice. drift is of one aircraft.
+    """
+
+    topic: ClassVar[str] = "@world/wind"
+    version: ClassVar[int] = 1
+
+    t: Annotated[float, about("time of the estimate [s since 1970]")]
+    origin: Annotated[tuple[int, int, int], about("of `nodes` [1e-7 deg, 1e-7 deg, mm], at the ground")]
+    uavs: Annotated[tuple[int, ...], about("aircraft whose estimates it contains")]
+    wind: Annotated[tuple[float, float], about("mean at 100 m, north and east, where it blows to [m/s]")]
+    wind_sigma: Annotated[float, about("standard deviation of its components [m/s]")]
+    sigma: Annotated[float, about("standard deviation of f [m/s]")]
+    length_m: Annotated[float, about("correlation length of f [m]")]
+    persistence_s: Annotated[float, about("lifetime of f [s]")]
+    drift_sigma: Annotated[float, about("standard deviation of the drift of one aircraft [m/s]")]
+    drift_s: Annotated[float, about("correlation time of that drift [s]")]
+    profile: Annotated[Array, about("factors of g for north and east, (2, 2) [m/s]")]
+    nodes: Annotated[Array, about("positions of the nodes of f at t, NED, (b, 3) [m]")]
+    values: Annotated[Array, about("f there, north and east, (b, 2) [m/s]")]
+    covariance: Annotated[Array, about("of factors and f, one component, (b + 2, b + 2) [m2/s2]")]
+    drifts: Annotated[Array, about("of each aircraft, north, east, variance, (n, 3) [m/s, m2/s2]")]
 
 
 class Predictions(msgspec.Struct, frozen=True, kw_only=True):
@@ -864,7 +905,7 @@ PER_UAV: tuple[type[Message], ...] = (
     *(Sample, Status, Mission, Params, History),
     *(Model, Prediction, Mismatch, Alert, Proposal, Approval, Execution),
 )
-CONTROL: tuple[type, ...] = (FleetState, Predictions, GatewayCounters, Claim, Handover)
+CONTROL: tuple[type, ...] = (FleetState, Predictions, WindField, GatewayCounters, Claim, Handover)
 QUERIES: dict[type, type] = {Prediction: WhatIf, Handover: HandoverRequest}  # optional payload of a query on a key
 TOPICS: dict[str, type] = {c.topic: c for c in (*PER_UAV, *CONTROL)}  # type: ignore[attr-defined]
 

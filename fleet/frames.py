@@ -18,16 +18,27 @@ Positive aileron rolls right, positive elevator pitches up, positive rudder yaws
 """
 
 from functools import lru_cache
-from math import cos, pi, radians, sin, sqrt
-from typing import Any, NamedTuple
+from math import cos, radians, sin, sqrt
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numba as nb
 import numpy as np
+
+if TYPE_CHECKING:
+    from fleet.compiled_frames import air_direction as air_direction
+    from fleet.compiled_frames import wrap as wrap
 
 G = 9.80665  # standard gravity [m/s2]
 _A = 6378137.0  # WGS-84 equatorial radius [m]
-_DEGREE = pi / 180.0  # [rad]
 _E2 = 6.69437999014e-3  # WGS-84 first eccentricity squared [-]
+
+
+def __getattr__(name: str) -> Any:
+    """Import `wrap` and `air_direction` on first use: numba would dominate the start of commands without it."""
+    if name in ("wrap", "air_direction"):
+        from fleet import compiled_frames
+
+        return getattr(compiled_frames, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 class Origin(NamedTuple):
@@ -57,22 +68,12 @@ def to_ned(origin: Origin, lat_e7: np.ndarray, lon_e7: np.ndarray, alt_mm: np.nd
     Returns:
         position, NED, (n, 3) [m]
     """
+    from fleet.compiled_frames import to_ned_in_place
+
     out = np.empty((*np.shape(lat_e7), 3))
     out[..., 0], out[..., 1], out[..., 2] = lat_e7, lon_e7, alt_mm
-    _to_ned_in_place(out.reshape(-1, 3), float(origin[0]), float(origin[1]), float(origin[2]), _radii(origin))
+    to_ned_in_place(out.reshape(-1, 3), float(origin[0]), float(origin[1]), float(origin[2]), _radii(origin))
     return out
-
-
-@nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath: same result as numpy
-def _to_ned_in_place(
-    positions: np.ndarray, lat_e7: float, lon_e7: float, alt_mm: float, radii: tuple[float, float]
-) -> None:
-    """Convert geodetic positions, (n, 3), to NED in place."""
-    for k in range(len(positions)):
-        d_lon = (positions[k, 1] - lon_e7 + 1.8e9) % 3.6e9 - 1.8e9  # shortest difference across the date line
-        positions[k, 0] = (positions[k, 0] - lat_e7) * 1e-7 * _DEGREE * radii[0]
-        positions[k, 1] = d_lon * 1e-7 * _DEGREE * radii[1]
-        positions[k, 2] = (alt_mm - positions[k, 2]) * 1e-3
 
 
 def to_geodetic(origin: Origin, ned: np.ndarray) -> np.ndarray:
@@ -94,22 +95,11 @@ def body_to_ned(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray, body: np.nd
 
 def ned_to_body(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray, ned: np.ndarray) -> np.ndarray:
     """Rotate NED vectors to the body. Angles (n,) [rad], NED (n, 3)."""
+    from fleet.compiled_frames import ned_to_body_rows
+
     euler, out = np.column_stack([phi, theta, psi]).astype(float), np.empty((len(phi), 3))
-    _ned_to_body_rows(euler, np.ascontiguousarray(ned, float), out)
+    ned_to_body_rows(euler, np.ascontiguousarray(ned, float), out)
     return out
-
-
-@nb.njit(cache=True, nogil=True)
-def _ned_to_body_rows(euler: np.ndarray, ned: np.ndarray, out: np.ndarray) -> None:
-    """Rotate NED vectors to the body, (n, 3), into `out`; compiled because it dominates the cost of resampling."""
-    for k in range(len(euler)):
-        cf, sf, ct, st = cos(euler[k, 0]), sin(euler[k, 0]), cos(euler[k, 1]), sin(euler[k, 1])
-        cp, sp = cos(euler[k, 2]), sin(euler[k, 2])
-        n, e, d = ned[k, 0], ned[k, 1], ned[k, 2]
-        ahead, right = cp * n + sp * e, cp * e - sp * n
-        out[k, 0] = ct * ahead - st * d
-        out[k, 1] = sf * st * ahead + cf * right + sf * ct * d
-        out[k, 2] = cf * st * ahead - sf * right + cf * ct * d
 
 
 def rotation(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarray:
@@ -121,21 +111,3 @@ def rotation(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarray:
         [-st, sf * ct, cf * ct],
     ]
     return np.array(rows)
-
-
-@nb.njit(cache=True)
-def wrap(angle: Any) -> Any:
-    """Wrap an angle, or an array of them, to (-pi, pi] [rad]; a non-finite angle stays non-finite."""
-    wrapped = (angle + pi) % (2 * pi) - pi
-    return wrapped + 2 * pi * (wrapped <= -pi)
-
-
-@nb.njit(cache=True)
-def air_direction(phi: Any, theta: Any, psi: Any, gamma: Any) -> Any:
-    """Return the horizontal direction of the velocity through the air without sideslip, numbers or arrays [rad].
-
-    In a banked turn the angle of attack moves it out of the turn. The velocity is (cos(alpha), 0, sin(alpha)) in the
-    body; rotated by phi and theta, with theta - gamma = alpha cos(phi) for small alpha, it lies left of the nose by
-    alpha sin(phi) = (theta - gamma) tan(phi).  Source: Beard & McLain 2012, section 2.3.
-    """
-    return psi - (theta - gamma) * np.tan(phi)

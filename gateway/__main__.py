@@ -10,7 +10,7 @@ from pathlib import Path
 
 from fleet.access.entry import BusConfig
 from fleet.access.roles import GATEWAY
-from fleet.cli import id_range, make_parser, run_command, stop_on_signal
+from fleet.cli import check_file, id_range, make_parser, run_command, stop_on_signal
 from fleet.config import MAX_UAVS, bus_config_from, has_operators, router_arguments
 from fleet.process.logs import log_arguments, report_status
 from fleet.process.malloc_trim import enable_malloc_trim
@@ -111,6 +111,8 @@ def run(args: argparse.Namespace) -> int:
     specs += [read_forward(text) for text in args.forward]
     if args.most_uavs < 1:
         raise ValueError(f"--most-uavs: found {args.most_uavs}, expected at least 1; write e.g. 250")
+    if args.keys is not None:
+        check_file("--keys", args.keys, "a file of keys")
     gates = make_admissions(specs, len(args.forward), args.keys)
     bus_config = bus_config_from(args, GATEWAY)
     check_commands(args, bus_config)

@@ -6,7 +6,7 @@ from urllib.parse import parse_qsl, unquote
 
 import numpy as np
 
-from fleet.cli import did_you_mean
+from fleet.cli import LISTENING, NETWORK_LINKS, check_link
 from fleet.telemetry.mavlink.parsing.decode import IDS
 from fleet.telemetry.mavlink.parsing.scan import COMPONENT, ID, SYSTEM
 from fleet.telemetry.recording.opening import read_speed
@@ -65,11 +65,8 @@ def _read_numbers(name: str, text: str) -> tuple[int, ...]:
 
 LOOPBACK = "127.0.0.1"
 MAX_COPIES = 10_000
-NETWORK = ("udpin", "udpout", "udpbcast", "tcpin", "tcp")
-KINDS = (*NETWORK, "serial", "replay")
 BAUD = 57_600  # default, of a telemetry radio
 _MAX_BAUD = 4_000_000
-LISTENING = ("udpin", "tcpin")  # the host is optional: loopback
 SIGN = ("accept", "require")
 
 
@@ -77,7 +74,7 @@ class LinkSpec(NamedTuple):
     """Specification of a link."""
 
     text: str
-    kind: str  # one of KINDS
+    kind: str  # one of LINK_KINDS
     address: str  # host or path
     port: int  # or baud
     speed: float = 1.0  # recorded seconds per second; inf: as fast as possible
@@ -109,11 +106,8 @@ def read_spec(text: str, offset: int = 0) -> LinkSpec:
         spec = spec._replace(
             message_filter=read_filter(settings), sign=settings.pop("sign", ""), key=settings.pop("key", "")
         )
-    if kind not in KINDS:
-        near = did_you_mean(kind, KINDS) if kind != "udp" else "; did you mean udpin:0.0.0.0:14550?"
-        raise ValueError(f"--link: found {text!r}, expected {', '.join(KINDS)}, each with an address behind a :{near}")
-    if spec is None and kind in NETWORK:
-        raise ValueError(f"--link: found {text!r}, expected {kind}:HOST:PORT; write e.g. {kind}:127.0.0.1:14550")
+    if spec is None:
+        check_link("--link", text)
     if spec is None and kind == "serial":
         raise ValueError(f"--link: found {text!r}, expected serial:PATH:BAUD; write e.g. serial:/dev/ttyUSB0:57600")
     if spec is None or settings or spec.sign not in ("", *SIGN) or (spec.key and not spec.sign):
@@ -139,7 +133,7 @@ def read_forward(text: str) -> LinkSpec:
 
 def _read_endpoint(text: str, kind: str, rest: str) -> LinkSpec | None:
     """Parse a link without its settings; None if it is invalid."""
-    if kind in NETWORK:
+    if kind in NETWORK_LINKS:
         host, _, port = rest.rpartition(":")
         if port.isdecimal() and 0 < int(port) < 65536 and (host or kind in LISTENING):
             return LinkSpec(text, kind, host.strip("[]") or LOOPBACK, int(port))

@@ -13,7 +13,7 @@ from conftest import LONG_FILES, ROOT
 PACKAGES = ("fleet", "gateway", "twin_worker", "viewer")
 
 ORDER = (  # a folder, or a module in the root of a package, imports only from itself and from those on lines above
-    ("fleet.process",),
+    ("fleet.process", "fleet.compiled_frames"),
     ("fleet", "fleet.frames", "fleet.vehicles", "fleet.commands"),
     ("fleet.contract",),
     ("fleet.mission_jumps", "fleet.mission_legs"),
@@ -318,9 +318,9 @@ def test_no_folder_is_crowded() -> None:
 
 
 SHARED = (  # what concealer and finder may both stand on: words, frames, formats; nothing that flies or decides
-    *("fleet", "fleet.contract", "fleet.cli", "fleet.process", "fleet.commands", "fleet.frames", "fleet.config"),
+    *(f"fleet.{name}" for name in ("contract", "cli", "process", "commands", "frames", "compiled_frames", "config")),
     *("fleet.mission", "fleet.mission_jumps", "fleet.mission_legs", "fleet.simulator", "fleet.bus", "fleet.bus.codec"),
-    *(f"fleet.process.{name}" for name in ("sanitise", "logs", "children", "interrupt", "private_files")),
+    *("fleet", *(f"fleet.process.{name}" for name in ("sanitise", "logs", "children", "interrupt", "private_files"))),
 )
 READERS = ("fleet.telemetry", "fleet.airframes", "fleet.vehicles", "fleet.window", "fleet.metrics", "fleet.access")
 AUTOPILOT = "fleet.autopilots"  # flies the pretend aircraft; the finder has no use for it, but draws beside who has

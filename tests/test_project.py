@@ -27,6 +27,7 @@ PEERS = {
     "pysindy",
     "sippy-unipi",
 }  # of the bench, in an environment of their own
+OPTIONAL = {"rerun": "rerun-sdk"}  # package imported where it is installed, and its distribution
 TOOLS = {"ruff", "mypy", "pytest", "pytest-xdist"}  # development dependencies that are run rather than imported
 
 
@@ -75,8 +76,8 @@ def third_party(*folders: str) -> set[str]:
     for path in sources():
         if path.startswith(folders):
             for top in tops(path) - set(sys.stdlib_module_names) - local:
-                if bare(top) in PEERS:
-                    found.add(bare(top))
+                if bare(top) in PEERS or top in OPTIONAL:
+                    found.add(OPTIONAL.get(top, bare(top)))
                     continue
                 assert top in offered, f"{path} imports {top}, which is not installed"
                 found |= {bare(offer) for offer in offered[top]}
@@ -86,14 +87,19 @@ def third_party(*folders: str) -> set[str]:
 def test_what_is_imported_is_declared_and_what_is_declared_is_imported() -> None:
     run_time = {bare(line) for line in PROJECT["dependencies"]}
     development = {bare(line) for line in PROJECT["optional-dependencies"]["dev"]}
-    optional = {bare(line) for line in PROJECT["optional-dependencies"]["multirotor"]}
+    optional = {bare(line) for extra in ("multirotor", "rerun") for line in PROJECT["optional-dependencies"][extra]}
     assert third_party(*PACKAGES) == (run_time | optional) - OFFERED
     assert {bare(line) for line in PROJECT["optional-dependencies"]["bench"]} == PEERS <= third_party("tests/bench")
     assert third_party("tests") <= run_time | optional | development | PEERS
     assert development <= third_party("tests") | TOOLS
 
 
-LOCKS = {"requirements.lock": "dev", "requirements-bench.lock": "bench", "requirements-docs.lock": "docs"}
+LOCKS = {
+    "requirements.lock": "dev",
+    "requirements-bench.lock": "bench",
+    "requirements-docs.lock": "docs",
+    "requirements-rerun.lock": "rerun",
+}
 
 
 @pytest.mark.parametrize(("lock", "extra"), LOCKS.items())
@@ -104,7 +110,7 @@ def test_the_lock_holds_every_dependency_by_version_and_hash_and_no_address(lock
     assert all(re.match(r"[a-z0-9._-]+==[^ ]+ +--hash=sha256:[0-9a-f]{64}", entry) for entry in entries), entries
     locked = {entry.split("==")[0] for entry in entries}
     wanted = set(PROJECT["optional-dependencies"][extra])
-    if extra != "docs":  # the site is built without the packages themselves
+    if extra in ("dev", "bench"):  # the others are added to what is installed, or need nothing of it
         wanted |= {*PROJECT["dependencies"], "setuptools"}
     assert {bare(line) for line in wanted} <= locked
     assert "cvxopt" not in locked  # GPL; named by rotorpy, whose flight dynamics do not need it

@@ -160,6 +160,7 @@ def _move_flight(twin: Twin, query: WhatIf) -> None:
         if float(np.linalg.norm(offset)) > _NEW_FRAME_M:
             twin.telemetry.set_origin(to)
     if query.wind is not None:
+        twin.environment.set_wind_field(None)
         twin.environment.wind.reset_wind(twin.telemetry.history.newest, wind_after)
         newest = np.array([twin.telemetry.history.newest])
         twin.telemetry.history.replace_rows("wind", newest, wind_after[None, :2])  # the autopilot's estimate, too

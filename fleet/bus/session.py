@@ -1,4 +1,4 @@
-"""Publish, subscribe and query on Zenoh. The only file that imports zenoh.
+"""Publish, subscribe and query on Zenoh. The only file that imports zenoh, when a session is opened.
 
 A client must never block the router. A message that must not be dropped on congestion (CongestionControl.BLOCK) stops
 the router's reading thread for up to 5 s where its receiver does not read; all other traffic of that thread, and every
@@ -6,6 +6,8 @@ declaration, waits. Therefore received messages are buffered immediately, indepe
 dropped when the buffer is full; large replies are sent one by one, dropped on congestion and queried again; small
 replies have a queue of their own, which telemetry cannot fill.
 """
+
+from __future__ import annotations  # zenoh is imported when it is used: no `--help` needs it
 
 import json
 import logging
@@ -15,9 +17,7 @@ import threading
 from collections.abc import Callable, Collection, Container, Iterable, Iterator
 from contextlib import AbstractContextManager
 from itertools import islice
-from typing import Any, TypeVar
-
-import zenoh
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from fleet.access.entry import ROUTER, BusConfig, parse_endpoint
 from fleet.access.knock import probe_router
@@ -26,26 +26,19 @@ from fleet.bus.bus_protocol import QueryHandler, RawMessage, key_of, replies_abo
 from fleet.bus.codec import EncodedMessage, Stamp, decode_for_key, encode, encoding, pack_stamp, unpack_stamp
 from fleet.contract import PER_UAV, Claim
 
+if TYPE_CHECKING:
+    import zenoh
+
 M = TypeVar("M")
 _log = logging.getLogger(__name__)
 Callback = Callable[[Any, Stamp | None], None]
 RawCallback = Callable[[bytes, str, Stamp | None], None]
 BatchCallback = Callable[[list[RawMessage]], None]
 LivelinessCallback = Callable[[str, bool], None]
-_RELIABLE: dict[
-    type, dict[str, Any]
-] = {  # rare and essential: the sender blocks on congestion; all other messages are dropped
-    Claim: {"congestion_control": zenoh.CongestionControl.BLOCK, "priority": zenoh.Priority.INTERACTIVE_HIGH}
-}
 _LIVE_PREFIX = f"{ROOT}/@live/"
 _BUFFER_SIZE = 20_000  # messages of a class buffered until `dispatch`
 _QUEUE_SIZE = 4096  # messages of a subscription, or queries of a queryable, waiting for Python; the oldest are dropped
 _REPLY_QUEUE_SIZE = 4096  # replies waiting to be read
-_SMALL_REPLIES = {"priority": zenoh.Priority.DATA_HIGH}  # kilobytes: a queue separate from telemetry
-_LARGE_REPLIES = {  # replies of megabytes: telemetry and predictions overtake them, a slow reader blocks no one else
-    "priority": zenoh.Priority.DATA_LOW,
-    "congestion_control": zenoh.CongestionControl.DROP,
-}
 _TOKEN_QUEUE_SIZE = 4096  # tokens in one query; with the default channel more than 256 block for ever
 
 
@@ -53,9 +46,19 @@ class Bus(AbstractContextManager):
     """Bus of one process. Use it in a `with` statement: an unclosed session can block at exit."""
 
     def __init__(self, session: zenoh.Session) -> None:
+        import zenoh
+
         self.writer = secrets.randbits(63)  # random id of this process on the bus
         self.bad = 0  # received messages that do not decode
-        self._session = session
+        self._session, self._zenoh = session, zenoh
+        priority, congestion = zenoh.Priority, zenoh.CongestionControl
+        self._reliable: dict[type, dict[str, Any]] = {  # rare and essential: the sender blocks on congestion
+            Claim: {"congestion_control": congestion.BLOCK, "priority": priority.INTERACTIVE_HIGH}
+        }
+        # kilobytes: a queue separate from telemetry
+        self._small_replies: dict[str, Any] = {"priority": priority.DATA_HIGH}
+        # megabytes: telemetry and predictions overtake them, a slow reader blocks no one else
+        self._large_replies: dict[str, Any] = {"priority": priority.DATA_LOW, "congestion_control": congestion.DROP}
         self._declared: list[Any] = []
         self._publishers: dict[tuple[type, int], Any] = {}
         self._lock = threading.Lock()
@@ -74,8 +77,9 @@ class Bus(AbstractContextManager):
             with self._lock:
                 if (publisher := self._publishers.get((encoded.kind, encoded.uav))) is None:
                     name = key_of(encoded.kind, encoded.uav if encoded.kind in PER_UAV else f"{self.writer:016x}")
-                    options: dict[str, Any] = {"encoding": encoding(encoded.kind)} | _RELIABLE.get(encoded.kind, {})
-                    publisher = self._session.declare_publisher(name, **options)
+                    publisher = self._session.declare_publisher(
+                        name, encoding=encoding(encoded.kind), **self._reliable.get(encoded.kind, {})
+                    )
                     self._publishers[encoded.kind, encoded.uav] = publisher
         publisher.put(encoded.payload, attachment=pack_stamp(stamp) if stamp else None)
 
@@ -119,19 +123,18 @@ class Bus(AbstractContextManager):
 
     def _declare_subscriber(self, kind: type, handle: Callable[[zenoh.Sample], None], queue_size: int) -> None:
         """Call `handle` for every message of a class on a thread of its own; queue at most `queue_size` messages."""
-        subscriber = self._session.declare_subscriber(key_of(kind, "*"), zenoh.handlers.RingChannel(queue_size))
+        subscriber = self._session.declare_subscriber(key_of(kind, "*"), self._zenoh.handlers.RingChannel(queue_size))
         self._declared.append(subscriber)
         self._consume(subscriber.handler, handle, key_of(kind, "*"))
 
-    @staticmethod
-    def _consume(channel: "zenoh.Handler[Any]", handle: Callable[[Any], None], name: str) -> None:
+    def _consume(self, channel: zenoh.Handler[Any], handle: Callable[[Any], None], name: str) -> None:
         """Call `handle` for every item of a channel in order, until the session is closed."""
 
         def run() -> None:
             while True:
                 try:
                     item = channel.recv()
-                except zenoh.ZError:  # the session is closed
+                except self._zenoh.ZError:  # the session is closed
                     return
                 try:
                     handle(item)
@@ -142,7 +145,7 @@ class Bus(AbstractContextManager):
 
     def subscribe_buffered(self, kind: type, callback: BatchCallback) -> None:
         """Buffer every message of a class, undecoded, until `dispatch`; a full buffer drops its oldest messages."""
-        subscriber = self._session.declare_subscriber(key_of(kind, "*"), zenoh.handlers.RingChannel(_BUFFER_SIZE))
+        subscriber = self._session.declare_subscriber(key_of(kind, "*"), self._zenoh.handlers.RingChannel(_BUFFER_SIZE))
         self._declared.append(subscriber)
         self._buffered.append((kind, subscriber.handler, callback))
 
@@ -170,7 +173,7 @@ class Bus(AbstractContextManager):
         def on_query(query: zenoh.Query) -> None:
             with query:
                 uav = uav_of_key(str(query.key_expr)) if kind in PER_UAV else None
-                reply_encoding = zenoh.Encoding(encoding(kind))
+                reply_encoding = self._zenoh.Encoding(encoding(kind))
                 payload = query.payload.to_bytes() if query.payload is not None else b""
                 try:
                     for message, stamp in replies_about(uav, handler(uav, _parameters(query), payload)):
@@ -183,7 +186,7 @@ class Bus(AbstractContextManager):
                     query.reply_err(str(error).encode(), encoding="text/plain")
 
         name = key_of(kind, "*" if kind in PER_UAV else f"{self.writer:016x}")
-        queryable = self._session.declare_queryable(name, zenoh.handlers.RingChannel(_QUEUE_SIZE), complete=False)
+        queryable = self._session.declare_queryable(name, self._zenoh.handlers.RingChannel(_QUEUE_SIZE), complete=False)
         self._declared.append(queryable)
         self._consume(queryable.handler, on_query, name)
 
@@ -212,30 +215,30 @@ class Bus(AbstractContextManager):
 
     def get_stream(self, kind: type[M], target: int | str, payload: bytes, timeout_s: float) -> Iterator[M]:
         """Query with a payload and yield every reply on arrival, for at most `timeout_s` [s]; omit error replies."""
-        for reply in self._iter_replies(key_of(kind, target), timeout_s, payload, _LARGE_REPLIES):
+        for reply in self._iter_replies(key_of(kind, target), timeout_s, payload, self._large_replies):
             if (sample := reply.ok) is not None and (pair := self._decode_sample(kind, sample)) is not None:
                 yield pair[0]
 
     def get_payloads(self, kind: type, target: int | str, timeout_s: float) -> Iterator[bytes]:
         """Query and yield the payload of every reply on arrival; skip other versions."""
-        for reply in self._iter_replies(key_of(kind, target), timeout_s, qos=_LARGE_REPLIES):
+        for reply in self._iter_replies(key_of(kind, target), timeout_s, qos=self._large_replies):
             if (sample := reply.ok) is not None and str(sample.encoding) == encoding(kind):
                 yield sample.payload.to_bytes()
 
     def _iter_replies(
-        self, name: str, timeout_s: float, payload: bytes | None = None, qos: dict[str, Any] = _SMALL_REPLIES
+        self, name: str, timeout_s: float, payload: bytes | None = None, qos: dict[str, Any] | None = None
     ) -> Iterator[zenoh.Reply]:
         try:
             yield from self._session.get(
                 name,
-                zenoh.handlers.FifoChannel(_REPLY_QUEUE_SIZE),
-                target=zenoh.QueryTarget.ALL,
-                consolidation=zenoh.ConsolidationMode.NONE,
+                self._zenoh.handlers.FifoChannel(_REPLY_QUEUE_SIZE),
+                target=self._zenoh.QueryTarget.ALL,
+                consolidation=self._zenoh.ConsolidationMode.NONE,
                 timeout=timeout_s,
                 payload=payload,
-                **qos,
+                **(qos or self._small_replies),
             )
-        except zenoh.ZError as error:
+        except self._zenoh.ZError as error:
             raise ConnectionError(
                 f"bus: the query on {name} failed ({error}), expected an open session; connect to the router again"
             ) from None
@@ -261,7 +264,7 @@ class Bus(AbstractContextManager):
         """Call `callback(name, alive)` for every liveliness token now, and on every later change."""
 
         def on_token(sample: zenoh.Sample) -> None:
-            callback(str(sample.key_expr).removeprefix(_LIVE_PREFIX), sample.kind == zenoh.SampleKind.PUT)
+            callback(str(sample.key_expr).removeprefix(_LIVE_PREFIX), sample.kind == self._zenoh.SampleKind.PUT)
 
         self._declared.append(self._session.liveliness().declare_subscriber(_LIVE_PREFIX + "**", on_token))
         self.list_liveliness(callback)
@@ -269,7 +272,7 @@ class Bus(AbstractContextManager):
     def list_liveliness(self, callback: LivelinessCallback) -> None:
         """Call `callback(name, True)` for every current liveliness token."""
         for reply in self._session.liveliness().get(
-            _LIVE_PREFIX + "**", zenoh.handlers.FifoChannel(_TOKEN_QUEUE_SIZE), timeout=1.0
+            _LIVE_PREFIX + "**", self._zenoh.handlers.FifoChannel(_TOKEN_QUEUE_SIZE), timeout=1.0
         ):
             if reply.ok is not None:
                 callback(str(reply.ok.key_expr).removeprefix(_LIVE_PREFIX), True)
@@ -297,6 +300,8 @@ def _parameters(query: zenoh.Query) -> dict[str, str]:
 
 
 def _config(settings: dict[str, Any]) -> zenoh.Config:
+    import zenoh
+
     config = zenoh.Config()
     for path, value in settings.items():
         config.insert_json5(path, json.dumps(value))
@@ -314,6 +319,8 @@ def connect(router: str | BusConfig = ROUTER, *, retry: bool = False) -> Bus:
         ConnectionError: when no router responds or it rejects the client; start `zenohd` or `fleet up`.
         ValueError: when a credential is missing, expired or readable by others.
     """
+    import zenoh
+
     bus_config = _as_bus_config(router)
     if probe_router(bus_config):
         try:
@@ -337,6 +344,8 @@ def open_router(router: str | BusConfig = ROUTER) -> zenoh.Session:
         ConnectionError: when `router` is not a free address of this machine; Zenoh itself would retry for ever.
         ValueError: when its certificate is missing, expired or readable by others.
     """
+    import zenoh
+
     bus_config = _as_bus_config(router)
     family = socket.AF_INET6 if ":" in parse_endpoint(bus_config.endpoint)[0] else socket.AF_INET
     try:

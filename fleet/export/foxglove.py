@@ -12,9 +12,9 @@ import numpy as np
 
 from fleet.contract import Alert, Prediction
 from fleet.export.features import path_features
-from fleet.export.geometry import PredictedPath
+from fleet.export.geometry import PredictedPath, enu
 from fleet.export.map_files import geojson
-from fleet.frames import Origin, to_geodetic, to_ned
+from fleet.frames import Origin
 
 FRAME = "map"  # east, north, up from the first position
 _INFO, _WARNING = 2, 3  # foxglove.Log.Level
@@ -120,14 +120,14 @@ def scene_prediction(message: Prediction, path: PredictedPath, origin: Origin) -
         "pose": _pose(np.zeros(3), _NO_TURN),
         "thickness": 2.0,
         "scale_invariant": True,
-        "points": [_xyz(p) for p in _enu(path, path.at(ahead)[0], origin)],
+        "points": [_xyz(p) for p in enu(path, path.at(ahead)[0], origin)],
         "color": _PATH_COLOUR,
         "colors": [],
         "indices": [],
     }
     spheres = [
         {"pose": _pose(centre, _yaw(heading)), "size": _xyz(2 * axes), "color": _REGION_COLOUR}
-        for centre, axes, heading in zip(_enu(path, centres, origin), half_axes, path.headings(marks), strict=True)
+        for centre, axes, heading in zip(enu(path, centres, origin), half_axes, path.headings(marks), strict=True)
     ]
     about = {"state": message.state.value, "horizon_s": f"{path.horizon_s:.1f}"}
     entity = {
@@ -146,16 +146,20 @@ def scene_prediction(message: Prediction, path: PredictedPath, origin: Origin) -
 
 def log(alert: Alert) -> dict[str, Any]:
     """Return an alert as a log message: a warning when raised, information when cleared."""
+    return {
+        "timestamp": time_stamp(alert.t),
+        "level": _WARNING if alert.active else _INFO,
+        "message": alert_text(alert),
+        "name": f"uav-{alert.uav}",
+        "file": "",
+        "line": 0,
+    }
+
+
+def alert_text(alert: Alert) -> str:
+    """Return the line of an alert in a log."""
     text = f"uav-{alert.uav}: {alert.kind.value.replace('_', ' ')}: {alert.sentence or 'no details'}"
-    level, text = (_WARNING, text) if alert.active else (_INFO, f"cleared: {text}")
-    stamp = time_stamp(alert.t)
-    return {"timestamp": stamp, "level": level, "message": text, "name": f"uav-{alert.uav}", "file": "", "line": 0}
-
-
-def _enu(path: PredictedPath, ned: np.ndarray, origin: Origin) -> np.ndarray:
-    """Map NED positions of a prediction, (n, 3) [m], to ENU from another origin, (n, 3) [m]."""
-    moved = to_ned(origin, *to_geodetic(path.origin, ned).astype(float).T)
-    return moved[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+    return text if alert.active else f"cleared: {text}"
 
 
 def _xyz(values: np.ndarray) -> dict[str, float]:

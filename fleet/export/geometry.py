@@ -1,11 +1,14 @@
 """Geometry of messages on the map: flown positions, predicted path, ellipses of the prediction region."""
 
-from typing import NamedTuple
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fleet.contract import Prediction, Rows, Sample
-from fleet.frames import Origin, to_geodetic
+from fleet.frames import Origin, to_geodetic, to_ned
 
 MAX_REACH_M = 200_000.0  # a path that reaches farther from its origin is invalid [m]
 MAX_ELLIPSES = 24  # ellipses of one prediction region
@@ -67,11 +70,65 @@ def coordinates(origin: Origin, ned: np.ndarray) -> list[list[float]]:
     return rounded(to_geodetic(origin, ned))
 
 
+def enu(path: PredictedPath, ned: np.ndarray, origin: Origin) -> np.ndarray:
+    """Map NED positions of a prediction, (n, 3) [m], to east, north, up from another origin, (n, 3) [m]."""
+    moved = to_ned(origin, *to_geodetic(path.origin, ned).astype(float).T)
+    return moved[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+
+
 def rounded(lat_lon_alt: np.ndarray) -> list[list[float]]:
     """Convert integers of MAVLink, (n, 3) [1e-7 deg, 1e-7 deg, mm], to longitude, latitude [deg], altitude [m]."""
     return [
         [round(lon * 1e-7, 7), round(lat * 1e-7, 7), round(alt * 1e-3, 3)] for lat, lon, alt in lat_lon_alt.tolist()
     ]
+
+
+def cut_at_antimeridian(geometry: str, points: Any) -> tuple[str, Any]:
+    """Cut a line or a polygon that crosses 180 degrees of longitude, as RFC 7946, section 3.1.9 asks.
+
+    Args:
+        geometry: Point, LineString or Polygon
+        points: its coordinates as in GeoJSON, longitudes within +-180 deg
+    Returns:
+        the same, or MultiLineString or MultiPolygon with a part on each side
+    """
+    if geometry == "LineString":
+        parts = cut_line(points)
+        return ("LineString", points) if len(parts) == 1 else ("MultiLineString", parts)
+    if geometry != "Polygon" or max(lon := [point[0] for point in points[0]]) - min(lon) <= 180:
+        return geometry, points
+    eastern = [[lon + 360 if lon < 0 else lon, *rest] for lon, *rest in points[0]]
+    beyond = _clip_ring([[lon - 360, *rest] for lon, *rest in eastern], -180.0, 1)
+    return "MultiPolygon", [[ring] for ring in (_clip_ring(eastern, 180.0, -1), beyond) if len(ring) > 3]
+
+
+def cut_line(points: Sequence[Sequence[float]]) -> list[list[list[float]]]:
+    """Cut a line, points with longitude first [deg], where it crosses 180 degrees; both parts end there."""
+    parts: list[list[list[float]]] = [[]]
+    for point in map(list, points):
+        if parts[-1] and abs(step := point[0] - (last := parts[-1][-1])[0]) > 180:
+            side = math.copysign(180.0, last[0])
+            share = (side - last[0]) / (step - math.copysign(360.0, step))
+            crossing = [round(a + share * (b - a), 7) for a, b in zip(last[1:], point[1:], strict=True)]
+            if last[0] != side:
+                parts[-1].append([side, *crossing])
+            parts.append([] if point[0] == -side else [[-side, *crossing]])
+        parts[-1].append(point)
+    return [part for part in parts if len(part) > 1] or parts[:1]
+
+
+def _clip_ring(ring: list[list[float]], limit: float, side: int) -> list[list[float]]:
+    """Clip a closed ring to the longitudes below (`side` -1) or above (1) a limit [deg]."""
+    clipped: list[list[float]] = []
+    for a, b in pairwise(ring):
+        inside, next_inside = side * (a[0] - limit) >= 0, side * (b[0] - limit) >= 0
+        if inside:
+            clipped.append(a)
+        if inside != next_inside:
+            share = (limit - a[0]) / (b[0] - a[0])
+            clipped.append([limit, *(round(p + share * (q - p), 7) for p, q in zip(a[1:], b[1:], strict=True))])
+    clipped = [[round(lon, 7), *rest] for lon, *rest in clipped]
+    return [*clipped, clipped[0]] if clipped else []
 
 
 def ellipse(centre: np.ndarray, half_axes: np.ndarray, heading: float) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from fleet.export.features import MapFeature, date
+from fleet.export.geometry import cut_at_antimeridian
 
 _KML = "http://www.opengis.net/kml/2.2"
 _STYLES = {  # colour aabbggrr, width; as on the viewer's page
@@ -31,7 +32,8 @@ def geojson_text(features: Iterable[MapFeature]) -> str:
 
 
 def _geojson_feature(feature: MapFeature) -> dict[str, Any]:
-    geometry = {"type": feature.geometry, "coordinates": feature.coordinates} if feature.geometry else None
+    kind, coordinates = cut_at_antimeridian(feature.geometry, feature.coordinates)
+    geometry = {"type": kind, "coordinates": coordinates} if kind else None
     properties = {"kind": feature.kind, "uav": feature.uav, "time": date(feature.t), **feature.properties}
     return {"type": "Feature", "geometry": geometry, "properties": properties}
 
@@ -66,11 +68,19 @@ def _placemark(folder: ElementTree.Element, feature: MapFeature) -> None:
     ElementTree.SubElement(placemark, "styleUrl").text = f"#{feature.kind}"
     if not feature.geometry:
         return
-    shape = ElementTree.SubElement(placemark, feature.geometry)
+    kind, coordinates = cut_at_antimeridian(feature.geometry, feature.coordinates)
+    if parts := kind.startswith("Multi"):
+        placemark = ElementTree.SubElement(placemark, "MultiGeometry")
+    for part in coordinates if parts else [coordinates]:
+        _shape(placemark, kind.removeprefix("Multi"), part)
+
+
+def _shape(parent: ElementTree.Element, geometry: str, coordinates: Any) -> None:
+    shape = ElementTree.SubElement(parent, geometry)
     ElementTree.SubElement(shape, "altitudeMode").text = "absolute"
-    points, parent = feature.coordinates, shape
-    if feature.geometry == "Polygon":
+    points, holder = coordinates, shape
+    if geometry == "Polygon":
         (points,) = points
-        parent = ElementTree.SubElement(ElementTree.SubElement(shape, "outerBoundaryIs"), "LinearRing")
-    points = [points] if feature.geometry == "Point" else points
-    ElementTree.SubElement(parent, "coordinates").text = " ".join(",".join(map(str, point)) for point in points)
+        holder = ElementTree.SubElement(ElementTree.SubElement(shape, "outerBoundaryIs"), "LinearRing")
+    points = [points] if geometry == "Point" else points
+    ElementTree.SubElement(holder, "coordinates").text = " ".join(",".join(map(str, point)) for point in points)

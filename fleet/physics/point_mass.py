@@ -24,8 +24,8 @@ COARSE_STEP = 0.25  # the same for ensembles [s]
 GAMMA_S = 0.6  # time constant of the flight-path angle [s]
 _LAG_SUBSTEPS = 4  # substeps of the lags per step
 _THROTTLE_S = 0.3  # of the motor from idle to full [s]
-_SHEAR = 1 / 7  # wind over height, open ground [-]
-_MIN_SHEAR_HEIGHT = 5.0  # minimum height of the wind's power law [m]
+SHEAR = 1 / 7  # wind over height, open ground [-]
+MIN_SHEAR_HEIGHT = 5.0  # minimum height of the wind's power law [m]
 _MAX_BANK = 1.3  # maximum bank; the model diverges beyond [rad]
 
 # columns of `parameters`: identified
@@ -99,7 +99,7 @@ def simulate_route(
             )
         if k % steps_per_s == 0:
             if air[H_0] > 0.0:
-                shear = (max(air[GROUND] - p[2], _MIN_SHEAR_HEIGHT) / air[H_0]) ** _SHEAR
+                shear = (max(air[GROUND] - p[2], MIN_SHEAR_HEIGHT) / air[H_0]) ** SHEAR
             if k // steps_per_s < len(draws):
                 z = draws[k // steps_per_s]
                 wind[0], wind[1] = wind[0] + drift_std * z[0], wind[1] + drift_std * z[1]

@@ -1,16 +1,20 @@
 """Text tables of an inspected recording, with the same figures as the JSON output."""
 
+from __future__ import annotations  # findings are needed for their types alone: `--help` imports no numba
+
 from collections import Counter
 from collections.abc import Iterable
 from datetime import UTC, datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from fleet.process.sanitise import printable
-from fleet.telemetry.inspection.findings import AircraftFindings, FileFindings, RowStatistics, mode_seconds
+
+if TYPE_CHECKING:
+    from fleet.telemetry.inspection.findings import AircraftFindings, FileFindings, RowStatistics
 
 _MAX_EVENTS = 14
 _EVENT_PRIORITY = ("text", "clock", "link", "gap", "parameter", "disarmed", "armed", "mission", "mode")
@@ -31,6 +35,8 @@ def table(file: FileFindings) -> RenderableType:
 
 def summary_lines(findings: AircraftFindings) -> list[tuple[str, str]]:
     """Return the summary without events and abilities: (heading, text)."""
+    from fleet.telemetry.inspection.findings import mode_seconds
+
     vehicle, firmware = findings.vehicle.replace("_", " "), findings.firmware or "firmware unknown"
     jumps = f"{findings.clock_jumps} clock jumps" if findings.clock_jumps else "no clock jump"
     rows = findings.rows.items()

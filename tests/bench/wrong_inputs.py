@@ -1,4 +1,4 @@
-"""Wrong inputs, the answer of each, and its exit code: `python -m tests.bench.wrong_inputs > wrong-inputs.md`.
+"""Wrong inputs, the answer of each, and its exit code: `python -m tests.bench.wrong_inputs > docs/wrong-inputs.md`.
 
 The inputs are those of `tests/fleet/test_wrong_inputs.py`, which holds the answers. Each is given to a process of its
 own in a folder with `folder/`, `text.txt` and `bad.toml`; the answer is the last line on standard error.
@@ -14,6 +14,13 @@ from fleet.process.logs import strip_time
 from tests.fleet.test_wrong_inputs import ANSWERS
 
 ROOT = Path(__file__).resolve().parents[2]
+HEAD = """# Wrong inputs
+
+Every command checks its options before it starts anything. A wrong one is answered in one line that names the subject,
+what was found, what is expected, and the remedy; the exit code is 2. A command that was interrupted ends with 130, one
+whose work failed with 1. In this table `folder` is a folder, `text.txt` a text file and `bad.toml` not TOML; `nosuch`
+does not exist. `python -m tests.bench.wrong_inputs > docs/wrong-inputs.md` renews it.
+"""
 MODULES = {"fleet": "fleet.cli"}
 
 
@@ -29,6 +36,7 @@ def answer(line: str, folder: str) -> tuple[str, int]:
 def main() -> int:
     """Print the table as Markdown; exit code 1 where an answer is not the tested one."""
     wrong = 0
+    print(HEAD)
     print("| Input | Answer | Exit code |\n| --- | --- | --- |")
     with TemporaryDirectory() as folder:
         (Path(folder) / "folder").mkdir()

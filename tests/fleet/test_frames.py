@@ -39,4 +39,4 @@ def test_a_heading_of_dataflash_is_wrapped_alike() -> None:
 def test_nobody_wraps_radians_on_their_own() -> None:
     own = re.compile(r"pi\)\s*%\s*\(\s*2(\.0)?\s*\*\s*(np\.)?pi\)")
     files = [path for name in ("fleet", "gateway", "twin_worker", "viewer") for path in (ROOT / name).rglob("*.py")]
-    assert [path.name for path in files if own.search(path.read_text())] == ["frames.py"]
+    assert [path.name for path in files if own.search(path.read_text())] == ["compiled_frames.py"]

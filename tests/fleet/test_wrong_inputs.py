@@ -31,8 +31,13 @@ ANSWERS = {  # command line -> part of the last line
     "fleet status --watch --json": "--watch: found --json too, expected only one; drop one",
     "fleet status --router nonsense": "--router: found 'nonsense', expected e.g. tcp/127.0.0.1:7447",
     "fleet status --router tcp/127.0.0.1:1": "router tcp/127.0.0.1:1: no response; start `zenohd` or `fleet up`",
-    "fleet status --config nosuch.toml": "found no file 'nosuch.toml', expected one; check the path",
-    "fleet status --config folder": "found a folder 'folder', expected a file; name a file in it",
+    "fleet status --config nosuch.toml": "--config: found no file 'nosuch.toml', expected one such as deploy",
+    "fleet status --config folder": "--config: found a folder 'folder', expected a TOML file; name a file in it",
+    "gateway --config nosuch.toml": "--config: found no file 'nosuch.toml', expected one such as deploy/fleet.toml",
+    "fleet up --link ftp:127.0.0.1:21": "--link: found 'ftp:127.0.0.1:21', expected udpin, udpout, udpbcast",
+    "fleet up --link udpin:127.0.0.1": "--link: found 'udpin:127.0.0.1', expected udpin:HOST:PORT",
+    "fleet up --forward serail:/dev/ttyUSB0": "--forward: found 'serail:/dev/ttyUSB0', expected udpin, udpout",
+    "fleet up --keys nosuch.txt": "--keys: found no file 'nosuch.txt', expected a file of keys; check the path",
     "fleet status --config bad.toml": "--config: found invalid TOML in bad.toml",
     "fleet up --uavs x": "--uavs: found 'x', expected a whole number; correct it",
     "fleet up --uavs 0": "--uavs: found 0, expected 1 to 250 aircraft",
@@ -58,7 +63,7 @@ ANSWERS = {  # command line -> part of the last line
     "fleet assess folder": "FILE: found a folder 'folder', expected a recording; name a file in it",
     "fleet calibrate text.txt": "--out: found none, expected one; add it",
     "fleet export": "FILE: found none, expected one; add it",
-    "fleet export x.txt": "FILE: found 'x.txt', expected a name that ends in .geojson, .kml, .mcap; rename it",
+    "fleet export x.txt": "FILE: found 'x.txt', expected a name that ends in .geojson, .kml, .mcap, .rrd; rename it",
     "fleet export nosuch/x.kml": "FILE: found no folder 'nosuch', expected one; create it first",
     "fleet export x.kml --for -1": "--for: found -1 s, expected 0 (until Ctrl-C) or more; change it",
     "fleet export x.kml --from nosuch.parauav": "--from: found no file 'nosuch.parauav', expected a recording",
@@ -66,9 +71,9 @@ ANSWERS = {  # command line -> part of the last line
     "fleet export x.kml --from text.txt --for 3": "--for: found --from too, expected only one",
     "fleet export x.kml --uavs 9-3": "--uavs: found '9-3', expected a range of ids such as 0-49",
     "fleet whatif seven": "uav: found 'seven', expected a whole number; correct it",
-    "fleet whatif 7 --wind=nan,2": "--wind: found (nan, 2.0), expected two finite numbers; write e.g. --wind=6,-2",
+    "fleet whatif 7 --wind=nan,2": "--wind: found 'nan,2', expected two numbers, north and east; write e.g.",
     "fleet whatif 7 --param WP_RADIUS=nan": "--param: found 'WP_RADIUS=nan', expected NAME=VALUE",
-    "fleet whatif 7 --wind 3": "--wind: found 1 numbers, expected north and east; write e.g. --wind=6,-2",
+    "fleet whatif 7 --wind 3": "--wind: found '3', expected two numbers, north and east; write e.g. --wind=6,-2",
     "fleet schema predictoin": "did you mean prediction?",
     "fleet effects nosuch": "found 'nosuch', expected an effect such as actuator_stuck",
     "fleet completion tcsh": "shell: found 'tcsh', expected bash, zsh, fish",
@@ -78,7 +83,7 @@ ANSWERS = {  # command line -> part of the last line
     "gateway --link serial:/dev/ttyUSB0:x7:0": "expected serial:PATH:BAUD; write e.g. serial:/dev/ttyUSB0:57600",
     "gateway --record text.txt": "--record: 'text.txt' cannot be created (File exists); name another folder",
     "gateway --record-budget lots --record r": "--record-budget: found 'lots', expected a size such as 500M or 10G",
-    "gateway --keys folder": "found a folder 'folder', expected a file; name a file in it",
+    "gateway --keys folder": "--keys: found a folder 'folder', expected a file of keys; name a file in it",
     "gateway --most-uavs 0": "--most-uavs: found 0, expected at least 1; write e.g. 250",
     "twin_worker --uavs 9-3": "--uavs: found '9-3', expected a range of ids such as 0-49; write the lower one first",
     "twin_worker --separation 5": "--separation: found '5', expected two distances in m, e.g. 50,20; correct it",
@@ -128,27 +133,38 @@ def test_a_wrong_input_is_answered_in_one_line(line: str, folder: None, capsys: 
         assert said.startswith(f"usage: {verb} ")
 
 
-def test_version_and_help_of_all_commands_compile_and_import_nothing_heavy() -> None:
+def test_the_page_of_wrong_inputs_has_every_answer() -> None:
+    """Made by `python -m tests.bench.wrong_inputs > docs/wrong-inputs.md`."""
+    rows = dict(re.findall(r"^\| `(.*?)` \| (.*) \| 2 \|$", (ROOT / "docs" / "wrong-inputs.md").read_text(), re.M))
+    assert list(rows) == list(ANSWERS)
+    assert [line for line, answer in ANSWERS.items() if answer not in rows[line].replace("\\|", "|")] == []
+
+
+def test_version_and_help_of_all_commands_and_verbs_import_nothing_heavy() -> None:
     """What takes time is imported when a command runs; the modules are counted, as seconds are the machine's."""
     code = """
 import json, sys
 from importlib import import_module
-found = {}
+from fleet.cli import command_modules
+lines = [("fleet.cli", verb, "--help") for verb in command_modules()]
 for name in ("fleet.cli", "gateway.__main__", "twin_worker.__main__", "viewer.__main__"):
-    main = import_module(name).main
-    for option in ("--version", "--help"):
-        try:
-            main([option])
-        except SystemExit as left:
-            found[name + option] = left.code
-heavy = [name for name in ("numba", "scipy", "zenoh", "viser", "pymavlink", "jsbsim") if name in sys.modules]
-print(json.dumps([found, heavy]), file=sys.stderr)
+    lines += [(name, "--version"), (name, "--help")]
+heavy, codes = {}, []
+for name, *words in lines:
+    try:
+        import_module(name).main(words)
+    except SystemExit as left:
+        codes.append(left.code)
+    for name in ("numba", "scipy", "zenoh", "viser", "pymavlink", "jsbsim", "matplotlib", "rerun"):
+        if name in sys.modules:
+            heavy.setdefault(name, words)
+print(json.dumps([len(lines), codes, heavy]), file=sys.stderr)
 """
     line = [sys.executable, "-W", "error", "-c", code]
     done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
-    found, heavy = json.loads(done.stderr)
-    assert set(found.values()) == {0} and len(found) == 8 and heavy == []
-    assert done.stdout.count("parauav ") == 4 and "examples:" in done.stdout
+    count, codes, heavy = json.loads(done.stderr)
+    assert codes == [0] * count and count == 8 + len(cli.command_modules()) and heavy == {}
+    assert done.stdout.count("\nparauav ") == 4 and done.stdout.count("examples:") == count - 4
 
 
 def test_completion_offers_all_verbs_and_their_options() -> None:

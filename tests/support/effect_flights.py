@@ -9,7 +9,7 @@ from fleet.effects import Body, Effect, Flow, Parameter, Stage
 from twin_worker.diagnosis.data.card import AircraftCard, FaultHypothesis
 from twin_worker.diagnosis.data.flight import DT, FlightData
 from twin_worker.diagnosis.model.baseline import ActuatorTiming, Baseline
-from twin_worker.diagnosis.model.residual import RHO_0
+from twin_worker.diagnosis.model.equations import RHO_0
 from twin_worker.diagnosis.model.simulate import STATE, Runs, Simulation
 
 LONG_S = 80.0

@@ -44,6 +44,8 @@ from fleet.contract import (
     Status,
     TwinState,
     Verdict,
+    WindEstimate,
+    WindField,
 )
 
 UAV, T = 7, 1_700_000_000.25
@@ -113,6 +115,7 @@ ROW = FleetRow(
     t10_n=4,
     epoch=1_700_000_000_000,
     alerts=("uav 8 in 12 s",),
+    wind=WindEstimate(t=T, position=(470_000_000, 80_000_000, 550_000), height_m=100.0, wind=(4.5, -2.25), sigma=0.5),
 )
 
 MESSAGES = (
@@ -177,6 +180,7 @@ MESSAGES = (
         quantile=0.9,
         horizon_s=2.0,
         horizon_open=True,
+        early_exceedance=0.125,
         coverage=0.875,
         coverage_n=8,
         calibration="calibrated on 288 predictions of 16 flights",
@@ -334,6 +338,23 @@ MESSAGES = (
         wall_t=T + 1.0,
         machine="ground-1",
         code="0123456789abcdef",
+    ),
+    WindField(
+        t=T,
+        origin=(470_000_000, 80_000_000, 450_000),
+        uavs=(UAV, 8, 9),
+        wind=(4.0, -2.0),
+        wind_sigma=0.25,
+        sigma=0.5,
+        length_m=300.0,
+        persistence_s=300.0,
+        drift_sigma=0.25,
+        drift_s=60.0,
+        profile=Array.of([[4.0, -2.0], [0.5, 0.25]]),
+        nodes=Array.of([[0.0, 0.0, -100.0], [500.0, -250.0, -150.0]]),
+        values=Array.of([[0.5, -0.25], [0.0, 0.25]]),
+        covariance=Array.of(0.25 * np.eye(4)),
+        drifts=Array.of([[0.125, 0.0, 0.0625], [0.0, 0.25, 0.0625], [0.0, 0.0, 0.0625]]),
     ),
     Claim(
         t=T,

@@ -21,7 +21,7 @@ class AlertRule(NamedTuple):
 _IMMINENT_S = 30.0  # hazards nearer than this have no additional delay [s]
 RULES = {
     AlertKind.LINK_LOST: AlertRule(0.5, 0.5, 0.0, 0.0),
-    AlertKind.SHORT_HORIZON: AlertRule(0.9, 0.1, 15.0, 5.0),
+    AlertKind.SHORT_HORIZON: AlertRule(0.5, 0.25, 15.0, 5.0),
     AlertKind.CONFLICT: AlertRule(0.25, 0.05, 2.0, 5.0, 0.15),
     AlertKind.GROUND: AlertRule(0.5, 0.2, 2.0, 5.0, 0.15),
     AlertKind.GEOFENCE: AlertRule(0.5, 0.2, 2.0, 5.0, 0.15),

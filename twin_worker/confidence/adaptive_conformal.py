@@ -20,9 +20,9 @@ import numpy as np
 
 from twin_worker.confidence.calibration_table import ATOMS, KNOTS, CalibrationTable
 from twin_worker.confidence.prediction_log import EVERY_S, KNOT_OF, PredictionLog
-from twin_worker.confidence.weighted_quantile import censored_quantile, critical_factor, weighted_quantile
+from twin_worker.confidence.weighted_quantile import censored_distribution, critical_factor, weighted_quantile
 from twin_worker.numerics.interpolation import interpolate_rows
-from twin_worker.numerics.prediction_errors import NOMINAL_COVERAGE
+from twin_worker.numerics.prediction_errors import ERROR_LIMIT, NOMINAL_COVERAGE
 
 _TABLE_WEIGHT = 10.0  # independent predictions that the table counts as [-]
 _DECAY_S = 400.0  # time constant of the weight of a score [s]
@@ -86,18 +86,24 @@ class ScaleFactors:
     Attributes:
         tube: on the table's half-axes, by knot and axis, (13, 3) [-]
         horizon: on the error ratio that determines the horizon [-]
+        critical: critical factors of the horizon, and the probability of each, (2, n) [-]
         own_count: number of this aircraft's predictions behind them [-]
         bounded: a level or factor of the tube is at its upper bound, so further misses cannot widen the tube
     """
 
     tube: np.ndarray
     horizon: float
+    critical: np.ndarray
     own_count: int
     bounded: bool = False
 
     def at(self, ahead: np.ndarray) -> np.ndarray:
         """Return the factor on half-axes by look-ahead, (n, 3) [-]."""
         return interpolate_rows(ahead, KNOTS, self.tube)
+
+    def exceedance(self, ratio: float) -> float:
+        """Return the probability that the relative error exceeds its limit before a running maximum of `ratio` [-]."""
+        return float(self.critical[1, self.critical[0] * ratio >= ERROR_LIMIT].sum())
 
 
 def scale_factors(log: PredictionLog, group: str, table: CalibrationTable, levels: AdaptiveLevels) -> ScaleFactors:
@@ -109,10 +115,11 @@ def scale_factors(log: PredictionLog, group: str, table: CalibrationTable, level
     axis = _axis_factors(ratios, weight, table)
     scores = (ratios / axis).max(axis=2)
     tube = _joint_quantiles(table.scores, scores.T, weight.T, levels.tube)[:, None] * axis
-    horizon = _horizon_factor(log, rows, table.risks * axis.max(), levels.horizon)
+    critical = _critical_factors(log, rows, table.risks * axis.max())
+    horizon = float(weighted_quantile(critical[:1], critical[1:], np.array([levels.horizon]))[0])
     own_count = int((weight > 0).any(axis=1).sum())
     bounded = bool((levels.tube >= _MAX_LEVEL).any() or (tube >= _MAX_FACTOR).any())
-    return ScaleFactors(np.clip(tube, _MIN_FACTOR, _MAX_FACTOR), horizon, own_count, bounded)
+    return ScaleFactors(np.clip(tube, _MIN_FACTOR, _MAX_FACTOR), horizon, critical, own_count, bounded)
 
 
 def _axis_factors(ratios: np.ndarray, weight: np.ndarray, table: CalibrationTable) -> np.ndarray:
@@ -136,11 +143,14 @@ def _joint_quantiles(atoms: np.ndarray, scores: np.ndarray, weight: np.ndarray, 
     return weighted_quantile(x, np.hstack([np.full((r, ATOMS), _TABLE_WEIGHT / ATOMS), weight]), level)
 
 
-def _horizon_factor(log: PredictionLog, rows: np.ndarray, risks: np.ndarray, level: float) -> float:
-    """Return the factor at which a share `level` of first passages lies beyond the horizon."""
+def _critical_factors(log: PredictionLog, rows: np.ndarray, risks: np.ndarray) -> np.ndarray:
+    """Return the critical factors of table and own predictions, and the probability of each, (2, n) [-].
+
+    The horizon factor is a quantile of them: that share of first passages then lies beyond the horizon.
+    """
     followed, exceeded = log.followed[rows], log.exceeded[rows]
     x = critical_factor(log.ratio[rows], followed)
     age = np.clip(log.evaluated_until - log.t0[rows], 0.0, None)
     weight = np.where((followed > 0) | exceeded, _HORIZON_WEIGHT * np.exp(-age / _DECAY_S), 0.0)
     x, exact = np.append(risks, x), np.append(np.ones(ATOMS, bool), exceeded)
-    return censored_quantile(x, np.append(np.full(ATOMS, _TABLE_WEIGHT / ATOMS), weight), exact, level)
+    return censored_distribution(x, np.append(np.full(ATOMS, _TABLE_WEIGHT / ATOMS), weight), exact)

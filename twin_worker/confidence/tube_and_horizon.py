@@ -80,6 +80,7 @@ __all__ = [
     "path_length",
     "track_frame",
 ]
+EARLY_S = 10.0  # look-ahead of `Confidence.early_exceedance` [s]
 _GROUPS = 8  # groups whose levels are stored
 _PASSAGES = 60  # passages stored per method
 _EXTRAPOLATED_EVERY_S = (
@@ -123,6 +124,7 @@ class Confidence:
         factor: half-axes of the tube over those of the table, by knot and axis, (13, 3) [-]
         ratio: running maximum of half-axes over predicted path length, (n,) [-]
         axis_quantile: coverage of each half-axis by itself [-]
+        early_exceedance: probability that the error exceeds 10 % within `EARLY_S` [-]
     """
 
     tube: np.ndarray
@@ -132,6 +134,7 @@ class Confidence:
     factor: np.ndarray
     ratio: np.ndarray
     axis_quantile: float = INDEPENDENT
+    early_exceedance: float = 0.0
 
 
 @dataclass
@@ -164,7 +167,9 @@ class ConfidenceTracker:
         adaptation = f", adapted to {scale.own_count} own predictions" if scale.own_count else ""
         adaptation += "; adaptation is at its bound: coverage may be below the target" if scale.bounded else ""
         tube = scale.at(forecast.ahead) * half_axes
-        return Confidence(tube, horizon, horizon_open, description + adaptation, scale.tube, ratio, table.alone)
+        early = scale.exceedance(float(np.interp(EARLY_S, forecast.ahead - forecast.ahead[0], ratio)))
+        sentence = description + adaptation
+        return Confidence(tube, horizon, horizon_open, sentence, scale.tube, ratio, table.alone, early)
 
     def _factors(self, group: str, table: CalibrationTable) -> ScaleFactors:
         """Return the scale factors, recomputed after every prediction that was added."""

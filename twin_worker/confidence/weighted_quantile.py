@@ -57,12 +57,16 @@ def kaplan_meier_masses(x: np.ndarray, weight: np.ndarray, exact: np.ndarray) ->
     return out
 
 
+def censored_distribution(x: np.ndarray, weight: np.ndarray, exact: np.ndarray) -> np.ndarray:
+    """Return left-censored values and the probability of each, (2, n + 1); 0 has what lies below every value."""
+    mass = kaplan_meier_masses(x, weight, exact)
+    return np.array([np.append(x, 0.0), np.append(mass, max(1.0 - float(mass.sum()), 0.0))])
+
+
 def censored_quantile(x: np.ndarray, weight: np.ndarray, exact: np.ndarray, level: float) -> float:
     """Return a quantile of left-censored values; 0 where the quantile lies below every value."""
-    mass = kaplan_meier_masses(x, weight, exact)
-    rest = max(1.0 - float(mass.sum()), 0.0)
-    x, mass = np.append(x, 0.0), np.append(mass, rest)
-    return float(weighted_quantile(x[None], mass[None], np.array([level]))[0])
+    values, mass = censored_distribution(x, weight, exact)
+    return float(weighted_quantile(values[None], mass[None], np.array([level]))[0])
 
 
 Passages = Sequence[tuple[float, bool]]  # first passage of 10 % or censoring time [s], whether it is censored

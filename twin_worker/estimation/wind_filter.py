@@ -289,6 +289,13 @@ class WindFilter:
         return np.array([x[2] + x[4], x[3] + x[5], 0.0])
 
     @property
+    def present_wind(self) -> tuple[np.ndarray, float]:
+        """Return the wind with gust, north and east, (2,) [m/s], and the mean variance of a component [m2/s2]."""
+        total = np.tile(np.eye(2), (1, 3))
+        cov = total @ self.P[2:, 2:] @ total.T
+        return total @ self.x[2:], float(cov.trace() / 2)
+
+    @property
     def drift_sigma(self) -> float:
         """Return the standard deviation of slow changes of the wind: root of the posterior mean variance [m/s]."""
         weight = np.exp(self._drift_evidence - self._drift_evidence.max())

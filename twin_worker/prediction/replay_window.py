@@ -12,6 +12,7 @@ from fleet.frames import Origin, wrap
 from fleet.mission import FIRST_ITEM, Route
 from fleet.process.sanitise import format_below
 from fleet.window import Window
+from twin_worker.estimation.wind_field import SharedWind
 from twin_worker.estimation.wind_filter import WindFilter
 from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.prediction.autopilot_parameters import ControllerTwin, RouteOverride
@@ -132,6 +133,8 @@ class PredictionContext:
         onboard: active route and parameters
         wind_filter: current wind filter
         origin: origin of the twin's NED frame
+        uav: id of the aircraft
+        shared_wind: wind field of all aircraft; None: not known
     """
 
     window: Window
@@ -139,6 +142,8 @@ class PredictionContext:
     onboard: AutopilotConfig
     wind_filter: WindFilter
     origin: Origin
+    uav: int = -1
+    shared_wind: SharedWind | None = None
 
 
 def reported(history: TelemetryHistory, name: str, query_t: np.ndarray, max_age: float) -> np.ndarray:

@@ -276,5 +276,6 @@ def fleet_row(twin: Twin, now: float, alerts: Iterable[Alert] = (), **claim: obj
         t10_censored=censored,
         t10_n=n,
         alerts=tuple(alert.sentence for alert in alerts),
+        wind=twin.wind_estimate,
         **claim,  # type: ignore[arg-type]
     )

@@ -94,7 +94,7 @@ def _proof(mismatch: Mismatch) -> list[tuple[str, str]]:
 
 MAX_ROWS = 50
 LOW_FIT = 50.0  # below this fit the residual exceeds half of the motion, RMS; a verified model has little power [%]
-SHORT_HORIZON_S = 10.0  # a shorter horizon is reported; the alert of the worker has the same threshold [s]
+SHORT_HORIZON_S = 10.0  # a shorter horizon is reported [s]
 FULL_BAR_S = 10.0  # smallest horizon of a full bar in the table [s]
 
 
@@ -169,7 +169,7 @@ def alert_sentence(alert: Alert, record: StatusRecord) -> str:
     if alert.kind is AlertKind.LINK_LOST:
         return f"no sample for {age_text(record.sample_age_s)}; the twin predicts without telemetry"
     if alert.kind is AlertKind.SHORT_HORIZON:
-        return f"confidence horizon {horizon_text(record)}; raised below {SHORT_HORIZON_S:.0f} s"
+        return f"confidence horizon {horizon_text(record)}; an error of 10 % within 10 s was more likely than not"
     return alert.sentence
 
 

@@ -1,8 +1,9 @@
-"""Export positions, predictions, regions and alerts as GeoJSON, KML or MCAP, from a running fleet or a recording.
+"""Export positions, predictions, regions and alerts as GeoJSON, KML, MCAP or Rerun, live or from a recording.
 
 The ending of FILE selects the format. GeoJSON and KML contain the flown path and the newest prediction of each
 aircraft: the path up to its confidence horizon, the path beyond it, ellipses of the prediction region, and the active
-alerts. MCAP contains every message on its time, with Foxglove schemas (LocationFix, GeoJSON, SceneUpdate, Log).
+alerts. MCAP contains every message on its time, with Foxglove schemas (LocationFix, GeoJSON, SceneUpdate, Log); a
+Rerun recording (.rrd) has the same and needs the package rerun-sdk (extra `rerun`).
 """
 
 import argparse
@@ -13,7 +14,6 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import IO
 
 from fleet.bus.session import connect
 from fleet.cli import check_file, check_parent, id_range, stop_on_signal
@@ -23,6 +23,7 @@ from fleet.export.features import MapFeature, summarise
 from fleet.export.map_files import geojson_text, kml_text
 from fleet.export.mcap_file import McapExport
 from fleet.export.message_source import LiveSource, only, recorded_messages
+from fleet.export.rerun_file import RerunExport, check_rerun
 from fleet.process.logs import report_progress
 from fleet.telemetry.recording.fleet_news import BusMessageReader
 from fleet.telemetry.recording.opening import COMPRESSED, RecordingFile
@@ -33,7 +34,7 @@ EXAMPLES = """
   fleet export monday.kml --from monday.parauav         a recording of `fleet record`
   fleet export seven.geojson --uavs 7 --overwrite
 """
-FORMATS = (".geojson", ".kml", ".mcap")
+FORMATS = (".geojson", ".kml", ".mcap", ".rrd")
 SECONDS = 5.0  # default duration of a live export: every aircraft predicts at least once [s]
 _RECORDING = ".parauav"
 
@@ -92,6 +93,8 @@ def check_arguments(args: argparse.Namespace) -> None:
         raise ValueError(
             f"FILE: found {args.file.name!r}, expected a name that ends in {', '.join(FORMATS)}; rename it"
         )
+    if args.file.suffix.lower() == ".rrd":
+        check_rerun()
     check_parent("FILE", args.file)
     if args.file.is_dir():
         raise ValueError(f"FILE: found a folder {str(args.file)!r}, expected a file; name a file in it")
@@ -125,24 +128,29 @@ def _write(path: Path, messages: Iterator[Message]) -> Counter[str]:
     """Write a temporary file beside the file and rename it when it is complete; return what was written."""
     temporary = path.with_name(f".{path.name}.part")
     try:
-        with temporary.open("wb") as file:
-            counts = _write_mcap(file, messages) if path.suffix.lower() == ".mcap" else _write_map(path, file, messages)
+        counts = _write_content(temporary, messages, path.suffix.lower())
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
     return counts
 
 
-def _write_mcap(file: IO[bytes], messages: Iterator[Message]) -> Counter[str]:
-    with McapExport(file) as export:
+def _write_content(path: Path, messages: Iterator[Message], suffix: str) -> Counter[str]:
+    """Write a file in the format of `suffix`."""
+    if suffix == ".rrd":
+        return _copy(messages, RerunExport(path))
+    with path.open("wb") as file:
+        if suffix == ".mcap":
+            return _copy(messages, McapExport(file))
+        flights = summarise(messages)
+        features: list[MapFeature] = [feature for uav in sorted(flights) for feature in flights[uav].features()]
+        file.write((kml_text(features) if suffix == ".kml" else geojson_text(features)).encode())
+        return Counter(feature.kind for feature in features)
+
+
+def _copy(messages: Iterator[Message], export: McapExport | RerunExport) -> Counter[str]:
+    """Write every message and complete the file."""
+    with export:
         for message in messages:
             export.add(message)
     return export.counts
-
-
-def _write_map(path: Path, file: IO[bytes], messages: Iterator[Message]) -> Counter[str]:
-    flights = summarise(messages)
-    features: list[MapFeature] = [feature for uav in sorted(flights) for feature in flights[uav].features()]
-    text = kml_text(features) if path.suffix.lower() == ".kml" else geojson_text(features)
-    file.write(text.encode())
-    return Counter(feature.kind for feature in features)

@@ -27,6 +27,7 @@ GROUPS = {"plane": ("small",), "mixed": ("small", "quad")}  # taken in turn by t
 STORIES = ("conflict",)
 CHOICES = (*AIRCRAFT, *MULTIROTORS, *GROUPS)
 AIRCRAFT_HELP = "small (11 kg, electric) or plane, c172p, quad, quad_large, mixed: small and quad in turn (small)"
+WIND_FIELDS = ("shared", "independent")
 _DEFAULT_TLOG_S = 300.0  # length of a recording when --for is not given [s]
 
 
@@ -45,6 +46,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         default="2",
         metavar="LEVEL",
         help="MIL-F-8785C: none, light (3), moderate (4), severe (6) or 0..7 (2, typical of a wind of 4 m/s)",
+    )
+    parser.add_argument(
+        "--wind-field",
+        choices=WIND_FIELDS,
+        default=WIND_FIELDS[0],
+        help="one field coherent in space and time for all aircraft, or an independent drift of each (shared)",
     )
     parser.add_argument("--loss", type=float, default=0.02, metavar="SHARE", help="share of frames lost (0.02)")
     parser.add_argument("--for", dest="seconds", type=float, metavar="S", help="duration (unlimited; 300 with --tlog)")
@@ -74,13 +81,16 @@ def run(args: argparse.Namespace) -> int:
     from fleet.simulator.flight import drive  # loads JSBSim and the compiler: not for --help
     from fleet.simulator.flight.story import story_aircraft
     from fleet.simulator.flight.uav import SimulatedUav
+    from fleet.simulator.vehicle.missions import HOME
     from fleet.simulator.vehicle.weather import turbulence_level
+    from fleet.simulator.vehicle.wind_field import CoherentWind
 
     _check(args)
     stop = stop_on_signal()
     level = turbulence_level(args.turbulence)
     host, port = host_and_port("--to", args.to)
-    options = {"autopilot": args.autopilot, "wind": args.wind, "turbulence": level}
+    field = CoherentWind.of_fleet(args.wind, args.seed, HOME) if args.wind_field == "shared" else None
+    options = {"autopilot": args.autopilot, "wind": args.wind, "turbulence": level, "wind_field": field}
     faulty = faults_of(args, args.uavs)
     uavs: list[drive.SimulatedAircraft] = []
     if args.story:

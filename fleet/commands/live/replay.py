@@ -12,10 +12,9 @@ from fleet.config import router_arguments, router_options
 from fleet.process.children import run_until
 from fleet.process.logs import report_progress
 from fleet.report.progress import show_progress
-from fleet.telemetry.recording.ids import IdAllocator
+from fleet.telemetry.recording.ids import MAX_PER_LINK, IdAllocator
 from fleet.telemetry.recording.opening import read_speed
 from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
-from fleet.telemetry.replay.broadcaster import MAX_PER_LINK, Broadcaster, loopback_address, share_out
 
 EXAMPLES = """
   fleet replay flight.tlog
@@ -60,6 +59,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _send(args: argparse.Namespace) -> int:
     """Send every file in a thread of its own; return exit code 1 if one was not sent completely."""
+    from fleet.telemetry.replay.broadcaster import Broadcaster, loopback_address, share_out
+
     broadcasts, destinations = [], []
     for destination, numbers in zip(map(loopback_address, args.to), share_out(args.copies, len(args.to)), strict=True):
         ids = IdAllocator(1, MAX_PER_LINK)

@@ -5,7 +5,7 @@ import json
 import sys
 import threading
 import time
-from math import isfinite
+from math import atan2, degrees, hypot, isfinite
 
 import msgspec
 from rich.console import Console, Group, RenderableType
@@ -18,7 +18,7 @@ from fleet.bus.codec import is_plausible_epoch
 from fleet.bus.session import Bus, connect
 from fleet.cli import stop_on_signal
 from fleet.config import bus_config_from, router_arguments
-from fleet.contract import Claim, FleetRow, FleetState, GatewayCounters, Status, TwinState
+from fleet.contract import Claim, FleetRow, FleetState, GatewayCounters, Status, TwinState, WindField
 from fleet.process.sanitise import printable
 from fleet.report.report_text import id_ranges
 
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
             json.dump(as_objects(rows), sys.stdout, indent=1)
             print()
         else:
-            Console().print(_overview(rows, processes(bus)))
+            Console().print(_overview(rows, processes(bus), wind_text(bus)))
     return 0 if rows else 1
 
 
@@ -65,7 +65,7 @@ def watch(bus: Bus, stop: threading.Event, console: Console) -> int:
         while not stop.is_set():
             rows = fleet_rows(bus)
             heading = Text(f"{time.strftime('%H:%M:%S')}, every {WATCH_S:g} s until Ctrl-C", style="dim")
-            view = Group(heading, _overview(rows, processes(bus)))
+            view = Group(heading, _overview(rows, processes(bus), wind_text(bus)))
             if console.is_terminal:
                 live.update(view, refresh=True)
             else:
@@ -74,11 +74,26 @@ def watch(bus: Bus, stop: threading.Event, console: Console) -> int:
     return 0 if rows else 1
 
 
-def _overview(rows: list[FleetRow], running: list[tuple[str, str, str, str]]) -> RenderableType:
-    """Return the tables of aircraft and processes."""
+def _overview(rows: list[FleetRow], running: list[tuple[str, str, str, str]], wind: str) -> RenderableType:
+    """Return the tables of aircraft and processes, and the wind."""
     empty = Text("no UAV known yet: is a gateway running and an aircraft connected?")
     parts: list[RenderableType] = [fleet_table(rows) if rows else empty]
+    parts += [Text(""), Text(wind)] if wind else []
     return Group(*parts, Text(""), machines(running)) if running else Group(*parts)
+
+
+def wind_text(bus: Bus) -> str:
+    """Query the wind field and describe it; empty without one."""
+    fields = [(stamp, one) for one, stamp in bus.get(WindField) if stamp and is_plausible_epoch(stamp.epoch)]
+    if not fields:
+        return ""
+    newest = max(fields, key=lambda pair: pair[0])[1]
+    north, east = newest.wind
+    direction = degrees(atan2(-east, -north)) % 360.0
+    return (
+        f"wind field: {hypot(north, east):.1f} m/s from {direction:.0f}° at 100 m, ± {newest.wind_sigma:.1f} m/s, "
+        f"estimated from {len(newest.uavs)} aircraft"
+    )
 
 
 def fleet_rows(bus: Bus) -> list[FleetRow]:

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from fleet.access.knock import probe_router
 from fleet.bus.session import Bus, connect, open_router
-from fleet.cli import check_file, check_parent, check_port, host_and_port, stop_on_signal
+from fleet.cli import check_file, check_link, check_parent, check_port, host_and_port, stop_on_signal
 from fleet.commands.live.fly import AIRCRAFT_HELP, AUTOPILOTS, CHOICES, STORIES, fault_arguments, faults_of
 from fleet.commands.live.replay import check_arguments as check_playing
 from fleet.commands.live.replay import replay_link
@@ -116,6 +116,10 @@ def _check(args: argparse.Namespace) -> None:
     faults_of(args, range(args.uavs))
     if args.results and not args.replay:
         raise ValueError("--results: found no --replay, expected a recording made by `fleet record`; name one")
+    for text in args.link:
+        check_link("--link", text)
+    for text in args.forward:
+        check_link("--forward", text)
     for name in args.replay:
         check_file("--replay", name)
     for text in args.baseline:
@@ -126,6 +130,8 @@ def _check(args: argparse.Namespace) -> None:
             check_file(f"--{option}", file if Path(file).exists() else file.rpartition("@")[0] or file, "a raster file")
     if args.map and not args.no_viewer:
         check_file("--map", args.map, "an MBTiles or PMTiles file")
+    if args.keys:
+        check_file("--keys", args.keys, "a file of keys")
     check_port("--port", args.port)
     check_parent("--summary", args.summary)
     if not (args.link or args.replay):

@@ -79,10 +79,9 @@ def build_request(args: argparse.Namespace) -> WhatIf:
     Raises:
         ValueError: when an option is invalid; the text names it.
     """
-    if args.wind is not None and len(args.wind) != 2:
-        raise ValueError(f"--wind: found {len(args.wind)} numbers, expected north and east; write e.g. --wind=6,-2")
-    if args.wind is not None and not np.isfinite(args.wind).all():
-        raise ValueError(f"--wind: found {args.wind}, expected two finite numbers; write e.g. --wind=6,-2")
+    if args.wind is not None and (len(args.wind) != 2 or not np.isfinite(args.wind).all()):
+        given = ",".join(f"{value:g}" for value in args.wind)
+        raise ValueError(f"--wind: found {given!r}, expected two numbers, north and east; write e.g. --wind=6,-2")
     params = {}
     for pair in args.param:
         name, _, value = pair.partition("=")

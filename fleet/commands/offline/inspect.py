@@ -1,5 +1,7 @@
 """Describe the content of a recording and its use for a twin: table, JSON, page to print."""
 
+from __future__ import annotations  # what reads recordings is imported when it is used: `--help` needs none of it
+
 import argparse
 import contextlib
 import json
@@ -8,7 +10,7 @@ import tempfile
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 from rich.console import Console
@@ -20,10 +22,11 @@ from fleet.process.interrupt import interrupt_deferred
 from fleet.process.logs import report_progress
 from fleet.report.progress import show_progress
 from fleet.report.report_text import table
-from fleet.telemetry.inspection.findings import AircraftFindings, FileFindings, LinkTexts, compute_findings
-from fleet.telemetry.inspection.survey import Survey, survey_recording
 from fleet.telemetry.recording.options import NO_OPTIONS, RecordingOptions, add_recording_arguments
-from fleet.telemetry.recording.recordings import Recording
+
+if TYPE_CHECKING:
+    from fleet.telemetry.inspection.findings import AircraftFindings, FileFindings, LinkTexts
+    from fleet.telemetry.inspection.survey import Survey
 
 EXAMPLES = """
   fleet inspect flight.tlog
@@ -48,6 +51,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Show every recording; return exit code 1 if anything was skipped, assumed or unusable, 2 for invalid options."""
+    from fleet.telemetry.inspection.findings import LinkTexts
+
     if args.keys:
         print(describe_keys())
         return 0
@@ -78,6 +83,8 @@ def run(args: argparse.Namespace) -> int:
 
 def describe_keys() -> str:
     """Describe the keys of the JSON."""
+    from fleet.telemetry.inspection.findings import FileFindings
+
     lines = ['{"files": [File, ...]}']
     for part in (FileFindings, *parts_of(FileFindings)):
         lines += ["", f"{part.__name__}: {summary(part)}", *fields_of(part)]
@@ -88,6 +95,10 @@ def inspect_file(
     path: Path, offset: int = 0, options: RecordingOptions = NO_OPTIONS
 ) -> tuple[FileFindings, dict[int, Survey], dict[int, LinkTexts]]:
     """Read one recording; return its findings, with every error as a text, and survey and texts by UAV id."""
+    from fleet.telemetry.inspection.findings import FileFindings, LinkTexts, compute_findings
+    from fleet.telemetry.inspection.survey import survey_recording
+    from fleet.telemetry.recording.recordings import Recording
+
     surveys: dict[int, Survey] = {}
     facts: dict[int, LinkTexts] = {}
     sentences: list[str] = []

@@ -1,7 +1,7 @@
 """One simulated aircraft: flight dynamics, sensors, autopilot and MAVLink interface."""
 
 from collections.abc import Mapping, Sequence
-from math import atan2, pi, sin
+from math import atan2, sin
 from types import MappingProxyType
 
 import numpy as np
@@ -33,7 +33,8 @@ from fleet.simulator.vehicle.jsbsim import Aircraft
 from fleet.simulator.vehicle.missions import HOME, StartState, draw_mission
 from fleet.simulator.vehicle.sensors import Estimate, Sensors, servo_commands, servo_pulses
 from fleet.simulator.vehicle.types import TYPES, FlightSetup, Weather
-from fleet.simulator.vehicle.weather import GaussMarkov
+from fleet.simulator.vehicle.weather import GaussMarkov, fleet_wind_direction
+from fleet.simulator.vehicle.wind_field import CoherentWind, LocalWind
 
 DT = 1 / TICK_HZ
 _INNER, _OUTER = 2, 10  # attitude loop at 50 Hz, guidance at 10 Hz [ticks]
@@ -64,6 +65,7 @@ class SimulatedUav:
         extra_params: Mapping[str, float] = MappingProxyType({}),
         faults: Sequence[Fault] = (),
         setup: FlightSetup | None = None,
+        wind_field: CoherentWind | None = None,
     ):
         """Initialise one aircraft in flight.
 
@@ -79,6 +81,7 @@ class SimulatedUav:
             extra_params: autopilot parameters that override its own
             faults: faults of the aircraft
             setup: conditions of the flight; None: drawn from the seed
+            wind_field: wind of the whole fleet; None: mean wind and a drift of its own, as in the setup
         Raises:
             ValueError: when `uav_id` is outside the MAVLink range.
         """
@@ -88,7 +91,7 @@ class SimulatedUav:
         aircraft_seed = int(np.random.SeedSequence((seed, uav_id)).generate_state(1)[0])
         if setup is None:
             kind = instrumented_type(aircraft) if faults else TYPES[aircraft]
-            weather = Weather(wind, np.random.default_rng((seed, 5)).uniform(-pi, pi), turbulence)
+            weather = Weather(wind, fleet_wind_direction(seed), turbulence)
             plan = plan or draw_mission(aircraft_seed, kind.cruise, origin, kind.geometry, autopilot)
             setup = FlightSetup(aircraft_seed, kind, plan, weather)
         rng = np.random.default_rng((setup.flight_seed, 4))
@@ -106,7 +109,8 @@ class SimulatedUav:
         self._mission_seq = start.seq  # current mission item
         self._target: np.ndarray | None = None  # commanded point, NED, (3,) [m]
         self._speed: tuple[float, float] | None = None  # commanded airspeed, and that of the mission then [m/s]
-        self._wind = setup.weather.wind(rng, DT * _OUTER)
+        drift = setup.weather.wind(rng, DT * _OUTER)
+        self._wind = drift if wind_field is None else LocalWind(wind_field, origin, DT * _OUTER)
         scale_rng = altitude_rng = self._jitter = None
         dialect = DIALECTS[autopilot]
         if setup.is_exam:
@@ -120,7 +124,7 @@ class SimulatedUav:
         self._endpoint = MavlinkEndpoint(uav_id + 1, self.items, self.params, dialect)
         gusts = (setup.flight_seed, setup.weather.w20_fps)
         self.aircraft = Aircraft(origin, aircraft_seed, setup.weather.severity, setup.kind, gusts)
-        mean_wind = self._wind.step(-start.p[2])
+        mean_wind = self._wind.step(start.p)
         self._wind_estimate = self._estimate_wind(mean_wind)
         self._phi_c = 0.0
         self._theta_c, delta_e, self._delta_t = self.aircraft.start(start.p, start.psi, setup.kind.cruise, mean_wind)
@@ -250,7 +254,7 @@ class SimulatedUav:
     def _update_wind(self) -> None:
         """Update the wind and its estimate."""
         height = -float(self.estimate.p[2])
-        wind = (*self._wind.step(height), 0.0)
+        wind = (*self._wind.step(self.estimate.p), 0.0)
         if self.fault_set is not None:
             w_n, w_e, w_d = wind + self.fault_set.wind(self.tick * DT, height)
             wind = float(w_n), float(w_e), float(w_d)

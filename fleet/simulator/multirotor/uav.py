@@ -5,7 +5,7 @@ It arms a few seconds after the start, flies its mission, lands, disarms, and st
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from math import hypot, pi
+from math import hypot
 from types import MappingProxyType
 from typing import Any
 
@@ -34,6 +34,8 @@ from fleet.simulator.multirotor.tuning import motor_inputs, motor_pulses, tuned_
 from fleet.simulator.vehicle.missions import HOME
 from fleet.simulator.vehicle.sensors import Estimate, Sensors
 from fleet.simulator.vehicle.types import Weather
+from fleet.simulator.vehicle.weather import fleet_wind_direction
+from fleet.simulator.vehicle.wind_field import CoherentWind, LocalWind
 
 DT = 1 / TICK_HZ
 _OUTER = 2  # position control at 50 Hz [ticks]
@@ -58,6 +60,7 @@ class SimulatedMultirotor:
         aircraft: str = "quad",
         mission: MultirotorMission | None = None,
         extra_params: Mapping[str, float] = MappingProxyType({}),
+        wind_field: CoherentWind | None = None,
     ):
         """Place one aircraft at its home.
 
@@ -71,6 +74,7 @@ class SimulatedMultirotor:
             aircraft: name in `airframes.TYPES`
             mission: mission and home; None: random
             extra_params: autopilot parameters that override its own
+            wind_field: wind of the whole fleet; None: mean wind and a drift of its own
         Raises:
             ValueError: when `uav_id` is outside the MAVLink range.
         """
@@ -87,9 +91,10 @@ class SimulatedMultirotor:
         cruise = self.params["MPC_XY_CRUISE"] if is_px4 else 0.01 * self.params["WPNAV_SPEED"]
         self.items, self.origin = mission or draw_mission(aircraft_seed, autopilot, cruise, origin)
         kind, motors = draw_airframe(TYPES[aircraft], np.random.default_rng((aircraft_seed, 1)))
-        weather = Weather(wind, np.random.default_rng((seed, 5)).uniform(-pi, pi), turbulence)
+        weather = Weather(wind, fleet_wind_direction(seed), turbulence)
         self.vehicle = RotorBody(kind, motors, rng, weather.w20_fps * 0.3048)
-        self._wind = weather.wind(rng, DT * 10)
+        drift = weather.wind(rng, DT * 10)
+        self._wind = drift if wind_field is None else LocalWind(wind_field, self.origin, DT * 10)
         self._sensors = Sensors(rng, DT)
         self._endpoint = MultirotorEndpoint(uav_id + 1, self.items, self.params, DIALECTS[autopilot])
         self._sequence = TaskSequence(self.items, self.origin, 0 if is_px4 else 1)
@@ -176,7 +181,7 @@ class SimulatedMultirotor:
 
     def _tick(self) -> list[bytes]:
         if self.tick % 10 == 0:
-            self.vehicle.set_wind(*self._wind.step(-float(self.estimate.p[2])))
+            self.vehicle.set_wind(*self._wind.step(self.estimate.p))
         self._control()
         state: Callable[[], Any] = self._telemetry_state  # of this vehicle class
         frames = [] if self.silent or self.link_lost else self._endpoint.telemetry(self.tick, state)

@@ -194,10 +194,11 @@ class Aircraft:
         """Return the state in SI, NED and FRD."""
         x = np.array([getter() for getter in self._getters])
         origin = self._origin
+        d_lon = x[1] - np.radians(origin.lon_e7 * 1e-7)  # JSBSim's longitude jumps at 180 degrees
         p = np.array(
             [
                 (x[0] - np.radians(origin.lat_e7 * 1e-7)) * self._per_rad[0],
-                (x[1] - np.radians(origin.lon_e7 * 1e-7)) * self._per_rad[1],
+                (d_lon - 2 * np.pi * np.rint(d_lon / (2 * np.pi))) * self._per_rad[1],
                 origin.alt_mm * 1e-3 - x[2] * FT,
             ]
         )

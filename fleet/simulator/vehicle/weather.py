@@ -7,6 +7,7 @@ import numpy as np
 FT = 0.3048  # [m]
 _W20_FPS = (0.0, 8.0, 16.0, 25.0, 50.0, 62.0, 75.0, 88.0)
 REFERENCE_M = 100.0  # reference height of the mean wind
+MIN_HEIGHT_M = 5.0  # height above ground below which the profiles of the mean wind are constant
 HELLMANN = 0.143  # exponent of the mean wind over height, over open ground
 
 
@@ -66,11 +67,16 @@ class MeanWind:
         sigma = drift * (0.12 * mean + 0.1) if mean > 0 else 0.0
         self._drift = GaussMarkov(rng, np.full(2, sigma), np.full(2, 90.0), dt)
 
-    def step(self, height: float) -> tuple[float, float]:
-        """Advance by dt and return the wind, NED north and east, at `height` above ground [m/s]."""
-        speed = self._mean * (max(height, 5.0) / REFERENCE_M) ** self._exponent
+    def step(self, p: np.ndarray) -> tuple[float, float]:
+        """Advance by dt and return the wind, NED north and east, at p NED from the ground, (3,) [m], [m/s]."""
+        speed = self._mean * (max(-float(p[2]), MIN_HEIGHT_M) / REFERENCE_M) ** self._exponent
         d_n, d_e = self._drift.step()
         return speed * cos(self._towards) + d_n, speed * sin(self._towards) + d_e
+
+
+def fleet_wind_direction(seed: int) -> float:
+    """Return the direction to which the mean wind of all aircraft of a seed blows, clockwise from north [rad]."""
+    return float(np.random.default_rng((seed, 5)).uniform(-pi, pi))
 
 
 def turbulence_level(text: str) -> int:

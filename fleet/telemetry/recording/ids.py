@@ -3,6 +3,8 @@
 from collections.abc import Hashable
 from itertools import chain
 
+MAX_PER_LINK = 250  # system ids 1 to 250; higher ones are for ground stations
+
 
 class IdAllocator:
     """Allocator of ids.

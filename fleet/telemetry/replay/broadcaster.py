@@ -71,7 +71,6 @@ def send_datagrams(connection: socket.socket, data: np.ndarray, start: np.ndarra
 SystemFrames = tuple[np.ndarray, FrameBlock]
 """Frames of one aircraft rewritten for each copy, (n, b) uint8, and their positions; each frame is a datagram."""
 STEP_S = 0.05  # recorded time between two batches of datagrams [s]
-MAX_PER_LINK = 250  # system ids 1 to 250; higher ones are for ground stations
 
 
 def share_out(copies: int, places: int) -> list[range]:

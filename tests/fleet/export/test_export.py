@@ -229,6 +229,59 @@ def test_the_scene_of_a_prediction_is_where_the_map_has_it(recording: Path, tmp_
     assert SCHEMAS["foxglove.SceneUpdate"]["title"] == "foxglove.SceneUpdate"
 
 
+# --- Rerun -----------------------------------------------------------------------------------------------------------
+
+
+def rerun_columns(path: Path) -> dict[str, dict[str, list[Any]]]:
+    """Read a recording with Rerun's own reader: the columns of each entity, rows in order of time."""
+    chunk = pytest.importorskip("rerun.chunk", reason="rerun-sdk is absent: pip install -r requirements-rerun.lock")
+    (store,) = chunk.RrdReader(path).recordings()
+    assert store.application_id == "ParaUAV"
+    entities: dict[str, dict[str, list[Any]]] = {}
+    for part in chunk.RrdReader(path).stream().to_chunks():
+        columns = entities.setdefault(part.entity_path, {})
+        rows = part.to_record_batch()
+        for name, column in zip(rows.schema.names, rows.columns, strict=True):
+            if name == "time":
+                column = column.cast("int64")
+            columns.setdefault(name, []).extend(column.to_pylist())
+    return entities
+
+
+def test_rerun_opens_with_its_library_and_has_the_paths_of_the_map(recording: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rerun", reason="rerun-sdk is absent: pip install -r requirements-rerun.lock")
+    entities = rerun_columns(exported(recording, tmp_path, "flight.rrd"))
+    (tmp_path / "flight.rrd").unlink()
+    features = geojson.loads(exported(recording, tmp_path, "now.geojson").read_text()).features
+    newest = {(f.properties["uav"], f.properties["kind"]): f for f in features}
+    assert "/uav/1/prediction/map" not in entities  # identifying: no prediction
+    for uav in (0, 2):
+        fixes = entities[f"/uav/{uav}/location"]
+        assert len(fixes["time"]) > 10 * (SECONDS - 1) and min(fixes["time"]) >= (T - 1) * 1e9
+        lon, lat, _ = newest[uav, "position"].geometry.coordinates
+        assert fixes["GeoPoints:positions"][-1][0] == pytest.approx([lat, lon], abs=1e-5)  # at most 1 s apart
+        lines = entities[f"/uav/{uav}/prediction/map"]
+        last = int(np.argmax(lines["time"]))
+        (line,) = lines["GeoLineStrings:line_strings"][last]
+        path = newest[uav, "predicted_path"].geometry.coordinates
+        assert np.array(line)[[0, -1]] == pytest.approx(np.array(path)[[0, -1], 1::-1], abs=1e-6)
+        sizes = np.array(entities[f"/uav/{uav}/prediction/region"]["Ellipsoids3D:half_sizes"][last])
+        assert sizes[-1] == pytest.approx(newest[uav, "prediction_region"].properties["half_axes_m"], abs=0.01)
+        horizon = entities[f"/uav/{uav}/horizon_s"]["Scalars:scalars"][last]
+        cleared = entities[f"/uav/{uav}/prediction"]  # the newest prediction ends at its horizon, and no earlier one
+        assert cleared["Clear:is_recursive"] == [[True]]
+        assert cleared["time"] == pytest.approx([lines["time"][last] + horizon[0] * 1e9], abs=1e6)
+    assert len(entities["/alerts"]["TextLog:text"]) == 1
+
+
+def test_a_rerun_file_without_its_package_is_refused_with_the_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("fleet.export.rerun_file.find_spec", lambda name: None)
+    assert cli.main(["export", str(tmp_path / "x.rrd")]) == 2
+    assert "found no package rerun-sdk" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
 # --- invalid content -------------------------------------------------------------------------------------------------
 
 

@@ -164,7 +164,7 @@ def test_one_seed_one_flight_two_seeds_two() -> None:
 
 
 def test_aircraft_of_one_fleet_share_the_mean_wind() -> None:
-    drawn = [SimulatedUav(i, 5, wind=6.0, turbulence=0)._wind.step(100.0) for i in range(3)]
+    drawn = [SimulatedUav(i, 5, wind=6.0, turbulence=0)._wind.step(np.array([0.0, 0.0, -100.0])) for i in range(3)]
     assert np.std(drawn, axis=0).max() < 2.0
     assert np.mean(np.hypot(*np.transpose(drawn))) == pytest.approx(6.0, abs=2.0)
 
@@ -180,8 +180,9 @@ def test_gauss_markov_has_its_deviation_and_memory() -> None:
 
 def test_wind_grows_with_height_and_can_be_calm() -> None:
     wind = MeanWind(8.0, np.random.default_rng(3), 0.1, towards=0.0)
-    assert wind.step(300.0)[0] > wind.step(20.0)[0] > 2
-    assert MeanWind(0.0, np.random.default_rng(3), 0.1).step(100.0) == (0.0, 0.0)
+    high, low = (wind.step(np.array([0.0, 0.0, -height]))[0] for height in (300.0, 20.0))
+    assert high > low > 2
+    assert MeanWind(0.0, np.random.default_rng(3), 0.1).step(np.array([0.0, 0.0, -100.0])) == (0.0, 0.0)
 
 
 def test_sensor_errors_are_small_but_there() -> None:

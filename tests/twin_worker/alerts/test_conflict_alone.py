@@ -331,13 +331,13 @@ def test_home_is_item_0_or_where_it_stood() -> None:
 
 
 def test_a_short_horizon_must_last_and_be_measured() -> None:
-    short = straight(7, horizon_s=6.0, coverage_n=40)
+    short = straight(7, horizon_s=6.0, early_exceedance=0.7, coverage_n=40)
     assert told(flying(), short, 15) == [] and told(flying(), msgspec.structs.replace(short, coverage_n=5), 60) == []
     twin = flying()
     (alert,) = told(twin, short, 30)
-    assert alert.kind is AlertKind.SHORT_HORIZON and alert.t == T + 15 and "6 s" in alert.sentence
-    assert told(twin, msgspec.structs.replace(short, horizon_s=11.0), 30, start=30) == []  # not yet long enough
-    (over,) = told(twin, msgspec.structs.replace(short, horizon_s=30.0), 30, start=60)
+    assert alert.kind is AlertKind.SHORT_HORIZON and alert.t == T + 15 and "probability of 70%" in alert.sentence
+    assert told(twin, msgspec.structs.replace(short, early_exceedance=0.4), 30, start=30) == []  # not yet low enough
+    (over,) = told(twin, msgspec.structs.replace(short, early_exceedance=0.1), 30, start=60)
     assert not over.active
 
 
@@ -365,7 +365,9 @@ def test_hostile_numbers_raise_nothing() -> None:
     twin.onboard.params = Params(uav=7, t=T, values={"FENCE_ENABLE": 1.0, "FENCE_RADIUS": NAN, "TECS_CLMB_MAX": NAN})
     nowhere = item(0, alt_m=1e30)
     twin.onboard.mission = msgspec.structs.replace(twin.onboard.mission, items=(nowhere, item(1, alt_m=NAN)))
-    broken = msgspec.structs.replace(SINKING, path=Array.of(np.full((3, 3), NAN)), horizon_s=NAN, coverage_n=99)
+    broken = msgspec.structs.replace(
+        SINKING, path=Array.of(np.full((3, 3), NAN)), horizon_s=NAN, early_exceedance=NAN, coverage_n=99
+    )
     assert told(twin, broken, 30) == []
 
 

@@ -11,6 +11,7 @@ from twin_worker.confidence.prediction_log import CAPACITY
 from twin_worker.confidence.table_files import TableSet
 from twin_worker.confidence.tube_and_horizon import (
     AHEAD,
+    EARLY_S,
     ERROR_LIMIT,
     ConfidenceTracker,
     PointForecast,
@@ -177,11 +178,11 @@ def tables() -> TableSet:
     return TableSet({GROUP: fit(made_up.scored(10, 30, seed=1), GROUP)})
 
 
-def flight(record: ConfidenceTracker, loud: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def flight(record: ConfidenceTracker, loud: np.ndarray, seed: int) -> np.ndarray:
     """Fly straight on, a prediction every 5 s, with errors so many times those of the tables' flights.
 
     Returns:
-        share of look-aheads inside the tube drawn, horizon, and first passage of each
+        share of look-aheads inside the tube drawn, horizon, first passage, and probability of an early one, (4, n)
     """
     rng, found = np.random.default_rng(seed), []
     for k, times in enumerate(loud):
@@ -192,15 +193,16 @@ def flight(record: ConfidenceTracker, loud: np.ndarray, seed: int) -> tuple[np.n
         record.add(made, trust)
         miss = axes_error(made.path, made.path + error)
         passage, _ = first_passage(miss[:, 3] / path_length(LINE, V))
-        found.append((np.mean((miss[1:, :3] <= trust.tube[1:]).all(axis=1)), trust.horizon_s, passage))
+        found.append(
+            (np.mean((miss[1:, :3] <= trust.tube[1:]).all(axis=1)), trust.horizon_s, passage, trust.early_exceedance)
+        )
         at = t + np.arange(0.0, 5.1, 0.5)
         record.evaluate(at, np.column_stack([V * at, 0 * at, 0 * at - 100.0]))
-    inside, horizon, passage = np.array(found).T
-    return inside, horizon, passage
+    return np.array(found).T
 
 
 def test_the_tube_holds_nine_of_ten_and_so_does_the_horizon(tables):
-    inside, horizon, passage = flight(ConfidenceTracker(tables), np.ones(300), seed=8)
+    inside, horizon, passage, _ = flight(ConfidenceTracker(tables), np.ones(300), seed=8)
     assert inside.mean() == pytest.approx(0.9, abs=0.03)
     assert np.mean(passage >= horizon) >= 0.9
 
@@ -208,7 +210,7 @@ def test_the_tube_holds_nine_of_ten_and_so_does_the_horizon(tables):
 @pytest.mark.parametrize(("times", "alone"), [(2.0, 0.75), (0.4, 0.97)])
 def test_it_recovers_when_errors_change(tables, times, alone):
     record = ConfidenceTracker(tables)
-    inside, horizon, passage = flight(record, np.r_[np.ones(60), np.full(180, times)], seed=9)
+    inside, horizon, passage, _ = flight(record, np.r_[np.ones(60), np.full(180, times)], seed=9)
     first, late = inside[60:70].mean(), inside[120:].mean()
     assert first < alone if times > 1 else first > alone
     assert late == pytest.approx(0.9, abs=0.04)
@@ -219,7 +221,7 @@ def test_it_recovers_when_errors_change(tables, times, alone):
 def test_calm_air_narrows_the_region_along_the_path_only(tables):
     """A wind that does not drift: errors along are a fifth of those of the tables' flights, the others as usual."""
     record = ConfidenceTracker(tables)
-    inside, _, _ = flight(record, np.tile([0.2, 1.0, 1.0], (150, 1)), seed=14)
+    inside, *_ = flight(record, np.tile([0.2, 1.0, 1.0], (150, 1)), seed=14)
     made = PointForecast(750.0, "hybrid", GROUP, AHEAD, moved(750), V, made_up.GROWTH)
     ratio = record.confidence_of(made).tube / ConfidenceTracker(tables).confidence_of(made).tube
     columns = np.searchsorted(AHEAD, [5, 16, 30, 60])
@@ -229,7 +231,7 @@ def test_calm_air_narrows_the_region_along_the_path_only(tables):
 
 @pytest.mark.parametrize("times", [0.3, 1.0, 5.0])
 def test_untaught_it_learns_in_flight(times):
-    inside, _, _ = flight(ConfidenceTracker(TableSet({})), np.full(240, times), seed=10)
+    inside, *_ = flight(ConfidenceTracker(TableSet({})), np.full(240, times), seed=10)
     assert inside[120:].mean() == pytest.approx(0.9, abs=0.06)
 
 
@@ -250,6 +252,13 @@ def test_groups_learn_apart(tables):
 
 
 # --- the horizon -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("times", [1.0, 4.0])
+def test_an_early_error_is_as_probable_as_it_is_frequent(tables, times):
+    _, _, passage, early = flight(ConfidenceTracker(tables), np.full(240, times), seed=15)
+    happened = (passage[120:] < EARLY_S).mean()
+    assert 0.02 < happened < 0.6 and early[120:].mean() == pytest.approx(happened, abs=0.08)
 
 
 def test_the_horizon_tells_easy_minutes_from_hard_ones(tables):

@@ -15,7 +15,7 @@ from twin_worker.diagnosis.inference.isolation.decision import CLASS_PROBABILITY
 from twin_worker.diagnosis.inference.isolation.evidence import TURBULENCE, Explanation, Weights, load_table
 from twin_worker.diagnosis.inference.isolation.isolate import ScoredHypothesis
 from twin_worker.diagnosis.inference.isolation.onset import onset_posterior
-from twin_worker.diagnosis.inference.isolation.search import _variance_onset
+from twin_worker.diagnosis.inference.isolation.search import _variance_onset, chance_gain, turbulence_evidence
 from twin_worker.diagnosis.inference.isolation.unmodelled import Anomaly, ChannelEquation, find_tones
 from twin_worker.diagnosis.inference.report import ReportOutcome
 from twin_worker.diagnosis.inference.validation.cross_validate import CrossValidation
@@ -49,6 +49,39 @@ def test_a_gain_that_nominal_flights_reach_is_no_evidence() -> None:
     loss = explained({"force_x": 600.0}, "thrust_loss")
     assert decide([loss], WEIGHTS).none < 0.05
     assert decide([replace(loss, chance=500.0)], WEIGHTS).none > 0.95
+
+
+def test_the_chance_of_an_effect_is_that_of_the_same_kind_of_onset() -> None:
+    """Constant differences between nominal flights say nothing of changes in flight."""
+    chance = {"drag_increase|always": 600.0, "drag_increase|step": 20.0, "actuator_lag:aileron|step": 70.0}
+    drag = FaultHypothesis(catalogue()["drag_increase"], "", (0.02,))
+    assert chance_gain(chance, drag, vane=True) == 600.0
+    assert chance_gain(chance, replace(drag, onset=STEP), vane=True) == 20.0
+    loss = FaultHypothesis(catalogue()["control_effectiveness_loss"], "aileron", (0.3,), STEP)
+    assert chance_gain(chance, loss, vane=True) == 70.0  # of the same surface
+
+
+def residuals_of(scatter: float, offset: float = 0.0, noise: float = 1.0) -> Any:
+    """Whitened residuals of a flight; in the air channels with this scatter and offset, relative to its own noise."""
+    air = [CHANNELS.index(name) for name in ("side", "lift", "airspeed")]
+    e = np.random.default_rng(3).standard_normal((1000, len(CHANNELS)))
+    e[:, air] = scatter * e[:, air] + offset
+    own = unit_noise()
+    own.sigma[air] = noise
+    base = SimpleNamespace(vane=True, noise=unit_noise(), usual=np.ones(len(CHANNELS)))
+    zero = np.zeros((*e.shape, 1))
+    t = np.arange(1000) * 0.2
+    return SimpleNamespace(
+        base=base, e=e, Jn=zero, xn=np.zeros(1), ok=np.ones(1000, bool), noise=own, modelled=SimpleNamespace(t=t)
+    )
+
+
+def test_turbulence_is_scatter_beyond_that_of_nominal_flights() -> None:
+    """Not relative to the noise of the flight itself, which turbulence raises, and not a lasting difference."""
+    gain, ratio, onset = turbulence_evidence(residuals_of(1.0, noise=3.0))
+    assert gain.sum() > 1000.0 and ratio == pytest.approx(9.0, rel=0.1) and onset is None
+    assert not turbulence_evidence(residuals_of(1.0))[0].any()
+    assert not turbulence_evidence(residuals_of(1.0, offset=3.0))[0].any()
 
 
 def test_the_class_holds_what_is_close_and_leaves_out_what_is_not() -> None:
@@ -164,6 +197,7 @@ def quiet(seed: int) -> Any:
         xn=np.zeros(1),
         Ann=np.eye(1),
         bn=np.zeros(1),
+        whiten_onset_slopes=lambda slopes: np.stack([slopes, slopes]),  # white noise
     )
 
 
@@ -222,8 +256,8 @@ def test_a_hum_is_heard_in_its_channel_and_noise_is_none(hertz: float) -> None:
 
 def test_a_constant_term_does_not_drown_the_others() -> None:
     rate = np.random.default_rng(2).standard_normal(len(T))
-    sight = with_added(quiet(3), "gyro_yaw", 0.8 * rate * (T > ONSET_S))
-    equation = ChannelEquation(sight, "gyro_yaw", {"1": np.ones_like(T), "rate": rate})
+    sight = with_added(quiet(3), "airspeed", 0.8 * rate * (T > ONSET_S))
+    equation = ChannelEquation(sight, "airspeed", {"1": np.ones_like(T), "lagging": rate})
     (_, alone), (worth, t0, _) = next(equation.gain_per_term()), equation.gain_of_all()
     assert alone[0] > 250.0 and worth > alone[0] - 20.0 and abs(t0 - ONSET_S) < 3.0
     assert equation.gain_in_flight()[0] > 100.0

@@ -10,8 +10,8 @@ from twin_worker.diagnosis.baseline.own_past import OwnPast, find_output_faults
 from twin_worker.diagnosis.data.card import UNKNOWN
 from twin_worker.diagnosis.data.flight import read_flights
 from twin_worker.diagnosis.data.outputs import ServoOutputs
-from twin_worker.diagnosis.inference.output_faults import FrozenOutput, find_frozen_outputs
-from twin_worker.diagnosis.inference.report import OUTPUT_CHANNEL, ReportOutcome
+from twin_worker.diagnosis.inference.output_faults import FrozenOutput, find_frozen_outputs, with_frozen_outputs
+from twin_worker.diagnosis.inference.report import OUTPUT_CHANNEL, FigureSeries, Report, ReportOutcome
 
 TRUSTED_S, FAULT_S, END_S, STEP_S = 60.0, 90.0, 120.0, 0.25
 PARAMS = {f"SERVO{n}_FUNCTION": float(function) for n, function in ((1, 4), (2, 19), (3, 70), (4, 21))}
@@ -26,6 +26,10 @@ FAILURES = {  # recording -> surface and onset after the first frame [s]
     "alfa_09-11-15-06-34_3_rudder_left_failure": ("rudder", 60.2),
     "alfa_10-05-14-37-22_3_left_aileron_failure": ("aileron", 72.4),
 }
+NO_MISMATCH = Report(
+    *("flight", ReportOutcome.NONE, "", (), {}, {}, np.nan, np.nan, np.nan, np.nan, np.nan, np.nan, ("", ()), {}),
+    *((), (), FigureSeries(*(np.zeros(0),) * 9)),
+)
 HEALTHY = (  # the quadplane changes to hover, the last one lands
     *("alfa_07-30-16-39-00_3_no_failure.tlog.xz", "alfa_10-05-15-52-12_1_no_failure.tlog.xz"),
     *("../sitl/s09_quadplane_nominal.tlog.xz", "px4_proto_flt09.ulg.xz"),
@@ -111,6 +115,8 @@ def test_a_throttle_at_idle_is_cut_unless_its_law_brings_it_there() -> None:
     outputs = frozen_at(flown(3), 2, 1000.0)
     (found,) = find_frozen_outputs(outputs, TRUSTED_S)
     assert found.surface == "throttle" and found.pulse == 1000.0 and found.since == pytest.approx(FAULT_S, abs=0.5)
+    report = with_frozen_outputs(NO_MISMATCH, [found])
+    assert report.outcome is ReportOutcome.NAMED and report.sentence.startswith("thrust_loss: throttle output 3 is cut")
     energy = outputs.errors[:, 2].copy()
     energy[outputs.t >= FAULT_S] -= 30.0  # a descent is commanded
     signals = (*outputs.signals[:2], np.column_stack([energy, outputs.signals[2][:, 1:]]))
@@ -120,11 +126,25 @@ def test_a_throttle_at_idle_is_cut_unless_its_law_brings_it_there() -> None:
 
 def test_a_throttle_at_full_power_is_frozen_unless_its_law_brings_it_there() -> None:
     outputs = frozen_at(flown(4), 2, 2000.0)
-    assert [one.surface for one in find_frozen_outputs(outputs, TRUSTED_S)] == ["throttle"]
+    found = find_frozen_outputs(outputs, TRUSTED_S)
+    assert [one.surface for one in found] == ["throttle"]
+    report = with_frozen_outputs(NO_MISMATCH, found)  # no thrust is lost
+    assert report.outcome is ReportOutcome.UNKNOWN and "mismatch in throttle output 3 (90-120 s)" in report.sentence
     energy = outputs.errors[:, 2].copy()
     energy[outputs.t >= FAULT_S] += 30.0
     signals = (*outputs.signals[:2], np.column_stack([energy, outputs.signals[2][:, 1:]]))
     assert find_frozen_outputs(replace(outputs, signals=signals), TRUSTED_S) == []
+
+
+def test_a_throttle_whose_law_has_just_failed_is_not_judged_at_a_limit() -> None:
+    """In the seconds before, the output jumped by hundreds of microseconds that its law does not predict."""
+    outputs = frozen_at(flown(4), 2, 2000.0)
+    assert find_frozen_outputs(outputs, TRUSTED_S) != []
+    pulses, before = outputs.pulses.copy(), (outputs.t > FAULT_S - 6.0) & (outputs.t < FAULT_S)
+    pulses[before, 2] += 400.0 * np.sign(np.sin(2 * np.pi * outputs.t[before] / 6.0))
+    noise = np.random.default_rng(6).integers(1, 99, before.sum())
+    pulses[before, 2] = np.clip(pulses[before, 2], 1000.0 + noise, 2000.0 - noise)
+    assert find_frozen_outputs(replace(outputs, pulses=pulses), TRUSTED_S) == []
 
 
 def test_a_demand_far_beyond_what_the_trusted_flight_excited_is_no_evidence() -> None:

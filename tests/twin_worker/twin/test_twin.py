@@ -93,6 +93,7 @@ def test_the_row_of_the_fleet_table(twin):
     assert (row.uav, row.state, row.worker, row.epoch) == (1, twin.prediction.state, "ff", 3)
     assert row.sample_age_s == pytest.approx(0.5)
     assert row.prediction_age_s is not None and row.prediction_age_s >= 0.5
+    assert row.horizon_s == twin.prediction.latest.horizon_s > 0.0  # as in the message of the same prediction
     empty = fleet_row(Twin.of(9), 5.0)
     assert (empty.sample_age_s, empty.prediction_age_s, empty.t10_s) == (None, None, None)
 

@@ -15,9 +15,10 @@ from pmtiles.tile import Compression, TileType, zxy_to_tileid
 from pmtiles.writer import Writer
 
 from fleet.frames import Origin
-from tests.support.pretend_feed import HOME
+from tests.support import pretend_feed
+from tests.support.pretend_feed import HOME, Clock, T, feed_of
 from viewer.scene.map import tiles
-from viewer.scene.map.raster import read_raster, to_mercator
+from viewer.scene.map.raster import MERCATOR, Raster, read_raster, to_mercator, to_utm
 from viewer.scene.map.tiles import TILE_PX, open_tiles
 from viewer.scene.map.world import FILE, ground_lines, overview_html, world
 from viewer.scene.terrain import TerrainLayer, spread
@@ -115,6 +116,50 @@ def test_lines_go_on_across_the_180th_meridian() -> None:
     coast, _ = ground_lines(SceneFrame(Origin(-168_000_000, 1_799_900_000, 0)))
     assert (coast[..., 0] < -1).any() and (coast[..., 0] > 1).any()
     assert np.linalg.norm(np.diff(coast, axis=1), axis=-1).max() * UNIT_M < 50_000
+
+
+FIJI = Origin(-168_000_000, 1_799_999_000, 0)  # 10.6 m west of the 180 degree meridian
+
+
+def test_a_raster_goes_on_across_the_180th_meridian() -> None:
+    """Heights that grow eastwards by 1 m per step of 0.01 degrees, in degrees and in the square of web maps."""
+    lat, lon = np.full(3, -16.8), np.array([179.95, 180.0, -179.95])
+    columns = np.arange(21.0)[None, :].repeat(3, axis=0)
+    degrees = Raster("dem", columns, np.array([[0.01, 0, 179.9], [0, -0.1, -16.7]]))
+    assert degrees.sample(lat, lon) == pytest.approx([5, 10, 15], abs=1e-3)
+    west = Raster("dem", columns, np.array([[0.01, 0, -180.1], [0, -0.1, -16.7]]))
+    assert west.sample(lat, lon) == pytest.approx([5, 10, 15], abs=1e-3)
+    _, y = to_mercator(np.array(-16.8), np.array(0.0))
+    tiles = Raster("map", columns, np.array([[0.01 / 360, 0, 179.9 / 360 + 0.5], [0, 1e-4, float(y) - 1e-4]]), MERCATOR)
+    assert tiles.sample(lat, lon) == pytest.approx([5, 10, 15], abs=1e-3)
+    x, _ = to_utm(np.array([-16.8, -16.8]), np.array([179.999, -179.999]), 60, north=False)
+    assert np.diff(x) == pytest.approx(0.002 * 111_320 * np.cos(np.radians(16.8)), rel=2e-3)
+
+
+def drawn_at(home: Origin, monkeypatch: pytest.MonkeyPatch) -> np.ndarray:
+    """Fly six aircraft around a place: all points of tracks, routes and predictions in the scene, (n, 3) [10 m]."""
+    monkeypatch.setattr(pretend_feed, "HOME", home)
+    clock = Clock()
+    feed, fleet, _ = feed_of(clock, 6)
+    for k in range(1, 150):
+        clock.now += 0.2
+        fleet.advance(T + k / 5)
+        feed.poll()
+    frame = feed.scene_frame
+    assert frame is not None
+    parts = []
+    for vehicle in feed.all():
+        parts.append(feed.track(vehicle)[:, 1:4])
+        items = [item for item in fleet.uavs[vehicle.uav].mission(T).items if item.lat_e7]
+        parts.append(frame.from_geodetic(*np.array([(i.lat_e7, i.lon_e7, i.alt_m * 1e3) for i in items]).T))
+        if vehicle.forecast is not None:
+            parts.append(np.array([vehicle.forecast.position_at(ahead) for ahead in (0.0, 5.0, 20.0, 40.0)]))
+    return np.concatenate(parts)
+
+
+def test_tracks_routes_and_predictions_are_the_same_on_the_180th_meridian(monkeypatch: pytest.MonkeyPatch) -> None:
+    elsewhere, across = (drawn_at(Origin(FIJI.lat_e7, lon, 0), monkeypatch) for lon in (85_455_940, FIJI.lon_e7))
+    assert len(across) > 300 and across == pytest.approx(elsewhere, abs=0.005)  # 5 cm: rounded to 1e-7 degrees
 
 
 @pytest.mark.parametrize("palette", [DARK, LIGHT], ids=["dark", "light"])

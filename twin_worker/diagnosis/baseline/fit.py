@@ -9,7 +9,7 @@ from twin_worker.diagnosis.data.card import AircraftCard
 from twin_worker.diagnosis.data.flight import FlightData
 from twin_worker.diagnosis.model import equations as eq
 from twin_worker.diagnosis.model.baseline import ActuatorTiming, Baseline
-from twin_worker.diagnosis.model.residual import RHO_0, EquationTerms, ModelledFlight
+from twin_worker.diagnosis.model.residual import EquationTerms, ModelledFlight
 from twin_worker.diagnosis.model.weather import RAW_ROWS_PER_SAMPLE, airspeed_scale, fit_wind, weather_hypotheses
 from twin_worker.numerics.ridge_regression import solve_ridge
 
@@ -199,7 +199,7 @@ def _refit_airspeed_scale(all_terms: list[EquationTerms]) -> float:
     """Fit the ratio of reported to indicated airspeed."""
     if any("Va" not in m.modelled.flight.readings for m in all_terms):
         return 1.0
-    pairs = [np.stack([m.flow.Va * np.sqrt(m.flow.rho / RHO_0), m.measured["airspeed"]]) for m in all_terms]
+    pairs = [np.stack([m.flow.Va * np.sqrt(m.flow.rho / eq.RHO_0), m.measured["airspeed"]]) for m in all_terms]
     x, y = np.concatenate([pair[:, m.modelled.ok] for pair, m in zip(pairs, all_terms, strict=True)], axis=1)
     return float((x @ y) / (x @ x))
 

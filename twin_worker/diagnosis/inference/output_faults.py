@@ -66,6 +66,7 @@ class FrozenOutput:
         since, until: [s]
         evidence: log likelihood ratio [-]
         error_before: rms of the output less its prediction, over that of trusted flight [-]
+        excess: median of the output less its prediction [us]
     """
 
     number: int
@@ -76,6 +77,12 @@ class FrozenOutput:
     until: float
     evidence: float
     error_before: float
+    excess: float
+
+    @property
+    def is_runaway(self) -> bool:
+        """Return whether this is a throttle output above what its law demands: no thrust is lost."""
+        return self.surface == "throttle" and self.excess > 0.0
 
 
 def find_frozen_outputs(outputs: ServoOutputs, trusted_until: float) -> list[FrozenOutput]:
@@ -217,11 +224,11 @@ class _ModelledOutput:
 
     def _frozen(self, evidence: float, first: int, end: int) -> FrozenOutput:
         t, y = self._outputs.t, self._y
-        misfit = float(np.sqrt(np.mean(self._misfit(first + 1, end) ** 2))) / self._scale
-        last = min(end - 1, len(t) - 1)
-        return FrozenOutput(
-            self._k + 1, self._surface, float(y[last]), 0.0, float(t[first]), float(t[last]), evidence, misfit
-        )
+        misfit = self._misfit(first + 1, end)
+        relative = float(np.sqrt(np.mean(misfit**2))) / self._scale
+        since, until, pulse = float(t[first]), float(t[min(end - 1, len(t) - 1)]), float(y[min(end - 1, len(t) - 1)])
+        excess = float(np.median(misfit))
+        return FrozenOutput(self._k + 1, self._surface, pulse, 0.0, since, until, evidence, relative, excess)
 
 
 class _ModelledThrottle(_ModelledOutput):
@@ -266,14 +273,17 @@ class _ModelledThrottle(_ModelledOutput):
     def _evidence(self, first: int, end: int) -> float:
         """Return the log likelihood ratio of a run, from its prediction by the output before it.
 
-        The variance of the prediction is that of the law's error, as large as in trusted flight or before the run,
-        growing as of a random walk, and that of the regression coefficients.
+        The variance of the prediction is that of the regression coefficients, and that of the law's error, as large as
+        in trusted flight or, by the medians of its scatter and of its change over `_LAG_S`, in the seconds before the
+        run, growing as of a random walk.
         """
         recent, t = self._recent(first), self._outputs.t
         if recent.stop - recent.start < 2:
             return 0.0
-        error = (self._y - self._predicted)[recent]
-        scale = max(self._scale, float(np.median(np.abs(error - np.median(error)))) / _MEDIAN_SIGMAS)
+        error = self._y - self._predicted
+        earlier = np.searchsorted(t, t[recent] - _LAG_S)
+        deviations = error[recent] - np.median(error[recent]), error[recent] - error[earlier]
+        scale = max(self._scale, *(float(np.median(np.abs(x))) / _MEDIAN_SIGMAS for x in deviations))
         change = self._x[first:end] - self._x[recent].mean(axis=0)
         growth = np.maximum(t[first:end] - t[first - 1], _LAG_S) / _LAG_S
         sigmas = self._misfit(first, end) / (
@@ -294,10 +304,15 @@ def _ridge_regression(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def with_frozen_outputs(report: Report, frozen: list[FrozenOutput]) -> Report:
     """Return the report with the frozen outputs as its first findings.
 
-    Effects on the airframe remain where they began before: afterwards the flight leaves what was calibrated.
+    Effects on the airframe remain where they began before: afterwards the flight leaves what was calibrated. No effect
+    stands for a throttle output above its demand: alone, it makes the outcome `unknown`.
     """
     if not frozen:
         return report
+    if all(one.is_runaway for one in frozen):
+        where = (f"throttle output {frozen[0].number}", tuple((one.since, one.until) for one in frozen))
+        return with_sentence(replace(report, outcome=ReportOutcome.UNKNOWN, where=where, terms={}))
+    frozen = [one for one in frozen if not one.is_runaway]
     first = frozen[0].since
     earlier = tuple(
         f for f in report.findings if report.outcome is ReportOutcome.NAMED and f.segments[0][0] < first - 5.0

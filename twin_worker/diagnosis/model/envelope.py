@@ -11,7 +11,8 @@ import numpy as np
 
 from twin_worker.diagnosis.data.flight import FlightData
 from twin_worker.diagnosis.model.baseline import Baseline, Envelope
-from twin_worker.diagnosis.model.residual import ModelledFlight, density
+from twin_worker.diagnosis.model.equations import density
+from twin_worker.diagnosis.model.residual import ModelledFlight
 
 DENSITY_SIGMA = {"thrust": 1.0, "rho": 1.0, "airspeed_scale:log_scale": 0.5}
 """Nuisance -> standard deviation of its exponent of density [-]."""

@@ -17,18 +17,12 @@ from twin_worker.diagnosis.data.flight import DT, STEP_S, FlightData, decimated,
 from twin_worker.diagnosis.model import equations as eq
 from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline
 
-RHO_0 = 1.225  # [kg/m3]
 _DIFFERENTIATED = ("v_n", "v_e", "v_d", "phi", "theta", "psi", "p", "q", "r")
 _FLOW_STAGES = (Stage.SENSOR, Stage.DELTA, Stage.AIR)
 _ROLL_DAMPING = eq.LATERAL.index("p")
 _N_RECENT = 6  # results stored for repeated evaluations
 Signals = dict[str, np.ndarray]
 Value = TypeVar("Value")
-
-
-def density(h: Any) -> Any:
-    """Return the density of the standard atmosphere at height h [m], [kg/m3]."""
-    return RHO_0 * np.clip(1.0 - 2.25577e-5 * h, 0.1, 2.0) ** 4.2559  # a free run may leave the atmosphere
 
 
 @dataclass
@@ -82,6 +76,7 @@ class ModelledFlight:
         self.t = decimated(flight.t)
         self.ok = valid_decimated(flight.ok)
         self.throttle_integral = decimated(np.cumsum(flight.commands[:, 3]) * DT)
+        self._zeros = np.zeros(len(self.t))
         self._recent_flow: _Recent[FlowTerms] = _Recent()
         self._recent_residuals: _Recent[np.ndarray] = _Recent()
 
@@ -183,7 +178,7 @@ class ModelledFlight:
         for hypothesis in hypotheses:
             if hypothesis.effect.stage in stages:
                 for name, x in hypothesis.act(flow, hypothesis.parameters_at(self.t)).items():
-                    total[name] = total.get(name, 0.0) + x
+                    total[name] = total.get(name, self._zeros) + x
         return total
 
     def _flow_terms(self, hypotheses: tuple[FaultHypothesis, ...]) -> "FlowTerms":
@@ -203,23 +198,21 @@ class ModelledFlight:
         )
         air = self._increments(flow, hypotheses, (Stage.AIR,))
         R, derived, disagreement = self._sensor_agreement if s is self._smooth else self._agreement(s)
-        ground = np.array(
-            [s["v_n"] - air.get("w_n", 0.0), s["v_e"] - air.get("w_e", 0.0), s["v_d"] - air.get("w_d", 0.0)]
-        )
-        u, v, w = np.einsum("ijn,in->jn", R, ground)
+        ground = np.array([s["v_n"], s["v_e"], s["v_d"]])
+        wind = np.array([air.get(name, self._zeros) for name in ("w_n", "w_e", "w_d")])
         f = np.array([s["a_x"], s["a_y"], s["a_z"]]) if base.vane else derived
-        Va = np.maximum(np.sqrt(u * u + v * v + w * w), 1.0)
-        flow.Va, flow.alpha, flow.beta = Va, np.arctan2(w, u), np.arcsin(np.clip(v / Va, -1, 1))
-        flow.p, flow.q, flow.r = s["p"], s["q"], s["r"]
-        flow.rho = density(s["h"]) * (1.0 + air.get("rho", 0.0))
-        flow.q_bar = 0.5 * flow.rho * Va * Va
+        flow.Va, flow.alpha, flow.beta, flow.rho, flow.q_bar = eq.air_data(
+            R, ground, wind, s["h"], air.get("rho", self._zeros), 1.0
+        )
+        flow.p, flow.q, flow.r, Va = s["p"], s["q"], s["r"], flow.Va
         q_S = flow.q_bar * body.S
-        thrust = eq.thrust_terms(d_t, Va, flow.rho / RHO_0, base.speed)
+        thrust = eq.thrust_terms(d_t, Va, flow.rho / eq.RHO_0, base.speed)
         if "T" in base.coef:
             flow.T = base.coef["T"] @ thrust
             flow.C_m_elevator, flow.C_n_rudder = base.coef["M"][3] * d_e, base.coef["N"][5] * d_r
         flow.C_L = -body.mass * f[2] / q_S
-        L, M, N = eq.moments((s["p_dot"], s["q_dot"], s["r_dot"]), (flow.p, flow.q, flow.r), base.card)
+        inertia = base.card.inertia, base.card.known
+        L, M, N = eq.moments((s["p_dot"], s["q_dot"], s["r_dot"]), (flow.p, flow.q, flow.r), *inertia)
         measured = {
             "L": L,
             "M": M,
@@ -246,12 +239,8 @@ class ModelledFlight:
         span, chord = body.b / (2 * flow.Va), body.c / (2 * flow.Va)
         p_hat, q_hat, r_hat = flow.p * span, flow.q * chord, flow.r * span
         add = self._increments(flow, hypotheses, (Stage.WRENCH, Stage.MASS))
-        mass = body.mass * (1.0 + add.get("mass", 0.0))
-        force = mass * f
-        # coefficients of the clean aircraft: remove the scaling and increments of effects first
-        c_z = (force[2] / q_S + add.get("C_L", 0.0)) / (1.0 + add.get("lift", 0.0))
-        c_y = (force[1] / q_S - add.get("C_Y", 0.0)) * (1.0 + add.get("side", 0.0))
-        c_z_dot = np.gradient(c_z, STEP_S) * chord
+        mass, force, c_z, c_y = eq.body_coefficients(f, q_S, body.mass, eq.stack_increments(add, len(q_S)))
+        c_z_dot = eq.gradient(c_z, STEP_S) * chord
         regressors = {
             "alpha": eq.alpha_terms(c_z, c_z_dot, q_hat, d_e),
             "beta": eq.beta_terms(c_y, p_hat, r_hat, d_r),
@@ -259,7 +248,7 @@ class ModelledFlight:
         }
         beta = base.coef["beta"] @ regressors["beta"] if "beta" in base.coef else flow.beta
         regressors["X"] = eq.force_terms(c_z, d_e, beta)
-        regressors["L"] = regressors["N"] = eq.lateral_terms(beta, (p_hat, r_hat), (d_a, d_r), c_z)
+        regressors["L"] = regressors["N"] = eq.lateral_terms(beta, p_hat, r_hat, d_a, d_r, c_z)
         regressors["M"] = eq.pitch_terms(c_z, q_hat, d_e, c_z_dot, force[0] / q_S)
         measured = {"X": force[0]} | of_flow
         intermediate = {"mass": mass, "force": force, "c_z": c_z} | unaffected
@@ -272,19 +261,12 @@ class ModelledFlight:
     def _compute_residuals(self, hypotheses: tuple[FaultHypothesis, ...]) -> np.ndarray:
         terms = self.equation_terms(hypotheses)
         base, flow, add, measured = self.base, terms.flow, terms.add, terms.measured
-        T = (base.coef["T"] @ terms.regressors["T"]) * (1.0 + add.get("thrust", 0.0))
-        alpha, beta = (base.coef[name] @ terms.regressors[name] for name in ("alpha", "beta"))
-        X, L, M, N = (evaluate_equation(base, add, name, terms.regressors[name]) for name in "XLMN")
-        # increment of effects over the clean lift coefficient
-        lift = add.get("lift", 0.0) * -terms.intermediate["c_z"] + add.get("C_L", 0.0)
-        X = terms.scale["X"] * (X + lift * np.sin(alpha) - add.get("C_D", 0.0) * np.cos(alpha)) + T
-        L = terms.scale["L"] * (L + add.get("C_l", 0.0)) + add.get("L", 0.0)
-        N = terms.scale["N"] * (N + add.get("C_n", 0.0)) + add.get("N", 0.0)
-        M = terms.scale["M"] * (M + add.get("C_m", 0.0)) + T * base.coef["M"][-1] + add.get("M", 0.0)
-        if "x_cg" in add or "y_cg" in add:
-            x, y, force = add.get("x_cg", 0.0), add.get("y_cg", 0.0), terms.intermediate["force"]
-            # gravity acts at the centre of gravity, the aerodynamic force at an offset from it
-            M, N, L = M + x * force[2], N - x * force[1] + y * force[0], L - y * force[2]
+        T, alpha, beta = (base.coef[name] @ terms.regressors[name] for name in ("T", "alpha", "beta"))
+        coefficients = [evaluate_equation(base, add, name, terms.regressors[name]) for name in "XLMN"]
+        increments, q_S = eq.stack_increments(add, len(self.t)), terms.scale["X"]
+        X, T = eq.axial_force(coefficients[0], T, alpha, terms.intermediate["c_z"], q_S, increments)
+        lengths = base.card.body.b, base.card.body.c, float(base.coef["M"][-1])
+        L, M, N = eq.body_moments(np.array(coefficients[1:]), T, terms.intermediate["force"], q_S, lengths, increments)
         J_x, J_y, J_z, _ = base.card.inertia
         out = np.zeros((len(self.t), len(CHANNELS)))
         out[:, 0] = (measured["X"] - X) / terms.intermediate["mass"]
@@ -296,7 +278,7 @@ class ModelledFlight:
         if "C_l_p" in add:
             out[:, 3] = self._with_nominal_gusts(out[:, 3], add["C_l_p"], terms)
         if "Va" in self.flight.readings:
-            out[:, 6] = measured["airspeed"] / base.airspeed - flow.Va * np.sqrt(flow.rho / RHO_0)
+            out[:, 6] = measured["airspeed"] / base.airspeed - flow.Va * np.sqrt(flow.rho / eq.RHO_0)
             out[:, 6] /= terms.intermediate["Va_share"]  # in units of the faulty sensor
         out[:, 7:13] = terms.intermediate["apart"]
         if "baro" in self.flight.readings:
@@ -337,7 +319,8 @@ def evaluate_equation(base: Baseline, add: Signals, equation: str, terms: np.nda
     """Evaluate an equation, with relative errors of its derivatives from `add`, (n,)."""
     coef = base.coef[equation][: len(terms)]
     out = coef @ terms
-    for k, name in enumerate(eq.TERMS[equation][: len(terms)]):
-        if (share := add.get(f"{equation}:{name}")) is not None:
+    for name, share in add.items():
+        if name.startswith(f"{equation}:"):
+            k = eq.TERMS[equation].index(name[len(equation) + 1 :])
             out = out + share * coef[k] * terms[k]
     return out

@@ -16,7 +16,6 @@ from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.data.flight import DT
 from twin_worker.diagnosis.model import equations as eq
 from twin_worker.diagnosis.model.baseline import Baseline
-from twin_worker.diagnosis.model.residual import RHO_0, density
 
 STATE = ("v_n", "v_e", "v_d", "p", "q", "r", "phi", "theta", "psi", "h")
 _MAX_PITCH = 1.45  # limit of the pitch angle [rad]
@@ -63,7 +62,7 @@ class Simulation:
                 groups.setdefault(f"{g.effect.stage}:{g.label}", []).append((g, run))
         self._groups = [_EffectGroup([g for g, _ in group], [run for _, run in group]) for group in groups.values()]
         self._servos = [(run, g) for g, run in acting if g.effect.stage is Stage.DELTA]
-        self._no_wind = np.zeros((3, self.runs))
+        self._zeros, self._no_wind = np.zeros(self.runs), np.zeros((3, self.runs))
 
     def simulate(self, start: np.ndarray, pilot: Pilot, n: int) -> Runs:
         """Simulate n steps of `DT`; commands are constant over a step, servos and engine follow with lag.
@@ -153,7 +152,7 @@ class Simulation:
     def _wind(self, air: dict[str, np.ndarray]) -> np.ndarray:
         if not air:
             return self._no_wind
-        return np.stack([air.get(name, self._no_wind[0]) for name in ("w_n", "w_e", "w_d")])
+        return np.array([air.get(name, self._zeros) for name in ("w_n", "w_e", "w_d")])
 
     def derivatives(
         self, x: np.ndarray, delta: np.ndarray, t: np.ndarray, used: np.ndarray
@@ -172,62 +171,43 @@ class Simulation:
         flow = Flow(t, h, h - self.ground, body, p=p, q=q, r=r, delta_t=d_t, throttle_time=used)
         air = self._increments(flow, (Stage.AIR,))
         R = rotation(phi, theta, psi)
-        air_velocity = v - self._wind(air)
-        ua, va, wa = np.einsum("ijn,in->jn", R, air_velocity)
-        flow.Va = np.maximum(np.sqrt(ua * ua + va * va + wa * wa), _MIN_AIRSPEED)
-        flow.alpha, flow.beta = np.arctan2(wa, ua), np.arcsin(np.clip(va / flow.Va, -1, 1))
-        flow.rho = density(h) * (1.0 + air.get("rho", 0.0))
-        flow.q_bar = 0.5 * flow.rho * flow.Va**2
+        flow.Va, flow.alpha, flow.beta, flow.rho, flow.q_bar = eq.air_data(
+            R, v, self._wind(air), h, air.get("rho", self._zeros), _MIN_AIRSPEED
+        )
         span, chord = body.b / (2 * flow.Va), body.c / (2 * flow.Va)
         p_hat, q_hat, r_hat, q_S = p * span, q * chord, r * span, flow.q_bar * body.S
-        thrust = eq.thrust_terms(d_t, flow.Va, flow.rho / RHO_0, base.speed)
-        flow.T = base.coef["T"] @ thrust
-        flow.C_m_elevator, flow.C_n_rudder = base.coef["M"][3] * d_e, base.coef["N"][5] * d_r
-        A, B = base.coef["alpha"], base.coef["beta"]
-        c_z = solve_c_z(A, flow.alpha - A[0] - A[3] * q_hat - A[5] * d_e)
+        coef = base.coef
+        flow.T = coef["T"] @ eq.thrust_terms(d_t, flow.Va, flow.rho / eq.RHO_0, base.speed)
+        flow.C_m_elevator, flow.C_n_rudder = coef["M"][3] * d_e, coef["N"][5] * d_r
+        A, B = coef["alpha"], coef["beta"]
+        c_z = eq.solve_c_z(A, flow.alpha - A[0] - A[3] * q_hat - A[5] * d_e)
         c_y = (flow.beta - B[0] - B[2] * p_hat - B[3] * r_hat - B[4] * d_r) / B[1]
         flow.C_L = -c_z
         add = self._increments(flow, (Stage.WRENCH, Stage.MASS))
-        coef, zero = base.coef, np.zeros(self.runs)
-        T = flow.T * (1.0 + add.get("thrust", zero))
+        increments, zero = eq.stack_increments(add, self.runs), self._zeros
+        c_x = coef["X"] @ eq.force_terms(c_z, d_e, flow.beta)
+        X, T = eq.axial_force(c_x, flow.T, flow.alpha, c_z, q_S, increments)
         lift = add.get("lift", zero) * -c_z + add.get("C_L", zero)
-        X = coef["X"] @ eq.force_terms(c_z, d_e, flow.beta) + lift * np.sin(flow.alpha)
-        X = q_S * (X - add.get("C_D", zero) * np.cos(flow.alpha)) + T
-        force = np.stack([X, q_S * (c_y + add.get("C_Y", zero)), q_S * (c_z - lift)])
-        lateral = eq.lateral_terms(flow.beta, (p_hat, r_hat), (d_a, d_r), c_z)
-        L = q_S * body.b * (coef["L"] @ lateral + add.get("C_l", zero)) + add.get("L", zero)
-        N = q_S * body.b * (coef["N"] @ lateral + add.get("C_n", zero)) + add.get("N", zero)
-        M = q_S * body.c * (coef["M"][:-1] @ eq.pitch_terms(c_z, q_hat, d_e, zero, X / q_S) + add.get("C_m", zero))
-        M = M + flow.T * base.coef["M"][-1] + add.get("M", zero)
-        x_cg, y_cg = add.get("x_cg", zero), add.get("y_cg", zero)
-        M, N, L = M + x_cg * force[2], N - x_cg * force[1] + y_cg * force[0], L - y_cg * force[2]
+        force = np.array([X, q_S * (c_y + add.get("C_Y", zero)), q_S * (c_z - lift)])
+        lateral = eq.lateral_terms(flow.beta, p_hat, r_hat, d_a, d_r, c_z)
+        c_m = coef["M"][:-1] @ eq.pitch_terms(c_z, q_hat, d_e, zero, X / q_S)
+        lengths = body.b, body.c, float(coef["M"][-1])
+        moments = eq.body_moments(
+            np.array([coef["L"] @ lateral, c_m, coef["N"] @ lateral]), T, force, q_S, lengths, increments
+        )
         f = force / (body.mass * (1.0 + add.get("mass", zero)))
         acceleration = np.einsum("ijn,jn->in", R, f)
         acceleration[2] += G
-        rates = np.concatenate([acceleration, self._rotation_derivatives(x, (L, M, N)), -v[2:3]])
+        rates = np.concatenate([acceleration, self._rotation_derivatives(x, moments), -v[2:3]])
         return rates, f, flow.Va, flow.rho
 
-    def _rotation_derivatives(self, x: np.ndarray, moments: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
-        (p, q, r), phi = x[3:6], x[6]
+    def _rotation_derivatives(self, x: np.ndarray, moments: np.ndarray) -> np.ndarray:
+        (p, q, r), phi, card = x[3:6], x[6], self.base.card
         theta = np.clip(x[7], -_MAX_PITCH, _MAX_PITCH)
         sf, cf = np.sin(phi), np.cos(phi)
         turn = (q * sf + r * cf) / np.cos(theta)
-        return np.stack(
-            [
-                *eq.angular_accelerations(moments, (p, q, r), self.base.card),
-                p + np.sin(theta) * turn,
-                q * cf - r * sf,
-                turn,
-            ]
-        )
-
-
-def solve_c_z(A: np.ndarray, lift_angle: np.ndarray) -> np.ndarray:
-    """Solve A1 c_z + A2 c_z2 = lift_angle for c_z, the root near zero."""
-    c_z = lift_angle / A[1]
-    for _ in range(3):
-        c_z = c_z - (A[1] * c_z + A[2] * c_z**2 - lift_angle) / (A[1] + 2 * A[2] * c_z)
-    return c_z
+        accelerations = eq.angular_accelerations(moments, x[3:6], card.inertia, card.known)
+        return np.concatenate([accelerations, [p + np.sin(theta) * turn, q * cf - r * sf, turn]])
 
 
 class _EffectGroup:

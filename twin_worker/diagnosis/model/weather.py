@@ -7,7 +7,8 @@ from fleet.effects import catalogue
 from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.data.flight import decimated
 from twin_worker.diagnosis.model.baseline import wind_is_nominal
-from twin_worker.diagnosis.model.residual import RHO_0, ModelledFlight
+from twin_worker.diagnosis.model.equations import RHO_0
+from twin_worker.diagnosis.model.residual import ModelledFlight
 
 RAW_ROWS_PER_SAMPLE = 50.0  # residual rows per independent sample
 _SHEAR = 1.0  # prior standard deviation of the wind shear [m/s per 100 m]

@@ -9,6 +9,7 @@ from fleet.physics import point_mass as H
 from twin_worker.confidence.tube_and_horizon import track_frame
 from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel
 from twin_worker.prediction.closed_loop import InitialCondition
+from twin_worker.prediction.fixed_wing.path_wind import drift_draws, surer_field
 from twin_worker.prediction.fixed_wing.point_mass_rollout import (
     model_ground_velocity,
     start_and_air,
@@ -34,9 +35,10 @@ def draw_members(
     noise: np.ndarray,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, ...]:
-    """Draw parameters, air and start of members for `noise`, (m, seconds, 4); see `fleet.physics.point_mass.bundle`.
+    """Draw parameters, air and start of members for `noise`, (m, seconds, 4); see `simulate_ensemble`.
 
-    The first member is the mean, without random deviations.
+    The first member is the mean, without random deviations. Where the shared wind field is surer than the aircraft's
+    own wind, the drift of every member is a draw from it, and its columns of `noise` are changed in place.
     """
     members = len(noise)
     state, air = start_and_air(context, initial.window)
@@ -50,6 +52,12 @@ def draw_members(
         np.arctan2(wind_state[:, 1], wind_state[:, 0]),
     )
     airs[:, H.W_N : H.DRIFT_E + 1] = wind_state[:, 2:6]
+    shared = surer_field(context, initial, model, (state, air), float(noise.shape[1] - 1))
+    if shared is not None:
+        wind, mean_drift = shared
+        drift = mean_drift + _correlated_draws(wind.cov, members, rng)
+        airs[:, H.W_N : H.DRIFT_N], airs[:, H.DRIFT_N : H.DRIFT_E + 1] = air[H.W_N : H.DRIFT_N], drift[:, 0]
+        noise[..., :2] = drift_draws(wind, drift, air, noise.shape[1])
     airs[:, H.REST] *= _TURBULENCE_FACTOR * context.wind_filter.innovation_ratio
     states[:, :3] += _POSITION_SIGMA * z[:, 8:11]
     states[:, H.V] = states[:, H.V] / air[H.SCALE] * airs[:, H.SCALE] + _AIRSPEED_SIGMA * z[:, 11]
@@ -59,6 +67,14 @@ def draw_members(
     parameters[:, H.A_0] += _ALPHA_SIGMA * z[:, 18]
     parameters[:, [H.WN_PHI, H.WN_THETA]] *= np.exp(_LAG_SIGMA * z[:, 19:20])
     return parameters, airs, states
+
+
+def _correlated_draws(cov: np.ndarray, members: int, rng: np.random.Generator) -> np.ndarray:
+    """Return draws of two components with a covariance (k, k), zero for the first member, (members, k, 2)."""
+    values, vectors = np.linalg.eigh(cov)
+    z = rng.standard_normal((members, len(cov), 2))
+    z[0] = 0.0
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ z)
 
 
 def ensemble_std(

@@ -10,6 +10,13 @@ from fleet.window import Window
 from twin_worker.estimation.wind_filter import DRIFT_S, GUST, GUST_S
 from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel, airspeed_of
 from twin_worker.prediction.closed_loop import InitialCondition, sample_rollout
+from twin_worker.prediction.fixed_wing.path_wind import (
+    FIELD_SPAN_S,
+    drift_draws,
+    surer_field,
+    with_drift,
+    with_mean_wind,
+)
 from twin_worker.prediction.replay_window import PredictionContext, Rollout
 from twin_worker.telemetry.velocity import present_velocity
 
@@ -92,6 +99,14 @@ def model_ground_velocity(start: np.ndarray, air: np.ndarray) -> np.ndarray:
     return air[[H.REST_N, H.REST_E]] - unexplained_velocity(start, air, np.zeros(2))
 
 
+def in_field_wind(context: PredictionContext, initial: InitialCondition, model: PointMassModel) -> InitialCondition:
+    """Return the start of `fly_from` in the shared wind field where it is surer than the aircraft's own wind."""
+    if context.shared_wind is None:
+        return initial
+    shared = surer_field(context, initial, model, start_and_air(context, initial.window), FIELD_SPAN_S)
+    return initial if shared is None else with_mean_wind(initial, shared[0])
+
+
 def fly_point_mass(
     context: PredictionContext, initial: InitialCondition, model: PointMassModel, ahead: np.ndarray
 ) -> Rollout:
@@ -104,7 +119,13 @@ def fly_point_mass(
     """
     ctl, par, legs = initial.synchronised
     state, air = start_and_air(context, initial.window)
-    out = np.empty((int(ahead[-1] / H.STEP) + 2, 3))
+    out, draws = np.empty((int(ahead[-1] / H.STEP) + 2, 3)), _NO_NOISE
+    shared = surer_field(context, initial, model, (state, air), float(ahead[-1]))
+    if shared is not None:
+        wind, drift = shared
+        air = with_drift(air, drift[0])
+        draws = np.zeros((int(ahead[-1]) + 2, 4))
+        draws[:, :2] = drift_draws(wind, drift, air, len(draws))
     ctl = ctl.copy()
-    n_rows = H.simulate_route(ctl, par, legs, model.parameters, air, state, _NO_NOISE, H.STEP, out)
+    n_rows = H.simulate_route(ctl, par, legs, model.parameters, air, state, draws, H.STEP, out)
     return sample_rollout(out[:n_rows], H.STEP, initial, ctl, ahead)

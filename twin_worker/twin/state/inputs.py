@@ -8,7 +8,7 @@ import numpy as np
 from fleet.airframes.airframe import ASSUMED, ServoMap, servo_map
 from fleet.airframes.servo_learning import MIN_ROWS, learn_servo_map
 from fleet.autopilots.modes import ModeEntry
-from fleet.contract import Item, Mission, Params, Sample, Status
+from fleet.contract import Item, Mission, Params, Sample, Status, WindField
 from fleet.frames import Origin
 from fleet.mission_jumps import JUMPS, count_jumps, resets_counters
 from twin_worker.estimation.wind_filter import WindFilter, update_from_history
@@ -249,6 +249,7 @@ class Environment(msgspec.Struct):
         reported_wind_t: when it last took the wind that the autopilot reports, without airspeed [s since 1970]
         flight_phase: flying, landed, landing
         autopilot: law and parameters identified from flight
+        wind_field: newest wind field of all aircraft; None: not known
     """
 
     wind: WindFilter = msgspec.field(default_factory=WindFilter)
@@ -256,6 +257,15 @@ class Environment(msgspec.Struct):
     reported_wind_t: float = -np.inf
     flight_phase: FlightPhase = msgspec.field(default_factory=FlightPhase)
     autopilot: AutopilotEstimate = msgspec.field(default_factory=AutopilotEstimate)
+    wind_field: WindField | None = None
+
+    def set_wind_field(self, wind_field: WindField | None) -> None:
+        """Store the wind field for the next predictions; it must be valid, see `SharedWind`."""
+        self.wind_field = wind_field
+
+    def has_own_wind(self, now: float) -> bool:
+        """Return whether recent airspeeds feed the wind filter at `now` [s since 1970]."""
+        return self.wind.t != self.reported_wind_t and abs(now - self.wind.t) < _WIND_MAX_AGE_S
 
     def update_wind(self, history: TelemetryHistory) -> None:
         """Update the wind filter with new rows, once a second."""
@@ -279,6 +289,7 @@ class Environment(msgspec.Struct):
     def reset_clock(self) -> None:
         """Forget times: the new time may be earlier than the old one."""
         self.wind.t = self.wind_t = self.reported_wind_t = -np.inf
+        self.wind_field = None
         self.flight_phase = FlightPhase()
 
     def shift_clock(self, step: float) -> None:

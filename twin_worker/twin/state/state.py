@@ -1,7 +1,7 @@
 """State of one twin: telemetry, active model, past predictions; and the ingestion of messages."""
 
 from collections.abc import Mapping
-from math import isfinite
+from math import isfinite, sqrt
 from typing import Any
 
 import msgspec
@@ -18,11 +18,13 @@ from fleet.contract import (
     Sample,
     Status,
     Verdict,
+    WindEstimate,
 )
 from fleet.frames import Origin
 from fleet.mission import FIRST_ITEM, extends, route_items
 from fleet.vehicles import UNKNOWN, VehicleClass, vehicle_class
 from fleet.window import Window
+from twin_worker.estimation.wind_field import shared_wind
 from twin_worker.prediction.autopilot_identification import law_in_force
 from twin_worker.prediction.replay_window import AutopilotConfig, PredictionContext
 from twin_worker.twin.state.budget import ComputeBudget, Schedule, Work
@@ -46,6 +48,7 @@ from twin_worker.validation.verify import FIT_THRESHOLD
 
 _CONTROLLER_PREFIXES = ("FW_", "MPC_", "NAV_", "NPFG_", "Q_WP_", "RTL_", "WPNAV_", "WP_")  # not ArduPlane
 _ARDUPLANE_NAMES = {name for row in arduplane.TABLE for name in (row.name, *(older for older, _ in row.old_names))}
+_POSITION_AGE_S = 2.0  # maximum age of the position of a wind estimate [s]
 _MAX_NAMED = 3  # maximum number of changed parameters in the text
 AUTO = "auto"  # use the prediction method with the lowest error
 
@@ -203,7 +206,33 @@ class Twin(msgspec.Struct):
             tuple(self.onboard.jumps),
         )
         return PredictionContext(
-            window, self.telemetry.history, autopilot_config, self.environment.wind, self.telemetry.origin
+            window,
+            self.telemetry.history,
+            autopilot_config,
+            self.environment.wind,
+            self.telemetry.origin,
+            self.config.uav,
+            None if self.environment.wind_field is None else shared_wind(self.environment.wind_field),
+        )
+
+    @property
+    def wind_estimate(self) -> WindEstimate | None:
+        """Return the wind with gusts by the aircraft's own filter; None without recent airspeed, position or home."""
+        now, wind = self.telemetry.history.newest, self.environment.wind
+        if self.home is None or not self.environment.has_own_wind(now):
+            return None
+        t, position = self.telemetry.history.rows_since("position", wind.t - _POSITION_AGE_S)
+        if not len(t):
+            return None
+        k = int(np.abs(t - wind.t).argmin())
+        lat_e7, lon_e7, alt_mm = (int(x) for x in position[k])
+        present, variance = wind.present_wind
+        return WindEstimate(
+            t=float(wind.t),
+            position=(lat_e7, lon_e7, alt_mm),
+            height_m=1e-3 * (alt_mm - self.home.alt_mm),
+            wind=(float(present[0]), float(present[1])),
+            sigma=sqrt(max(variance, 0.0)),
         )
 
     @property

@@ -21,7 +21,6 @@ from twin_worker.prediction.route_cache import cached_route
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.kinematic_prediction import is_hovering
 
-_SHORT_S, _LONG_S = 10.0, 12.0  # an alert is raised below the first confidence horizon and cleared above the second [s]
 _MIN_SCORED = 30  # minimum number of scored predictions; below it, the 90 % horizon comes from the prior table [-]
 _TURN_RATE_REACH_S = 15.0  # ground and geofence look-ahead of turn-rate predictions [s]
 _REACH_S = 90.0  # maximum look-ahead; beyond it, the tube is wider than usual geofence margins [s]
@@ -126,17 +125,11 @@ def _is_landing(twin: Twin, on_rotors: bool) -> bool:
 
 
 def _short_horizon(prediction: Prediction | None) -> HazardEstimate:
-    """Evaluate the confidence horizon of a route prediction, once enough past predictions are scored."""
-    level = 0.0
-    if (
-        prediction is not None
-        and prediction.method != "imm"
-        and prediction.coverage_n >= _MIN_SCORED
-        and not prediction.horizon_open
-    ):
-        level = 1.0 if prediction.horizon_s < _SHORT_S else 0.5 if prediction.horizon_s < _LONG_S else 0.0
-    sentence = f"predictions stay within 10 % for only {prediction.horizon_s if prediction else 0.0:.0f} s"
-    return HazardEstimate(AlertKind.SHORT_HORIZON, level, sentence, "confidence horizon recovered")
+    """Evaluate the early error of a route prediction, once enough past predictions are scored."""
+    is_scored = prediction is not None and prediction.method != "imm" and prediction.coverage_n >= _MIN_SCORED
+    probability = prediction.early_exceedance if prediction is not None and is_scored else 0.0
+    sentence = f"predictions exceed an error of 10 % within 10 s with a probability of {probability:.0%}"
+    return HazardEstimate(AlertKind.SHORT_HORIZON, probability, sentence, "predictions hold 10 s again")
 
 
 def mission_feasibility(twin: Twin, now: float) -> HazardEstimate:

@@ -256,6 +256,7 @@ def _to_message(twin: Twin, forecast: PointForecast, confidence: Confidence) -> 
         axis_quantile=confidence.axis_quantile,
         horizon_s=max(confidence.horizon_s - start, 0.0),
         horizon_open=confidence.horizon_open,
+        early_exceedance=confidence.early_exceedance,
         coverage=overall,
         coverage_n=overall_n,
         coverage_propagated=renewed,

@@ -13,7 +13,7 @@ from twin_worker.numerics.interpolation import interpolate_rows
 from twin_worker.prediction.closed_loop import InitialCondition, fly_from, synchronise_controller
 from twin_worker.prediction.failsafe_route import with_failsafe
 from twin_worker.prediction.fixed_wing import ensemble
-from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_point_mass
+from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_point_mass, in_field_wind
 from twin_worker.prediction.replay_window import PredictionContext, Rollout
 from twin_worker.telemetry.track import Track
 from twin_worker.twin.state.budget import EARLY_FRACTION, Work
@@ -129,7 +129,10 @@ def method_paths(
         dynamics_ahead = (
             ahead[: np.searchsorted(ahead, max(_DYNAMICS_SPAN_S, ahead[0]), side="right")] if by_method else ahead
         )
-        rollout = fly_from(initial[1], twin.models.active_model, dynamics_ahead)
+        start = initial[1]
+        if twin.models.point_mass is not None:
+            start = in_field_wind(*initial, twin.models.point_mass)
+        rollout = fly_from(start, twin.models.active_model, dynamics_ahead)
         reason = reason if by_method else rollout.sentence
         if rollout.path is not None:
             path = _extend_path(rollout.path, by_method[HYBRID]) if by_method else rollout.path

@@ -23,7 +23,7 @@ def to_utm(lat_deg: np.ndarray, lon_deg: np.ndarray, zone: int, *, north: bool) 
 
     Source: Krüger 1912 as Karney 2011, "Transverse Mercator with an accuracy of a few nanometers", eq. 7-11.
     """
-    phi, lam = np.radians(lat_deg), np.radians(np.asarray(lon_deg) - (6 * zone - 183))
+    phi, lam = np.radians(lat_deg), np.radians((np.asarray(lon_deg) - (6 * zone - 183) + 180) % 360 - 180)
     e = 2 * np.sqrt(_N) / (1 + _N)
     t = np.sinh(np.arctanh(np.sin(phi)) - e * np.arctanh(e * np.sin(phi)))
     xi, eta = np.arctan2(t, np.cos(lam)), np.arcsinh(np.sin(lam) / np.hypot(t, np.cos(lam)))
@@ -74,10 +74,11 @@ class Raster(NamedTuple):
         return values.reshape((*np.shape(lat_deg), *self.values.shape[2:]))
 
     def _project(self, lat: np.ndarray, lon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if self.zone is None:
-            return lon, lat
-        if isinstance(self.zone, str):
-            return to_mercator(lat, lon)
+        if self.zone is None or isinstance(self.zone, str):
+            middle = self.affine[0] @ [self.values.shape[1] / 2, self.values.shape[0] / 2, 1.0]
+            middle = middle if self.zone is None else (middle - 0.5) * 360
+            lon = middle + (lon - middle + 180) % 360 - 180  # continuous where the raster crosses 180 degrees
+            return (lon, lat) if self.zone is None else to_mercator(lat, lon)
         return to_utm(lat, lon, self.zone[0], north=self.zone[1])
 
 

@@ -1,6 +1,6 @@
 """Scan all effects, targets and onsets; one whitened Jacobian per effect and target serves all onsets."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -77,12 +77,13 @@ class Scanner:
 
     Args:
         whitened: residuals without any effect
+        effects: effects with their targets; by default all of the catalogue that the calibration covers
     """
 
-    def __init__(self, whitened: WhitenedResiduals) -> None:
+    def __init__(self, whitened: WhitenedResiduals, effects: Iterable[tuple[Effect, str]] | None = None) -> None:
         self._slopes: list[_Slopes] = []
         self._starts: list[_Starts] = []
-        for effect, target in candidates(whitened):
+        for effect, target in candidates(whitened) if effects is None else effects:
             if effect.initial_guesses:
                 starts = [FaultHypothesis(effect, target, start) for start in effect.initial_guesses]
                 reference = whitened.residuals(())
@@ -149,7 +150,7 @@ def _prepare_slopes(whitened: WhitenedResiduals, effect: Effect, target: str) ->
             continue
         sums = normal_equations(whitened, J, gates, kind)
         if kind is Onset.STEP and onset_slopes is not None:
-            sums = _with_onset_slopes(whitened, J, onset_slopes, gates, sums)
+            sums = with_onset_slopes(whitened, J, onset_slopes, gates, sums)
         kinds.append(_StepsOf(kind, gates, onsets, np.linalg.inv(_profiled_matrix(whitened, sums[0], sums[2]))))
     return _Slopes(zero, scale, J, onset_slopes, kinds)
 
@@ -188,7 +189,7 @@ def _onset_sums(x: np.ndarray, gates: np.ndarray, kind: Onset) -> np.ndarray:
     return (gates @ x.reshape(len(x), -1)).reshape(len(gates), *x.shape[1:])  # type: ignore[no-any-return]
 
 
-def _with_onset_slopes(
+def with_onset_slopes(
     whitened: WhitenedResiduals,
     J: np.ndarray,
     onset_slopes: np.ndarray,

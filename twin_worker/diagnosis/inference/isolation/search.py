@@ -223,10 +223,15 @@ class Search:
 
     def _add_anomaly(self, beside: Explanation, anomaly: Anomaly) -> None:
         gain, channel = beside.channel_gain.copy(), CHANNELS.index(anomaly.channel)
-        gain[channel] += max(anomaly.net_gain, 0.0)
         block_gain = beside.block_gain
+        hypotheses = [member.hypothesis for member in beside.members]
+        if anomaly.hypothesis is not None:
+            hypotheses.append(anomaly.hypothesis)
+            gain = self._no_effect - self._costs(hypotheses)
+            block_gain = self._no_effect_blocks - self.blocks.cost(hypotheses)
+        else:
+            gain[channel] += max(anomaly.net_gain, 0.0)
         if anomaly.series is not None:
-            hypotheses = [member.hypothesis for member in beside.members]
             block_gain = self._no_effect_blocks - self.blocks.cost(hypotheses, (channel, anomaly.series))
         chance = beside.chance + self.whitened.base.chance.get(anomaly.kind, 0.0)
         key = (*sorted(member.kind for member in beside.members), anomaly.kind)
@@ -247,8 +252,8 @@ def chance_gain(
 ) -> float:
     """Return the gain that an effect reaches on nominal flights, from `Baseline.chance` or `Baseline.block_chance`.
 
-    With a fast accelerometer the largest of the same effect or of the same surface; else of the same kind of onset, and
-    where constants differ between flights, beyond that without an onset.
+    That of the same kind of onset: with a fast accelerometer the largest of the same effect or surface; else that of
+    the effect, and where constants differ between flights, beyond that without an onset.
     """
     if vane:
         return max((x for kind, x in chance.items() if _is_related(kind, hypothesis)), default=0.0)
@@ -257,11 +262,10 @@ def chance_gain(
 
 
 def _is_related(kind: str, hypothesis: FaultHypothesis) -> bool:
-    """Return whether a chance gain applies to a hypothesis: same effect, or same surface."""
-    label = kind.partition("|")[0]
-    return label == hypothesis.label or (
-        hypothesis.effect.stage is Stage.DELTA and label.endswith(f":{hypothesis.target}")
-    )
+    """Return whether a chance gain applies to a hypothesis: same kind of onset, and same effect or surface."""
+    label, _, onset = kind.partition("|")
+    same_surface = hypothesis.effect.stage is Stage.DELTA and label.endswith(f":{hypothesis.target}")
+    return onset == hypothesis.onset.kind and (label == hypothesis.label or same_surface)
 
 
 def best_hypotheses(
@@ -325,12 +329,16 @@ def turbulence_evidence(whitened: WhitenedResiduals) -> tuple[np.ndarray, float,
     """Return gain by channel, (c + 1,), variance ratio of gusts, and their onset [s]; None if it is before the flight.
 
     Sideslip, lift and airspeed scatter more, the sensor channels do not. The onset is the change point of the variance,
-    r_1 before and r_2 after it:  G = -sum n_i ln r_i, against n (r - 1 - ln r) of one variance throughout.
+    r_1 before and r_2 after it:  G = -sum n_i ln r_i, against n (r - 1 - ln r) of one variance throughout. Reference is
+    the variance of nominal flights; without a fast accelerometer, where it follows the weather of each flight, that of
+    the noise of this flight.
     """
     air_channels = [CHANNELS.index(name) for name in ("side", "lift", "airspeed")]
     sensor_channels = [k for k, name in enumerate(CHANNELS) if name.startswith(("gps", "gyro"))]
     gain = np.zeros(len(CHANNELS) + 1)
-    square = ((whitened.e + whitened.Jn @ whitened.xn) ** 2 / whitened.base.usual)[whitened.ok]
+    base, e = whitened.base, (whitened.e + whitened.Jn @ whitened.xn)[whitened.ok]
+    scale = (whitened.noise.sigma / base.noise.sigma) ** 2 if base.vane else 1.0 / base.usual
+    square = (e - e.mean(axis=0)) ** 2 * scale
     t = whitened.modelled.t[whitened.ok]
     onset = _variance_onset(t, square[:, air_channels], load_table().weights.rows_per_sample)
     after = square if onset is None else square[t >= onset]

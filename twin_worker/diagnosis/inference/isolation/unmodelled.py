@@ -7,20 +7,24 @@ coefficients without an effect in the catalogue compete with the named effects d
 
 from collections.abc import Iterator
 from copy import copy
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.signal import lfilter
 
-from fleet.effects import Onset
+from fleet.effects import Effect, Onset, Parameter, Stage
+from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.data.flight import STEP_S
 from twin_worker.diagnosis.inference.isolation.isolate import (
     MIN_R2,
     PARAMETER_COST,
+    Scanner,
     normal_equations,
     onset_gates,
     solve_onsets,
+    with_onset_slopes,
 )
+from twin_worker.diagnosis.inference.isolation.refine import refine
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 from twin_worker.diagnosis.model import equations as eq
 from twin_worker.diagnosis.model.baseline import CHANNEL_OF, CHANNELS
@@ -32,8 +36,29 @@ _UNCATALOGUED_TERMS = {  # terms without an effect: stability, cross damping, cr
     "M": ("c_x",),
     "N": ("beta", "p", "delta_a"),
 }
-# sensor terms: lagging pressures, scale errors of gyros and accelerometers
-_SLOW, _RATE, _FORCE = "lagging", "rate", "force"
+_SLOW, _RATE, _FORCE = "lagging", "rate", "force"  # terms of sensors: lagging pressures, scale errors
+_SCALED = {  # readings of gyros and accelerometers: channel and term of their scale error
+    **{f"a_{axis}": (f"gps_{axis}", _FORCE) for axis in "xyz"},
+    **dict(zip("pqr", ((f"gyro_{axis}", _RATE) for axis in ("roll", "pitch", "yaw")), strict=True)),
+}
+
+
+def _scale(readings: dict[str, Any], share: Any, of: str) -> dict[str, Any]:
+    return {of: readings[of] * (1.0 + share)}
+
+
+SENSOR_SCALE = Effect(
+    name="sensor_scale",
+    stage=Stage.SENSOR,
+    channel="imu",
+    equation="reading (1 + x)",
+    source="Beard & McLain 2012, section 7.1 (accelerometers and gyros)",
+    parameters=(Parameter("x", "-", "relative error", step=0.05, low=-0.9, high=0.9),),
+    act=_scale,
+    examples=((0.1,),),
+    targets=tuple(_SCALED),
+)
+"""Scale error of one axis: an effect outside the catalogue that changes all channels of the simulation."""
 
 
 class Gain(NamedTuple):
@@ -61,23 +86,29 @@ class ChannelEquation:
         white = whitened.noise.whiten(slopes)[:, c] * whitened.ok[:, None]
         norm = np.linalg.norm(white, axis=0) + 1e-12
         self._J, self._raw = (white / norm)[:, None, :], slopes[:, c] / norm
+        self._onset_slopes = whitened.whiten_onset_slopes(slopes)[:, :, [c]] / norm
         self._whitened = copy(whitened)  # this channel alone; the nuisance information of the other channels stays
         self._whitened.e, self._whitened.Jn = whitened.e[:, [c]], whitened.Jn[:, [c]]
 
     def gain_of_all(self) -> Gain:
         """Return the gain of freeing all terms from the best onset."""
-        return _step_gain(self._whitened, self._J, self._raw)
+        return _step_gain(self._whitened, self._J, self._onset_slopes, self._raw)
 
     def gain_in_flight(self) -> Gain:
         """Return the gain of a step at the best onset with all terms free throughout, whatever the calibration."""
-        return _step_gain(_with_free_terms(self._whitened, self._J), self._J, self._raw, _MIN_SIDE_S)
+        free = _with_free_terms(self._whitened, self._J)
+        return _step_gain(free, self._J, self._onset_slopes, self._raw, _MIN_SIDE_S)
 
     def gain_per_term(self) -> Iterator[tuple[str, Gain]]:
         """Yield the gain of freeing each single term that has no effect in the catalogue."""
         equation = next((name for name, channel in CHANNEL_OF.items() if channel == self.channel), "")
         for k, name in enumerate(self.names):
-            if name in (*_UNCATALOGUED_TERMS.get(equation, ()), _SLOW, _RATE, _FORCE):
-                yield name, _step_gain(self._whitened, self._J[:, :, [k]], self._raw[:, [k]])
+            if name in (*_UNCATALOGUED_TERMS.get(equation, ()), _SLOW):
+                one = [k]
+                yield (
+                    name,
+                    _step_gain(self._whitened, self._J[..., one], self._onset_slopes[..., one], self._raw[:, one]),
+                )
 
 
 def channel_equations(whitened: WhitenedResiduals) -> Iterator[ChannelEquation]:
@@ -114,11 +145,20 @@ def _lag(x: np.ndarray) -> np.ndarray:
     return np.asarray(lfilter([1.0 - decay], [1.0, -decay], x, zi=[decay * x[0]])[0] - x)
 
 
-def _step_gain(whitened: WhitenedResiduals, J: np.ndarray, raw: np.ndarray, margin_s: float = 0.0) -> Gain:
-    """Return the gain of a step in terms, (n, 1, k), at least `margin_s` from both ends [s]; raw: before whitening."""
+def _step_gain(
+    whitened: WhitenedResiduals, J: np.ndarray, onset_slopes: np.ndarray, raw: np.ndarray, margin_s: float = 0.0
+) -> Gain:
+    """Return the gain of a step in terms, (n, 1, k), at least `margin_s` from both ends [s].
+
+    Args:
+        whitened: residuals of one channel
+        J: whitened slopes of the terms; onset_slopes: the first rows of a step, (2, n, 1, k); raw: before whitening
+        margin_s: least time before and after the onset [s]
+    """
     t = whitened.modelled.t
-    onset_rows, onsets = onset_gates(t, Onset.STEP)
-    gain, x = solve_onsets(whitened, *normal_equations(whitened, J, onset_rows, Onset.STEP))
+    onset_rows, onsets = onset_gates(t, Onset.STEP, 1)
+    sums = normal_equations(whitened, J, onset_rows, Onset.STEP)
+    gain, x = solve_onsets(whitened, *with_onset_slopes(whitened, J, onset_slopes, onset_rows, sums))
     gain = np.where((t[onset_rows] > t[0] + margin_s) & (t[onset_rows] < t[-1] - margin_s), gain, 0.0)
     best = int(np.argmax(gain))
     series = raw @ x[best] * onsets[best].gate(t)
@@ -173,7 +213,10 @@ def _tail_sums(x: np.ndarray, starts: np.ndarray) -> np.ndarray:
 
 
 class Anomaly(NamedTuple):
-    """Gain of a change less its cost, with channel, onset [s], kind, term, part of the residual and parameters."""
+    """Gain of a change less its cost, with channel, onset [s], kind, term, and number of parameters.
+
+    It either adds a series to the residual of its channel, or acts in the simulation like an effect, as a hypothesis.
+    """
 
     net_gain: float
     channel: str
@@ -182,6 +225,7 @@ class Anomaly(NamedTuple):
     term: str = ""
     series: np.ndarray | None = None
     parameters: int = 1
+    hypothesis: FaultHypothesis | None = None
 
     @property
     def kind(self) -> str:
@@ -212,8 +256,18 @@ def find_changed_coefficients(whitened: WhitenedResiduals) -> list[Anomaly]:
     """Return the change of each single coefficient without an effect in the catalogue (`one`); empty as above."""
     if not whitened.base.vane:
         return []
-    return [
+    out = [
         Anomaly(gain.net, equation.channel, gain.t0, "one", name, gain.series)
         for equation in channel_equations(whitened)
         for name, gain in equation.gain_per_term()
     ]
+    return [*out, *_scaled_sensors(whitened)]
+
+
+def _scaled_sensors(whitened: WhitenedResiduals) -> Iterator[Anomaly]:
+    """Yield the scale error of every gyro and accelerometer; the best one refined, as effects are."""
+    scanned = Scanner(whitened, [(SENSOR_SCALE, reading) for reading in _SCALED]).scan(whitened)
+    for scored in (*scanned, *(refine(whitened, one.hypothesis) for one in scanned[:1])):
+        channel, term = _SCALED[scored.hypothesis.target]
+        onset = scored.hypothesis.onset
+        yield Anomaly(scored.net_gain, channel, onset.t0, "one", term, None, 1, scored.hypothesis)

@@ -14,8 +14,8 @@ from fleet.effects import Stage
 from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.data.flight import DECIMATION, DT
 from twin_worker.diagnosis.model import equations as eq
-from twin_worker.diagnosis.model.residual import RHO_0, EquationTerms, ModelledFlight, evaluate_equation
-from twin_worker.diagnosis.model.simulate import STATE, Simulation, solve_c_z
+from twin_worker.diagnosis.model.residual import EquationTerms, ModelledFlight, evaluate_equation
+from twin_worker.diagnosis.model.simulate import STATE, Simulation
 
 LIFT = ("velocity", "pitch")
 SIDE = ("velocity", "roll", "yaw")
@@ -109,13 +109,13 @@ def predict_force(eq_terms: EquationTerms, source: tuple[str, str, str]) -> np.n
     body = base.card.body
     q_bar = flow.q_bar
     if source[2] == "airspeed":
-        q_bar = 0.5 * RHO_0 * (eq_terms.measured["airspeed"] / base.airspeed) ** 2
+        q_bar = 0.5 * eq.RHO_0 * (eq_terms.measured["airspeed"] / base.airspeed) ** 2
     q_S = q_bar * body.S
     hats = flow.p * body.b / (2 * flow.Va), flow.q * body.c / (2 * flow.Va), flow.r * body.b / (2 * flow.Va)
     d_a, d_e, d_r = eq_terms.intermediate["delta"][:3]
     T = (base.coef["T"] @ eq_terms.regressors["T"]) * (1.0 + add.get("thrust", 0.0))
     A, B = base.coef["alpha"], base.coef["beta"]
-    c_z = solve_c_z(A, flow.alpha - A[0] - A[3] * hats[1] - A[5] * d_e)
+    c_z = eq.solve_c_z(A, flow.alpha - A[0] - A[3] * hats[1] - A[5] * d_e)
     beta = flow.beta
 
     def axial(c_z: np.ndarray) -> np.ndarray:
@@ -134,7 +134,7 @@ def predict_force(eq_terms: EquationTerms, source: tuple[str, str, str]) -> np.n
             c_z = (rest - M[5] * c_z**2 - M[6] * (axial(c_z) + T / q_S)) / (M[1] + shift)
     if source[1] != "velocity":
         name = {"roll": "L", "yaw": "N"}[source[1]]
-        terms = eq.lateral_terms(np.zeros_like(c_z), (hats[0], hats[2]), (d_a, d_r), c_z)
+        terms = eq.lateral_terms(np.zeros_like(c_z), hats[0], hats[2], d_a, d_r, c_z)
         rest = (eq_terms.measured[name] - add.get(name, 0.0)) / (q_S * body.b) - add.get(f"C_{name.lower()}", 0.0)
         rest = rest - evaluate_equation(base, {}, name, terms)
         rest = rest + (add.get("y_cg", 0.0) / body.b * c_z if name == "L" else 0.0)
