@@ -143,10 +143,8 @@ class Plan:
     def is_circling(self, seconds: float) -> bool:
         """Return whether the aircraft flies a circle of its mission `seconds` ahead, or is about to."""
         seq = self.seq_after(Change(uav=self.uav), seconds)
-        item = next((item for item in self.items if item.seq == seq), None)
-        if item is None or not is_circle(item):
-            return False
-        return bool(np.hypot(*(self.at(seconds)[:2] - self.position(item))) < 2 * _PASSING_M)
+        circles = [item for item in self.items if item.seq == seq and is_circle(item)]
+        return any(np.hypot(*(self.at(seconds)[:2] - self.position(item))) < 2 * _PASSING_M for item in circles)
 
     def seq_after(self, change: Change, seconds: float) -> int:
         """Return the item of a changed mission that is flown to `seconds` ahead, after the present plan until then."""

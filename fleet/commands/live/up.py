@@ -19,12 +19,12 @@ from fleet.commands.live.fly import AIRCRAFT_HELP, AUTOPILOTS, CHOICES, STORIES,
 from fleet.commands.live.replay import check_arguments as check_playing
 from fleet.commands.live.replay import replay_link
 from fleet.commands.live.status import as_objects, fleet_rows, fleet_table
-from fleet.commands.live.story import ConflictStory
 from fleet.config import bus_config_from, router_arguments, router_options
 from fleet.contract import FleetRow, FleetState, TwinState
 from fleet.process.children import Children
 from fleet.process.logs import add_time, report_progress
 from fleet.process.sanitise import printable
+from fleet.report.story import ConflictStory
 from fleet.telemetry.recording.options import add_recording_arguments
 
 EXAMPLES = """

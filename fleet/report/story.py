@@ -7,7 +7,6 @@ import numpy as np
 
 from fleet.bus.session import Bus
 from fleet.contract import Alert, AlertKind, Execution, ExecutionState, Message, Proposal, Sample
-from fleet.export.geometry import position_rows
 from fleet.frames import Origin, to_ned
 from fleet.process.sanitise import printable
 
@@ -97,8 +96,8 @@ class ConflictStory:
         """Store positions from the alert on."""
         if self._alert is None or self.ended:
             return
-        rows = position_rows(sample)
-        if len(rows[0]):
+        if sample.position is not None and sample.position.t.shape[0]:
+            rows = sample.position.t.numpy(), sample.position.x.numpy().astype(float)
             self._positions[sample.uav].append(rows)
             if min(self._newest(uav) for uav in PAIR) > (self._alert.predicted_t or 0.0) + _AFTER_S:
                 self._end()

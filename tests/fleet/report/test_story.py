@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from fleet.cli import main
-from fleet.commands.live.story import ConflictStory
 from fleet.contract import (
     Alert,
     AlertKind,
@@ -18,6 +17,7 @@ from fleet.contract import (
     Sample,
 )
 from fleet.frames import Origin, to_geodetic
+from fleet.report.story import ConflictStory
 
 T = 1_700_000_000.0
 HOME = Origin(474_000_000, 85_000_000, 450_000)
