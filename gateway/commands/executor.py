@@ -148,15 +148,15 @@ class CommandExecutor:
 
     def _approve(self, approval: Approval, now: float) -> None:
         """Check an approval; begin its execution or publish why it is refused."""
-        found: tuple[ReceivedProposal, Option] | Option | str = approval_refusal(approval, now, self._audit.executed)
-        if not found:
-            found = self._undoable(approval) if approval.undo else self._executable(approval, now)
+        checked: tuple[ReceivedProposal, Option] | Option | str = approval_refusal(approval, now, self._audit.executed)
+        if not checked:
+            checked = self._undoable(approval) if approval.undo else self._executable(approval, now)
         entry = {"proposal": approval.proposal, "uav": approval.uav, "who": printable(approval.who[:MAX_TEXT])}
-        if isinstance(found, str):
-            self._entries.append({"event": "refused", **entry, "undo": approval.undo, "reason": found})
-            self._bus.publish(_refused(approval, found, now))
+        if isinstance(checked, str):
+            self._entries.append({"event": "refused", **entry, "undo": approval.undo, "reason": checked})
+            self._bus.publish(_refused(approval, checked, now))
             return
-        run = self._undo_of(approval) if isinstance(found, Option) else self._begin(approval, *found)
+        run = self._undo_of(approval) if isinstance(checked, Option) else self._begin(approval, *checked)
         option = run.option
         event = UNDO_APPROVED if approval.undo else APPROVED
         self._entries.append({"event": event, **entry, "approved_t": approval.t, "changes": list(option.changes)})
@@ -172,13 +172,13 @@ class CommandExecutor:
 
     def _executable(self, approval: Approval, now: float) -> tuple[ReceivedProposal, Option] | str:
         """Return the version of the proposal and the option to execute, or why none is."""
-        fleet, found = self._fleet(), approved_version(approval, self._proposals.get(approval.proposal), now)
-        if isinstance(found, str):
-            return found
-        received, option = found
+        fleet, checked = self._fleet(), approved_version(approval, self._proposals.get(approval.proposal), now)
+        if isinstance(checked, str):
+            return checked
+        received, option = checked
         refusals = (change_refusal(change, fleet) for change in option.changes)
         reason = next(filter(None, refusals), "") or situation_refusal(option, received, fleet, now)
-        return reason or found
+        return reason or checked
 
     def _undoable(self, approval: Approval) -> Option | str:
         """Return the executed option whose plan from before can be restored, or why it cannot."""

@@ -274,9 +274,9 @@ class Panels:
     def _proposals_html(self, vehicle: Vehicle, now: float) -> str:
         """Return confirmation, execution and proposals of the selected UAV."""
         code, palette = self._approval_code, self._palette
-        asked = "" if self._approvals is None else self._approvals.html(vehicle, palette, now, code)
+        pending = "" if self._approvals is None else self._approvals.html(vehicle, palette, now, code)
         executed = execution_html(vehicle.execution, vehicle.uav, palette, code)
-        return asked + executed + proposals_html(vehicle, palette, now, self.units, code)
+        return pending + executed + proposals_html(vehicle, palette, now, self.units, code)
 
     def _passes(self, vehicle: Vehicle, now: float, selected: int | None) -> bool:
         if self._filter == "Alerts" and not vehicle.alerts:

@@ -197,7 +197,7 @@ class App:
                     browser.client.gui.reset()
                     self._terrain_layer.reset_client(client_id)
                 approvals = None if self._approver is None else ApprovalDialog(self.store, *self._approver)
-                view = View(browser, self.store, self.recordings, browser.palette, self._wake.set, approvals)
+                view = View(browser, self.store, self.recordings, self._wake.set, approvals)
         except Exception:  # an error on one page must not end the others
             self._failed_clients.add(client_id)
             self.views.pop(client_id, None)

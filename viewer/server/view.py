@@ -34,7 +34,6 @@ from viewer.store.profile import Surface, altitude_profile
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.theme.events import clip
-from viewer.theme.palette import Palette
 from viewer.timeline.deck import Timeline
 from viewer.timeline.recordings import RecordingStore
 
@@ -52,11 +51,10 @@ class View:
         browser: Browser,
         store: FleetStore,
         recordings: RecordingStore,
-        palette: Palette,
         wake: Callable[[], None],
         approvals: ApprovalDialog | None = None,
     ) -> None:
-        client = browser.client
+        client, palette = browser.client, browser.palette
         self.client, self.browser, self._store, self.palette, self._wake = client, browser, store, palette, wake
         self.scene = Scene(client.scene, palette, self._on_aircraft)
         self.measure, self._route = Measure(client.scene, palette), NOTHING

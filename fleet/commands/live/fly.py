@@ -165,7 +165,7 @@ def _check(args: argparse.Namespace) -> None:
     if args.seed < 0:
         raise ValueError(f"--seed: found {args.seed}, expected an integer from 0; change --seed")
     if args.story and (args.aircraft != "small" or args.fault or args.uavs[0] != 0):
-        found = f"--aircraft {args.aircraft}, {len(args.fault)} faults, first id {args.uavs[0]}"
-        raise ValueError(f"--story: found {found}, expected small aircraft from id 0 without faults; leave these out")
+        given = f"--aircraft {args.aircraft}, {len(args.fault)} faults, first id {args.uavs[0]}"
+        raise ValueError(f"--story: found {given}, expected small aircraft from id 0 without faults; leave these out")
     if args.seconds is not None and not args.seconds > 0:
         raise ValueError(f"--for: found {args.seconds} s, expected more than 0; change --for")

@@ -111,8 +111,8 @@ def _check(args: argparse.Namespace) -> None:
     if args.fault and (args.link or args.replay):
         raise ValueError("--fault: found --link or --replay, expected simulated aircraft; leave one out")
     if args.story and (args.link or args.replay or args.fault or args.aircraft != "small" or args.uavs < 2):
-        found = "--link, --replay, --fault, another --aircraft or fewer than 2 --uavs"
-        raise ValueError(f"--story: found {found}, expected 2 or more simulated small aircraft; leave these out")
+        given = "--link, --replay, --fault, another --aircraft or fewer than 2 --uavs"
+        raise ValueError(f"--story: found {given}, expected 2 or more simulated small aircraft; leave these out")
     faults_of(args, range(args.uavs))
     if args.results and not args.replay:
         raise ValueError("--results: found no --replay, expected a recording made by `fleet record`; name one")
@@ -205,8 +205,8 @@ def _watch(bus: Bus, children: Children, args: argparse.Namespace, stop: threadi
             if first_sample_t is None and any(row.sample_age_s is not None for row in rows):
                 first_sample_t = time.monotonic()
             elapsed = 0.0 if first_sample_t is None else time.monotonic() - first_sample_t
-            told = [] if story is None else list(story.sentences)
-            display.draw([*_lines(rows, children, worker_texts[-1], elapsed, args), *told], rows, worker_texts)
+            scene = [] if story is None else list(story.sentences)
+            display.draw([*_lines(rows, children, worker_texts[-1], elapsed, args), *scene], rows, worker_texts)
             if children.failures() or (args.seconds and elapsed >= args.seconds):
                 break
     failed = children.failures()
