@@ -112,10 +112,10 @@ def moment(said: Said, since: float = SETTLED_S, uav: int | None = None) -> tupl
     return best or otherwise
 
 
-def offered(said: Said, after_s: float) -> tuple[int, float]:
-    """Tell of whom and when something is proposed, `after_s` after the first time [s since 1970]."""
-    first = next(m for _, m, _ in said if isinstance(m, Proposal) and len(m.options) > 1)
-    return first.uav, next(t for t, m, _ in said if t >= first.t + after_s)
+def offered(said: Said, since: float) -> tuple[int, float]:
+    """Tell of whom and when something is first proposed after `since` [s], and 1 s later [s since 1970]."""
+    first = next(m for t, m, _ in said if t > said[0][0] + since and isinstance(m, Proposal) and m.options)
+    return first.uav, next(t for t, m, _ in said if t >= first.t + 1.0)
 
 
 def named_s(said: Said) -> float:
