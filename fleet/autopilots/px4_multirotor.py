@@ -18,7 +18,8 @@ import numba as nb
 import numpy as np
 
 from fleet.autopilots.copter import A_N, B_N, HOLD, N_SEGMENT, SPEED
-from fleet.autopilots.copter_legs import JERK, POS_P, VEL_D, VEL_P, track_reference
+from fleet.autopilots.position_loop import JERK, POS_P, VEL_D, VEL_P, drag, track_reference
+from fleet.autopilots.position_loop import N_PAR as _N_LOOP
 
 LAW = "px4: jerk-limited velocity along the legs, behind the position loop"
 
@@ -27,13 +28,13 @@ PHASE = N_SEGMENT
 LEG, TAKEOFF, CLIMB_IN_PLACE, LANDING = 0.0, 1.0, 2.0, 3.0
 N_COLUMNS = N_SEGMENT + 1
 
-# parameters after those of `copter_legs`: acceptance [m], horizontal and vertical acceleration up and down [m/s2],
+# parameters after those of `position_loop`: acceptance [m], horizontal and vertical acceleration up and down [m/s2],
 # vertical speed limits up and down [m/s], MPC_XY_ERR_MAX [m], MPC_XY_TRAJ_P [-], take-off speed [m/s] and its ramp [s],
 # heights above ground where landing begins to slow down and is slow [m], landing speed [m/s], position of the ground
 # down [m]
-ACCEPT, ACCEPT_Z, ACC, ACC_UP, ACC_DOWN, UP, DOWN, MAX_LAG, TURN_GAIN = range(15, 24)
-TAKEOFF_SPEED, RAMP, HIGH, LOW, LAND_SPEED, GROUND = range(24, 30)
-N_PAR = 30
+ACCEPT, ACCEPT_Z, ACC, ACC_UP, ACC_DOWN, UP, DOWN, MAX_LAG, TURN_GAIN = range(_N_LOOP, _N_LOOP + 9)
+TAKEOFF_SPEED, RAMP, HIGH, LOW, LAND_SPEED, GROUND = range(_N_LOOP + 9, _N_LOOP + 15)
+N_PAR = _N_LOOP + 15
 
 # state of the navigation: segment, time waited at its end [s], speed before the turn [m/s]; position, velocity and
 # acceleration of the trajectory, three each
@@ -226,8 +227,10 @@ def begin_trajectory(state: np.ndarray, xva: np.ndarray, par: np.ndarray) -> Non
     """Set the trajectory with whose velocity and acceleration the aircraft accelerates as it does."""
     r = state[TRAJECTORY:].reshape(3, 3)
     r[:] = xva[:3]
+    resistance = drag(xva[1, 0], xva[1, 1], par)
     for i in range(2):
-        r[0, i] += (par[VEL_D] * r[2, i] - xva[3, i]) / (par[VEL_P] * par[POS_P])
+        r[2, i] -= resistance[i]
+        r[0, i] += (par[VEL_D] * r[2, i] + resistance[i] - xva[3, i]) / (par[VEL_P] * par[POS_P])
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)

@@ -4,7 +4,7 @@ import numpy as np
 
 from fleet.airframes import GENERIC, load
 from fleet.airframes.airframe import servo_map
-from fleet.autopilots import arduplane, copter, copter_legs, greybox, px4_multirotor
+from fleet.autopilots import arduplane, copter, copter_legs, greybox, position_loop, px4_multirotor
 from fleet.autopilots.laws import remember
 from fleet.autopilots.shadow import NO_MEMORY, replay_controller
 from fleet.contract import Array, Item, Prediction, TwinState
@@ -90,9 +90,9 @@ def _run_multirotors() -> None:
     state, par = np.zeros(px4_multirotor.N_STATE), np.ones(px4_multirotor.N_PAR)
     px4_multirotor.begin_trajectory(state, motion, par)
     px4_multirotor.follow(state, segments, motion, par, 0.1, out)
-    segments, par = np.ones((2, copter_legs.N_COLUMNS)), np.ones(copter_legs.N_PAR)
+    segments, par = np.ones((2, copter_legs.N_COLUMNS)), np.ones(position_loop.N_PAR)
     copter_legs.follow(np.zeros(copter_legs.N_STATE), segments, motion, par, 0.1, out)
-    states, simulated = np.empty((5, copter_legs.N_STATE)), np.empty((5, 3, 3))
+    states, simulated = np.empty((5, copter_legs.N_STATE)), np.empty((5, 4, 3))
     copter_legs.simulated_states(segments, 1, par, 0.1, states, simulated)
 
 

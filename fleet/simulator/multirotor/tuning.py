@@ -52,6 +52,7 @@ _ARDUCOPTER: dict[str, float] = {
     "RTL_LOIT_TIME": 5000.0,
     "RTL_SPEED": 0.0,
     "RTL_CLIMB_MIN": 0.0,
+    "RTL_CONE_SLOPE": 3.0,
     "LAND_SPEED": 50.0,
     "LAND_SPEED_HIGH": 0.0,
     "LAND_ALT_LOW": 1000.0,

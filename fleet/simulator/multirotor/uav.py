@@ -236,6 +236,9 @@ class SimulatedMultirotor:
         self.reference = self._guidance.step(DT * _OUTER, e.p, e.v, self._following)
         if self._guidance.finished and self.mode == self.mission_mode:
             self._next_task()
+        if isinstance(self._guidance, CopterGuidance) and self._guidance.restarts:
+            self._position.take_over(e)
+            self._guidance.restarts = False
         phi_c, theta_c, throttle = self._position.step(self.reference, e, DT * _OUTER)
         heading = self._guidance.heading(e.p, self.reference)
         self._command = (phi_c, theta_c, self._command[2] if heading is None else heading)

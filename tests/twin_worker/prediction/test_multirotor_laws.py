@@ -5,10 +5,12 @@ import pytest
 
 from fleet.autopilots import copter_legs
 from fleet.contract import Mission
+from fleet.frames import G
 from fleet.simulator.multirotor.uav import SimulatedMultirotor
 from tests.support.flights import HERE, item
 from twin_worker.numerics.prediction_errors import min_path_length
 from twin_worker.prediction.multirotor import copter_rollout
+from twin_worker.prediction.multirotor.fit import fit_drag_and_wind
 from twin_worker.prediction.multirotor.rollout import MultirotorModel, fly_route, multirotor_config, speed_in_force
 from twin_worker.prediction.multirotor.route import limit_speeds, segments_from_mission
 from twin_worker.telemetry.track import STEP, Track
@@ -53,8 +55,8 @@ def test_a_wait_ends_by_the_flight_before_it_not_by_the_late_report_of_the_item(
     config = multirotor_config(Mission(uav=0, t=0.0, items=mission), {}, "ardupilot", 0.0, origin=HERE, flown=None)
     segments, _ = segments_from_mission(mission, 2, HERE, np.zeros(3), {}, arcs=True)
     segments = limit_speeds(segments, config.limit)
-    par = copter_rollout.parameters(config.limit, {}, 0.2)
-    states, flown = np.zeros((500, copter_legs.N_STATE)), np.zeros((500, 3, 3))
+    par = copter_rollout.parameters(config.limit, {}, (0.25, 0.01, 0.0, 0.0))
+    states, flown = np.zeros((500, copter_legs.N_STATE)), np.zeros((500, 4, 3))
     copter_legs.simulated_states(segments, len(segments), par, STEP, states, flown)
     seq = segments[states[:, copter_legs.SEGMENT].astype(int), 10]
     reported = np.concatenate([np.full(9, 2.0), seq[:-9]])
@@ -65,7 +67,7 @@ def test_a_wait_ends_by_the_flight_before_it_not_by_the_late_report_of_the_item(
             STEP * np.arange(k + 1),
             flown[: k + 1, 0],
             flown[: k + 1, 1],
-            np.zeros((k + 1, 3)),
+            np.full((k + 1, 3), np.nan),
             np.ones(k + 1, bool),
             "",
         )
@@ -92,8 +94,37 @@ def test_errors_in_hover_are_related_to_five_metres() -> None:
 def test_the_speed_in_force_limits_legs_and_circles_but_no_return() -> None:
     turns = item(2, 18, north=100.0, param1=1.0, param3=20.0)
     mission = (item(0), item(1, north=50.0), turns, item(3, 178, param1=1.0, param2=7.0), item(4), item(5, 20))
-    for speed, leg, circle in ((0.0, 0.0, 20.0 * np.pi / 9.0), (4.0, 4.0, 4.0)):
+    for speed in (0.0, 4.0):
         rows, _ = segments_from_mission(mission, 1, HERE, np.zeros(3), {}, arcs=True, speed=speed)
         arc = rows[:, copter_legs.TURN] != 0.0
-        assert rows[rows[:, 10] == 1, 6].tolist() == [leg] and rows[arc, 6] == pytest.approx(circle)
+        assert rows[rows[:, 10] == 1, 6].tolist() == [speed] == rows[arc, copter_legs.SPEED_BEFORE].tolist()
+        assert rows[arc, 6] == pytest.approx(20.0 * np.pi / 9.0)  # of CIRCLE_RATE; limited when the law prepares it
         assert rows[rows[:, 10] == 4, 6].tolist() == [7.0] and rows[rows[:, 10] == 5, 6][0] == 0.0
+
+
+def test_drag_and_wind_are_found_from_the_tilt() -> None:
+    """A flight on a square in wind, whose tilt balances acceleration and drag (k1 + k2 |u|) u."""
+    k1, k2, wind = 0.3, 0.02, np.array([4.0, -2.0])
+    t = STEP * np.arange(600)
+    heading = np.pi / 2 * np.floor(t / 20.0)
+    target = 9.0 * np.column_stack([np.cos(heading), np.sin(heading)])
+    v = np.zeros((len(t), 3))
+    for k in range(1, len(t)):
+        v[k, :2] = v[k - 1, :2] + (target[k] - v[k - 1, :2]) * STEP / 1.5
+    acceleration = np.gradient(v[:, :2], STEP, axis=0)
+    u = v[:, :2] - wind
+    thrust = acceleration + (k1 + k2 * np.linalg.norm(u, axis=1, keepdims=True)) * u
+    noise = np.random.default_rng(4).normal(0.0, 0.005, (len(t), 2))
+    theta = np.arctan(-thrust[:, 0] / G) + noise[:, 0]
+    phi = np.arctan(thrust[:, 1] * np.cos(theta) / G) + noise[:, 1]
+    p = np.vstack([np.zeros(3), np.cumsum(v[:-1] * STEP, axis=0)])
+    p[:, 2] = -50.0
+    track = Track(t, p, v, np.column_stack([phi, theta, 0.0 * t]), np.ones(len(t), bool), "")
+    mission = Mission(uav=0, t=0.0, items=(item(0), item(1, north=50.0)))
+    config = multirotor_config(mission, {}, "ardupilot", 0.0, origin=HERE, flown=None)
+    model = fit_drag_and_wind(track, config, MultirotorModel())
+    airspeed = 9.0
+    assert model.drag[0] + model.drag[1] * airspeed == pytest.approx(k1 + k2 * airspeed, rel=0.1)
+    assert model.wind == pytest.approx(wind, abs=0.5)
+    short = Track(t[:20], p[:20], v[:20], track.euler[:20], track.ok[:20], "")
+    assert fit_drag_and_wind(short, config, MultirotorModel()) == MultirotorModel()

@@ -1,15 +1,16 @@
 """Fit of the multirotor model: minimise the rollout error from many starts over the last minute.
 
-Drag and wind come from the tilt: horizontal thrust minus acceleration is drag, which depends on the airspeed.
-Source: drag as in Mahony, Kumar & Corke 2012 (linear in airspeed).
+Drag and wind come from the tilt: horizontal thrust minus acceleration is drag, (k1 + k2 |u|) u with u = v - w.
+Source: drag as in Faessler, Franchi & Scaramuzza 2018 (linear in airspeed) and its quadratic part.
 """
 
 from dataclasses import replace
-from math import isfinite, tan
+from math import isfinite
 
 import numpy as np
 
 from fleet.frames import G
+from twin_worker.prediction.multirotor.copter_rollout import tilt_acceleration
 from twin_worker.prediction.multirotor.rollout import (
     MultirotorConfig,
     MultirotorModel,
@@ -17,13 +18,17 @@ from twin_worker.prediction.multirotor.rollout import (
     fly_segments,
     time_on_item,
 )
+from twin_worker.prediction.multirotor.route import home_position
 from twin_worker.telemetry.track import STEP, Track
 
 _HISTORY_ROWS = 300  # flight before each start
 _MIN_TRACK_S = 2.0  # minimum track before a rollout [s]
 _COMPARE_S = 60.0  # compared flight [s]
-_MIN_TILT_S, _TILT_ROWS = 20.0, 5  # minimum flight for drag and wind [s], rows from one to the next
-_MIN_VELOCITY_CHANGE = 3.0  # minimum range of the horizontal velocity for both [m/s]
+_MIN_TILT_S, _MEAN_ROWS = 20.0, 10  # minimum flight for drag and wind [s], rows of one mean
+_MIN_HEIGHT = 2.0  # above home [m]
+_PRIOR = ((0.25, 0.01, 0.0, 0.0), (0.15, 0.01, 4.0, 4.0))  # drag and wind: mean and standard deviation
+_ITERATIONS, _MAX_WIND = 8, 25.0  # [-, m/s]
+_DRAG_STD = 0.3  # of a mean of the drag before its scatter is known [m/s2]
 _START_INTERVAL_S, _RUN_S = 4.0, 10.0  # interval of starts, length of a rollout [s]
 _LAG_VALUES = (0.7, 1.0, 1.4, 2.0, 2.8)  # tried natural frequencies [rad/s]
 _FRACTIONS = (0.6, 0.8, 0.9, 1.0, 1.1, 1.25)  # tried fractions of the limits
@@ -40,7 +45,7 @@ _PRIOR_COST_ASSUMED, _PRIOR_COST_RECEIVED = 20.0, 200.0
 
 def fit_model(track: Track, seq: np.ndarray, config: MultirotorConfig, model: MultirotorModel) -> MultirotorModel:
     """Fit lag, speed, acceleration and stop delay to the last minute by the rollout error from many starts."""
-    model = _fit_drag_and_wind(track, config, model)
+    model = fit_drag_and_wind(track, config, model)
     starts = _starts(track, seq, config)
     if len(starts) < 3:
         return model
@@ -63,8 +68,9 @@ def fit_model(track: Track, seq: np.ndarray, config: MultirotorConfig, model: Mu
         return float(np.mean(errors)) + prior / len(starts)
 
     name, trials = _TRIALS[model.n_comparisons % len(_TRIALS)]
-    if name in ("wn", "stop_delay_s") and (config.plans_legs or config.smooths_velocity):
-        trials = ()  # these navigation laws have gains and stops of their own
+    limit = {"speed_fraction": "speed", "accel_fraction": "acc"}.get(name)
+    if (config.plans_legs or config.smooths_velocity) and limit not in config.absent:
+        trials = ()  # these navigation laws have gains and stops of their own, and follow their limits
     options = [replace(model, **{name: value}) for value in dict.fromkeys((getattr(model, name), *trials))]
     costs = [cost_of(option) for option in options]
     best = int(np.argmin(costs))
@@ -98,27 +104,43 @@ def _rollout_error(
     return float(np.linalg.norm(path - actual, axis=1).mean())
 
 
-def _fit_drag_and_wind(track: Track, config: MultirotorConfig, model: MultirotorModel) -> MultirotorModel:
-    """Fit drag and wind to the tilt: horizontal thrust minus acceleration is k (v - w), linear in k and k w."""
-    rows = np.arange(len(track) - 1, max(len(track) - int(_COMPARE_S / STEP), 10), -_TILT_ROWS)
-    rows = rows[track.ok[rows] & np.isfinite(track.euler[rows]).all(axis=1)]
-    if len(rows) < _MIN_TILT_S / (_TILT_ROWS * STEP):
+def fit_drag_and_wind(track: Track, config: MultirotorConfig, model: MultirotorModel) -> MultirotorModel:
+    """Fit drag and wind to the tilt by maximum a posteriori Gauss-Newton; `model` if the flight is too short."""
+    ground = home_position(config.items, config.origin)[2]
+    v, f = _means(track, ground)
+    if len(v) < _MIN_TILT_S / (_MEAN_ROWS * STEP):
         return model
-    euler = track.euler[rows]
-    cf, sf, ct, st, cp, sp = (g(euler[:, i]) for i in range(3) for g in (np.cos, np.sin))
-    down = np.column_stack([cf * st * cp + sf * sp, cf * st * sp - sf * cp, cf * ct])  # body z axis in NED
-    acceleration = (track.v[rows] - track.v[rows - 10]) / (10 * STEP)
-    thrust = (G - acceleration[:, 2]) / np.maximum(down[:, 2], 0.5)
-    v = track.v[rows, :2] - 0.5 * STEP * 10 * acceleration[:, :2]
-    drag = -down[:, :2] * thrust[:, None] - acceleration[:, :2]
-    unit = np.ones(len(rows))
-    zero = 0.0 * unit
-    A = np.vstack([np.column_stack([v[:, 0], -unit, zero]), np.column_stack([v[:, 1], zero, -unit])])
-    solution = np.linalg.solve(A.T @ A + np.diag([20.0, 2.0, 2.0]), A.T @ drag.T.ravel() + [20.0 * 0.2, 0.0, 0.0])
-    k = float(solution[0])
-    if not 0.03 < k < 2.0 or np.ptp(v, axis=0).max() < _MIN_VELOCITY_CHANGE:
+    mean, std = np.array(_PRIOR)
+    x, scatter = mean.copy(), _DRAG_STD
+    for _ in range(_ITERATIONS):
+        u = v - x[2:]
+        speed = np.hypot(*u.T)[:, None]
+        residual = f - (x[0] + x[1] * speed) * u
+        slope = x[0] + x[1] * speed[:, 0], x[1] * u / np.maximum(speed, 1e-6)
+        by_wind = -slope[0][:, None, None] * np.eye(2) - u[:, :, None] * slope[1][:, None, :]
+        J = np.concatenate([u[:, :, None], (speed * u)[:, :, None], by_wind], axis=2).reshape(-1, 4)
+        information = J.T @ J / scatter**2 + np.diag(std**-2.0)
+        x += np.linalg.solve(information, J.T @ residual.ravel() / scatter**2 + (mean - x) / std**2)
+        x[:2] = np.maximum(x[:2], (0.02, 0.0))
+        scatter = max(float(np.sqrt(np.mean(residual**2))), 0.05)
+    if not (np.isfinite(x).all() and np.hypot(*x[2:]) < _MAX_WIND):
         return model
-    wind = solution[1:] / k
-    if not np.hypot(*wind) < 25.0:
-        return model
-    return replace(model, max_tilt_airspeed=G * tan(config.limit.tilt) / k, wind=(float(wind[0]), float(wind[1])))
+    k1_std, k2_std = np.sqrt(np.diag(np.linalg.inv(information))[:2]).tolist()
+    k1, k2, w_n, w_e = x.tolist()
+    return replace(model, drag=(k1, k2), drag_std=(k1_std, k2_std), wind=(w_n, w_e))
+
+
+def _means(track: Track, ground: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return means of the horizontal velocity and drag in flight, (n, 2) each [m/s, m/s2]."""
+    n = (len(track) - 1) // _MEAN_ROWS
+    first = len(track) - 1 - n * _MEAN_ROWS
+    ends = first + _MEAN_ROWS * np.arange(n + 1)
+    a = np.diff(track.v[ends], axis=0) / (STEP * _MEAN_ROWS)
+
+    def mean(x: np.ndarray) -> np.ndarray:
+        return x[first : first + n * _MEAN_ROWS].reshape(n, _MEAN_ROWS, -1).mean(axis=1)
+
+    thrust = mean(tilt_acceleration(track.euler)) * (1.0 - a[:, 2:] / G)
+    whole = (mean(track.ok[:, None].astype(float)) == 1.0)[:, 0] & np.isfinite(thrust).all(axis=1)
+    flies = whole & (mean(track.p)[:, 2] < ground - _MIN_HEIGHT)
+    return mean(track.v)[flies, :2], (thrust - a[:, :2])[flies]

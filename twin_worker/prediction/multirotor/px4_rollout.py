@@ -22,6 +22,7 @@ _GAINS = (
     (0.4, ("MPC_XY_VEL_I_ACC",)),
     (0.2, ("MPC_XY_VEL_D_ACC",)),
     (0.0, ()),  # the jerk is constant
+    (1.0, ()),  # no position is shaped
 )
 _DEFAULTS = {
     "NAV_ACC_RAD": 10.0,
@@ -44,19 +45,19 @@ _MAX_REPLAY, _MAX_OFFSET_M = 80, 3.0  # rows after the begin of an item; deviati
 _LEVEL_M = 0.3  # shorter horizontal legs are vertical [m]
 
 
-def parameters(limit: Limits, params: Mapping[str, float], drag: float, ground: float) -> np.ndarray:
+def parameters(limit: Limits, params: Mapping[str, float], airframe: Sequence[float], ground: float) -> np.ndarray:
     """Return the parameters of the trajectory, (px4_multirotor.N_PAR,).
 
     Args:
         limit, params: limits and autopilot parameters
-        drag: over mass and airspeed [1/s]
+        airframe: drag and wind as of `copter_rollout.parameters`
         ground: its height, NED [m]
     """
     known = {name: value for name, value in params.items() if name in _DEFAULTS and isfinite(value) and value > 0}
     values = _DEFAULTS | known
     own = [values[name] for name in _DEFAULTS]
     own[2] = limit.acc  # with what was learnt from flight
-    return np.array([*gains(_GAINS, limit, params, (0.0, drag)), *own, ground])
+    return np.array([*gains(_GAINS, limit, params, (0.0, *airframe)), *own, ground])
 
 
 def prepare(

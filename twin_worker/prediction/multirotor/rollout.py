@@ -7,7 +7,7 @@ Source: ArduCopter and PX4 limits as in `fleet.autopilots.copter`.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from math import isfinite, tan
+from math import isfinite, sqrt, tan
 
 import numpy as np
 
@@ -33,7 +33,6 @@ from twin_worker.telemetry.track import STEP, Track
 HOLD_MODES = ("LOITER", "POSHOLD", "BRAKE", "AUTO.LOITER", "QLOITER", "HOLD", "POSCTL")
 RETURN_MODES = ("RTL", "AUTO.RTL", "SMART_RTL")
 _ZETA = 0.9
-_DRAG = 0.2  # drag over mass and airspeed before it is identified [1/s]
 _TRANSITION_ACCEL = 4.0  # acceleration of a quadplane in transition [m/s2]
 _ITEM_MAX_AGE_S = 15.0  # maximum age of a reported item [s]
 _STATIONARY_SPEED = 0.8  # stationary below this speed [m/s]
@@ -49,7 +48,8 @@ class MultirotorModel:
         speed_fraction: flown over allowed speed [-]
         accel_fraction: flown over allowed acceleration [-]
         stop_delay_s: delay at each stop in addition to the wait of the mission [s]
-        max_tilt_airspeed: airspeed at the largest tilt; nan if unknown [m/s]
+        drag: linear and quadratic drag over mass [1/s, 1/m]
+        drag_std: their standard deviations; those of the prior before the first fit [1/s, 1/m]
         wind: NED, the direction it blows to, (2,) [m/s]
         mean_error: mean error over 10 s of past flight [m]; nan before the first fit
         n_starts: number of rollouts in that mean
@@ -60,7 +60,8 @@ class MultirotorModel:
     speed_fraction: float = 1.0
     accel_fraction: float = 1.0
     stop_delay_s: float = 0.5
-    max_tilt_airspeed: float = float("nan")
+    drag: tuple[float, float] = (0.25, 0.01)
+    drag_std: tuple[float, float] = (0.15, 0.01)
     wind: tuple[float, float] = (0.0, 0.0)
     mean_error: float = float("nan")
     n_starts: int = 0
@@ -130,7 +131,7 @@ class MultirotorConfig:
             return (longer, more) if len(k) and k[0] <= 1 else (route, problems)
         changed = int(np.flatnonzero(seq != seq[-1])[-1]) if (seq != seq[-1]).any() else None
         if before.command == _TURNS and changed is not None:
-            par = copter_rollout.parameters(self.limit, self.params, 0.0)
+            par = copter_rollout.parameters(self.limit, self.params, (0.0, 0.0, 0.0, 0.0))
             route[0, copter.A_N : copter.A_N + 3] = copter_rollout.stopping_point(
                 track.p[changed], track.v[changed], par
             )
@@ -267,15 +268,20 @@ class MultirotorTwin:
         )
 
     @property
-    def drag(self) -> float:
-        """Return drag over mass and airspeed [1/s]."""
-        drag = G * tan(min(self.config.limit.tilt, 1.2)) / self.model.max_tilt_airspeed
-        return drag if isfinite(drag) else _DRAG
+    def airframe(self) -> tuple[float, float, float, float]:
+        """Return linear and quadratic drag over mass, and the wind north and east [1/s, 1/m, m/s, m/s]."""
+        return (*self.model.drag, *self.model.wind)
 
     @property
     def par(self) -> np.ndarray:
-        """Return the parameters of the kernel."""
-        return np.array([self.config.limit.jerk, self.model.wn, _ZETA, self.model.max_tilt_airspeed, *self.model.wind])
+        """Return the parameters of the general law."""
+        return np.array([self.config.limit.jerk, self.model.wn, _ZETA, self.max_tilt_airspeed, *self.model.wind])
+
+    @property
+    def max_tilt_airspeed(self) -> float:
+        """Return the airspeed at the largest tilt, k1 v + k2 v^2 = g tan(tilt) [m/s]."""
+        linear, quadratic = self.model.drag
+        return 2 * (a := G * tan(min(self.limit.tilt, 1.2))) / (linear + sqrt(linear**2 + 4 * quadratic * a))
 
 
 def fly_segments(
@@ -297,14 +303,14 @@ def fly_segments(
     segments[stops, copter.HOLD] += 0.0 if stops_by_law else twin.model.stop_delay_s
     segments[:, copter.SPEED] *= np.where(commanded[:, copter.SPEED] > 0, twin.model.speed_fraction, 1.0)
     if segments.shape[1] == copter_legs.N_COLUMNS:
-        segments = copter_rollout.prepare(segments, commanded, twin.config.items, twin.config.params)
-        par = copter_rollout.parameters(twin.limit, twin.config.params, twin.drag)
+        segments = copter_rollout.prepare(segments, commanded, twin.config.items, twin.config.params, twin.limit)
+        par = copter_rollout.parameters(twin.limit, twin.config.params, twin.airframe)
         return copter_rollout.fly(track, segments, (seq, since), par, ahead)
     if twin.config.smooths_velocity:
         config, cruise = twin.config, (twin.limit.speed, twin.model.speed_fraction)
         segments = px4_rollout.prepare(segments, commanded, config.items, cruise)
         ground = float(home_position(config.items, config.origin)[2])
-        par = px4_rollout.parameters(twin.limit, config.params, twin.drag, ground)
+        par = px4_rollout.parameters(twin.limit, config.params, twin.airframe, ground)
         return px4_rollout.fly(track, segments, (seq, since), par, ahead)
     p, v = track.p[-1].copy(), track.v[-3:].mean(axis=0)
     ref = _initial_reference(track, segments, seq, twin.model.wn)

@@ -21,6 +21,10 @@ _CIRCLE_SEGMENTS = 12  # segments of one circle
 _SLOW_LANDING_M = 10.0  # height below which a landing is slow [m]
 _RETURN, _JUMP, _DELAY = 20, 177, 93  # MAV_CMD
 _RTL_M = 15.0  # ArduCopter's default RTL_ALT [m]
+_LOITER_S = 5.0  # ArduCopter's default RTL_LOIT_TIME [s]
+_MIN_SLOPE = 0.5  # smallest RTL_CONE_SLOPE that limits the height
+_PLACE_M = 0.005  # shorter than the rounding of a place [m]
+_EDGE_M = 3.0  # ArduCopter circles at once when nearer to the circle [m]
 _CIRCLE_M, _CIRCLE_RATE = 10.0, 20.0  # ArduCopter's default CIRCLE_RADIUS and CIRCLE_RATE [m, deg/s]
 
 
@@ -32,9 +36,9 @@ class _SegmentBuilder:
     rows: list[np.ndarray]
     arcs: bool = False
 
-    def add(self, b: np.ndarray, seq: float, hold: float = 0.0, speed: float = 0.0) -> None:
-        """Add a segment to `b`; skip a segment of zero length without a wait."""
-        if np.linalg.norm(b - self.end) < 0.3 and not hold:
+    def add(self, b: np.ndarray, seq: float, hold: float = 0.0, speed: float = 0.0, *, shortest: float = 0.3) -> None:
+        """Add a segment to `b`; skip a segment shorter than `shortest` [m] without a wait."""
+        if np.linalg.norm(b - self.end) < shortest and not hold:
             return
         row = np.zeros(copter_legs.N_COLUMNS if self.arcs else copter.N_SEGMENT)
         row[copter.A_N : copter.A_N + 3], row[copter.B_N : copter.B_N + 3] = self.end, b
@@ -176,20 +180,38 @@ def _add_leg(
 
 def _add_descent(builder: _SegmentBuilder, ground: float, seq: float) -> None:
     """Add a descent to the ground, the last ten metres at landing speed."""
+    if builder.arcs:
+        builder.add(np.array([*builder.end[:2], ground]), seq, inf, -1.0)  # -1: landing speed
+        builder.rows[-1][copter_legs.DESCENT] = 1.0
+        return
     if builder.end[2] < ground - _SLOW_LANDING_M:
         builder.add(np.array([*builder.end[:2], ground - _SLOW_LANDING_M]), seq)
-    builder.add(np.array([*builder.end[:2], ground]), seq, inf, -1.0)  # -1: landing speed
+    builder.add(np.array([*builder.end[:2], ground]), seq, inf, -1.0)
 
 
 def _add_return(builder: _SegmentBuilder, home: np.ndarray, params: Mapping[str, float], seq: float) -> None:
     height = params.get("RTL_ALT_M", params.get("RTL_RETURN_ALT", params.get("RTL_ALT", 100.0 * _RTL_M) * 0.01))
     height = min(height, 1e3) if height > 0 else 0.0
+    if builder.arcs:
+        height = _return_height(builder.end, home, params, height)
     top = min(home[2] - height, builder.end[2])
-    builder.add(np.array([*builder.end[:2], top]), seq, STOP_WAIT_S if top < builder.end[2] - 0.3 else 0.0)
-    wait_s = params.get("RTL_LAND_DELAY", params.get("RTL_LOIT_TIME", 0.0) * 1e-3)
+    if builder.arcs:  # it flies through the top of the climb, which has a length even if there is none
+        top = min(top, builder.end[2] - _PLACE_M)
+        builder.add(np.array([*builder.end[:2], top]), seq, shortest=0.0)
+    else:
+        builder.add(np.array([*builder.end[:2], top]), seq, STOP_WAIT_S if top < builder.end[2] - 0.3 else 0.0)
+    wait_s = params.get("RTL_LAND_DELAY", params.get("RTL_LOIT_TIME", 1e3 * _LOITER_S) * 1e-3)
     builder.add(np.array([*home[:2], top]), seq, wait_s if STOP_WAIT_S < wait_s < 1e3 else STOP_WAIT_S)
-    if not params.get("RTL_ALT_FINAL", 0.0) > 0:
+    if not params.get("RTL_ALT_FINAL_M", params.get("RTL_ALT_FINAL", 0.0)) > 0:
         _add_descent(builder, home[2], seq)
+
+
+def _return_height(p: np.ndarray, home: np.ndarray, params: Mapping[str, float], height: float) -> float:
+    """Return ArduCopter's height of a return: within the cone above home, and at least RTL_CLIMB_MIN above p [m]."""
+    climb = max(params.get("RTL_CLIMB_MIN_M", params.get("RTL_CLIMB_MIN", 0.0) * 0.01), 0.0)
+    lowest, slope = home[2] - p[2] + climb, params.get("RTL_CONE_SLOPE", 3.0)
+    height = max(height, lowest)
+    return float(min(height, max(hypot(*(p - home)[:2]) * slope, lowest)) if slope >= _MIN_SLOPE else height)
 
 
 def _add_circle(builder: _SegmentBuilder, leg: np.ndarray, params: Mapping[str, float]) -> None:
@@ -214,12 +236,15 @@ def _add_arc(builder: _SegmentBuilder, leg: np.ndarray, radius: float, rate: flo
     offset = (builder.end - centre)[:2]
     distance = hypot(*offset)
     out = offset / distance if distance > 0.1 else np.array([1.0, 0.0])
+    edge = np.array([*(centre[:2] + abs(radius) * out), centre[2]])
     builder.stop()
-    builder.add(np.array([*(centre[:2] + abs(radius) * out), centre[2]]), seq, STOP_WAIT_S, leg[m.VA_C])
-    builder.add(builder.end, seq, STOP_WAIT_S, max(min(rate * abs(radius), leg[m.VA_C] or inf), 0.3))
+    if np.linalg.norm(edge - builder.end) > _EDGE_M:
+        builder.add(edge, seq, STOP_WAIT_S, leg[m.VA_C])
+    builder.add(builder.end, seq, STOP_WAIT_S, max(rate * abs(radius), 0.3))
     row = builder.rows[-1]
     row[copter_legs.RADIUS], row[copter_legs.TURN] = abs(radius), 2 * pi * turns * (1 if radius >= 0 else -1)
     row[copter_legs.C_N], row[copter_legs.C_E] = centre[:2]
+    row[copter_legs.SPEED_BEFORE] = leg[m.VA_C]
 
 
 def stop_position(items: Sequence[Item], seq: int, origin: Origin) -> np.ndarray | None:
