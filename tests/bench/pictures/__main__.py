@@ -36,15 +36,13 @@ TRAILS_S = 45.0  # until a crowd has trails [s]
 SHARE = 0.62  # of the real flight, where it is looked at
 
 
-def told(browser: Any, said: Said, when: tuple[int, float], file: Path, *options: str, all_of_it: bool = False) -> None:
-    """Say it all again and take the picture of a UAV, or of all of them with one selected, at a moment."""
+def told(browser: Any, said: Said, when: tuple[int, float], file: Path, *options: str) -> None:
+    """Say it all again and take the picture of a UAV at a moment."""
     uav, t = when
     with Speaker(said, t) as speaker, viewer(speaker.router, *options) as address, page(browser, address) as one:
         speaker.begin()
         speaker.there.wait()
         turn_to(one, uav)
-        if all_of_it:
-            command(one, "Camera: from the side")
         shoot(one, file)
 
 
@@ -65,7 +63,7 @@ def mismatch(browser: Any, out: Path) -> None:
 def proposal(browser: Any, out: Path) -> None:
     """Show two aircraft that will meet, and what is proposed against it, ready to be approved."""
     said = judged(flown("conflict", *MEETING), proposes=True)
-    told(browser, said, offered(said, OFFERED_S), out / "proposal.png", "--allow", "approvals", all_of_it=True)
+    told(browser, said, offered(said, OFFERED_S), out / "proposal.png", "--allow", "approvals")
 
 
 def trouble(router: str, stop: threading.Event) -> None:
