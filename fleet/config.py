@@ -4,7 +4,7 @@ import argparse
 import tomllib
 from pathlib import Path
 
-from fleet.access.entry import ROUTER, BusConfig
+from fleet.access.entry import ROUTER, BusConfig, parse_endpoint
 from fleet.access.roles import TOOLS
 
 KEYS = ("at", "certificates", "passwords")
@@ -30,6 +30,26 @@ def bus_config_from(args: argparse.Namespace, role: str = TOOLS) -> BusConfig:
     # absolute: the output of `fleet router` is read in another folder, zenohd under systemd runs in /
     paths = {n: args.config.absolute().parent / settings[n] for n in ("certificates", "passwords") if n in settings}
     return BusConfig(args.router or settings.get("at", ROUTER), role, **paths)
+
+
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+
+
+def has_operators(option: str, bus_config: BusConfig) -> bool:
+    """Return whether the router knows who is an operator; False on loopback, where every process may approve.
+
+    Args:
+        option: that needs it, for the error
+        bus_config: address of the router and credentials
+    Raises:
+        ValueError: when other machines could approve without the certificate of an operator.
+    """
+    if not bus_config.identifies_roles and parse_endpoint(bus_config.endpoint)[0] not in LOOPBACK:
+        raise ValueError(
+            f"{option}: found router {bus_config.endpoint} without certificates or passwords, expected them: "
+            "only an operator may approve; name them in the file of --config, see deploy/README.md"
+        )
+    return bus_config.identifies_roles
 
 
 def router_options(args: argparse.Namespace) -> list[str]:

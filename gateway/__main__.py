@@ -8,10 +8,10 @@ import sys
 import threading
 from pathlib import Path
 
-from fleet.access.entry import BusConfig, parse_endpoint
+from fleet.access.entry import BusConfig
 from fleet.access.roles import GATEWAY
 from fleet.cli import check_file, id_range, make_parser, run_command, stop_on_signal
-from fleet.config import MAX_UAVS, bus_config_from, router_arguments
+from fleet.config import MAX_UAVS, bus_config_from, has_operators, router_arguments
 from fleet.process.logs import log_arguments, report_status
 from fleet.process.malloc_trim import enable_malloc_trim
 from fleet.process.private_files import state_folder
@@ -22,7 +22,6 @@ COLD_S = 2.0  # compilation that takes longer is logged [s]
 COMPILING = "compiling the decoder for this machine, once; links open when that is done"
 GC_THRESHOLD = 50_000  # allocations between cycle collections; a tick allocates thousands of objects without cycles
 TRIM_BYTES = 1 << 20  # larger allocations are returned to the system: batches of a flood, not of every tick [bytes]
-LOOPBACK = ("127.0.0.1", "::1", "localhost")
 DEFAULT_LINK = "udpin:127.0.0.1:14550"
 EXAMPLES = """
   gateway                                              listen on loopback, port 14550
@@ -84,14 +83,8 @@ def check_commands(args: argparse.Namespace, bus_config: BusConfig) -> None:
         return
     if args.listen_only:
         raise ValueError("--allow commands: found --listen-only as well, expected one of both; leave one out")
-    if bus_config.identifies_roles:
-        return
-    if parse_endpoint(bus_config.endpoint)[0] not in LOOPBACK:
-        raise ValueError(
-            f"--allow commands: found router {bus_config.endpoint} without certificates or passwords, expected them: "
-            "only an operator may approve; name them in the file of --config, see deploy/README.md"
-        )
-    _log.warning("commands are allowed on a router without roles: every process of this machine can approve them")
+    if not has_operators("--allow commands", bus_config):
+        _log.warning("commands are allowed on a router without roles: every process of this machine can approve them")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -2,13 +2,16 @@
 
 import argparse
 import gc
+import logging
 import sys
+from contextlib import ExitStack
 
-from fleet.access.roles import VIEWER
+from fleet.access.roles import OPERATOR, VIEWER
 from fleet.cli import check_port, make_parser, run_command, stop_on_signal
-from fleet.config import bus_config_from, router_arguments
+from fleet.config import LOOPBACK, bus_config_from, has_operators, router_arguments
 from fleet.process.logs import log_arguments, report_status
 from fleet.process.malloc_trim import enable_malloc_trim
+from fleet.report.changes import user_name
 
 GC_THRESHOLDS = 50_000, 10, 10  # a large fleet allocates 10,000 objects per second, almost none in cycles
 LARGE_BLOCK_BYTES = 48 * 1024  # below a receive buffer of the bus, which one queued message keeps allocated [bytes]
@@ -18,7 +21,11 @@ EXAMPLES = """
   viewer --terrain dem.tif --imagery aerial.png@47.30,8.40,47.45,8.60
   viewer --terrain N47E008.hgt --map region.mbtiles
   viewer --router tcp/10.0.0.5:7447
+  viewer --allow approvals --config fleet.toml --who "Kim Lee"     buttons that approve proposals, as an operator
 """
+APPROVALS = "approvals"
+"""What `--allow` allows."""
+_log = logging.getLogger(__name__)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -49,6 +56,12 @@ def main(argv: list[str] | None = None) -> int:
         "--imagery", metavar="FILE", help="ground imagery: GeoTIFF, PNG or JPEG, or FILE@south,west,north,east"
     )
     parser.add_argument("--map", metavar="FILE", help="map tiles: MBTiles or PMTiles with PNG, JPEG or WebP images")
+    parser.add_argument(
+        "--allow",
+        choices=(APPROVALS,),
+        help="show buttons that approve proposals, with the certificate or password of the role operator (off)",
+    )
+    parser.add_argument("--who", metavar="NAME", help="the person who approves on this page (user@machine)")
     parser.add_argument("--light", action="store_true", help="light theme, for bright surroundings")
     return run_command("viewer", run, parser.parse_args(argv))
 
@@ -61,6 +74,7 @@ def run(args: argparse.Namespace) -> int:
         OSError: when the port is in use.
     """
     check_port("--port", args.port)
+    _check_approvals(args)
     from fleet.bus.session import connect  # here, as --help and --version need none of these
     from viewer.browser.http_server import serve, without_stdout
     from viewer.scene.map.raster import read_raster
@@ -75,16 +89,44 @@ def run(args: argparse.Namespace) -> int:
     gc.set_threshold(*GC_THRESHOLDS)
     enable_malloc_trim(LARGE_BLOCK_BYTES)
     terrain_layer = TerrainLayer(terrain, imagery, tiles)
-    with connect(bus_config_from(args, VIEWER), retry=True) as bus:  # the page shows a missing router
+    with (
+        connect(bus_config_from(args, VIEWER), retry=True) as bus,
+        ExitStack() as stack,
+    ):  # the page shows a missing router
+        approver = None
+        if args.allow == APPROVALS:  # a session of its own: the page itself cannot approve
+            operator = stack.enter_context(connect(bus_config_from(args, OPERATOR), retry=True))
+            approver = operator.publish, args.who or user_name()
         server = serve(args.host, args.port, args.name)
         try:
-            app = App(bus, server, light=args.light, terrain_layer=terrain_layer)
+            app = App(bus, server, light=args.light, terrain_layer=terrain_layer, approver=approver)
             report_status("viewer", f"http://{args.host}:{args.port}")
             app.run(stop)
         finally:
             with without_stdout():
                 server.stop()
     return 0
+
+
+def _check_approvals(args: argparse.Namespace) -> None:
+    """Check the options of approvals.
+
+    Raises:
+        ValueError: when other machines could approve without the credentials of an operator.
+    """
+    if args.allow is None:
+        if args.who is not None:
+            raise ValueError(
+                f"--who: found {args.who!r} without --allow approvals, expected it; add it or leave this out"
+            )
+        return
+    if args.host not in LOOPBACK:
+        raise ValueError(
+            f"--allow approvals: found --host {args.host}, expected 127.0.0.1: the page has no password, and whoever "
+            "opens it can approve; serve it through an authenticating reverse proxy with --name"
+        )
+    if not has_operators("--allow approvals", bus_config_from(args, OPERATOR)):
+        _log.warning("approvals are allowed on a router without roles: every process of this machine can approve")
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 Every check returns why the approval is refused, or an empty text. An approval of an execution passes only if
 
     it is new, at most 30 s old, and names a person
-    the gateway has received the proposal itself, and its newest version is valid and has this option unchanged
+    the gateway has received the proposal itself, a valid version of it has this option, and so has the newest
     every changed aircraft may be commanded, is received, armed, flown automatically and not being commanded
     its mission and mode are those of the proposal, and it is within the region predicted for this time with it
 """
@@ -38,10 +38,22 @@ class Situation(NamedTuple):
 
 
 class ReceivedProposal(NamedTuple):
-    """The newest version of a proposal, and the situation of each changed aircraft when it arrived."""
+    """A version of a proposal, and the situation of each changed aircraft when it arrived.
+
+    Attributes:
+        proposal: as received
+        situations: by UAV id
+        earlier: versions before this one that are still valid
+    """
 
     proposal: Proposal
     situations: dict[int, Situation]
+    earlier: "tuple[ReceivedProposal, ...]" = ()
+
+    def valid_versions(self, now: float) -> "tuple[ReceivedProposal, ...]":
+        """Return all versions that may be approved, the newest first; a withdrawal ends the earlier ones, too."""
+        versions = (self._replace(earlier=()), *self.earlier) if self.proposal.options else ()
+        return tuple(one for one in versions if now <= one.proposal.valid_until)
 
 
 class Fleet(NamedTuple):
@@ -70,8 +82,14 @@ def approval_refusal(approval: Approval, now: float, executed: Collection[tuple[
     return ""
 
 
-def approved_option(approval: Approval, received: ReceivedProposal | None, now: float) -> Option | str:
-    """Return the approved option of the newest version of a proposal, or why there is none."""
+def approved_version(
+    approval: Approval, received: ReceivedProposal | None, now: float
+) -> tuple[ReceivedProposal, Option] | str:
+    """Return the version of a proposal that a person has approved and its option, or why there is none.
+
+    A proposal is renewed while a person decides. What was shown may be approved while it is valid, and as long as the
+    newest version has the same option, or renewed with its inserted item farther ahead.
+    """
     if received is None or received.proposal.uav != approval.uav:
         return "no worker has published this proposal"
     proposal = received.proposal
@@ -81,8 +99,27 @@ def approved_option(approval: Approval, received: ReceivedProposal | None, now: 
         return f"the proposal expired {now - proposal.valid_until:.0f} s ago"
     if not proposal.t <= now + MAX_AGE_S:
         return "the proposal is from the future; synchronise the clocks"
-    option = next((one for one in proposal.options if digest_of(one) == approval.digest), None)
-    return option or "the proposal has no option with the changes that were approved; look at its newest version"
+    for version in received.valid_versions(now):
+        option = next((one for one in version.proposal.options if digest_of(one) == approval.digest), None)
+        if option is not None and any(is_renewal(option, newer) for newer in proposal.options):
+            return version, option
+    return "the proposal has no option with the changes that were approved; look at its newest version"
+
+
+def is_renewal(option: Option, newer: Option) -> bool:
+    """Return whether two options have the same changes, except for one item of a mission and for the current item."""
+    if [change.uav for change in option.changes] != [change.uav for change in newer.changes]:
+        return False
+    return all(map(_is_same_change, option.changes, newer.changes))
+
+
+def _is_same_change(one: Change, other: Change) -> bool:
+    if (one.speed, one.mode) != (other.speed, other.mode):
+        return False
+    if one.items is None or other.items is None:
+        return one == other
+    different = [a for a, b in zip(one.items, other.items, strict=False) if a != b]
+    return len(one.items) == len(other.items) and len(different) <= 1
 
 
 def change_refusal(change: Change, fleet: Fleet) -> str:

@@ -4,13 +4,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+from fleet.bus.codec import digest_of
 from fleet.contract import Approval, Execution, ExecutionState, ExecutionStep, Option, Proposal, ProposedPath
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
 from gateway.commands.approval_check import Positions
 from gateway.commands.plan_steps import FormerPlan
-from gateway.commands.region import Deviation, deviation
+from gateway.commands.region import Deviation, deviation, read_path
 from gateway.commands.steps import CommandStep
 
+PATH_WAIT_S = 10.0  # wait for the path predicted after the execution, before that of the proposal is taken [s]
 _RUNNING = (ExecutionState.APPROVED, ExecutionState.SENDING)
 
 
@@ -40,6 +42,7 @@ class RunningExecution:
     accepted_t: float = float("inf")  # when the last step was acknowledged [s since 1970]
     results_t: list[float] = field(default_factory=list)  # time of each result [s since 1970]
     published: tuple[object, ...] = ()  # what was published last
+    predicted: Proposal | None = None  # with the paths from the execution on
 
     @property
     def is_sending(self) -> bool:
@@ -81,12 +84,20 @@ class RunningExecution:
                 self.sentence = "the plan from before is restored" if self.approval.undo else "all steps acknowledged"
 
     def compare(self, now: float, aircraft: dict[int, AircraftLink], positions: Positions) -> None:
-        """Compare the flight with the predicted paths of the option; at their end the execution is done."""
+        """Compare the flight with the paths predicted for the option; at their end the execution is done.
+
+        They are those from the actual execution on. Where no worker sends any, they are those of the proposal, which
+        assume a later or an earlier start.
+        """
         self.compared_t = now
-        paths = {path.uav: path for path in self.option.paths if path.uav in self.former}  # checked at the approval
-        deviations = {uav: self._deviation(path, positions) for uav, path in paths.items()}
+        if self.predicted is None and now - self.accepted_t < PATH_WAIT_S:
+            return
+        proposal = self.predicted or self.proposal
+        option = proposal.options[0] if self.predicted is not None else self.option
+        paths = {path.uav: path for path in option.paths if path.uav in self.former}
+        deviations = {uav: self._deviation(path, proposal.t, positions) for uav, path in paths.items()}
         compared = {uav: one for uav, one in deviations.items() if one is not None}
-        if now - self.proposal.t > max((float(path.ahead.numpy()[-1]) for path in paths.values()), default=0.0):
+        if now - proposal.t > max((float(path.ahead.numpy()[-1]) for path in paths.values()), default=0.0):
             self.state = ExecutionState.DONE
             self.sentence = f"the predicted path has ended; last: {self.sentence}"
             return
@@ -102,11 +113,18 @@ class RunningExecution:
         self.follows = not texts
         self.sentence = f"does not follow: {'; '.join(texts)}" if texts else "follows within its region"
 
-    def _deviation(self, path: ProposedPath, positions: Positions) -> Deviation | None:
+    def _deviation(self, path: ProposedPath, path_t: float, positions: Positions) -> Deviation | None:
         if path.uav not in positions:
             return None
         t, position = positions[path.uav]
-        return deviation(path, t - self.proposal.t, position)
+        return deviation(path, t - path_t, position)
+
+    def replace_paths(self, proposal: Proposal) -> None:
+        """Take the paths that a worker has predicted after the execution of this option; ignore all else."""
+        is_later = self.state is ExecutionState.ACCEPTED and proposal.t > self.proposal.t
+        is_same = len(proposal.options) == 1 and digest_of(proposal.options[0]) == self.approval.digest
+        if is_later and is_same and all(_is_valid(path) for path in proposal.options[0].paths):
+            self.predicted = proposal
 
     def message(self, now: float, index: int) -> Execution:
         """Return the state as a message of the bus; `index`: of the option."""
@@ -135,3 +153,11 @@ class RunningExecution:
             dry_run=self.is_dry,
             sentence=self.sentence,
         )
+
+
+def _is_valid(path: ProposedPath) -> bool:
+    try:
+        read_path(path)
+    except ValueError:
+        return False
+    return True

@@ -22,7 +22,7 @@ from gateway.commands.approval_check import (
     Fleet,
     ReceivedProposal,
     approval_refusal,
-    approved_option,
+    approved_version,
     change_refusal,
     situation_of,
     situation_refusal,
@@ -33,6 +33,7 @@ from gateway.commands.mission_transfer import is_for_us
 from gateway.commands.plan_steps import change_steps, former_plan, undo_steps
 from gateway.commands.steps import AcknowledgedCommand
 
+MAX_VERSIONS = 8  # earlier versions of a proposal that are stored
 MAX_PROPOSALS = 1_000  # newest versions of proposals that are stored
 EXPIRED_S = 60.0  # time for which an expired proposal is stored, so that its refusal says so [s]
 MAX_EXECUTIONS = 200  # executions that are stored for an undo
@@ -135,7 +136,11 @@ class CommandExecutor:
             return
         uavs = {change.uav for option in proposal.options for change in option.changes}
         situations = {uav: situation_of(self._aircraft[uav]) for uav in uavs if uav in self._aircraft}
-        self._proposals[proposal.id] = ReceivedProposal(proposal, situations)
+        run = self._executions.get(proposal.id)
+        if run is not None:
+            run.replace_paths(proposal)
+        earlier = () if before is None else self._proposals[proposal.id].valid_versions(now)
+        self._proposals[proposal.id] = ReceivedProposal(proposal, situations, earlier[:MAX_VERSIONS])
         self._proposals.move_to_end(proposal.id)
         expired = [key for key, one in self._proposals.items() if not now - one.proposal.valid_until < EXPIRED_S]
         for key in expired + list(self._proposals)[: max(len(self._proposals) - MAX_PROPOSALS, 0)]:
@@ -143,15 +148,16 @@ class CommandExecutor:
 
     def _approve(self, approval: Approval, now: float) -> None:
         """Check an approval; begin its execution or publish why it is refused."""
-        option: Option | str = approval_refusal(approval, now, self._audit.executed)
-        if not option:
-            option = self._undoable(approval) if approval.undo else self._executable(approval, now)
+        checked: tuple[ReceivedProposal, Option] | Option | str = approval_refusal(approval, now, self._audit.executed)
+        if not checked:
+            checked = self._undoable(approval) if approval.undo else self._executable(approval, now)
         entry = {"proposal": approval.proposal, "uav": approval.uav, "who": printable(approval.who[:MAX_TEXT])}
-        if isinstance(option, str):
-            self._entries.append({"event": "refused", **entry, "undo": approval.undo, "reason": option})
-            self._bus.publish(_refused(approval, option, now))
+        if isinstance(checked, str):
+            self._entries.append({"event": "refused", **entry, "undo": approval.undo, "reason": checked})
+            self._bus.publish(_refused(approval, checked, now))
             return
-        run = self._undo_of(approval) if approval.undo else self._begin(approval, option)
+        run = self._undo_of(approval) if isinstance(checked, Option) else self._begin(approval, *checked)
+        option = run.option
         event = UNDO_APPROVED if approval.undo else APPROVED
         self._entries.append({"event": event, **entry, "approved_t": approval.t, "changes": list(option.changes)})
         self._publish(run, now)
@@ -164,15 +170,15 @@ class CommandExecutor:
         busy = {uav for run in self._running() for uav in run.uavs}
         return Fleet(self._aircraft, self._positions, self._is_allowed, busy)
 
-    def _executable(self, approval: Approval, now: float) -> Option | str:
-        """Return the option to execute, or why none is."""
-        received, fleet = self._proposals.get(approval.proposal), self._fleet()
-        option = approved_option(approval, received, now)
-        if isinstance(option, str) or received is None:
-            return option
+    def _executable(self, approval: Approval, now: float) -> tuple[ReceivedProposal, Option] | str:
+        """Return the version of the proposal and the option to execute, or why none is."""
+        fleet, checked = self._fleet(), approved_version(approval, self._proposals.get(approval.proposal), now)
+        if isinstance(checked, str):
+            return checked
+        received, option = checked
         refusals = (change_refusal(change, fleet) for change in option.changes)
         reason = next(filter(None, refusals), "") or situation_refusal(option, received, fleet, now)
-        return reason or option
+        return reason or checked
 
     def _undoable(self, approval: Approval) -> Option | str:
         """Return the executed option whose plan from before can be restored, or why it cannot."""
@@ -191,8 +197,7 @@ class CommandExecutor:
                 return f"uav-{uav} is in mode {mode}, after the execution it was {former.final_mode}: it was commanded"
         return run.option
 
-    def _begin(self, approval: Approval, option: Option) -> RunningExecution:
-        received = self._proposals[approval.proposal]
+    def _begin(self, approval: Approval, received: ReceivedProposal, option: Option) -> RunningExecution:
         former, steps = {}, []
         for change in option.changes:
             aircraft = self._aircraft[change.uav]

@@ -22,6 +22,7 @@ from websockets.typing import Origin, Subprotocol
 
 from tests.support.fake_link import PATIENCE_S, until
 from tests.support.memory_bus import MemoryBus
+from viewer.__main__ import main
 from viewer.browser.http_server import POLICY, REFUSED, VIOLATION, request_filter, serve, without_stdout
 from viewer.server.app import App
 
@@ -230,6 +231,21 @@ class Mute(MemoryBus):
         raise AssertionError("the viewer published")
 
     publish = answer = present = put
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (("--allow", "approvals", "--host", "0.0.0.0"), "has no password"),
+        (("--allow", "approvals", "--router", "tcp/192.0.2.1:7447"), "without certificates or passwords"),
+        (("--who", "kim"), "without --allow approvals"),
+    ],
+)
+def test_approvals_are_allowed_only_to_an_operator_on_this_machine(
+    options: tuple[str, ...], expected: str, capsys
+) -> None:
+    assert main(["--port", str(unused_port()), *options]) == 2
+    assert expected in capsys.readouterr().err
 
 
 def test_to_hear_and_to_ask_is_all_it_needs_of_the_bus(server: SimpleNamespace) -> None:

@@ -71,6 +71,21 @@ def test_a_defect_of_one_page_is_said_there_and_in_the_log_and_the_others_go_on(
     assert broken(first) == ""
 
 
+def test_a_page_has_no_way_to_approve_unless_the_viewer_allows_it(site) -> None:
+    first, second = site.views
+
+    def hidden(view: View) -> list:
+        inputs = view.client.gui._gui_input_handle_from_uuid.values()
+        return [one for one in inputs if getattr(one, "label", "") == "approval"]
+
+    assert not hidden(first) and first.panels._approval_code == "" and first.panels._approvals is None
+    site.app._approver = (site.bus.publish, "kim")
+    second.browser.set_theme(light=True)  # opens the view anew
+    site.run()
+    view = next(one for one in site.app.views.values() if one.client is second.client)
+    assert len(hidden(view)) == 1 and view.panels._approval_code and not hidden(first)
+
+
 def test_a_page_that_cannot_be_opened_is_left_alone(site, caplog, monkeypatch) -> None:
     number, other = sorted(site.app.views)
     del site.app.views[number]

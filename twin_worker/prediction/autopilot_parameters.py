@@ -162,6 +162,8 @@ class RouteOverride:
         speed: airspeed at the start, ground speed for hovering aircraft [m/s]; None: unchanged
         first_item: number of the first item to fly, as for `fleet.mission.unroll_route`
         jumps_taken: jumps taken so far at each jump, as for `fleet.mission.unroll_route`
+        after_s: time for which a fixed wing continues on its present route [s]
+        mode_route: flown in place of the mission; None: the mission is flown
     """
 
     items: tuple[Item, ...]
@@ -171,9 +173,13 @@ class RouteOverride:
     speed: float | None = None
     first_item: int = 1
     jumps_taken: Mapping[int, int] = field(default_factory=dict)
+    after_s: float = 0.0
+    mode_route: Route | None = None
 
     def to_route(self, origin: Origin, received: Mapping[str, float]) -> Route:
         """Return the route."""
+        if self.mode_route is not None:
+            return self.mode_route
         return unroll_route(
             self.items,
             seq=self.seq,

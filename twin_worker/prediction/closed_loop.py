@@ -9,9 +9,9 @@ import numpy as np
 
 from fleet.autopilots import arduplane, laws
 from fleet.autopilots.arduplane.params import EAS2TAS
-from fleet.autopilots.control_law import V_DEM
+from fleet.autopilots.control_law import SWITCH_LEG, SWITCH_S, V_DEM
 from fleet.autopilots.shadow import NO_MEMORY, replay_controller
-from fleet.mission import KIND, LAND, P_D, P_N, SPEED, TAKEOFF
+from fleet.mission import KIND, LAND, P_D, P_N, SPEED, TAKEOFF, VA_C
 from fleet.physics.simulate import N_STATE, simulate
 from fleet.window import Window
 from twin_worker.estimation.airspeed_setpoint import (
@@ -175,12 +175,26 @@ def _apply_override(
     if len(legs):
         new_setpoint = np.nan if cruise in override.parameters else setpoint
         legs = apply_setpoint(legs, float(override.seq), float(controller.values[cruise]), new_setpoint)
+        if override.after_s > 0.0 and len(old_legs):
+            if cruise in override.parameters:  # the parameter itself would act at once
+                legs = legs.copy()
+                legs[legs[:, VA_C] <= 0.0, VA_C] = override.parameters[cruise]
+            return _schedule_route(initial, legs, override.after_s)
         ctl = transfer_controller(ctl, old_legs, par, legs, (override.restart_leg, initial.window.p[-1]))
     state = initial.state[0].copy()
     state[3:6] = override.scale_to_speed(state[3:6])
     sentence = new_route.summary
     initial = replace(initial, state=(state, *initial.state[1:]), synchronised=(ctl, par, legs))
     return replace(initial, seq=override.seq, sentence=sentence, controller=controller)
+
+
+def _schedule_route(initial: InitialCondition, legs: np.ndarray, after_s: float) -> InitialCondition:
+    """Append a route that begins after a time [s], at the position reached then."""
+    ctl, par, present = initial.synchronised
+    ctl = ctl.copy()
+    # the separator keeps the new route from being a continuation of the last leg
+    ctl[SWITCH_S], ctl[SWITCH_LEG] = after_s, len(present) + 1
+    return replace(initial, synchronised=(ctl, par, np.vstack([present, present[-1:], legs])))
 
 
 def _not_modelled(initial: InitialCondition) -> Rollout | None:

@@ -34,7 +34,10 @@ _SPEEDS = 5  # airspeeds tried, evenly spaced between the lowest and the highest
 _ROTOR_SPEEDS = (0.4, 0.6, 0.8)  # speeds of a multirotor that are tried, of its present limit [-]
 _MIN_SPEED_STEP = 1.0  # a smaller change of speed is none [m/s]
 _DELAYS_S = (20.0, 40.0)  # circling or waiting times that are tried [s]
-_REACTION_S = 4.0  # to read a proposal, and again to upload it; an inserted item lies farther ahead [s]
+DECISION_S = 20.0
+"""Time from a proposal to the start of its change: a person reads, decides and confirms, the gateway uploads [s]."""
+_MARGIN_S = 5.0  # an inserted item lies at least so far behind the start of the change [s]
+_PASSING_M = 100.0  # an item is passed where the path comes nearer and goes away again [m]
 _DEFAULT_CLIMB = 2.0  # climb and sink rate without received limits [m/s]
 _SKIPPED = 2  # items nearest to the event of which each is left out
 _AHEAD_ITEMS = 8  # navigation items ahead that are looked at
@@ -130,6 +133,27 @@ class Plan:
         ahead = self.prediction.ahead.numpy()
         return np.array([np.interp(seconds, ahead, column) for column in self.prediction.path.numpy().T])
 
+    def passes(self, item: Item, seconds: float) -> bool:
+        """Return whether the predicted path passes an item before `seconds` ahead; a circle, whether it leaves it."""
+        ahead, path = self.prediction.ahead.numpy(), self.prediction.path.numpy()
+        distance = np.hypot(*(path[ahead <= seconds, :2] - self.position(item)).T)
+        nearest, far = int(distance.argmin()), 2 * _PASSING_M if is_circle(item) else 0.0
+        return bool(distance[nearest] < _PASSING_M and nearest < len(distance) - 1 and distance[-1] > far)
+
+    def is_circling(self, seconds: float) -> bool:
+        """Return whether the aircraft flies a circle of its mission `seconds` ahead, or is about to."""
+        seq = self.seq_after(Change(uav=self.uav), seconds)
+        circles = [item for item in self.items if item.seq == seq and is_circle(item)]
+        return any(np.hypot(*(self.at(seconds)[:2] - self.position(item))) < 2 * _PASSING_M for item in circles)
+
+    def seq_after(self, change: Change, seconds: float) -> int:
+        """Return the item of a changed mission that is flown to `seconds` ahead, after the present plan until then."""
+        items = self.items if change.items is None else change.items
+        ahead = [item for item in items if item.seq >= (self.seq if change.seq is None else change.seq)]
+        positional = [item for item in ahead if is_positional(item)]
+        following = [item.seq for item in positional if not self.passes(item, seconds)]
+        return min(following, default=self.seq)
+
     def reaches_current(self, seconds: float) -> bool:
         """Return whether the current item is passed within `seconds` at the present speed."""
         current = next((item for item in self.ahead if item.seq == self.seq), None)
@@ -142,6 +166,11 @@ class Plan:
     def min_height_m(self) -> float:
         """Return the smallest height above home at which items may lie [m]."""
         return MIN_HEIGHT_ROTORS_M if is_hovering(self.twin) else MIN_HEIGHT_WINGS_M
+
+
+def is_circle(item: Item) -> bool:
+    """Return whether an item is a circle."""
+    return m.KINDS.get(item.command) in m.CIRCLES
 
 
 def is_positional(item: Item) -> bool:
@@ -267,8 +296,8 @@ def _with_offset(plan: Plan, offset: float) -> tuple[Item, ...] | None:
         msgspec.structs.replace(item, alt_m=item.alt_m + offset) if item.seq in changed else item for item in plan.items
     ]
     rate = _climb_rate(plan.twin, offset)
-    seconds = 2 * _REACTION_S + abs(offset) / rate
-    if plan.reaches_current(seconds + _REACTION_S):
+    seconds = DECISION_S + _MARGIN_S + abs(offset) / rate
+    if plan.reaches_current(seconds + _MARGIN_S):
         return tuple(items)
     return insert(items, _item_on_path(plan, seconds, offset))
 
@@ -297,7 +326,7 @@ def _item_on_path(plan: Plan, seconds: float, offset: float = 0.0, **fields: flo
 
 def _with_wait(plan: Plan, seconds: float) -> tuple[Item, ...] | None:
     """Return the mission with a circle, of a multirotor a stop, on the present leg."""
-    ahead_s = 3 * _REACTION_S
+    ahead_s = DECISION_S + _MARGIN_S
     if plan.reaches_current(ahead_s):
         return None
     command = _WAYPOINT if is_hovering(plan.twin) else _LOITER_TIME

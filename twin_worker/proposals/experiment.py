@@ -1,8 +1,8 @@
 """Computational experiment: predict one aircraft with a changed plan, as its twin would after the change.
 
-Each experiment flies a copy of the twin through the same closed loop as a prediction, with its ensemble. New items, an
-item number or a speed replace the route from the present position on. A new mode is entered now, as when the autopilot
-reports it.
+Each experiment flies a copy of the twin through the same closed loop as a prediction, with its ensemble: on the present
+route for the time that a person needs to decide, then on the changed one. A multirotor changes its route at once, as
+its kinematic model has no scheduled change.
 """
 
 import copy
@@ -18,13 +18,14 @@ from scipy.special import ndtri
 from fleet.autopilots.modes import ModeEntry
 from fleet.contract import AlertKind, Change, Item, Mission, Prediction
 from fleet.frames import to_ned
-from fleet.mission import SPEED
+from fleet.mission import SPEED, Route
 from twin_worker.alerts.gaussian_forecast import GaussianForecast, to_gaussian
 from twin_worker.alerts.geofence import height_above_home, read_geofence
 from twin_worker.alerts.hysteresis import RULES
 from twin_worker.prediction.autopilot_parameters import SPEED_PARAMETERS, RouteOverride
-from twin_worker.proposals.candidates import LAND_MODE, MODES, Candidate, Deficit, Plan, to_change
+from twin_worker.proposals.candidates import DECISION_S, LAND_MODE, MODES, Candidate, Deficit, Plan, to_change
 from twin_worker.twin.state.events import invalidate_prediction
+from twin_worker.twin.state.routes import route_of_mode
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.alerts import limit_hazards, mission_feasibility, reach_s
 from twin_worker.twin.steps.predict_step import predict
@@ -75,10 +76,38 @@ def run(plan: Plan, candidates: Iterable[Candidate]) -> list[PlanExperiment]:
     experiments = []
     for candidate in candidates:
         change = to_change(plan, candidate)
-        experiment = None if change is None else _fly(_changeable(plan.twin), candidate, change)
+        experiment = None if change is None else run_change(plan, candidate, change)
         if experiment is not None:
             experiments.append(experiment)
     return experiments
+
+
+def run_change(
+    plan: Plan, candidate: Candidate | None, change: Change, after_s: float = DECISION_S
+) -> PlanExperiment | None:
+    """Predict one aircraft with a change that begins `after_s` from now [s]; None without a prediction on a route.
+
+    A change that begins at 0 was executed: the current item and the mode are those that the aircraft reports.
+    """
+    twin = _changeable(plan.twin)
+    if after_s and plan.is_circling(after_s) and not change.mode:
+        if change.items is not None:
+            return None  # the upload may begin the circle anew
+        after_s = after_s if change.seq is not None else 0.0  # a speed alone does not
+    _apply(twin, change, None if twin.vehicle_class.is_rotorcraft or not after_s else _Start(plan, after_s))
+    return _fly(twin, candidate, change)
+
+
+class _Start(NamedTuple):
+    """A change that begins later, on the present plan."""
+
+    plan: Plan
+    after_s: float
+
+    def mode_route(self, mode: str) -> Route | None:
+        """Return the route of a mode that is entered then."""
+        before, entry = self.plan.at(self.after_s - 0.5), self.plan.at(self.after_s)
+        return route_of_mode(self.plan.twin, mode, entry, atan2(*(entry - before)[1::-1]))
 
 
 def _changeable(twin: Twin) -> Twin:
@@ -88,9 +117,7 @@ def _changeable(twin: Twin) -> Twin:
 
 
 def _fly(twin: Twin, candidate: Candidate | None, change: Change | None) -> PlanExperiment | None:
-    """Predict a copy of a twin, which is changed."""
-    if change is not None:
-        _apply(twin, change)
+    """Predict a copy of a twin, to which the change was applied."""
     twin.prediction.forget_published()
     messages = predict(twin, twin.telemetry.history.newest)
     prediction = next((message for message in messages if isinstance(message, Prediction)), None)
@@ -103,14 +130,18 @@ def _fly(twin: Twin, candidate: Candidate | None, change: Change | None) -> Plan
     return PlanExperiment(candidate, change, forecast, probabilities, _margins(twin, forecast))
 
 
-def _apply(twin: Twin, change: Change) -> None:
-    """Change the plan of a copy."""
+def _apply(twin: Twin, change: Change, start: _Start | None) -> None:
+    """Change the plan of a copy; `start`: when it begins, None: now."""
+    mode_route, mission = None, twin.onboard.mission
     if change.mode and not _lands_by_mode(change):
-        _enter_mode(twin, MODES[change.mode])
-        return
-    items = twin.onboard.mission.items if twin.onboard.mission is not None else ()
-    present_seq = active_seq(twin)
-    items, seq = change.items or items, present_seq if change.seq is None else change.seq
+        mode_route = None if start is None else start.mode_route(MODES[change.mode])
+        if mode_route is None and twin.mode == MODES[change.mode]:
+            return
+        if mode_route is None:
+            _enter_mode(twin, MODES[change.mode])
+            return
+    present = mission.items if mission is not None else ()
+    items, seq = change.items or present, active_seq(twin)
     jumps = twin.onboard.jumps_taken if change.items is None else {}
     if _lands_by_mode(change):
         items, seq = _landing_here(twin)
@@ -120,8 +151,13 @@ def _apply(twin: Twin, change: Change) -> None:
             msgspec.structs.replace(item, param2=change.speed) if item.command == SPEED and item.seq < seq else item
             for item in items
         )
-    restart = change.items is not None or change.seq is not None or _lands_by_mode(change)
-    twin.prediction.set_override(RouteOverride(items, seq, parameters, restart, None, twin.first_item, jumps))
+    after_s = 0.0
+    if start is not None:
+        seq, after_s = start.plan.seq_after(change, start.after_s), start.after_s
+    restart = start is not None or items != present or _lands_by_mode(change)
+    twin.prediction.set_override(
+        RouteOverride(items, seq, parameters, restart, None, twin.first_item, jumps, after_s, mode_route)
+    )
     twin.confidence.tracker.censor_open()  # earlier predictions flew another plan
 
 

@@ -1,29 +1,36 @@
 """Proposals against the alerts of the aircraft of one worker: computed, renewed while the alert lasts, withdrawn."""
 
 import secrets
+from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from math import inf
 
 import msgspec
 
-from fleet.contract import Alert, AlertKey, AlertKind, Option, Proposal
+from fleet.bus.codec import digest_of
+from fleet.contract import Alert, AlertKey, AlertKind, Execution, ExecutionState, Option, Proposal, ProposedPath
 from fleet.frames import Origin
 from twin_worker.alerts.conflict_probability import Separation
 from twin_worker.alerts.gaussian_forecast import GaussianForecast
 from twin_worker.alerts.hysteresis import RULES
 from twin_worker.proposals.assessment import Comparison
 from twin_worker.proposals.candidates import Candidate, Plan, candidates
-from twin_worker.proposals.experiment import PlanExperiment, deficit, present, run
+from twin_worker.proposals.experiment import PlanExperiment, deficit, present, run, run_change
 from twin_worker.proposals.options import to_option, to_path
 from twin_worker.proposals.resolution import Airspace, Problem, Solution, pareto, solve
 from twin_worker.twin.state.state import Twin
+from twin_worker.twin.steps.kinematic_prediction import is_hovering
 
 PROPOSED = (AlertKind.CONFLICT, AlertKind.GROUND, AlertKind.GEOFENCE, AlertKind.NOT_ACHIEVABLE)
 """Alerts that are answered with a proposal."""
 RENEW_S = 5.0
 """Time after which a proposal is renewed while its alert lasts [s]."""
-_VALID_S = 15.0  # time for which a proposal may be approved [s]
+VALID_S = 15.0
+"""Time for which a version of a proposal may be approved; the upload takes the rest of `DECISION_S` [s]."""
+_EARLY_S = 2.0  # the earliest start of a change: approved at once [s]
+_EXECUTION_S, _AFTER_EXECUTION_S = 60.0, 10.0  # without proposals during an execution, and after it [s]
+_MAX_OFFERED = 1_000  # options whose execution is recognised
 _MAX_CHANGED = 3  # aircraft of a cluster whose plans may be changed: each costs about 20 experiments
 _EVENTS = {
     AlertKind.CONFLICT: "a conflict",
@@ -90,6 +97,8 @@ class Proposer:
     def __post_init__(self) -> None:
         self._current: dict[tuple[int, AlertKey], Current] = {}
         self._computed_t: dict[tuple[int, AlertKey], float] = {}  # data time of the last attempt [s since 1970]
+        self._offered: OrderedDict[tuple[str, str], Option] = OrderedDict()  # by id of the proposal and digest
+        self._executing: dict[int, float] = {}  # data time until which a change is executed, by UAV [s since 1970]
 
     def current(self, uav: int) -> list[Proposal]:
         """Return the proposals of one aircraft that are in force."""
@@ -113,6 +122,8 @@ class Proposer:
 
     def due(self, alert: Alert, now: float) -> bool:
         """Return whether the proposal against an active alert is to be computed at data time `now` [s since 1970]."""
+        if max(self._executing.get(uav, -inf) for uav in (alert.uav, alert.other)) > now:
+            return False
         return alert.kind in PROPOSED and not 0.0 <= now - self.computed_t(alert) < RENEW_S
 
     def computed_t(self, alert: Alert) -> float:
@@ -122,18 +133,66 @@ class Proposer:
     def update(self, alert: Alert, now: float) -> Proposal | None:
         """Compute or renew the proposal against an active alert; None if there is no twin, or again no option.
 
-        A renewed proposal keeps its id while its options are of the same aircraft and kinds.
+        A proposal keeps its id while its alert lasts and nothing is executed. Options that still avoid the event are
+        kept; new ones are computed when none does.
         """
         key = (alert.uav, alert.about)
         previous, self._computed_t[key] = self._current.get(key), now
         computed = self.compute(AvoidedEvent.of(alert), now, () if previous is None else previous.choices)
         if computed is None:
             return None
-        if previous is not None and (not computed.choices or _same_kinds(previous.choices, computed.choices)):
+        if previous is not None:
             computed = replace(computed, proposal=msgspec.structs.replace(computed.proposal, id=previous.proposal.id))
         self._current[key] = computed
+        for option in computed.proposal.options:
+            self._offered[computed.proposal.id, digest_of(option)] = option
+        while len(self._offered) > _MAX_OFFERED:
+            self._offered.popitem(last=False)
         is_news = bool(computed.choices) or previous is None or bool(previous.choices)
         return computed.proposal if is_news else None
+
+    def on_execution(self, execution: Execution, now: float) -> bool:
+        """Note the state of an execution at data time `now` [s since 1970]; return whether its paths are due.
+
+        While a proposal is executed, its aircraft get no other one; afterwards a proposal has another id.
+        """
+        option = self._offered.get((execution.proposal, execution.digest))
+        if option is None or execution.undo or execution.dry_run:
+            return False
+        uavs = {execution.uav, *(change.uav for change in option.changes)}
+        is_done = execution.state is ExecutionState.ACCEPTED and execution.follows is None  # later ones compare
+        if execution.state in (ExecutionState.APPROVED, ExecutionState.SENDING) or is_done:
+            until = now + (_AFTER_EXECUTION_S if is_done else _EXECUTION_S)
+            self._executing.update(dict.fromkeys(uavs, until))
+            for key in [key for key, one in self._current.items() if one.proposal.id == execution.proposal]:
+                del self._current[key]
+        elif execution.state is ExecutionState.FAILED:
+            for uav in uavs:
+                self._executing.pop(uav, None)
+        return is_done
+
+    def executed(self, execution: Execution) -> Proposal | None:
+        """Return the proposal with the paths of its executed option from now on; None where none is predicted."""
+        option = self._offered.get((execution.proposal, execution.digest))
+        if option is None:
+            return None
+        experiments: list[PlanExperiment] = []
+        for change in option.changes:
+            plan, _ = self._present(change.uav)
+            experiment = None if plan is None else run_change(plan, None, change, after_s=0.0)
+            if experiment is None:
+                return None
+            experiments.append(experiment)
+        t = experiments[0].prediction.t
+        paths: tuple[ProposedPath, ...] = tuple(to_path(experiment, t) for experiment in experiments)
+        return Proposal(
+            uav=execution.uav,
+            t=t,
+            id=execution.proposal,
+            options=(msgspec.structs.replace(option, paths=paths),),
+            valid_until=t,
+            sentence=f"uav-{execution.uav}: paths of the executed option from its execution on",
+        )
 
     def on_request(self, uav: int, now: float) -> Proposal | None:
         """Compute a proposal against the most probable event of an aircraft; None without its twin."""
@@ -173,6 +232,9 @@ class Proposer:
         probability = problem.probability()
         if probability < RULES[event.kind].clear_below:
             return Current(_proposal(event, t, (), probability, "not predicted with the present plan"), ())
+        if without := [uav for uav in plans if not _has_model(plans[uav].twin)]:
+            text = f"uav-{without[0]} has no model yet: no change of plan is tried"
+            return Current(_proposal(event, t, (), probability, text), ())
         retained = _retained(problem, plans, previous)
         experiments: dict[int, list[PlanExperiment]] = {}
 
@@ -184,7 +246,7 @@ class Proposer:
                 experiments[uav] = run(plans[uav], candidates(plans[uav], event.kind, vertical, place, short))
             return experiments[uav]
 
-        chosen = retained or pareto(solve(problem, experiments_of))
+        chosen = retained or _timely(problem, plans, solve(problem, experiments_of))
         options = tuple(to_option(problem, solution, advantage, plans, t) for solution, advantage in chosen)
         choices = tuple(_choice(solution) for solution, _ in chosen)
         text = f"{_count(len(options))} it" if options else "no change that was tried avoids it"
@@ -249,30 +311,50 @@ class Proposer:
 def _retained(
     problem: Problem, plans: dict[int, Plan], previous: tuple[tuple[Candidate, ...], ...]
 ) -> list[tuple[Solution, str]]:
-    """Return the options so far if each still avoids the event with the same changes; else none."""
+    """Return the options so far that still avoid the event with the same changes."""
     retained: list[tuple[Solution, str]] = []
     for choice in previous:
         repeated = tuple(one for c in choice if c.uav in plans for one in run(plans[c.uav], (c,)))
         if len(repeated) < len(choice) or not all(problem.is_admissible(one) for one in repeated):
-            return []
+            continue
         remaining = problem.conflicts_after(repeated)
         solution = None if remaining is None else problem.solution(repeated, remaining)
-        if solution is None:
-            return []
-        retained.append((solution, ""))
+        if solution is not None:
+            retained.append((solution, ""))
     ranked = {id(solution): advantage for solution, advantage in pareto([solution for solution, _ in retained])}
     return [(solution, ranked.get(id(solution), "")) for solution, _ in retained]
 
 
+def _has_model(twin: Twin) -> bool:
+    """Return whether a twin predicts with a model of its aircraft; the model of rotors is kinematic."""
+    return is_hovering(twin) or twin.models.active_model is not None or twin.models.point_mass is not None
+
+
+def _timely(problem: Problem, plans: dict[int, Plan], solutions: list[Solution]) -> list[tuple[Solution, str]]:
+    """Return the best solutions that avoid the event also when they begin at once."""
+    timely = dict[int, bool]()
+    while True:
+        front = pareto([one for one in solutions if timely.get(id(one), True)])
+        unchecked = [one for one, _ in front if id(one) not in timely]
+        if not unchecked:
+            return front
+        timely.update({id(one): _avoids_early(problem, plans, one) for one in unchecked})
+
+
+def _avoids_early(problem: Problem, plans: dict[int, Plan], solution: Solution) -> bool:
+    early = []
+    for experiment in solution.experiments:
+        assert experiment.change is not None
+        begun = run_change(plans[experiment.uav], experiment.candidate, experiment.change, after_s=_EARLY_S)
+        if begun is None or not problem.is_admissible(begun):
+            return False
+        early.append(begun)
+    remaining = problem.conflicts_after(tuple(early))
+    return remaining is not None and problem.solution(tuple(early), remaining) is not None
+
+
 def _choice(solution: Solution) -> tuple[Candidate, ...]:
     return tuple(one.candidate for one in solution.experiments if one.candidate is not None)
-
-
-def _same_kinds(one: tuple[tuple[Candidate, ...], ...], other: tuple[tuple[Candidate, ...], ...]) -> bool:
-    def kinds(choices: tuple[tuple[Candidate, ...], ...]) -> list[list[tuple[int, str]]]:
-        return [[(candidate.uav, candidate.kind) for candidate in choice] for choice in choices]
-
-    return kinds(one) == kinds(other)
 
 
 def _count(n: int) -> str:
@@ -291,7 +373,7 @@ def _proposal(
         other=event.other,
         options=options,
         probability=None if probability is None else round(probability, 3),
-        valid_until=t + _VALID_S if options else t,
+        valid_until=t + VALID_S if options else t,
         sentence=f"uav-{event.uav}: {chance}{event.text}; {text}",
     )
 

@@ -2,16 +2,19 @@
 
 import logging
 import threading
+from collections import deque
 from functools import partial
 from math import inf
 from typing import Protocol
 
-from fleet.contract import Alert, Message, Proposal
+from fleet.contract import Alert, Execution, Message, Proposal
 from twin_worker.ownership.twin_store import OwnedTwin, data_time
 from twin_worker.proposals.proposer import Proposer
 from twin_worker.service.identification_thread import CpuShareLimiter
 
 _POLL_S = 0.1  # between checks for new alerts [s]
+_SETTLED_S = 1.5  # after the last step, until mode and item are reported [s]
+_MAX_WAITING = 100  # states of executions that wait
 _log = logging.getLogger(__name__)
 
 
@@ -39,12 +42,19 @@ class ProposalThread:
 
     def __init__(self, source: AlertSource, proposer: Proposer, cpu_share: CpuShareLimiter) -> None:
         self._source, self._proposer, self._cpu_share = source, proposer, cpu_share
+        self._executions: deque[Execution] = deque(maxlen=_MAX_WAITING)  # received, not processed
+        self._executed: list[tuple[float, Execution]] = []  # whose paths are due, at a data time [s since 1970]
+
+    def on_execution(self, execution: Execution) -> None:
+        """Note the state of an execution, on a thread of the bus."""
+        self._executions.append(execution)
 
     def run(self, stop: threading.Event) -> None:
         """Answer alerts until `stop` is set."""
         while not stop.wait(_POLL_S):
             try:
                 self.withdraw()
+                self.follow_executions()
                 while not stop.is_set() and (due := self._next_due()) is not None:
                     self._cpu_share.run(partial(self._update, *due), stop)
             except ConnectionError:  # the session is closed: shutdown
@@ -55,6 +65,7 @@ class ProposalThread:
     def run_once(self) -> None:
         """Answer everything that is due now, on the caller's thread."""
         self.withdraw()
+        self.follow_executions()
         while (due := self._next_due()) is not None:
             self._update(*due)
 
@@ -64,6 +75,22 @@ class ProposalThread:
             uav, active = owned.twin.config.uav, self._source.active_alerts(owned)
             for proposal in self._proposer.withdraw(uav, active, data_time(owned)):
                 self._source.publish(proposal, owned)
+
+    def follow_executions(self) -> None:
+        """Publish the paths of executed options from their execution on, with which the gateway compares the flight."""
+        by_uav = {owned.twin.config.uav: owned for owned in self._source.owned_twins()}
+        while self._executions:
+            execution = self._executions.popleft()
+            owned = by_uav.get(execution.uav)
+            if owned is not None and self._proposer.on_execution(execution, data_time(owned)):
+                others = [(t, one) for t, one in self._executed if one.proposal != execution.proposal]
+                self._executed = [*others, (data_time(owned) + _SETTLED_S, execution)]
+        for due in list(self._executed):
+            owned = by_uav.get(due[1].uav)
+            if owned is None or data_time(owned) >= due[0]:
+                self._executed.remove(due)
+                if owned is not None and (proposal := self._proposer.executed(due[1])) is not None:
+                    self._source.publish(proposal, owned)
 
     def _next_due(self) -> tuple[OwnedTwin, Alert] | None:
         due = [

@@ -11,6 +11,7 @@ from fleet.bus.codec import Stamp, decode_for_key
 from fleet.bus.session import Bus
 from fleet.contract import (
     Alert,
+    Execution,
     FleetState,
     Message,
     Mismatch,
@@ -105,6 +106,7 @@ class Worker:
         self.bus.subscribe(Sample, lambda message, _: self._on_message(message), self._is_owned)
         for kind in LATCHED_TYPES:
             self.bus.subscribe(kind, lambda message, _: self._on_message(message), self._in_range)
+        self.bus.subscribe(Execution, lambda message, _: self.proposals.on_execution(message), self._in_range)
         self.bus.subscribe_buffered(Prediction, self._on_foreign_predictions)
         self.bus.subscribe(Model, self._on_foreign_result, lambda uav: uav in self.uavs and uav not in self._owned)
         self.bus.declare_queryable(Prediction, handlers.predictions)

@@ -1,5 +1,6 @@
 """Panels of the page: fleet, alerts and display options on the left, selected UAV on the right."""
 
+import time
 from collections.abc import Callable
 from html import escape
 from pathlib import Path
@@ -8,9 +9,10 @@ from typing import Any
 import viser
 
 from viewer.browser.http_server import Browser, parse_layout
+from viewer.panels.approval import ApprovalDialog, execution_html
 from viewer.panels.charts import Charts
 from viewer.panels.detail import figures_html, status_html
-from viewer.panels.proposals import Approve, parse_approval, proposals_html
+from viewer.panels.proposals import proposals_html
 from viewer.store.inbox import date_text, time_of_day, timestamp
 from viewer.store.states import notices
 from viewer.store.store import FleetStore
@@ -81,7 +83,15 @@ NO_UAV = "–"  # menu entry without a selection
 
 
 class Panels:
-    """All panels of one page."""
+    """All panels of one page.
+
+    Args:
+        browser: the page
+        palette: its colours
+        choose: selects a UAV
+        actions: commands of the palette, each with its key
+        approvals: approves proposals; None: this page has no way to do so
+    """
 
     def __init__(
         self,
@@ -89,16 +99,16 @@ class Panels:
         palette: Palette,
         choose: Callable[..., None],
         actions: dict[str, tuple[str, Callable[[], None]]],
+        approvals: ApprovalDialog | None = None,
     ) -> None:
         self._gui, self._palette, self._choose = browser.client.gui, palette, choose
-        self._browser = browser
+        self._browser, self._approvals = browser, approvals
         self._offered: set[int] = set()  # UAVs with a selection command
         for label, (key, act) in actions.items():
             self._gui.add_command(label, hotkey=key).on_trigger(lambda _, act=act: act())  # type: ignore[arg-type]
         self._pulse = False
         self.ground_error = ""  # error of the terrain files
         self.seek = ""  # page code that seeks to the time of an event
-        self.approve: Approve | None = None  # approves an option of a proposal; None: the page shows no button
         self._gui.configure_theme(
             dark_mode=palette.dark, show_logo=False, show_share_button=False, brand_color=triple(palette.predicting)
         )
@@ -157,11 +167,12 @@ class Panels:
         with panel.add_tab("Selected", viser.Icon.FOCUS_2):
             self._about = self._gui.add_html("")
             self._proposals = self._gui.add_html("")
-            self._approved_input = self._gui.add_text("approved", "", visible=False)
+            self._approval_code = ""  # page code that sends the text of a button
+            if self._approvals is not None:
+                self._add_approval_input(self._approvals)
             self.charts = Charts(self._gui, self._palette)
             self._events = self._gui.add_html("")
             self._facts = self._gui.add_html("")
-        self._approved_input.on_update(lambda _: self._approve(self._approved_input.value))
         panel.dock_right()
         self._right, self._widths = panel, (0, 0)
         self._fit_panels()
@@ -190,10 +201,17 @@ class Panels:
         if (click := parse_click(text)) is not None:
             self._choose(*click)
 
-    def _approve(self, text: str) -> None:
-        """Approve the option that a click wrote into the hidden input."""
-        if self.approve is not None and (approval := parse_approval(text)) is not None:
-            self.approve(*approval)
+    def _add_approval_input(self, approvals: ApprovalDialog) -> None:
+        """Add the hidden input into which the buttons of an approval write."""
+        hidden = self._gui.add_text("approval", "", visible=False)
+
+        def on_update(_: object) -> None:
+            if text := hidden.value:
+                hidden.value = ""  # the same button may be pressed again
+                approvals.on_click(text, time.monotonic())
+
+        hidden.on_update(on_update)
+        self._approval_code = self._handler(hidden)
 
     def show_error(self, sentence: str) -> None:
         """Show a drawing error; an empty sentence removes it."""
@@ -250,9 +268,15 @@ class Panels:
         _update(
             self._about, status_html(vehicle, self._palette, now, self.units) if vehicle is not None else placeholder
         )
-        code = self._handler(self._approved_input) if self.approve is not None else ""
-        proposals = "" if vehicle is None else proposals_html(vehicle, self._palette, now, self.units, code)
+        proposals = "" if vehicle is None else self._proposals_html(vehicle, now)
         _update(self._proposals, f'<div class="uav">{proposals}</div>' if proposals else "")
+
+    def _proposals_html(self, vehicle: Vehicle, now: float) -> str:
+        """Return confirmation, execution and proposals of the selected UAV."""
+        code, palette = self._approval_code, self._palette
+        pending = "" if self._approvals is None else self._approvals.html(vehicle, palette, now, code)
+        executed = execution_html(vehicle.execution, vehicle.uav, palette, code)
+        return pending + executed + proposals_html(vehicle, palette, now, self.units, code)
 
     def _passes(self, vehicle: Vehicle, now: float, selected: int | None) -> bool:
         if self._filter == "Alerts" and not vehicle.alerts:

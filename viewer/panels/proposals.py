@@ -1,10 +1,10 @@
-"""Proposals of the selected UAV: each option with its figures, and a button to approve it where that is possible."""
+"""Proposals of the selected UAV: each option with its figures, and how to approve it."""
 
-from collections.abc import Callable
 from html import escape
 from math import isfinite
 
 from fleet.contract import Option
+from viewer.panels.approval import APPROVE, button
 from viewer.store.proposal import MAX_OPTIONS, SceneProposal
 from viewer.store.vehicle import Vehicle
 from viewer.text.units import METRIC, Units
@@ -13,8 +13,7 @@ from viewer.theme.palette import Palette
 
 MAX_TEXT = 300  # characters of a received text
 MAX_CLEARANCE_M = 1e5  # a larger clearance means that nothing is near [m]
-Approve = Callable[[int, str, int], None]
-"""Approves an option: UAV, id of the proposal, index of the option."""
+ID_LETTERS = 8  # of the id of a proposal that are shown
 
 
 def proposals_html(vehicle: Vehicle, palette: Palette, now: float, units: Units = METRIC, approve: str = "") -> str:
@@ -25,7 +24,7 @@ def proposals_html(vehicle: Vehicle, palette: Palette, now: float, units: Units 
         palette: colours of the page
         now: monotonic [s]
         units: of the page
-        approve: page code of a button that approves what is inserted at `{}`, see `parse_approval`; empty: no button
+        approve: page code that sends the text of a button at `{}`; empty: the command is shown instead
     """
     clock, cards, number = vehicle.data_time(now), [], 0
     for proposal in vehicle.open_proposals():
@@ -33,8 +32,8 @@ def proposals_html(vehicle: Vehicle, palette: Palette, now: float, units: Units 
         for index, option in enumerate(proposal.options if proposal.is_valid(clock) else ()):
             number += 1
             if number <= MAX_OPTIONS:
-                button = _button(proposal, index, approve)
-                rows.append(_option(option, number, message.probability, (palette, units), button))
+                how = _approval(proposal, index, approve)
+                rows.append(_option(option, number, message.probability, (palette, units), how))
         if rows or not message.options:
             text = escape(clip(message.sentence, MAX_TEXT))
             colour = palette.mismatch if not rows else palette.horizon
@@ -42,7 +41,7 @@ def proposals_html(vehicle: Vehicle, palette: Palette, now: float, units: Units 
     return "".join(cards)
 
 
-def _option(option: Option, number: int, before: float | None, style: tuple[Palette, Units], button: str) -> str:
+def _option(option: Option, number: int, before: float | None, style: tuple[Palette, Units], how: str) -> str:
     palette, units = style
     figures = [units.height_text(option.clearance_m) + " clearance"] if _is_near(option.clearance_m) else []
     figures += [f"{option.delay_s:+.0f} s", f"energy {100 * (option.energy - 1):+.0f} %"]
@@ -51,7 +50,7 @@ def _option(option: Option, number: int, before: float | None, style: tuple[Pale
     figures.append(f"risk {risk}" if before is None else f"risk {100 * before:.0f} % → {risk}")
     return (
         f'<div class="option"><b style="color:{palette.option(number)}">{number}</b> '
-        f'{escape(clip(option.sentence, MAX_TEXT))}<div class="soft">{" · ".join(figures)}</div>{button}</div>'
+        f'{escape(clip(option.sentence, MAX_TEXT))}<div class="soft">{" · ".join(figures)}</div>{how}</div>'
     )
 
 
@@ -59,18 +58,10 @@ def _is_near(clearance_m: float) -> bool:
     return isfinite(clearance_m) and clearance_m < MAX_CLEARANCE_M
 
 
-def _button(proposal: SceneProposal, index: int, approve: str) -> str:
-    """Return the button of an option; empty where options cannot be approved."""
-    if not approve:
-        return ""
+def _approval(proposal: SceneProposal, index: int, code: str) -> str:
+    """Return the button that asks to approve an option, or the command that does so."""
     message = proposal.message
     name = "".join(letter for letter in message.id[:40] if letter.isalnum())
-    return f'<button class="approve" onclick="{approve.format(f"{message.uav}/{name}/{index}")}">Approve</button>'
-
-
-def parse_approval(text: str) -> tuple[int, str, int] | None:
-    """Parse `7/5f2c…/0`: UAV, id of the proposal and index of the option; None for any other text."""
-    uav, _, rest = text[:80].partition("/")
-    name, _, index = rest.partition("/")
-    is_number = all(part.isascii() and part.isdecimal() and len(part) <= 6 for part in (uav, index))
-    return (int(uav), name, int(index)) if is_number and name.isalnum() else None
+    if code:
+        return button(code, f"{APPROVE}/{message.uav}/{name}/{index}", "Approve …")
+    return f'<div class="command">fleet approve {name[:ID_LETTERS]} --option {index + 1}</div>'

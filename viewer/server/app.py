@@ -11,8 +11,9 @@ import numpy as np
 import viser
 
 from fleet.bus.session import Bus
-from fleet.contract import History
+from fleet.contract import Approval, History
 from viewer.browser.http_server import Browser
+from viewer.panels.approval import ApprovalDialog
 from viewer.scene.camera import IN_VIEW_M, set_initial_view, within_reach
 from viewer.scene.fleet_arrays import TRAIL_AGES_S, FleetArrays
 from viewer.scene.routes import home_alt_m
@@ -82,13 +83,23 @@ MAX_IMMEDIATE = 50  # UAVs of a large fleet with alerts that are decoded every t
 REQUEST_S = 10.0  # interval between requests for missing messages [s]
 
 
+Approver = tuple[Callable[[Approval], None], str]
+"""Publishes an approval with the credentials of an operator, and the name of the person."""
+
+
 class App:
     """Draw the store: aircraft at 10 Hz, in a large fleet at 5 Hz, everything else more slowly."""
 
     def __init__(
-        self, bus: Bus, server: viser.ViserServer, *, light: bool = False, terrain_layer: TerrainLayer | None = None
+        self,
+        bus: Bus,
+        server: viser.ViserServer,
+        *,
+        light: bool = False,
+        terrain_layer: TerrainLayer | None = None,
+        approver: Approver | None = None,
     ) -> None:
-        self._palette = LIGHT if light else DARK
+        self._palette, self._approver = LIGHT if light else DARK, approver
         self.store, self.fleet_arrays, self._server = FleetStore(bus), FleetArrays(), server
         self._backfill = Backfill(bus, self.store)
         self.recordings, self._terrain_layer = RecordingStore(), terrain_layer or TerrainLayer(None, None)
@@ -185,7 +196,8 @@ class App:
                     browser.client.scene.reset()
                     browser.client.gui.reset()
                     self._terrain_layer.reset_client(client_id)
-                view = View(browser, self.store, self.recordings, browser.palette, self._wake.set)
+                approvals = None if self._approver is None else ApprovalDialog(self.store, *self._approver)
+                view = View(browser, self.store, self.recordings, self._wake.set, approvals)
         except Exception:  # an error on one page must not end the others
             self._failed_clients.add(client_id)
             self.views.pop(client_id, None)

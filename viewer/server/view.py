@@ -9,6 +9,7 @@ import viser
 
 from viewer.browser.http_server import Browser
 from viewer.export import Export
+from viewer.panels.approval import ApprovalDialog
 from viewer.panels.detail import MAX_TEXT
 from viewer.panels.panels import Panels
 from viewer.scene.camera import (
@@ -33,7 +34,6 @@ from viewer.store.profile import Surface, altitude_profile
 from viewer.store.store import FleetStore
 from viewer.store.vehicle import Vehicle
 from viewer.theme.events import clip
-from viewer.theme.palette import Palette
 from viewer.timeline.deck import Timeline
 from viewer.timeline.recordings import RecordingStore
 
@@ -51,10 +51,10 @@ class View:
         browser: Browser,
         store: FleetStore,
         recordings: RecordingStore,
-        palette: Palette,
         wake: Callable[[], None],
+        approvals: ApprovalDialog | None = None,
     ) -> None:
-        client = browser.client
+        client, palette = browser.client, browser.palette
         self.client, self.browser, self._store, self.palette, self._wake = client, browser, store, palette, wake
         self.scene = Scene(client.scene, palette, self._on_aircraft)
         self.measure, self._route = Measure(client.scene, palette), NOTHING
@@ -71,7 +71,9 @@ class View:
             "Measure distance, bearing and altitude difference": ("M", self.toggle_measure),
             "Measure: point in the middle of the view": ("X", self.measure_middle),
         }
-        self.panels = Panels(browser, palette, self.focus_on, commands)
+        self.panels = Panels(browser, palette, self.focus_on, commands, approvals)
+        if approvals is not None:
+            approvals.changed = self._redraw
         self.timeline = Timeline(client, store, recordings, palette, self._redraw)
         self.panels.measure_button.on_click(lambda _: self.toggle_measure())
         self.panels.seek = self.timeline.send_code()

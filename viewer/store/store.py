@@ -13,6 +13,7 @@ from fleet.bus.codec import Stamp, decode_for_key, encoding
 from fleet.bus.session import Bus
 from fleet.contract import (
     Alert,
+    Execution,
     FleetState,
     GatewayCounters,
     Mismatch,
@@ -40,10 +41,11 @@ COALESCE_S: dict[type, float] = {
 }  # decoding interval in a large fleet for UAVs without alerts [s]
 PAST_S = 65.0  # age up to which past predictions are compared with the flight [s]
 MAX_AWAY = 10_000  # rejected UAVs that are counted
+MAX_STEPS = 32  # steps of an execution whose aircraft are looked at
 MAX_LINKS = 64  # links whose texts are stored
 MAX_WRITERS = 16  # workers whose texts are stored; a restarted worker counts as new
 # topics requested at the start, so that a late viewer is complete
-INITIAL_TOPICS = (Status, Mission, Model, Prediction, Alert, Proposal, Mismatch, FleetState, GatewayCounters)
+INITIAL_TOPICS = (Status, Mission, Model, Prediction, Alert, Proposal, Execution, Mismatch, FleetState, GatewayCounters)
 
 
 class FleetStore:
@@ -70,6 +72,7 @@ class FleetStore:
             Prediction: self._prediction,
             Alert: self._alert,
             Proposal: self._proposal,
+            Execution: self._execution,
             Mismatch: self._mismatch,
             FleetState: self._fleet,
         }
@@ -372,6 +375,12 @@ class FleetStore:
         }
         if len(others) < MAX_PROPOSALS or message.about in others:
             vehicle.proposals = {**others, message.about: check_proposal(message, self._scene_frame, now)}
+
+    def _execution(self, execution: Execution, stamp: Stamp | None, now: float) -> None:
+        for uav in {execution.uav, *(step.uav for step in execution.steps[:MAX_STEPS])}:
+            vehicle = self._vehicle(uav)
+            if vehicle.execution is None or execution.t >= vehicle.execution.t:
+                vehicle.execution = execution
 
     def _fleet(self, fleet: FleetState, stamp: Stamp | None, now: float) -> None:
         self.sentences[stamp.writer if stamp else 0] = fleet.sentence

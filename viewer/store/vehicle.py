@@ -14,6 +14,7 @@ from fleet.contract import (
     AlertKey,
     AlertKind,
     Controller,
+    Execution,
     FleetRow,
     Link,
     Mismatch,
@@ -91,6 +92,7 @@ class Vehicle:
     events: tuple[TimelineEvent, ...] = ()  # oldest first; immutable, replaced as a whole
     alerts: dict[AlertKey, Alert] = field(default_factory=dict)  # replaced as a whole, never mutated
     proposals: dict[ProposalKey, SceneProposal] = field(default_factory=dict)  # replaced as a whole, never mutated
+    execution: Execution | None = None  # newest of an approved proposal that changes this UAV
     refusal: tuple[float, str] = (-np.inf, "")  # last rejected message: time, monotonic [s], and reason
     trail: Trail = field(default_factory=Trail)  # newest stretch of the flight, as received
     track: FlightTrack = field(default_factory=FlightTrack)  # the whole flight, thinned
@@ -267,7 +269,7 @@ class Vehicle:
 
     def reset(self) -> None:
         """Clear the state of a flight after a clock step back or a new scene origin."""
-        self.at, self.alerts, self.proposals, self.floor = None, {}, {}, np.nan
+        self.at, self.alerts, self.proposals, self.execution, self.floor = None, {}, {}, None, np.nan
         self.time, self.detector_state, self.events = DataTime(), DetectorState(), ()
         self.t, self.forecast, self.prediction, self.model, self.row = -np.inf, None, None, None, None
         self.controller = self.mismatch = self.last_updated_forecast = None

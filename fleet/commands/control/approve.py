@@ -1,20 +1,17 @@
 """Approve an option of a proposal, which a gateway with --allow commands then sends to the aircraft."""
 
 import argparse
-import getpass
 import queue
-import socket
 import sys
 import time
-
-import msgspec
 
 from fleet.access.roles import OPERATOR
 from fleet.bus.codec import digest_of
 from fleet.bus.session import Bus, connect
 from fleet.config import bus_config_from, router_arguments
-from fleet.contract import Approval, Change, Execution, ExecutionState, Item, Mission, Option, Proposal
+from fleet.contract import Approval, Execution, ExecutionState, Mission, Proposal
 from fleet.process.sanitise import printable
+from fleet.report.changes import describe_changes, user_name
 
 EXAMPLES = """
   fleet approve 1a2b3c4d5e6f7081               show the first option, ask, and print each acknowledged step
@@ -71,7 +68,7 @@ def approve(bus: Bus, args: argparse.Namespace) -> int:
     remaining_s = proposal.valid_until - time.time()
     print(printable(proposal.sentence))
     print(f"option {args.option}: {printable(option.sentence)}")
-    print("\n".join(f"  {line}" for line in describe(option, missions)))
+    print("\n".join(f"  {line}" for line in describe_changes(option, missions)))
     print(f"  valid for {remaining_s:.0f} s" if remaining_s > 0 else "  expired: a gateway will refuse it")
     if not is_confirmed(args):
         return 1
@@ -100,33 +97,6 @@ def find_proposal(proposals: list[Proposal], start: str) -> Proposal:
     return max(matching, key=lambda one: one.t)
 
 
-def describe(option: Option, missions: dict[int, Mission]) -> list[str]:
-    """Return what an option sends, one line for each command."""
-    return [line for change in option.changes for line in _change_lines(change, missions.get(change.uav))]
-
-
-def _change_lines(change: Change, mission: Mission | None) -> list[str]:
-    lines = []
-    if change.items is not None:
-        lines.append(f"upload a mission of {len(change.items)} items: {_difference(change.items, mission)}")
-    if change.seq is not None:
-        lines.append(f"fly to item {change.seq} first")
-    if change.speed is not None:
-        lines.append(f"change the speed to {change.speed:.1f} m/s")
-    if change.mode:
-        lines.append(f"change the mode: {printable(change.mode)}")
-    return [f"uav-{change.uav}: {line}" for line in lines]
-
-
-def _difference(items: tuple[Item, ...], mission: Mission | None) -> str:
-    if mission is None:
-        return "the present one is not known"
-    present = {msgspec.structs.replace(item, seq=0) for item in mission.items}
-    new = [item.seq for item in items if msgspec.structs.replace(item, seq=0) not in present]
-    numbers = ", ".join(map(str, new[:8])) + (" …" if len(new) > 8 else "")
-    return f"the present one has {len(mission.items)}, new or changed are {numbers or 'none'}"
-
-
 def is_confirmed(args: argparse.Namespace) -> bool:
     """Return whether the person confirms; without a terminal only `--yes` does."""
     if args.yes:
@@ -143,7 +113,7 @@ def is_confirmed(args: argparse.Namespace) -> bool:
 
 def person(args: argparse.Namespace) -> str:
     """Return the name of the person who approves."""
-    return args.who or f"{getpass.getuser()}@{socket.gethostname()}"
+    return args.who or user_name()
 
 
 def send_approval(bus: Bus, approval: Approval) -> int:

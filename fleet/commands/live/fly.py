@@ -17,12 +17,14 @@ EXAMPLES = """
   fleet fly --uavs 0-1 --autopilot px4 --aircraft c172p
   fleet fly --uavs 0-5 --aircraft mixed                    wings and quadrotors in turn
   fleet fly --uavs 0-3 --fault drag_increase,dCD=0.03,at=120 --fault actuator_lag:elevator,tau_s=0.3 --fault-uav 2
+  fleet fly --uavs 0-7 --story conflict                    aircraft 0 and 1 meet after about 2 min
   fleet fly --uavs 0 --seed 3 --for 300 --tlog flight.tlog     as fast as possible, no network
 """
 AUTOPILOTS = ("ardupilot", "px4")  # both as in `fleet.simulator.flight.tuning`, which loads slowly
 AIRCRAFT = ("small", "c172p")
 MULTIROTORS = ("quad", "quad_large")  # as in `fleet.simulator.multirotor.airframes`
 GROUPS = {"plane": ("small",), "mixed": ("small", "quad")}  # taken in turn by the aircraft of one fleet
+STORIES = ("conflict",)
 CHOICES = (*AIRCRAFT, *MULTIROTORS, *GROUPS)
 AIRCRAFT_HELP = "small (11 kg, electric) or plane, c172p, quad, quad_large, mixed: small and quad in turn (small)"
 WIND_FIELDS = ("shared", "independent")
@@ -54,6 +56,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--loss", type=float, default=0.02, metavar="SHARE", help="share of frames lost (0.02)")
     parser.add_argument("--for", dest="seconds", type=float, metavar="S", help="duration (unlimited; 300 with --tlog)")
     fault_arguments(parser)
+    parser.add_argument("--story", choices=STORIES, help="conflict: aircraft 0 and 1 meet, the others are far away")
     parser.add_argument("--tlog", type=Path, metavar="FILE", help="write this .tlog as fast as possible instead")
 
 
@@ -76,6 +79,7 @@ def run(args: argparse.Namespace) -> int:
         ValueError: when an option is invalid; the text names it.
     """
     from fleet.simulator.flight import drive  # loads JSBSim and the compiler: not for --help
+    from fleet.simulator.flight.story import story_aircraft
     from fleet.simulator.flight.uav import SimulatedUav
     from fleet.simulator.vehicle.missions import HOME
     from fleet.simulator.vehicle.weather import turbulence_level
@@ -89,7 +93,9 @@ def run(args: argparse.Namespace) -> int:
     options = {"autopilot": args.autopilot, "wind": args.wind, "turbulence": level, "wind_field": field}
     faulty = faults_of(args, args.uavs)
     uavs: list[drive.SimulatedAircraft] = []
-    for uav, aircraft in zip(args.uavs, aircraft_types(args.aircraft, args.uavs), strict=True):
+    if args.story:
+        uavs += story_aircraft(len(args.uavs), args.seed, args.autopilot)
+    for uav, aircraft in () if args.story else zip(args.uavs, aircraft_types(args.aircraft, args.uavs), strict=True):
         if aircraft in MULTIROTORS:
             uavs.append(_multirotor_class()(uav, args.seed, aircraft=aircraft, **options))
         else:
@@ -158,5 +164,8 @@ def _check(args: argparse.Namespace) -> None:
         raise ValueError(f"--loss: found {args.loss}, expected a share from 0 to below 1; write e.g. 0.02")
     if args.seed < 0:
         raise ValueError(f"--seed: found {args.seed}, expected an integer from 0; change --seed")
+    if args.story and (args.aircraft != "small" or args.fault or args.uavs[0] != 0):
+        given = f"--aircraft {args.aircraft}, {len(args.fault)} faults, first id {args.uavs[0]}"
+        raise ValueError(f"--story: found {given}, expected small aircraft from id 0 without faults; leave these out")
     if args.seconds is not None and not args.seconds > 0:
         raise ValueError(f"--for: found {args.seconds} s, expected more than 0; change --for")

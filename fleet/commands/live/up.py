@@ -15,7 +15,7 @@ from rich.text import Text
 from fleet.access.knock import probe_router
 from fleet.bus.session import Bus, connect, open_router
 from fleet.cli import check_file, check_link, check_parent, check_port, host_and_port, stop_on_signal
-from fleet.commands.live.fly import AIRCRAFT_HELP, AUTOPILOTS, CHOICES, fault_arguments, faults_of
+from fleet.commands.live.fly import AIRCRAFT_HELP, AUTOPILOTS, CHOICES, STORIES, fault_arguments, faults_of
 from fleet.commands.live.replay import check_arguments as check_playing
 from fleet.commands.live.replay import replay_link
 from fleet.commands.live.status import as_objects, fleet_rows, fleet_table
@@ -24,12 +24,14 @@ from fleet.contract import FleetRow, FleetState, TwinState
 from fleet.process.children import Children
 from fleet.process.logs import add_time, report_progress
 from fleet.process.sanitise import printable
+from fleet.report.story import ConflictStory
 from fleet.telemetry.recording.options import add_recording_arguments
 
 EXAMPLES = """
   fleet up --uavs 8
   fleet up --uavs 4 --autopilot px4 --aircraft c172p
   fleet up --uavs 8 --aircraft mixed                                         wings and quadrotors in turn
+  fleet up --uavs 8 --story conflict                                         alert, proposals, your approval
   fleet up --uavs 4 --fault drag_increase,dCD=0.04,at=120 --fault-uav 2      its twin should diagnose the fault
   fleet up --link udpin:0.0.0.0:14550
   fleet up --link serial:/dev/ttyUSB0:57600 --forward udpin:127.0.0.1:14551      QGroundControl in addition, at 14551
@@ -48,6 +50,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--autopilot", choices=AUTOPILOTS, default="ardupilot", help="simulated autopilot (ardupilot)")
     parser.add_argument("--aircraft", choices=CHOICES, default="small", help=AIRCRAFT_HELP)
     fault_arguments(parser)
+    parser.add_argument(
+        "--story",
+        choices=STORIES,
+        help="conflict: two aircraft meet after 2 min; these simulated ones execute approved proposals",
+    )
     parser.add_argument(
         "--mavlink", default=_MAVLINK, metavar="HOST:PORT", help=f"UDP address they send to ({_MAVLINK})"
     )
@@ -103,6 +110,9 @@ def _check(args: argparse.Namespace) -> None:
     check_playing(args)
     if args.fault and (args.link or args.replay):
         raise ValueError("--fault: found --link or --replay, expected simulated aircraft; leave one out")
+    if args.story and (args.link or args.replay or args.fault or args.aircraft != "small" or args.uavs < 2):
+        given = "--link, --replay, --fault, another --aircraft or fewer than 2 --uavs"
+        raise ValueError(f"--story: found {given}, expected 2 or more simulated small aircraft; leave these out")
     faults_of(args, range(args.uavs))
     if args.results and not args.replay:
         raise ValueError("--results: found no --replay, expected a recording made by `fleet record`; name one")
@@ -151,36 +161,52 @@ def _start(children: Children, args: argparse.Namespace) -> None:
     if links:
         children.start("gateway", "gateway", *links, *gateway_options)
     else:
+        gateway_options += [f"--allow=commands:0-{args.uavs - 1}"] if args.story else []
         children.start("gateway", "gateway", f"--link=udpin:{args.mavlink}", "--offset=-1", *gateway_options)
-        aircraft = ["--uavs", f"0-{args.uavs - 1}", "--to", args.mavlink, "--seed", str(args.seed)]
-        aircraft += ["--autopilot", args.autopilot, "--aircraft", args.aircraft]
-        aircraft += [f"--fault={text}" for text in args.fault]
-        aircraft += [] if args.fault_uav is None else [f"--fault-uav={args.fault_uav}"]
-        children.start("aircraft", "fleet.cli", "fly", *aircraft)
+        if not args.story:  # its aircraft start when the worker is ready
+            _start_aircraft(children, args)
     if not args.no_viewer:
         map_options = [f"--{name}={file}" for name in ("terrain", "imagery", "map") if (file := getattr(args, name))]
+        map_options += ["--allow=approvals"] if args.story else []
         children.start("viewer", "viewer", "--port", str(args.port), *map_options, *router)
+
+
+def _start_aircraft(children: Children, args: argparse.Namespace) -> None:
+    aircraft = ["--uavs", f"0-{args.uavs - 1}", "--to", args.mavlink, "--seed", str(args.seed)]
+    aircraft += ["--autopilot", args.autopilot, "--aircraft", args.aircraft]
+    aircraft += [f"--fault={text}" for text in args.fault]
+    aircraft += [] if args.fault_uav is None else [f"--fault-uav={args.fault_uav}"]
+    aircraft += [f"--story={args.story}"] if args.story else []
+    children.start("aircraft", "fleet.cli", "fly", *aircraft)
 
 
 def _watch(bus: Bus, children: Children, args: argparse.Namespace, stop: threading.Event) -> int:
     """Show the fleet once a second until stopped, a process fails or the duration has elapsed."""
+    ready = threading.Event()  # the worker publishes
     worker_texts: list[str] = [""]  # texts of the worker, the newest last; none is lost between two polls
 
     def on_state(state: FleetState, _: object) -> None:
         if (text := printable(state.sentence)) != worker_texts[-1]:
             worker_texts.append(text)
+        if state.t > 0.0 or state.tasks:  # not while it compiles
+            ready.set()
 
     bus.subscribe(FleetState, on_state)
+    story = _story(bus, args)
     rows: list[FleetRow] = []
     first_sample_t = None
     display = _Display(Console(stderr=True))
     with display.live:
         while not stop.wait(1.0):
             rows = fleet_rows(bus) or rows
+            if story is not None and not story.sentences and ready.is_set():
+                _start_aircraft(children, args)
+                story.begin()
             if first_sample_t is None and any(row.sample_age_s is not None for row in rows):
                 first_sample_t = time.monotonic()
             elapsed = 0.0 if first_sample_t is None else time.monotonic() - first_sample_t
-            display.draw(_lines(rows, children, worker_texts[-1], elapsed, args), rows, worker_texts)
+            scene = [] if story is None else list(story.sentences)
+            display.draw([*_lines(rows, children, worker_texts[-1], elapsed, args), *scene], rows, worker_texts)
             if children.failures() or (args.seconds and elapsed >= args.seconds):
                 break
     failed = children.failures()
@@ -191,6 +217,16 @@ def _watch(bus: Bus, children: Children, args: argparse.Namespace, stop: threadi
     if stop.is_set():
         report_progress("fleet up", "stopping")
     return (2 if all(code == 2 for code, _ in failed) else 1) if failed else 0
+
+
+def _story(bus: Bus, args: argparse.Namespace) -> ConflictStory | None:
+    """Return the scene of `--story`, subscribed; None without one."""
+    if not args.story:
+        return None
+    router = f" --router {args.router}" if args.router else ""
+    story = ConflictStory("" if args.no_viewer else f"http://127.0.0.1:{args.port}", router)
+    story.subscribe(bus)
+    return story
 
 
 class _Display:

@@ -1,6 +1,6 @@
 """Pictures of the page for the README, of aircraft that fly, twins that judge, and a browser that draws.
 
-    PARAUAV_RECORDINGS=recordings python -m tests.bench.pictures             all five
+    PARAUAV_RECORDINGS=recordings python -m tests.bench.pictures             all of them
     python -m tests.bench.pictures --only selected mismatch --out pictures   some of them
 
 Eight aircraft fly a recording, which twins judge that need not hurry; all of it is then said on the bus again, in haste
@@ -24,12 +24,13 @@ from tests.bench.viewing.page import ARGS
 from tests.bench.viewing.process import free_port, start, tell
 
 from .page import command, page, shoot, turn_to, viewer
-from .said import ROOT, Said, Speaker, flown, judged, moment, named_s, played
+from .said import ROOT, Said, Speaker, flown, judged, moment, named_s, offered, played
 
 OUT = ROOT / "viewer"
 REAL = "real/alfa_20180718_155331_1_engine_failure.tlog"
 EIGHT = ("--uavs", "0-7", "--for", "232")
 FAULTY = ("--uavs", "0-3", "--for", "260", "--fault", "airspeed_bias,bias_mps=-6,at=120", "--fault-uav", "0")
+MEETING, OFFERED_S = ("--uavs", "0-1", "--for", "125", "--story", "conflict"), 80.0
 FAULTY_UAV = 1  # as MAVLink has it
 TRAILS_S = 45.0  # until a crowd has trails [s]
 SHARE = 0.62  # of the real flight, where it is looked at
@@ -57,6 +58,12 @@ def mismatch(browser: Any, out: Path) -> None:
     """Show a fault that was concealed, found and named."""
     said = judged(flown("faulty", *FAULTY), FAULTY_UAV)
     told(browser, said, moment(said, named_s(said), FAULTY_UAV), out / "mismatch.png")
+
+
+def proposal(browser: Any, out: Path) -> None:
+    """Show two aircraft that will meet, and what is proposed against it, ready to be approved."""
+    said = judged(flown("conflict", *MEETING), proposes=True)
+    told(browser, said, offered(said, OFFERED_S), out / "proposal.png", "--allow", "approvals")
 
 
 def trouble(router: str, stop: threading.Event) -> None:
@@ -107,7 +114,7 @@ def replay(browser: Any, out: Path) -> None:
         shoot(one, out / "replay.png")
 
 
-SCENES = {"selected": selected, "many": many, "mismatch": mismatch, "replay": replay}
+SCENES = {"selected": selected, "many": many, "mismatch": mismatch, "proposal": proposal, "replay": replay}
 
 
 def main() -> int:

@@ -1,5 +1,6 @@
 """What is said of a flight: flown into a recording, judged by twins that need not hurry, and said again on a bus."""
 
+import copy
 import subprocess
 import sys
 import tempfile
@@ -14,7 +15,7 @@ from typing import Any
 
 from fleet.bus.codec import Stamp
 from fleet.bus.session import connect, open_router
-from fleet.contract import DiagnosisOutcome, GatewayCounters, Mismatch, Prediction, Sample, Status
+from fleet.contract import DiagnosisOutcome, GatewayCounters, Mismatch, Prediction, Proposal, Sample, Status
 from fleet.process import private_files
 from fleet.telemetry.recording.recordings import Recording
 from tests.bench.mismatch.flown import Inline
@@ -22,6 +23,7 @@ from tests.bench.mismatch.world import baseline
 from tests.bench.viewing.process import free_port
 from twin_worker.alerts.traffic import TrafficMonitor
 from twin_worker.mismatch.coordinator import ALL_UAVS, Coordinator
+from twin_worker.proposals.proposer import Proposer
 from twin_worker.twin.step import Twin, advance
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -43,11 +45,15 @@ def flown(name: str, *options: str) -> Path:
     return path
 
 
-def judged(path: Path, diagnosed: int | None = None) -> Said:
-    """Let twins judge a recording; of one UAV also what its simulation lacks. Everything said, in the order of time."""
+def judged(path: Path, diagnosed: int | None = None, *, proposes: bool = False) -> Said:
+    """Let twins judge a recording; of one UAV also what its simulation lacks. Everything said, in the order of time.
+
+    With `proposes`, what a worker would propose against the alerts.
+    """
     said: Said = []
     twins: dict[int, Twin] = {}
     traffic, hand = TrafficMonitor(), Inline()
+    proposer = Proposer(traffic.separation, lambda uav: copy.deepcopy(twins.get(uav)), traffic.picture.forecasts)
     with tempfile.TemporaryDirectory() as folder:
         live = Coordinator(hand, {ALL_UAVS: baseline(1, Path(folder))}) if diagnosed is not None else None
     for now, news in Recording(str(path), 0).steps():
@@ -60,6 +66,9 @@ def judged(path: Path, diagnosed: int | None = None) -> Said:
                     twin.config.uav, twin.telemetry.last_step_t, advance(twin, (message,))
                 )
             ]
+            last_t = twin.telemetry.last_step_t
+            due = [one for one in traffic.active(message.uav) if proposes and proposer.due(one, last_t)]
+            said += [(now, told, STAMP) for alert in due if (told := proposer.update(alert, last_t)) is not None]
             if live is not None and isinstance(message, Sample) and message.uav == diagnosed:
                 hand.now = message.t
                 said += [(now, told, STAMP) for told in live.run_once([(twin, nullcontext())])]
@@ -101,6 +110,12 @@ def moment(said: Said, since: float = SETTLED_S, uav: int | None = None) -> tupl
             if len(run) >= STEADY and (off := abs(message.horizon_s - BEST_S)) < least:
                 best, least = (message.uav, t), off
     return best or otherwise
+
+
+def offered(said: Said, since: float) -> tuple[int, float]:
+    """Tell of whom and when something is first proposed after `since` [s], and 1 s later [s since 1970]."""
+    first = next(m for t, m, _ in said if t > said[0][0] + since and isinstance(m, Proposal) and m.options)
+    return first.uav, next(t for t, m, _ in said if t >= first.t + 1.0)
 
 
 def named_s(said: Said) -> float:

@@ -17,14 +17,14 @@ import msgspec
 import numpy as np
 
 from fleet.autopilots import laws
-from fleet.contract import Alert, AlertKind, Change, Message, Mission, Option, Proposal
+from fleet.contract import Alert, AlertKey, AlertKind, Change, Message, Mission, Option, Proposal
 from fleet.frames import to_geodetic, to_ned
-from fleet.mission import SPEED
+from fleet.mission import P_D, SEQ, SPEED
 from fleet.simulator.flight.drive import EPOCH_US, to_tlog
 from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.missions import HOME
 from fleet.telemetry.recording.recordings import replay_messages
-from tests.bench.alerts.world import Flight, Told, apart, arrange, make
+from tests.bench.alerts.world import Flight, Told, apart, arrange, fly, make
 from twin_worker.alerts.traffic import TrafficMonitor
 from twin_worker.proposals.candidates import MODES
 from twin_worker.proposals.proposer import PROPOSED, Proposer
@@ -32,13 +32,13 @@ from twin_worker.twin.state.budget import Schedule
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.step import advance
 
-APPROVED_S = 5.0  # from the alert to the change on board: computing, reading, approving, uploading [s]
-KNOWN_S = 30.0  # alerts before the first model count as offered without need [s]
+APPROVED_S = (3.0, 18.0)  # from a proposal to the change on board, drawn: reading, approving, uploading [s]
 UPLOAD_S = 1.0  # from the change on board to the new mission at the twin [s]
 END_S = 200.0  # end of a flight with a change [s]
 HEARD_S = 152.0  # end of a flight without one [s]
 WIDE_M, HIGH_M, SAFE_M = 50.0, 20.0, 30.0  # separation, and least height above home
-KINDS = ("pair", "triple", "ground", "geofence", "clear")
+KINDS = ("pair", "triple", "ground", "geofence", "clear", "leg")
+STEEP_S, STEEP_M, MISSED_M = 120.0, 220.0, 30.0  # when and how far a leg climbs; height by which it misses its end
 SCHEDULE = Schedule(identify=5.0)
 T_0 = EPOCH_US * 1e-6
 
@@ -63,6 +63,7 @@ class Outcome:
     name: str
     seed: int
     alert_s: float | None = None  # since the start
+    offered_s: float | None = None  # the first options, since the start
     event_s: float | None = None  # predicted, since the start
     offered: int = 0
     took_s: float | None = None  # to compute the options, this thread's CPU
@@ -72,17 +73,35 @@ class Outcome:
     new_alerts: list[str] = field(default_factory=list)  # raised after the change, with the first option
     unneeded: int = 0  # proposals with options where nothing happens
 
+    @property
+    def waited_s(self) -> float:
+        """Give the time from the alert to the options: of the flight, and of computing [s]; inf: none."""
+        if self.alert_s is None or self.offered_s is None or self.took_s is None:
+            return float("inf")
+        return max(self.offered_s - self.alert_s, 0.0) + self.took_s
+
 
 def arranged(name: str, seed: int) -> Case:
     """Arrange one case."""
+    limits = {"ground": AlertKind.GROUND, "geofence": AlertKind.GEOFENCE, "leg": AlertKind.NOT_ACHIEVABLE}
     rng = np.random.default_rng((seed, KINDS.index(name)))
     told = partial(Told, seed=seed, may_leave=name == "geofence")
     first = arrange(told(uav=0, meets=None, sinks=name == "ground"), rng, None)
-    flights, kind = [first], {"ground": AlertKind.GROUND, "geofence": AlertKind.GEOFENCE}.get(name)
+    flights, kind = [steepened(first) if name == "leg" else first], limits.get(name)
     for uav in range(1, {"pair": 2, "triple": 3, "clear": 2}.get(name, 1)):
         flights.append(arrange(told(uav=uav, meets=name != "clear", sinks=False), rng, first.path))
         kind = None if name == "clear" else AlertKind.CONFLICT
     return Case(name, flights, kind)
+
+
+def steepened(flight: Flight) -> Flight:
+    """Raise the waypoint that is flown to at STEEP_S beyond what the aircraft can climb, and fly the mission."""
+    seq = int(flight.seq[int(STEEP_S / 0.5)])
+    items = tuple(
+        msgspec.structs.replace(item, alt_m=item.alt_m + STEEP_M) if item.seq == seq else item
+        for item in flight.plan.items
+    )
+    return fly(flight.told, flight.plan._replace(items=items), END_S)
 
 
 class Changed:
@@ -91,6 +110,7 @@ class Changed:
     def __init__(self, uav: SimulatedUav, change: Change | None, at_s: float) -> None:
         self.uav, self.change, self.at_s = uav, change, at_s
         self.path: list[np.ndarray] = []
+        self.missed: list[tuple[int, float]] = []  # item that is flown to, and height above its end [m]
 
     @property
     def uav_id(self) -> int:
@@ -112,7 +132,9 @@ class Changed:
             self.change = None
         frames = self.uav.step(t)
         if self.uav.tick % 50 == 0:
-            self.path.append(self.uav.aircraft.truth().p.copy())
+            p, leg = self.uav.aircraft.truth().p.copy(), self.uav.leg
+            self.path.append(p)
+            self.missed.append((int(leg[SEQ]), float(leg[P_D] - p[2])))
         return frames
 
 
@@ -148,6 +170,7 @@ class Twins:
     received: int = 0
 
     def __post_init__(self) -> None:
+        self.active: dict[tuple[int, AlertKey], Alert] = {}
         self.proposer = Proposer(self.traffic.separation, self.copy_of, self.traffic.picture.forecasts)
 
     def copy_of(self, uav: int) -> Twin | None:
@@ -159,11 +182,17 @@ class Twins:
         self.received += 1
         twin = self.twins.setdefault(message.uav, Twin.of(message.uav, schedule=SCHEDULE))
         results = self.traffic.process_results(message.uav, twin.telemetry.last_step_t, advance(twin, (message,)))
-        return [one for one in results if isinstance(one, Alert) and one.kind in PROPOSED]
+        alerts = [one for one in results if isinstance(one, Alert) and one.kind in PROPOSED]
+        for alert in alerts:
+            if alert.active:
+                self.active[alert.uav, alert.about] = alert
+            else:
+                self.active.pop((alert.uav, alert.about), None)
+        return alerts
 
 
 def recording(case: Case, seconds: float, seed: int, changes: tuple[Change, ...] = (), at_s: float = 0.0):
-    """Fly a case into a recording, with changes from one instant on; give its path in memory and the true paths."""
+    """Fly a case into a recording, with changes from one instant on; give it, the true paths, and missed heights."""
     by_uav = {change.uav: change for change in changes}
     uavs = [Changed(uav, by_uav.get(uav.uav_id), at_s) for uav in case.make()]
     folder = tempfile.TemporaryDirectory()
@@ -173,7 +202,7 @@ def recording(case: Case, seconds: float, seed: int, changes: tuple[Change, ...]
         to_ned(HOME, *to_geodetic(one.plan.origin, np.array(uav.path)).T)
         for one, uav in zip(case.flights, uavs, strict=True)
     ]
-    return folder, path, paths
+    return folder, path, (paths, uavs[0].missed)
 
 
 def judged(name: str, seed: int, say: Any = print) -> Outcome:
@@ -182,39 +211,45 @@ def judged(name: str, seed: int, say: Any = print) -> Outcome:
     twins = Twins()
     folder, path, _ = recording(case, HEARD_S, seed)
     with folder:
-        alert, proposal = _until_alert(case, twins, path, out)
+        alert, proposal = _until_offered(case, twins, path, out)
     if alert is None or proposal is None:
         return out
-    out.alert_s, out.event_s = alert.t - T_0, (alert.predicted_t or alert.t) - T_0
+    out.event_s, out.offered_s = (alert.predicted_t or alert.t) - T_0, proposal.t - T_0
     out.offered, out.sentences = len(proposal.options), [one.sentence for one in proposal.options]
     say(f"{name} {seed}: alert at {out.alert_s:.0f} s; {'; '.join(out.sentences) or proposal.sentence}")
     for number, option in enumerate(proposal.options):
-        _fly_option(case, seed, (out, twins if number == 0 else None), (alert, option))
+        _fly_option(case, seed, (out, twins if number == 0 else None), (alert, option), proposal.t)
     return out
 
 
-def _until_alert(case: Case, twins: Twins, path: Path, out: Outcome) -> tuple[Alert | None, Proposal | None]:
-    """Let the twins hear a recording up to the expected alert; give it and the proposal against it."""
+def _until_offered(case: Case, twins: Twins, path: Path, out: Outcome) -> tuple[Alert | None, Proposal | None]:
+    """Let the twins hear a recording until options against the expected alert are offered; give alert and proposal."""
     for message in replay_messages(path, -1):
         for alert in twins.hear(message):
-            if not alert.active:
-                continue
+            if alert.active and alert.kind is case.kind and out.alert_s is None:
+                out.alert_s = alert.t - T_0
+        now = twins.twins[message.uav].telemetry.last_step_t
+        for alert in [one for one in twins.active.values() if twins.proposer.due(one, now)]:
             began = time.thread_time()
             proposal = twins.proposer.update(alert, twins.twins[alert.uav].telemetry.last_step_t)
-            if alert.kind is case.kind and alert.t >= T_0 + KNOWN_S:
+            if proposal is None or not proposal.options:
+                continue
+            if alert.kind is case.kind:
                 out.took_s = time.thread_time() - began
                 return alert, proposal
-            out.unneeded += bool(proposal is not None and proposal.options)
+            out.unneeded += 1
     return None, None
 
 
-def _fly_option(case: Case, seed: int, simulated: tuple[Outcome, Twins | None], chosen: tuple[Alert, Option]) -> None:
-    """Fly an option; let the twins hear it from the alert on."""
+def _fly_option(
+    case: Case, seed: int, simulated: tuple[Outcome, Twins | None], chosen: tuple[Alert, Option], offered_t: float
+) -> None:
+    """Fly an option, approved after a drawn time; let the twins hear it from the proposal on."""
     (out, twins), (alert, option) = simulated, chosen
-    at_s = alert.t - T_0 + APPROVED_S
-    folder, path, paths = recording(case, END_S, seed, option.changes, at_s)
+    at_s = offered_t - T_0 + float(np.random.default_rng((seed, 78)).uniform(*APPROVED_S))
+    folder, path, flown = recording(case, END_S, seed, option.changes, at_s)
     with folder:
-        out.without_event.append(not happens(case, paths, int(at_s / 0.5)))
+        out.without_event.append(not happens(case, flown, int(at_s / 0.5)))
         if twins is None:
             return
         out.cleared = False
@@ -244,8 +279,9 @@ def _after(messages: Iterator[Message], twins: Twins, changes: tuple[Change, ...
         yield message
 
 
-def happens(case: Case, paths: list[np.ndarray], since: int) -> bool:
+def happens(case: Case, flown: tuple[list[np.ndarray], list[tuple[int, float]]], since: int) -> bool:
     """Tell whether the event happens from a row on: of the whole case, any loss of separation counts."""
+    paths, missed = flown
     for one, other in combinations(paths, 2):
         wide, high = apart(one, other)
         if ((wide < WIDE_M) & (high < HIGH_M))[since:].any():
@@ -253,4 +289,7 @@ def happens(case: Case, paths: list[np.ndarray], since: int) -> bool:
     home, path = case.flights[0].home, paths[0][since:]
     if case.kind is AlertKind.GROUND:
         return bool((home[2] - path[:, 2] < SAFE_M).any())
+    if case.kind is AlertKind.NOT_ACHIEVABLE:
+        ends = [k for k in range(since + 4, len(missed)) if missed[k][0] != missed[k - 1][0]]
+        return any(abs(missed[k - 1][1]) > MISSED_M for k in ends)
     return case.kind is AlertKind.GEOFENCE and bool((np.hypot(*(path - home)[:, :2].T) > case.flights[0].radius).any())

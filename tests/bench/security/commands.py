@@ -13,10 +13,13 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from fleet.contract import ExecutionState
+from fleet.bus.codec import digest_of
+from fleet.contract import Alert, AlertKind, Approval, Change, ExecutionState, Option, Proposal
 from gateway.commands.mission_transfer import RawItem, planned_items
 from gateway.commands.steps import MissionCommand
 from tests.support.commanded import CommandedAircraft, CommandSite, StepDriver, mission, raised
+from tests.support.pretend_feed import STAMP, Clock, T, feed_of
+from viewer.panels.approval import ApprovalDialog
 
 from .trying import Admitted
 
@@ -188,7 +191,39 @@ def audited_and_undone() -> str:
     return f"{EXECUTIONS} of {EXECUTIONS} undone, {messages} messages sent, all in the audit"
 
 
+def page_without_confirmation() -> str:
+    """Texts of a foreign script into the input of a page that may approve: guessed, replayed, cancelled, of others."""
+    for k in range(ROUNDS):
+        clock = Clock()
+        feed, _, bus = feed_of(clock, 3)
+        sent: list[Approval] = []
+        dialog = ApprovalDialog(feed, sent.append, "kim")
+        bus.publish(Alert(uav=1, t=T, kind=AlertKind.CONFLICT, other=2), STAMP)
+        option = Option(sentence="", changes=(Change(uav=1, seq=k),), paths=(), probability=0.0, clearance_m=60.0)
+        given = {"kind": AlertKind.CONFLICT, "other": 2, "valid_until": feed.get(1).data_time(clock()) + 15.0}
+        bus.publish(Proposal(uav=1, t=T, id="a1", options=(option,), **given), STAMP)
+        dialog.on_click("approve/1/a1/0", clock())
+        name = dialog.pending.name if dialog.pending is not None else ""
+        guesses = [f"confirm/{guess}" for guess in ("", f"{k:016x}", name[:-1], name + "0", name.upper() + " ")]
+        for text in (*guesses, "undo/1", "confirm/a1", "confirm/1/a1/0", f"approve/2/a1/{k}", f"send/{name}"):
+            dialog.on_click(text, clock())
+            if dialog.pending is None or dialog.pending.name != name:
+                dialog.on_click("approve/1/a1/0", clock())
+                name = dialog.pending.name if dialog.pending is not None else ""
+        if sent or not name:
+            raise Admitted(f"round {k}: {len(sent)} sent, asked for: {bool(name)}")
+        dialog.on_click(f"cancel/{name}", clock())
+        dialog.on_click(f"confirm/{name}", clock())
+        if sent:
+            raise Admitted(f"round {k}: sent after it was cancelled")
+        dialog.on_click("approve/1/a1/0", clock())
+        dialog.on_click(f"confirm/{dialog.pending.name}", clock())  # type: ignore[union-attr]
+        if [one.digest for one in sent] != [digest_of(option)]:
+            raise Admitted(f"round {k}: the rightful one was not sent, so nothing was tried")
+    return f"0 of {11 * ROUNDS} sent, each rightful one was"
+
+
 BY_COMMAND: tuple[Callable[[], str], ...] = (
     *(lossy_uploads, forged_approvals, replayed_approvals, expired_approvals),
-    *(unapproved_proposals, outdated_approvals, audited_and_undone),
+    *(unapproved_proposals, outdated_approvals, audited_and_undone, page_without_confirmation),
 )

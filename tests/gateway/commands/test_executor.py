@@ -1,15 +1,12 @@
 """Approved execution: nothing without approval, nothing that has changed, everything recorded, all of it undone."""
 
-import stat
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 
-from fleet.bus.codec import digest_of
 from fleet.contract import Array, Change, ExecutionState, Option
-from gateway.commands.audit import AuditLog
 from tests.support.commanded import CommandedAircraft, CommandSite, mission, raised
 
 AUTOPILOTS = pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
@@ -325,7 +322,7 @@ def test_a_mission_that_somebody_else_changed_is_neither_overwritten_nor_undone(
 
 
 def test_a_flight_that_leaves_the_region_is_reported(site: CommandSite) -> None:
-    approve(site, site.option(speed=17.0), 5.0)
+    approve(site, site.option(speed=17.0), 12.0)  # no worker predicts anew: its own path is taken
     site.aircraft.offset[1] = -45.0
     published = site.run(4.0)
     assert published[-1].follows is False and published[-1].can_undo
@@ -339,34 +336,41 @@ def test_a_flight_that_leaves_the_region_is_reported(site: CommandSite) -> None:
     assert published[-1].state == S.DONE and "has ended" in published[-1].sentence
 
 
-# --- the audit -------------------------------------------------------------------------------------------------------
-
-
-def test_the_audit_is_private_appended_and_survives_a_torn_line(tmp_path: Path) -> None:
-    path = tmp_path / "new" / "commands.jsonl"
-    log = AuditLog(path)
-    log.write(1.0, [{"event": "approved", "proposal": "a", "x": float("nan")}])
-    log.close()
-    assert stat.S_IMODE(path.stat().st_mode) == 0o600 and stat.S_IMODE(path.parent.stat().st_mode) == 0o700
-    with path.open("a") as file:
-        file.write('{"event": "appro')
-    again = AuditLog(path)
-    again.write(2.0, [{"event": "undo_approved", "proposal": "a"}])
-    again.close()
-    again = AuditLog(path)
-    assert again.executed == {("a", False), ("a", True)}
-    assert path.read_text().splitlines()[0].endswith('"x":null}')
-    again.close()
-    path.chmod(0o666)
-    with pytest.raises(ValueError, match="0666"):
-        AuditLog(path)
-    link = tmp_path / "link.jsonl"
-    link.symlink_to(path)
-    with pytest.raises(OSError, match="symbolic"):
-        AuditLog(link)
-
-
-def test_a_digest_is_of_the_changes_alone(site: CommandSite) -> None:
+def test_a_flight_is_compared_with_the_path_predicted_after_the_execution(site: CommandSite) -> None:
+    """The path of the proposal is 300 m aside from the moment on at which the change begins."""
     option = site.option(speed=17.0)
-    assert digest_of(option) == digest_of(msgspec.structs.replace(option, probability=0.5, paths=()))
-    assert digest_of(option) != digest_of(site.option(speed=17.5))
+    (path,) = option.paths
+    aside = path.path.numpy() + np.float32([0.0, 300.0, 0.0])
+    late = msgspec.structs.replace(option, paths=(msgspec.structs.replace(path, path=Array.of(aside)),))
+    site.bus.publish(site.approval(site.propose(late, present=option.paths)))
+    assert site.run(3.0)[-1].state == S.ACCEPTED
+    other = msgspec.structs.replace(option, changes=(Change(uav=1, speed=15.0),))
+    for wrong in (other, msgspec.structs.replace(option, paths=(msgspec.structs.replace(path, path=path.ahead),))):
+        site.propose(wrong, valid_s=0.0)
+    site.run(2.0)
+    assert site.executions[-1].follows is None
+    site.propose(site.option(speed=17.0), valid_s=0.0)
+    assert site.run(3.0)[-1].sentence == "follows within its region"
+
+
+def test_a_version_that_was_shown_may_be_approved_while_it_is_renewed(site: CommandSite) -> None:
+    def inserted(ahead: int) -> Option:
+        items = mission()
+        moved = msgspec.structs.replace(items[3], lat_e7=items[3].lat_e7 + 100 * ahead)
+        return site.option(items=(*items[:3], moved, *items[4:]))
+
+    shown = site.propose(inserted(1), valid_s=15.0)
+    site.run(5.0)
+    site.propose(inserted(2), valid_s=15.0)
+    site.run(5.0)
+    site.bus.publish(site.approval(shown))
+    assert site.run(8.0)[-1].state == S.ACCEPTED
+    assert site.aircraft.items[3].lat_e7 == mission()[3].lat_e7 + 100, "what was shown"
+
+    shown = site.propose(site.option(speed=17.0), name="p2", valid_s=15.0)
+    site.run(16.0)
+    site.propose(site.option(speed=17.0), name="p2", valid_s=15.0)
+    site.run(1.0)
+    site.propose(name="p2")
+    site.bus.publish(site.approval(shown))
+    assert "withdrawn" in reason([one for one in site.run(1.0) if one.state == S.REFUSED])

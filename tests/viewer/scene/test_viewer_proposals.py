@@ -6,9 +6,23 @@ import msgspec
 import numpy as np
 import pytest
 
-from fleet.contract import Alert, AlertKind, Array, Change, Option, Proposal, ProposedPath
+from fleet.bus.codec import digest_of
+from fleet.contract import (
+    Alert,
+    AlertKind,
+    Approval,
+    Array,
+    Change,
+    Execution,
+    ExecutionState,
+    ExecutionStep,
+    Option,
+    Proposal,
+    ProposedPath,
+)
 from tests.support.pretend_feed import HOSTILE, STAMP, Clock, T, feed_of
-from viewer.panels.proposals import parse_approval, proposals_html
+from viewer.panels.approval import ApprovalDialog, execution_html, parse_option
+from viewer.panels.proposals import proposals_html
 from viewer.scene.selection.ghosts import DASHES, GhostPaths
 from viewer.store.proposal import MAX_OPTIONS
 from viewer.theme.palette import DARK
@@ -119,10 +133,126 @@ def test_a_hostile_proposal_is_text_or_rejected(page):
     assert feed.get(UAV).proposals == before and "not finite" in feed.get(UAV).refusal[1]
 
 
-def test_the_button_sends_what_is_approved(page):
+def test_without_approvals_the_page_shows_the_command(page):
+    publish(page, n=2)
+    html = shown(page)
+    assert "fleet approve 5f2c --option 1" in html and "--option 2" in html and "onclick" not in html
+
+
+def test_the_button_names_the_option(page):
     publish(page, n=1)
     html = shown(page, "send('{}')")
-    assert "send('1/5f2c/0')" in html and ">Approve</button>" in html
-    assert parse_approval("1/5f2c/0") == (1, "5f2c", 0)
+    assert "send('approve/1/5f2c/0')" in html and "fleet approve" not in html
+    assert parse_option("1/5f2c/0") == (1, "5f2c", 0)
     for text in ("", "1", "1/5f2c", "x/5f2c/0", "1/5f2c/-1", "1/5f 2c/0", "1//0", "9" * 90):
-        assert parse_approval(text) is None
+        assert parse_option(text) is None
+
+
+class Desk:
+    """The approvals of one page, and what they send."""
+
+    def __init__(self, page) -> None:
+        self.feed, self.bus, self.clock = page
+        self.sent: list[Approval] = []
+        self.dialog = ApprovalDialog(self.feed, self.sent.append, "kim")
+
+    def press(self, text: str) -> None:
+        self.dialog.on_click(text, self.clock())
+
+    def html(self) -> str:
+        return self.dialog.html(self.feed.get(UAV), DARK, self.clock(), "send('{}')")
+
+    @property
+    def name(self) -> str:
+        return self.dialog.pending.name
+
+
+def test_an_option_is_sent_after_a_confirmation_that_shows_the_change(page):
+    proposal, desk = publish(page, n=2), Desk(page)
+    desk.press("approve/1/5f2c/1")
+    assert desk.sent == [] and "uav-1: fly to item 1 first" in desk.html() and "valid for 10 s" in desk.html()
+    desk.press(f"confirm/{desk.name}")
+    (approval,) = desk.sent
+    assert (approval.uav, approval.proposal, approval.option, approval.who) == (UAV, "5f2c", 1, "kim")
+    assert approval.digest == digest_of(proposal.options[1]) and not approval.undo and approval.t > T
+    assert desk.html() == "" and desk.dialog.pending is None
+
+
+def test_what_is_confirmed_is_what_was_shown(page):
+    proposal, desk = publish(page, n=1), Desk(page)
+    desk.press("approve/1/5f2c/0")
+    publish(page, n=1, options=(option(3),))
+    desk.press(f"confirm/{desk.name}")
+    assert desk.sent[0].digest == digest_of(proposal.options[0])
+
+
+def test_nothing_is_sent_without_the_name_of_what_is_shown(page):
+    publish(page, n=1)
+    desk = Desk(page)
+    for text in ("confirm/", "confirm/0123456789abcdef", "approve/1/5f2c/7", "approve/9/5f2c/0", "approve/1/abcd/0",
+                 "undo/1", "undo/x", "", "confirm/é", "x" * 500):  # fmt: skip
+        desk.press(text)
+        assert desk.dialog.pending is None
+    desk.press("approve/1/5f2c/0")
+    name = desk.name
+    desk.press("confirm/" + "0" * len(name))
+    assert desk.sent == [] and desk.dialog.pending is not None
+    desk.press(f"cancel/{name}")
+    desk.press(f"confirm/{name}")
+    assert desk.sent == [] and desk.dialog.pending is None
+
+
+def test_an_expired_option_is_neither_asked_for_nor_sent_by_a_button(page):
+    publish(page, n=1)
+    desk = Desk(page)
+    desk.press("approve/1/5f2c/0")
+    desk.clock.now += 11.0
+    assert "expired" in desk.html() and ">Send<" not in desk.html() and ">Cancel<" in desk.html()
+    desk.press(f"cancel/{desk.name}")
+    desk.press("approve/1/5f2c/0")
+    assert desk.dialog.pending is None
+
+
+def execution(state: ExecutionState, uav: int = 2, **fields) -> Execution:
+    step = ExecutionStep(uav=UAV, sentence="current item 1", accepted=True, t=T)
+    own = {"proposal": "5f2c", "who": "kim", "digest": "ab", "approved_t": T, "steps": (step,), "can_undo": True}
+    return Execution(uav=uav, t=T + 1, state=state, **(own | fields))
+
+
+def test_the_execution_is_shown_and_undone_after_a_confirmation(page):
+    feed, bus, _ = page
+    desk = Desk(page)
+    bus.publish(execution(ExecutionState.ACCEPTED, follows=True, sentence="follows within its region"))
+    shown = feed.get(UAV).execution
+    html = execution_html(shown, UAV, DARK, "send('{}')")
+    assert "Option 1 approved by kim: accepted" in html and "follows within its region" in html
+    assert "send('undo/1')" in html and "✓ uav-1: current item 1" in html
+    assert "fleet undo 1" in execution_html(shown, UAV, DARK, "")
+    desk.press("undo/1")
+    assert "uav-1: undo current item 1" in desk.dialog.html(feed.get(2), DARK, desk.clock(), "send('{}')")
+    desk.press(f"confirm/{desk.name}")
+    (approval,) = desk.sent
+    assert approval.undo and (approval.uav, approval.proposal, approval.digest) == (2, "5f2c", "ab")
+    bus.publish(execution(ExecutionState.UNDONE, can_undo=False, undo=True, approved_t=T + 5))
+    desk.press("undo/1")
+    assert desk.dialog.pending is None and "Undo approved by kim" in execution_html(
+        feed.get(UAV).execution, 1, DARK, ""
+    )
+
+
+def test_hostile_texts_of_an_execution_are_text(page):
+    steps = (ExecutionStep(uav=UAV, sentence=HOSTILE, accepted=False, t=T),)
+    message = execution(ExecutionState.FAILED, who=HOSTILE, sentence=HOSTILE, steps=steps)
+    html = execution_html(message, UAV, DARK, "send('{}')")
+    assert HOSTILE not in html and html.count("&lt;img") == 3
+
+
+def test_a_missing_gateway_is_reported(page):
+    publish(page, n=1)
+    desk = Desk(page)
+    desk.press("approve/1/5f2c/0")
+    desk.press(f"confirm/{desk.name}")
+    desk.clock.now += 6.0
+    assert "No gateway has answered" in desk.html()
+    desk.bus.publish(execution(ExecutionState.REFUSED, uav=UAV, approved_t=desk.sent[0].t))
+    assert "No gateway" not in desk.html()

@@ -138,6 +138,19 @@ def failsafe_plan(twin: "Twin") -> FailsafePlan | None:
     return FailsafePlan(steps, route_of, "(assumes that every radio link is lost)", twin.telemetry.history.newest)
 
 
+def route_of_mode(twin: "Twin", mode: str, p: np.ndarray, course: float) -> Route | None:
+    """Return the route of a mode that is entered later; None for a mode that is flown by hand or not known.
+
+    Args:
+        twin: source of home, mission and parameters
+        mode: as in `Status.mode`
+        p: position at the entry, NED from the twin's origin, (3,) [m]
+        course: over ground at the entry [rad]
+    """
+    law = LAW_OF_AUTOPILOT.get(twin.autopilot, "")
+    return mode_route(law, mode, _situation(twin, p, course, None), twin.received_params)
+
+
 def _no_route(mode: str, p: np.ndarray, course: float) -> None:
     return None
 

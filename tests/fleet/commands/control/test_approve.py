@@ -39,7 +39,7 @@ def test_an_approval_shows_what_is_sent_and_prints_the_steps(site: CommandSite, 
     assert "uav-1: upload a mission of 10 items: the present one has 10, new or changed are 1, 2, 3" in out
     assert "uav-1: fly to item 3 first" in out and "uav-1: change the mode: return" in out and "valid for 15 s" in out
     assert out.count("  ok     uav-1: ") == 4 and "read back and compared" in out
-    assert out.endswith("accepted: follows within its region; to restore the plan from before: fleet undo 1\n")
+    assert out.endswith("accepted: all steps acknowledged; to restore the plan from before: fleet undo 1\n")
     assert site.entries()[0]["who"] == "Kim? Lee"
     assert undo.undo(site.bus, options()) == 0
     out = capsys.readouterr().out
