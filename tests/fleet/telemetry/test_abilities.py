@@ -46,7 +46,7 @@ def test_the_figures_are_those_the_twin_works_by():
     assert (needs._SKIP_BEGIN_S, needs._SKIP_END_S) == flight._TRANSIENT_S
     assert past.MIN_PAST_S + own_past.MIN_AFTER_S == needs.MIN_OWN_PAST_S
     assert flight_phase._AIRBORNE_HEIGHT_M == ROTOR_AIRBORNE_HEIGHT
-    assert (tilt._MIN_TILT_S, tilt._MIN_VELOCITY_CHANGE) == (needs.MIN_TILT_S, needs.MIN_VELOCITY_CHANGE)
+    assert tilt._MIN_TILT_S == needs.MIN_TILT_S
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from conftest import ROOT
 from fleet.commands.offline import inspect
 from fleet.contract import Sample
 from fleet.telemetry.inspection.thinned import DecimatedRows
+from fleet.telemetry.recording import recordings
 from fleet.telemetry.recording.recordings import Recording
 from tests.support import long_tlog
 from tests.support.talker import T0, of
@@ -73,7 +74,7 @@ def test_progress_rises_to_the_end(tmp_path, monkeypatch):
                 shares.append(self.share)
                 yield step
 
-    monkeypatch.setattr(inspect, "Recording", Watched)
+    monkeypatch.setattr(recordings, "Recording", Watched)
     assert inspect.inspect_file(path)[0].sentences == ()
     assert shares == sorted(shares) and len(set(shares)) >= 4 and shares[-1] == 1.0
 

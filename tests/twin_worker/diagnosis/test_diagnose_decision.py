@@ -15,7 +15,7 @@ from twin_worker.diagnosis.inference.isolation.decision import CLASS_PROBABILITY
 from twin_worker.diagnosis.inference.isolation.evidence import TURBULENCE, Explanation, Weights, load_table
 from twin_worker.diagnosis.inference.isolation.isolate import ScoredHypothesis
 from twin_worker.diagnosis.inference.isolation.onset import onset_posterior
-from twin_worker.diagnosis.inference.isolation.search import _variance_onset, chance_gain, turbulence_evidence
+from twin_worker.diagnosis.inference.isolation.search import _variance_onset, chance_gain
 from twin_worker.diagnosis.inference.isolation.unmodelled import Anomaly, ChannelEquation, find_tones
 from twin_worker.diagnosis.inference.report import ReportOutcome
 from twin_worker.diagnosis.inference.validation.cross_validate import CrossValidation
@@ -59,29 +59,6 @@ def test_the_chance_of_an_effect_is_that_of_the_same_kind_of_onset() -> None:
     assert chance_gain(chance, replace(drag, onset=STEP), vane=True) == 20.0
     loss = FaultHypothesis(catalogue()["control_effectiveness_loss"], "aileron", (0.3,), STEP)
     assert chance_gain(chance, loss, vane=True) == 70.0  # of the same surface
-
-
-def residuals_of(scatter: float, offset: float = 0.0, noise: float = 1.0) -> Any:
-    """Whitened residuals of a flight; in the air channels with this scatter and offset, relative to its own noise."""
-    air = [CHANNELS.index(name) for name in ("side", "lift", "airspeed")]
-    e = np.random.default_rng(3).standard_normal((1000, len(CHANNELS)))
-    e[:, air] = scatter * e[:, air] + offset
-    own = unit_noise()
-    own.sigma[air] = noise
-    base = SimpleNamespace(vane=True, noise=unit_noise(), usual=np.ones(len(CHANNELS)))
-    zero = np.zeros((*e.shape, 1))
-    t = np.arange(1000) * 0.2
-    return SimpleNamespace(
-        base=base, e=e, Jn=zero, xn=np.zeros(1), ok=np.ones(1000, bool), noise=own, modelled=SimpleNamespace(t=t)
-    )
-
-
-def test_turbulence_is_scatter_beyond_that_of_nominal_flights() -> None:
-    """Not relative to the noise of the flight itself, which turbulence raises, and not a lasting difference."""
-    gain, ratio, onset = turbulence_evidence(residuals_of(1.0, noise=3.0))
-    assert gain.sum() > 1000.0 and ratio == pytest.approx(9.0, rel=0.1) and onset is None
-    assert not turbulence_evidence(residuals_of(1.0))[0].any()
-    assert not turbulence_evidence(residuals_of(1.0, offset=3.0))[0].any()
 
 
 def test_the_class_holds_what_is_close_and_leaves_out_what_is_not() -> None:

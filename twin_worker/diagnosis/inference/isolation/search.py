@@ -329,16 +329,12 @@ def turbulence_evidence(whitened: WhitenedResiduals) -> tuple[np.ndarray, float,
     """Return gain by channel, (c + 1,), variance ratio of gusts, and their onset [s]; None if it is before the flight.
 
     Sideslip, lift and airspeed scatter more, the sensor channels do not. The onset is the change point of the variance,
-    r_1 before and r_2 after it:  G = -sum n_i ln r_i, against n (r - 1 - ln r) of one variance throughout. Reference is
-    the variance of nominal flights; without a fast accelerometer, where it follows the weather of each flight, that of
-    the noise of this flight.
+    r_1 before and r_2 after it:  G = -sum n_i ln r_i, against n (r - 1 - ln r) of one variance throughout.
     """
     air_channels = [CHANNELS.index(name) for name in ("side", "lift", "airspeed")]
     sensor_channels = [k for k, name in enumerate(CHANNELS) if name.startswith(("gps", "gyro"))]
     gain = np.zeros(len(CHANNELS) + 1)
-    base, e = whitened.base, (whitened.e + whitened.Jn @ whitened.xn)[whitened.ok]
-    scale = (whitened.noise.sigma / base.noise.sigma) ** 2 if base.vane else 1.0 / base.usual
-    square = (e - e.mean(axis=0)) ** 2 * scale
+    square = ((whitened.e + whitened.Jn @ whitened.xn) ** 2 / whitened.base.usual)[whitened.ok]
     t = whitened.modelled.t[whitened.ok]
     onset = _variance_onset(t, square[:, air_channels], load_table().weights.rows_per_sample)
     after = square if onset is None else square[t >= onset]
