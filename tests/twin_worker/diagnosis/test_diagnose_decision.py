@@ -15,7 +15,7 @@ from twin_worker.diagnosis.inference.isolation.decision import CLASS_PROBABILITY
 from twin_worker.diagnosis.inference.isolation.evidence import TURBULENCE, Explanation, Weights, load_table
 from twin_worker.diagnosis.inference.isolation.isolate import ScoredHypothesis
 from twin_worker.diagnosis.inference.isolation.onset import onset_posterior
-from twin_worker.diagnosis.inference.isolation.search import _variance_onset, chance_gain
+from twin_worker.diagnosis.inference.isolation.search import _variance_onset
 from twin_worker.diagnosis.inference.isolation.unmodelled import Anomaly, ChannelEquation, find_tones
 from twin_worker.diagnosis.inference.report import ReportOutcome
 from twin_worker.diagnosis.inference.validation.cross_validate import CrossValidation
@@ -49,16 +49,6 @@ def test_a_gain_that_nominal_flights_reach_is_no_evidence() -> None:
     loss = explained({"force_x": 600.0}, "thrust_loss")
     assert decide([loss], WEIGHTS).none < 0.05
     assert decide([replace(loss, chance=500.0)], WEIGHTS).none > 0.95
-
-
-def test_the_chance_of_an_effect_is_that_of_the_same_kind_of_onset() -> None:
-    """Constant differences between nominal flights say nothing of changes in flight."""
-    chance = {"drag_increase|always": 600.0, "drag_increase|step": 20.0, "actuator_lag:aileron|step": 70.0}
-    drag = FaultHypothesis(catalogue()["drag_increase"], "", (0.02,))
-    assert chance_gain(chance, drag, vane=True) == 600.0
-    assert chance_gain(chance, replace(drag, onset=STEP), vane=True) == 20.0
-    loss = FaultHypothesis(catalogue()["control_effectiveness_loss"], "aileron", (0.3,), STEP)
-    assert chance_gain(chance, loss, vane=True) == 70.0  # of the same surface
 
 
 def test_the_class_holds_what_is_close_and_leaves_out_what_is_not() -> None:

@@ -252,8 +252,8 @@ def chance_gain(
 ) -> float:
     """Return the gain that an effect reaches on nominal flights, from `Baseline.chance` or `Baseline.block_chance`.
 
-    That of the same kind of onset: with a fast accelerometer the largest of the same effect or surface; else that of
-    the effect, and where constants differ between flights, beyond that without an onset.
+    With a fast accelerometer the largest of the same effect or of the same surface; else of the same kind of onset, and
+    where constants differ between flights, beyond that without an onset.
     """
     if vane:
         return max((x for kind, x in chance.items() if _is_related(kind, hypothesis)), default=0.0)
@@ -262,10 +262,11 @@ def chance_gain(
 
 
 def _is_related(kind: str, hypothesis: FaultHypothesis) -> bool:
-    """Return whether a chance gain applies to a hypothesis: same kind of onset, and same effect or surface."""
-    label, _, onset = kind.partition("|")
-    same_surface = hypothesis.effect.stage is Stage.DELTA and label.endswith(f":{hypothesis.target}")
-    return onset == hypothesis.onset.kind and (label == hypothesis.label or same_surface)
+    """Return whether a chance gain applies to a hypothesis: same effect, or same surface."""
+    label = kind.partition("|")[0]
+    return label == hypothesis.label or (
+        hypothesis.effect.stage is Stage.DELTA and label.endswith(f":{hypothesis.target}")
+    )
 
 
 def best_hypotheses(
