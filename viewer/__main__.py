@@ -89,10 +89,8 @@ def run(args: argparse.Namespace) -> int:
     gc.set_threshold(*GC_THRESHOLDS)
     enable_malloc_trim(LARGE_BLOCK_BYTES)
     terrain_layer = TerrainLayer(terrain, imagery, tiles)
-    with (
-        connect(bus_config_from(args, VIEWER), retry=True) as bus,
-        ExitStack() as stack,
-    ):  # the page shows a missing router
+    with ExitStack() as stack:
+        bus = stack.enter_context(connect(bus_config_from(args, VIEWER), retry=True))  # the page shows a missing router
         approver = None
         if args.allow == APPROVALS:  # a session of its own: the page itself cannot approve
             operator = stack.enter_context(connect(bus_config_from(args, OPERATOR), retry=True))

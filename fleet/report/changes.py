@@ -9,6 +9,7 @@ from fleet.contract import Change, Item, Mission, Option
 from fleet.process.sanitise import printable
 
 MAX_NUMBERS = 8  # changed items that are listed
+ID_LETTERS = 8  # of the id of a proposal that are shown
 
 
 def describe_changes(option: Option, missions: dict[int, Mission]) -> list[str]:

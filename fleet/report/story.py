@@ -9,13 +9,13 @@ from fleet.bus.session import Bus
 from fleet.contract import Alert, AlertKind, Execution, ExecutionState, Message, Proposal, Sample
 from fleet.frames import Origin, to_ned
 from fleet.process.sanitise import printable
+from fleet.report.changes import ID_LETTERS
 
 PAIR = (0, 1)
 """Aircraft that meet, see `fleet.simulator.flight.story`."""
 HORIZONTAL_M, VERTICAL_M = 50.0, 20.0  # separation minima of `twin_worker`
 _AFTER_S = 15.0  # flight after the predicted time that is measured [s]
 _STEP_S = 0.1
-_ID_LETTERS = 8  # of the id of a proposal that are shown
 
 
 class ConflictStory:
@@ -69,7 +69,7 @@ class ConflictStory:
             return
         self._ids.add(proposal.id)
         self._offered = changes
-        name = printable(proposal.id[:_ID_LETTERS])
+        name = printable(proposal.id[:ID_LETTERS])
         self._add(f"step 3 of 5, proposal {name}: {printable(proposal.sentence)}")
         for number, option in enumerate(proposal.options, 1):
             self._add(f"    option {number}: {printable(option.sentence)}")

@@ -134,7 +134,7 @@ class Proposer:
         """Compute or renew the proposal against an active alert; None if there is no twin, or again no option.
 
         A proposal keeps its id while its alert lasts and nothing is executed. Options that still avoid the event are
-        kept; new ones are computed when none does.
+        retained; new ones are computed when none does.
         """
         key = (alert.uav, alert.about)
         previous, self._computed_t[key] = self._current.get(key), now
@@ -332,7 +332,7 @@ def _has_model(twin: Twin) -> bool:
 
 def _timely(problem: Problem, plans: dict[int, Plan], solutions: list[Solution]) -> list[tuple[Solution, str]]:
     """Return the best solutions that avoid the event also when they begin at once."""
-    timely = dict[int, bool]()
+    timely: dict[int, bool] = {}
     while True:
         front = pareto([one for one in solutions if timely.get(id(one), True)])
         unchecked = [one for one, _ in front if id(one) not in timely]

@@ -4,6 +4,7 @@ from html import escape
 from math import isfinite
 
 from fleet.contract import Option
+from fleet.report.changes import ID_LETTERS
 from viewer.panels.approval import APPROVE, button
 from viewer.store.proposal import MAX_OPTIONS, SceneProposal
 from viewer.store.vehicle import Vehicle
@@ -13,7 +14,6 @@ from viewer.theme.palette import Palette
 
 MAX_TEXT = 300  # characters of a received text
 MAX_CLEARANCE_M = 1e5  # a larger clearance means that nothing is near [m]
-ID_LETTERS = 8  # of the id of a proposal that are shown
 
 
 def proposals_html(vehicle: Vehicle, palette: Palette, now: float, units: Units = METRIC, approve: str = "") -> str:

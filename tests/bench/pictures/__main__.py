@@ -1,12 +1,11 @@
-"""Pictures of the page for the README, of aircraft that fly, twins that judge, and a browser that draws.
+"""Pictures of the page for the README: simulated flights, their twins, and a browser.
 
     PARAUAV_RECORDINGS=recordings python -m tests.bench.pictures             all of them
     python -m tests.bench.pictures --only selected mismatch --out pictures   some of them
 
-Eight aircraft fly a recording, which twins judge that need not hurry; all of it is then said on the bus again, in haste
-until the moment of the picture and slowly from then on: a browser without a graphics card takes its time. So is the
-flight whose airspeed sensor fails. The flight played again is a real one. The crowd is a synthetic fleet that speaks on
-the bus.
+The flights are simulated into recordings, which twins process offline. All messages are then published on a bus: fast
+until the moment of the picture, and slowly from then on, because a browser without a graphics card draws slowly. One
+flight has a faulty airspeed sensor, one is a replayed real flight, and the crowd is a synthetic fleet.
 """
 
 import argparse
@@ -23,51 +22,65 @@ from fleet.contract import Alert, AlertKind, Cause, DiagnosisOutcome, Mismatch
 from tests.bench.viewing.page import ARGS
 from tests.bench.viewing.process import free_port, start, tell
 
+from .messages import (
+    ROOT,
+    Publisher,
+    TimedMessages,
+    moment,
+    named_s,
+    proposed,
+    recorded_flight,
+    twin_messages,
+    with_replay_link,
+)
 from .page import command, page, shoot, turn_to, viewer
-from .said import ROOT, Said, Speaker, flown, judged, moment, named_s, offered, played
 
 OUT = ROOT / "viewer"
 REAL = "real/alfa_20180718_155331_1_engine_failure.tlog"
 EIGHT = ("--uavs", "0-7", "--for", "232")
 FAULTY = ("--uavs", "0-3", "--for", "260", "--fault", "airspeed_bias,bias_mps=-6,at=120", "--fault-uav", "0")
-MEETING, OFFERED_S = ("--uavs", "0-1", "--for", "125", "--story", "conflict"), 80.0
-FAULTY_UAV = 1  # as MAVLink has it
-TRAILS_S = 45.0  # until a crowd has trails [s]
-SHARE = 0.62  # of the real flight, where it is looked at
+MEETING, PROPOSED_S = ("--uavs", "0-1", "--for", "125", "--story", "conflict"), 80.0
+FAULTY_UAV = 1  # its id
+TRAILS_S = 45.0  # time for the trails of the crowd [s]
+SHARE = 0.62  # of the real flight: time of the picture [-]
 
 
-def told(browser: Any, said: Said, when: tuple[int, float], file: Path, *options: str) -> None:
-    """Say it all again and take the picture of a UAV at a moment."""
+def take(browser: Any, messages: TimedMessages, when: tuple[int, float], file: Path, *options: str) -> None:
+    """Publish the messages and take the picture of a UAV at a moment."""
     uav, t = when
-    with Speaker(said, t) as speaker, viewer(speaker.router, *options) as address, page(browser, address) as one:
-        speaker.begin()
-        speaker.there.wait()
+    with (
+        Publisher(messages, t) as publisher,
+        viewer(publisher.router, *options) as address,
+        page(browser, address) as one,
+    ):
+        publisher.begin()
+        publisher.reached.wait()
         turn_to(one, uav)
         shoot(one, file)
 
 
 def selected(browser: Any, out: Path) -> None:
     """Show eight aircraft, one of them selected, dark and light."""
-    said = judged(flown("eight", *EIGHT))
-    when = moment(said)
-    told(browser, said, when, out / "screenshot.png")
-    told(browser, said, when, out / "light.png", "--light")
+    messages = twin_messages(recorded_flight("eight", *EIGHT))
+    when = moment(messages)
+    take(browser, messages, when, out / "screenshot.png")
+    take(browser, messages, when, out / "light.png", "--light")
 
 
 def mismatch(browser: Any, out: Path) -> None:
-    """Show a fault that was concealed, found and named."""
-    said = judged(flown("faulty", *FAULTY), FAULTY_UAV)
-    told(browser, said, moment(said, named_s(said), FAULTY_UAV), out / "mismatch.png")
+    """Show a fault that the diagnosis has named."""
+    messages = twin_messages(recorded_flight("faulty", *FAULTY), FAULTY_UAV)
+    take(browser, messages, moment(messages, named_s(messages), FAULTY_UAV), out / "mismatch.png")
 
 
 def proposal(browser: Any, out: Path) -> None:
-    """Show two aircraft that will meet, and what is proposed against it, ready to be approved."""
-    said = judged(flown("conflict", *MEETING), proposes=True)
-    told(browser, said, offered(said, OFFERED_S), out / "proposal.png", "--allow", "approvals")
+    """Show a predicted conflict and a proposal that can be approved."""
+    messages = twin_messages(recorded_flight("conflict", *MEETING), proposes=True)
+    take(browser, messages, proposed(messages, PROPOSED_S), out / "proposal.png", "--allow", "approvals")
 
 
 def trouble(router: str, stop: threading.Event) -> None:
-    """Say of some of the crowd, again and again, that they need an eye."""
+    """Publish alerts and mismatches of some aircraft repeatedly."""
     with connect(router) as bus:
         while not stop.wait(2.0):
             t = time.time()
@@ -82,7 +95,7 @@ def trouble(router: str, stop: threading.Event) -> None:
 
 
 def many(browser: Any, out: Path) -> None:
-    """Show two hundred by exception."""
+    """Show two hundred aircraft, those with alerts first."""
     router, stop = f"tcp/127.0.0.1:{free_port()}", threading.Event()
     with ExitStack() as held:
         feeder = start("tests.bench.viewing.feeder", router, "--uavs", "200", "--hz", "5")
@@ -101,16 +114,20 @@ def many(browser: Any, out: Path) -> None:
 
 
 def replay(browser: Any, out: Path) -> None:
-    """Show a real flight played again, at a time before its end: what was claimed then, and what happened."""
+    """Show a replayed real flight at a time before its end: the prediction of that time and the path flown since."""
     flight = Path(os.environ["PARAUAV_RECORDINGS"]) / REAL
-    said = played(judged(flight), flight.name)
-    with Speaker(said, said[-1][0]) as speaker, viewer(speaker.router) as address, page(browser, address) as one:
-        speaker.begin()
+    messages = with_replay_link(twin_messages(flight), flight.name)
+    with (
+        Publisher(messages, messages[-1][0]) as publisher,
+        viewer(publisher.router) as address,
+        page(browser, address) as one,
+    ):
+        publisher.begin()
         one.get_by_text("recording ended").first.wait_for(timeout=240_000)
         bar = one.locator(".strip").bounding_box()
         one.mouse.click(bar["x"] + SHARE * bar["width"], bar["y"] + 0.5 * bar["height"])
         one.get_by_text("Not live").wait_for(timeout=60_000)
-        turn_to(one, said[0][1].uav)
+        turn_to(one, messages[0][1].uav)
         shoot(one, out / "replay.png")
 
 

@@ -15,7 +15,7 @@ from playwright.sync_api import TimeoutError
 
 from tests.bench.viewing.process import free_port
 
-from .said import ROOT
+from .messages import ROOT
 
 SIZE = {"width": 1600, "height": 900}
 MOST_BYTES = 300_000

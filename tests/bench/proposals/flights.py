@@ -75,7 +75,7 @@ class Outcome:
 
     @property
     def waited_s(self) -> float:
-        """Give the time from the alert to the options: of the flight, and of computing [s]; inf: none."""
+        """Return the time from the alert to the options: of the flight, and of computing [s]; inf: none."""
         if self.alert_s is None or self.offered_s is None or self.took_s is None:
             return float("inf")
         return max(self.offered_s - self.alert_s, 0.0) + self.took_s

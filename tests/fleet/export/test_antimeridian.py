@@ -33,7 +33,7 @@ def crossing(monkeypatch: pytest.MonkeyPatch) -> list:
 
 
 def lengths_m(line: list) -> np.ndarray:
-    """Give the length of each segment of a line in longitude, latitude [deg], altitude [m]."""
+    """Return the length of each segment of a line in longitude, latitude [deg], altitude [m]."""
     lon, lat, alt = np.array(line).T
     return np.linalg.norm(np.diff(to_ned(TAVEUNI, lat * 1e7, lon * 1e7, alt * 1e3), axis=0), axis=1)
 
