@@ -1,5 +1,7 @@
 """The page in a browser on a phone, a laptop and a large screen, dark and light: boxes, contrast, keys, one truth."""
 
+import base64
+import contextlib
 import threading
 import time
 from collections.abc import Iterator
@@ -10,6 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 from conftest import unused_port
+from playwright.sync_api import TimeoutError as TooLate
 
 from fleet.contract import Prediction, TwinState
 from tests.bench.viewing.page import PLACES, differing, drawn
@@ -35,6 +38,22 @@ CUT = """() => {
     if (block && e.scrollWidth > e.clientWidth + 1) bad.push('cut: ' + e.textContent);
     if (r.right > innerWidth + 1 || r.left < -1) bad.push('outside: ' + e.textContent);
   }
+  const bars = [...document.querySelectorAll('[data-mantine-scrollbar][data-orientation=vertical]')];
+  for (const bar of bars.filter(seen)) {
+    const edge = bar.getBoundingClientRect().left, area = bar.parentElement.getBoundingClientRect();
+    for (const e of bar.parentElement.querySelectorAll('button, input, .uav td, .uav th, .uav .card, .uav .say, h1')) {
+      const r = e.getBoundingClientRect(), padded = parseFloat(getComputedStyle(e).paddingRight) || 0;
+      const end = e.matches('td, th') ? r.right - padded : r.right;
+      if (seen(e) && r.bottom > area.top && r.top < area.bottom && end > edge - 2)
+        bad.push('at the scroll bar: ' + (e.textContent || e.getAttribute('aria-label') || e.tagName));
+    }
+  }
+  const choices = [...document.querySelectorAll('button.mantine-Button-root')].filter(
+    e => seen(e) && ['All', 'Alerts', 'Selected'].includes(e.textContent)).map(e => e.getBoundingClientRect().top);
+  if (new Set(choices).size > 1) bad.push('the choices of Show are in several rows');
+  const entries = [...document.querySelectorAll('.legend span')];
+  if (entries.length < 5) bad.push('the legend has ' + entries.length + ' entries');
+  bad.push(...entries.filter(e => !seen(e)).map(e => 'not in the legend: ' + e.textContent));
   for (const group of ['.legend', '.uav .cards', '.uav.buttons', 'tr.on']) {
     const parts = [...(document.querySelector(group) || {children: []}).children].filter(seen);
     parts.forEach((a, i) => parts.slice(i + 1).forEach(b => {
@@ -65,7 +84,19 @@ CONTRAST = """() => {
 }"""
 WIDTHS = """([texts, font]) => { const pen = document.createElement('canvas').getContext('2d'); pen.font = font;
   return texts.map(text => pen.measureText(text).width); }"""
+LONG_LIST = ".uav.list table { margin-bottom: 900px; }"  # the list of a fleet, longer than the window
+LABEL_PIXELS = """async ([box, png]) => {  // of a screenshot: relative luminance in a box [CSS px]
+  const image = await createImageBitmap(await (await fetch('data:image/png;base64,' + png)).blob());
+  const canvas = document.createElement('canvas'); canvas.width = image.width; canvas.height = image.height;
+  const pen = canvas.getContext('2d'); pen.drawImage(image, 0, 0);
+  const [left, top, width, height] = box, pixels = pen.getImageData(left, top, width, height).data, found = [];
+  for (let i = 0; i < pixels.length; i += 4)
+    found.push([0.2126, 0.7152, 0.0722].reduce((sum, weight, k) => sum + weight * (pixels[i + k] / 255) ** 2.2, 0));
+  return found.sort((a, b) => a - b);
+}"""
 SHARE = "window.__viserMutable.canvas.getBoundingClientRect().width / innerWidth"
+SCROLL_BARS = """[...document.querySelectorAll('[data-mantine-scrollbar][data-orientation=vertical]')].filter(
+  e => e.getClientRects().length && e.parentElement.querySelector('.uav.list')).length"""
 BARS_IN_REACH = """() => [...document.querySelectorAll('[role=button][aria-expanded]')].every(
   e => e.getBoundingClientRect().bottom <= innerHeight + 1)"""
 WIDE = """[...document.querySelectorAll('.mantine-Paper-root .mantine-ScrollArea-content')].filter(
@@ -146,6 +177,13 @@ def labels_fit(page, view, height: int) -> bool:
     return len(room) == len(widths) and all(a > b for a, b in zip(room, widths, strict=True))
 
 
+def settle_to_nothing(page, faults: str) -> None:
+    """Wait until a script finds no faults of the page; fail with those that remain."""
+    with contextlib.suppress(TooLate):
+        page.wait_for_function(f"({faults})().length === 0", timeout=5_000)
+    assert page.evaluate(faults) == []
+
+
 def view_of(live: SimpleNamespace):
     return next(iter(live.app.views.values()))
 
@@ -220,8 +258,13 @@ def test_nothing_is_cut_or_covered_at_this_size(live: SimpleNamespace, size: str
     page.locator("tr.on").first.wait_for(state="attached", timeout=PATIENCE_MS)
     if width > 600:
         page.wait_for_function(f"{SHARE} >= 0.6", timeout=PATIENCE_MS)
-    page.wait_for_function(f"({CUT})().length === 0", timeout=5_000)
-    assert page.evaluate(CUT) == [] and page.evaluate(CONTRAST) == [] and page.evaluate(AT_ZERO_SCROLL)
+    settle_to_nothing(page, CUT)
+    if width > 600:
+        style = page.add_style_tag(content=LONG_LIST)
+        page.wait_for_function(f"{SCROLL_BARS} > 0", timeout=PATIENCE_MS)
+        settle_to_nothing(page, CUT)
+        style.evaluate("style => style.remove()")
+    assert page.evaluate(CONTRAST) == [] and page.evaluate(AT_ZERO_SCROLL)
     until(page, lambda: (view.browser.layout.bottom > 0.4 * height) == (width < 600))  # the sheet, or the timeline
     until(page, lambda: 0 < view.browser.layout.top < 80)  # the header may be measured after the sheet
     layout = view.browser.layout
@@ -231,6 +274,30 @@ def test_nothing_is_cut_or_covered_at_this_size(live: SimpleNamespace, size: str
     assert all(box[0, 1] >= -0.5 + layout.bottom / height and box[1, 1] <= 0.5 - layout.top / height for box in boxes)
     until(page, lambda: labels_fit(page, view, height))  # labels come and go between two looks
     assert live.errors == []
+
+
+@pytest.mark.parametrize("light", [False, True], ids=["dark", "light"])
+def test_labels_in_the_scene_have_the_colours_of_the_theme(live: SimpleNamespace, *, light: bool) -> None:
+    """Most of a label is its ground; the letters differ from it by the contrast of WCAG AA."""
+    page = live.page
+    page.set_viewport_size({"width": 1280, "height": 720})
+    view_of(live).browser.set_theme(light=light)
+    page.wait_for_function(SCHEME, arg="light" if light else "dark", timeout=PATIENCE_MS)
+    until(page, lambda: view_of(live).palette.dark != light and view_of(live)._labels.boxes)
+    canvas = page.evaluate("(r => [r.x, r.y, r.width, r.height])(window.__viserMutable.canvas.getBoundingClientRect())")
+
+    def grounds() -> tuple[float, float]:
+        """Return ground of the first label and contrast of its letters: luminance and ratio."""
+        (left, low), (right, high) = view_of(live)._labels.boxes[0] * canvas[3]
+        box = canvas[0] + canvas[2] / 2 + left, canvas[1] + canvas[3] / 2 - high, right - left, high - low
+        inner = [box[0] + 0.2 * box[2], box[1] + 0.2 * box[3], 0.6 * box[2], 0.6 * box[3]]
+        png = base64.b64encode(page.screenshot()).decode()
+        found = np.array(page.evaluate(LABEL_PIXELS, [[round(x) for x in inner], png]))
+        ground, letters = np.median(found), found[0 if light else -1]
+        return float(ground), float((max(ground, letters) + 0.05) / (min(ground, letters) + 0.05))
+
+    until(page, lambda: (grounds()[0] > 0.5) == light)
+    until(page, lambda: grounds()[1] > 4.5)
 
 
 def test_a_phone_has_list_detail_and_timeline_as_sheets(live: SimpleNamespace) -> None:

@@ -169,7 +169,9 @@ def alert_sentence(alert: Alert, record: StatusRecord) -> str:
     if alert.kind is AlertKind.LINK_LOST:
         return f"no sample for {age_text(record.sample_age_s)}; the twin predicts without telemetry"
     if alert.kind is AlertKind.SHORT_HORIZON:
-        return f"confidence horizon {horizon_text(record)}; an error of 10 % within 10 s was more likely than not"
+        if record.horizon_s >= SHORT_HORIZON_S:
+            return f"confidence horizon {horizon_text(record)} again; it was shorter than {SHORT_HORIZON_S:.0f} s"
+        return f"confidence horizon {horizon_text(record)}; an error of 10 % within {SHORT_HORIZON_S:.0f} s is more likely than not"
     return alert.sentence
 
 

@@ -2,6 +2,7 @@
 
     PARAUAV_RECORDINGS=recordings python -m tests.bench.pictures             all of them
     python -m tests.bench.pictures --only selected mismatch --out pictures   some of them
+    python -m tests.bench.pictures --sizes --out sizes                       twelve, to look at: not for the README
 
 The flights are simulated into recordings, which twins process offline. All messages are then published on a bus: fast
 until the moment of the picture, and slowly from then on, because a browser without a graphics card draws slowly. One
@@ -13,7 +14,8 @@ import os
 import sys
 import threading
 import time
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +35,7 @@ from .messages import (
     twin_messages,
     with_replay_link,
 )
-from .page import command, page, shoot, turn_to, viewer
+from .page import command, page, settled, shoot, turn_to, viewer
 
 OUT = ROOT / "viewer"
 REAL = "real/alfa_20180718_155331_1_engine_failure.tlog"
@@ -41,6 +43,9 @@ EIGHT = ("--uavs", "0-7", "--for", "232")
 FAULTY = ("--uavs", "0-3", "--for", "260", "--fault", "airspeed_bias,bias_mps=-6,at=120", "--fault-uav", "0")
 MEETING, PROPOSED_S = ("--uavs", "0-1", "--for", "125", "--story", "conflict"), 80.0
 FAULTY_UAV = 1  # its id
+CROWD, ROTOR_SHARE = 60, 0.3  # aircraft of the pictures in three sizes; multirotors among them [-]
+SIZES, PHONE_PX = ((390, 844), (1280, 720), (1920, 1080)), 600  # of the window [CSS px]; narrower is a phone
+THEMES = {"dark": "", "light": "--light"}  # and the option of the viewer
 TRAILS_S = 45.0  # time for the trails of the crowd [s]
 SHARE = 0.62  # of the real flight: time of the picture [-]
 
@@ -79,33 +84,43 @@ def proposal(browser: Any, out: Path) -> None:
     take(browser, messages, proposed(messages, PROPOSED_S), out / "proposal.png", "--allow", "approvals")
 
 
-def trouble(router: str, stop: threading.Event) -> None:
+def trouble(router: str, stop: threading.Event, uavs: int) -> None:
     """Publish alerts and mismatches of some aircraft repeatedly."""
+    faulty, pairs = ((23, 61, 118, 164), ((7, 90), (45, 131), (150, 199))) if uavs > CROWD else ((23, 31), ((7, 40),))
     with connect(router) as bus:
         while not stop.wait(2.0):
             t = time.time()
-            for uav in (23, 61, 118, 164):
+            for uav in faulty:
                 cause = Cause(name="thrust_loss", channel="thrust", segments=((t - 30.0, t),))
                 bus.publish(
                     Mismatch(uav=uav, t=t, outcome=DiagnosisOutcome.NAMED, causes=(cause,), sentence="thrust is lost")
                 )
-            for uav, other in ((7, 90), (45, 131), (150, 199)):
+            for uav, other in pairs:
                 words = f"uav-{uav}: 40 m from uav-{other} in 18 s"
                 bus.publish(Alert(uav=uav, t=t, kind=AlertKind.CONFLICT, other=other, sentence=words))
 
 
-def many(browser: Any, out: Path) -> None:
-    """Show two hundred aircraft, those with alerts first."""
+@contextmanager
+def crowd(uavs: int, *themes: str) -> Iterator[list[str]]:
+    """Fly a synthetic fleet with alerts; give the address of a viewer for each theme, dark unless `--light`."""
     router, stop = f"tcp/127.0.0.1:{free_port()}", threading.Event()
     with ExitStack() as held:
-        feeder = start("tests.bench.viewing.feeder", router, "--uavs", "200", "--hz", "5")
+        command = "--uavs", str(uavs), "--hz", "5", "--multirotors", f"{ROTOR_SHARE}"
+        feeder = start("tests.bench.viewing.feeder", router, *command)
         held.callback(feeder.communicate)
         held.callback(feeder.kill)
-        address = held.enter_context(viewer(router))
+        addresses = [held.enter_context(viewer(router, *filter(None, [theme]))) for theme in themes]
         tell(feeder)
-        threading.Thread(target=trouble, args=(router, stop), daemon=True).start()
+        threading.Thread(target=trouble, args=(router, stop, uavs), daemon=True).start()
         held.callback(stop.set)
         stop.wait(TRAILS_S)
+        yield addresses
+
+
+def many(browser: Any, out: Path) -> None:
+    """Show two hundred aircraft, those with alerts first."""
+    with ExitStack() as held:
+        (address,) = held.enter_context(crowd(200, ""))
         one = held.enter_context(page(browser, address))
         one.get_by_text("200 UAVs").first.wait_for(timeout=60_000)
         one.locator("tr.pick").first.dispatch_event("pointerdown")
@@ -131,6 +146,49 @@ def replay(browser: Any, out: Path) -> None:
         shoot(one, out / "replay.png")
 
 
+def in_sizes(browser: Any, address: str, name: str, out: Path, prepare: Callable[[Any, bool], None]) -> None:
+    """Take the pictures of one theme in all sizes, as they are on the screen."""
+    for size in SIZES:
+        with page(browser, address, size) as one:
+            prepare(one, size[0] < PHONE_PX)
+            (out / f"{name}-{size[0]}x{size[1]}.png").write_bytes(settled(one))
+
+
+def sizes_selected(browser: Any, out: Path) -> None:
+    """Show one selected aircraft of eight in three sizes, dark and light; on a phone with the sheet of its details."""
+    messages = twin_messages(recorded_flight("eight", *EIGHT))
+    uav, t = moment(messages)
+
+    def prepare(one: Any, is_phone: bool) -> None:
+        turn_to(one, uav)
+        if is_phone:
+            one.get_by_role("button", name="Expand panel Selected").press("Enter")
+            one.locator(".uav .cards").wait_for(state="visible", timeout=60_000)
+
+    with Publisher(messages, t) as publisher, ExitStack() as held:
+        addresses = [
+            held.enter_context(viewer(publisher.router, *filter(None, [option]))) for option in THEMES.values()
+        ]
+        publisher.begin()
+        publisher.reached.wait()
+        for theme, address in zip(THEMES, addresses, strict=True):
+            in_sizes(browser, address, f"selected-{theme}", out, prepare)
+
+
+def sizes_crowd(browser: Any, out: Path) -> None:
+    """Show sixty aircraft in three sizes, dark and light, the most severe one selected."""
+
+    def prepare(one: Any, is_phone: bool) -> None:
+        one.get_by_text(f"{CROWD} UAVs").first.wait_for(timeout=60_000)
+        one.locator("tr.pick").first.dispatch_event("pointerdown")
+        command(one, "show the whole fleet")
+
+    with crowd(CROWD, *THEMES.values()) as addresses:
+        for theme, address in zip(THEMES, addresses, strict=True):
+            in_sizes(browser, address, f"crowd-{theme}", out, prepare)
+
+
+SIZE_SCENES = {"selected": sizes_selected, "many": sizes_crowd}
 SCENES = {"selected": selected, "many": many, "mismatch": mismatch, "proposal": proposal, "replay": replay}
 
 
@@ -138,15 +196,18 @@ def main() -> int:
     """Take the pictures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=SCENES, default=list(SCENES))
+    parser.add_argument("--sizes", action="store_true", help="selected and many in three sizes, dark and light")
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--chromium", default=os.environ.get("PARAUAV_CHROMIUM", "/usr/bin/chromium"))
     args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=args.chromium, headless=True, args=ARGS)
-        for name in args.only:
-            SCENES[name](browser, args.out)
+        scenes = SIZE_SCENES if args.sizes else SCENES
+        for name in [name for name in args.only if name in scenes]:
+            scenes[name](browser, args.out)
         browser.close()
     return 0
 

@@ -17,7 +17,7 @@ from tests.bench.viewing.process import free_port
 
 from .messages import ROOT
 
-SIZE = {"width": 1600, "height": 900}
+SIZE = (1600, 900)
 MOST_BYTES = 300_000
 TRIES = 4  # a page that is still being built hears no key
 VIVID = 36  # so far lie the parts of a vivid colour apart [of 255]
@@ -45,9 +45,9 @@ def viewer(router: str, *options: str) -> Iterator[str]:
 
 
 @contextlib.contextmanager
-def page(browser: Any, address: str) -> Iterator[Any]:
-    """Open a page."""
-    one = browser.new_page(viewport=SIZE)
+def page(browser: Any, address: str, size: tuple[int, int] = SIZE) -> Iterator[Any]:
+    """Open a page of a size [CSS px]."""
+    one = browser.new_page(viewport={"width": size[0], "height": size[1]})
     one.goto(address, timeout=60_000)
     one.add_style_tag(content=".mantine-Notification-root { display: none }")  # that it is drawn in software
     one.wait_for_function("window.__viserMutable && window.__viserMutable.canvas", timeout=60_000)
@@ -72,15 +72,20 @@ def command(one: Any, words: str) -> None:
 def turn_to(one: Any, uav: int) -> None:
     """Select a UAV with the command palette, which turns the camera to it."""
     command(one, f"UAV-{uav:03d}")
-    one.locator(".uav .head h1", has_text=f"UAV-{uav:03d}").wait_for(timeout=60_000)
+    one.locator(".uav .head h1", has_text=f"UAV-{uav:03d}").wait_for(state="attached", timeout=60_000)
 
 
-def shoot(one: Any, file: Path, frames: int = FRAMES) -> None:
-    """Take the picture once it stands still."""
+def settled(one: Any, frames: int = FRAMES) -> bytes:
+    """Return the screen as PNG once it stands still."""
     one.evaluate(
         "n => new Promise(done => { const step = () => n-- ? requestAnimationFrame(step) : done(); step(); })", frames
     )
-    image = Image.open(io.BytesIO(one.screenshot(timeout=120_000))).convert("RGB")
+    return bytes(one.screenshot(timeout=120_000))
+
+
+def shoot(one: Any, file: Path) -> None:
+    """Take the picture and pack it."""
+    image = Image.open(io.BytesIO(settled(one))).convert("RGB")
     packed = packed_png(image)
     if len(packed) > MOST_BYTES:
         packed = packed_png(image.resize((1280, 720), Image.Resampling.LANCZOS))

@@ -47,12 +47,16 @@ WIDTHS = {"attitude": 6, "imu": 6, "velocity": 3, "air": 3, "servo": 8, "command
 class World:
     """Where everybody is at any time: arrays of n."""
 
-    def __init__(self, n: int, begin: float) -> None:
+    def __init__(self, n: int, begin: float, rotor_share: float = 0.0) -> None:
         r = np.random.default_rng(10)
         self.n, self.begin = n, begin
         half = 250 * np.sqrt(n)
         self.centre = np.stack([r.uniform(-half, half, n), r.uniform(-half, half, n), -r.uniform(60, 220, n)], axis=-1)
         self.radius, self.speed = r.uniform(120, 420, n), r.uniform(12, 20, n)
+        self.rotors = (np.arange(n) > 0) & (np.arange(n) % 10 < 10 * rotor_share)  # multirotors: slow, small circles
+        self.radius, self.speed = (
+            np.where(self.rotors, part * x, x) for part, x in ((0.2, self.radius), (0.4, self.speed))
+        )
         self.rate, self.phase = self.speed / self.radius * r.choice([-1, 1], n), r.uniform(0, 2 * np.pi, n)
         luck = r.random(n)
         states = np.where(
@@ -98,7 +102,8 @@ def slowly(world: World, who: np.ndarray, t: float) -> list[Status | Prediction 
     ahead, tube = Array.of(AHEAD), Array.of(np.stack([1.6 * cross, cross, 0.4 * cross], axis=-1))
     found: list[Status | Prediction | Model] = []
     for k, uav in enumerate(who.tolist()):
-        found.append(Status(uav=uav, t=t, mode="AUTO", armed=True, autopilot="ardupilot", vehicle="fixed_wing"))
+        vehicle = "multirotor" if world.rotors[uav] else "fixed_wing"
+        found.append(Status(uav=uav, t=t, mode="AUTO", armed=True, autopilot="ardupilot", vehicle=vehicle))
         state = world.states[uav]
         if state is not TwinState.IDENTIFYING:
             origin = tuple(to_geodetic(HOME, paths[k, 0]).tolist())
@@ -162,13 +167,14 @@ def main() -> int:
     parser.add_argument("router")
     parser.add_argument("--uavs", type=int, default=1000)
     parser.add_argument("--hz", type=float, default=10.0)
+    parser.add_argument("--multirotors", type=float, default=0.0, metavar="SHARE", help="of the fleet (0)")
     args = parser.parse_args()
     stop = threading.Event()
     router = open_router(args.router)
     with connect(args.router) as bus:
         print("open", flush=True)
         sys.stdin.readline()  # the bench says when the feed begins
-        world = World(args.uavs, time.time())
+        world = World(args.uavs, time.time(), args.multirotors)
         begin(world, bus)
         print(world.begin, flush=True)
         with ThreadPoolExecutor(1) as pool:
