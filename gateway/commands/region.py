@@ -2,8 +2,10 @@
 
     d = p - path(t),  resolved along the course of the path, across it (right positive) and down
     inside: |d_along| <= a_along, |d_cross| <= a_cross, |d_down| <= a_vertical
+    a = sqrt(r^2 + e^2),  r: half-axis of the region, e: error of the received position
 
-This is how the coverage of the region is measured: inside on all three axes.
+The region is that of the aircraft, and near its start it is narrower than the error of a position of its receiver:
+without `e` a flight on its path would be reported as off it in the first seconds.
 """
 
 from math import cos, sin
@@ -15,6 +17,9 @@ from fleet.contract import ProposedPath
 from fleet.export.geometry import MAX_REACH_M, PredictedPath
 from fleet.frames import Origin, to_ned
 
+POSITION_ERROR_M = (3.0, 2.0, 3.0)
+"""Error of a received position against the path, within a minute: of the satellite receiver across and vertically,
+along the path also of its time stamp, 0.1 s at 20 m/s (along, cross, vertical) [m]; limits, not calibrated."""
 _WORDS = (("ahead of", "behind"), ("right of", "left of"), ("below", "above"))  # positive and negative, by axis
 
 
@@ -22,7 +27,7 @@ class Deviation(NamedTuple):
     """Deviation of a position from a predicted path at the same time."""
 
     errors: tuple[float, float, float]  # along, cross, down [m]
-    half_axes: tuple[float, float, float]  # along, cross, vertical [m]
+    half_axes: tuple[float, float, float]  # along, cross, vertical, with the error of the position [m]
 
     @property
     def is_inside(self) -> bool:
@@ -54,7 +59,7 @@ def deviation(path: ProposedPath, elapsed_s: float, position: np.ndarray) -> Dev
     course = float(predicted.headings(at)[0])
     north, east, down = to_ned(predicted.origin, *(np.array([x], float) for x in position))[0] - ned[0]
     along, cross = cos(course) * north + sin(course) * east, cos(course) * east - sin(course) * north
-    a, b, c = half_axes[0].tolist()
+    a, b, c = np.hypot(half_axes[0], POSITION_ERROR_M).tolist()
     return Deviation((float(along), float(cross), float(down)), (a, b, c))
 
 

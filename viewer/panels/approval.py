@@ -63,12 +63,19 @@ class ApprovalDialog:
         elif action == UNDO and rest.isascii() and rest.isdecimal():
             self.pending = self._of_undo(int(rest))
         elif self.pending is not None and secrets.compare_digest(rest.encode(), self.pending.name.encode()):
-            if action == CONFIRM:
+            if action == CONFIRM and not self._is_expired(self.pending, now):
                 approval = msgspec.structs.replace(self.pending.approval, t=time.time())
                 self._send(approval)
                 self._sent = approval, now
-            self.pending = None
+                self.pending = None
+            elif action == CANCEL:
+                self.pending = None
         self.changed()
+
+    def _is_expired(self, pending: PendingApproval, now: float) -> bool:
+        """Return whether a gateway would refuse it: the page that showed the button may be late, or gone on."""
+        vehicle = self._store.get(pending.approval.uav)
+        return pending.valid_until is not None and (vehicle is None or vehicle.data_time(now) >= pending.valid_until)
 
     def _of_option(self, uav: int, name: str, index: int, now: float) -> PendingApproval | None:
         vehicle = self._store.get(uav)

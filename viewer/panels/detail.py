@@ -118,7 +118,7 @@ def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
     alert = f'<div class="say" style="border-color:{palette.mismatch}">▲ '
     record, cards = vehicle.record(now), [mismatch_html(vehicle.mismatch, palette)]
     alerts = [a for a in vehicle.alerts.values() if a.kind is not AlertKind.LINK_LOST]  # said by `limitations`
-    cards += [f"{alert}{escape(clip(alert_sentence(a, record), MAX_TEXT))}</div>" for a in alerts]
+    cards += [f"{alert}{escape(clip(alert_sentence(a, vehicle, now), MAX_TEXT))}</div>" for a in alerts]
     texts = limitations(vehicle, now)
     cards += [f'<div class="say">{escape(clip(text, MAX_TEXT))}</div>' for text in texts]
     verdict = vehicle.model.verdict if vehicle.model is not None else None

@@ -164,15 +164,25 @@ def lost_text(record: StatusRecord) -> str:
     return f"{STATE_TEXT[TwinState.LINK_LOST]} {age_text(record.sample_age_s)}"
 
 
-def alert_sentence(alert: Alert, record: StatusRecord) -> str:
-    """Return the text of an alert, not escaped; ages and horizons in it are those of the record, not of its start."""
+def alert_sentence(alert: Alert, vehicle: Vehicle, now: float) -> str:
+    """Return the text of an alert, not escaped; ages, horizons and probabilities in it are the present ones.
+
+    An alert is published once. Where a proposal against it states the present probability, that one is shown, else
+    the text of the alert with the time of which it is.
+    """
+    record, proposal = vehicle.record(now), vehicle.proposals.get(alert.about)
     if alert.kind is AlertKind.LINK_LOST:
         return f"no sample for {age_text(record.sample_age_s)}; the twin predicts without telemetry"
     if alert.kind is AlertKind.SHORT_HORIZON:
+        least = f"{SHORT_HORIZON_S:.0f} s"
         if record.horizon_s >= SHORT_HORIZON_S:
-            return f"confidence horizon {horizon_text(record)} again; it was shorter than {SHORT_HORIZON_S:.0f} s"
-        return f"confidence horizon {horizon_text(record)}; an error of 10 % within {SHORT_HORIZON_S:.0f} s is more likely than not"
-    return alert.sentence
+            return f"confidence horizon {horizon_text(record)}; it was shorter than {least}"
+        return f"confidence horizon {horizon_text(record)}; an error of 10 % within {least} is more likely than not"
+    if proposal is not None and proposal.message.probability is not None and proposal.message.t >= alert.t:
+        other = f" with uav-{alert.other}" if alert.other >= 0 else ""
+        risk = f"risk {100 * proposal.message.probability:.0f} % with the present plan"
+        return f"{alert.kind.value.replace('_', ' ')}{other}: {risk}"
+    return f"at {time_of_day(alert.t)}: {alert.sentence}"
 
 
 def empty_html(store: FleetStore, now: float) -> str:
@@ -255,7 +265,7 @@ def lag_text(record: StatusRecord) -> str:
 def _problem_text(vehicle: Vehicle, status: str, now: float) -> str:
     """Return status, mismatch and alert texts of a UAV for the tooltip of its row; not escaped."""
     texts = [short_text(vehicle.mismatch)] if vehicle.mismatch is not None and in_force(vehicle.mismatch) else []
-    sentences = (alert_sentence(alert, vehicle.record(now))[:200] for alert in vehicle.alerts.values())
+    sentences = (alert_sentence(alert, vehicle, now)[:200] for alert in vehicle.alerts.values())
     return "; ".join([status, *texts, *sentences])
 
 
@@ -265,7 +275,7 @@ def alerts_html(fleet: list[Vehicle], palette: Palette, now: float, pick: str = 
     mismatched = sorted(mismatched, key=lambda item: -item[1].t)[:MAX_ROWS]
     mismatch_rows = [(v, "mismatch", mismatch.t, short_text(mismatch)) for v, mismatch in mismatched]
     alerts = sorted(((v, a) for v in fleet for a in v.alerts.values()), key=lambda item: -item[1].t)[:MAX_ROWS]
-    alert_rows = [(v, a.kind.value.replace("_", " "), a.t, alert_sentence(a, v.record(now))) for v, a in alerts]
+    alert_rows = [(v, a.kind.value.replace("_", " "), a.t, alert_sentence(a, v, now)) for v, a in alerts]
     cards = "".join(
         f'<div class="say pick" style="border-color:{palette.mismatch}" '
         f'onpointerdown="{pick.format(encode_click(vehicle.uav, t))}">'

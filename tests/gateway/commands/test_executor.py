@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from fleet.contract import Array, Change, ExecutionState, Option
+from fleet.frames import to_geodetic
+from gateway.commands.region import deviation, read_path
 from tests.support.commanded import CommandedAircraft, CommandSite, mission, raised
 
 AUTOPILOTS = pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
@@ -334,6 +336,20 @@ def test_a_flight_that_leaves_the_region_is_reported(site: CommandSite) -> None:
     site.t += 105.0
     published = site.run(15.0)
     assert published[-1].state == S.DONE and "has ended" in published[-1].sentence
+
+
+@pytest.mark.parametrize(("behind_m", "is_inside"), [(0.0, True), (1.5, True), (3.0, True), (6.0, False)])
+def test_the_region_of_a_position_has_its_error(site: CommandSite, behind_m: float, *, is_inside: bool) -> None:
+    """A second after the start the region of the path reaches 1 m: less than what a receiver's position is off."""
+    (path,) = site.option(speed=17.0).paths
+    narrow = np.ones_like(path.path.numpy())
+    path = msgspec.structs.replace(path, prediction_region_half_axes=Array.of(narrow))
+    predicted = read_path(path)
+    ned, course = predicted.at(np.array([1.0]))[0], float(predicted.headings(np.array([1.0]))[0])
+    ned -= behind_m * np.array([np.cos(course), np.sin(course), 0.0])
+    found = deviation(path, 1.0, to_geodetic(predicted.origin, ned)[0])
+    assert found is not None and found.errors[0] == pytest.approx(-behind_m, abs=0.05)
+    assert found.is_inside is is_inside
 
 
 def test_a_flight_is_compared_with_the_path_predicted_after_the_execution(site: CommandSite) -> None:

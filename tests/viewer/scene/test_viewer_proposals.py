@@ -22,9 +22,12 @@ from fleet.contract import (
 )
 from tests.support.pretend_feed import HOSTILE, STAMP, Clock, T, feed_of
 from viewer.panels.approval import ApprovalDialog, execution_html, parse_option
+from viewer.panels.detail import status_html
 from viewer.panels.proposals import proposals_html
 from viewer.scene.selection.ghosts import DASHES, GhostPaths
+from viewer.store.inbox import time_of_day
 from viewer.store.proposal import MAX_OPTIONS
+from viewer.text.words import alert_sentence, alerts_html
 from viewer.theme.palette import DARK
 
 UAV = 1
@@ -208,9 +211,24 @@ def test_an_expired_option_is_neither_asked_for_nor_sent_by_a_button(page):
     desk.press("approve/1/5f2c/0")
     desk.clock.now += 11.0
     assert "expired" in desk.html() and ">Send<" not in desk.html() and ">Cancel<" in desk.html()
+    desk.press(f"confirm/{desk.name}")  # of a page that is late
+    assert desk.sent == [] and "expired" in desk.html()
     desk.press(f"cancel/{desk.name}")
     desk.press("approve/1/5f2c/0")
     assert desk.dialog.pending is None
+
+
+def test_an_alert_states_the_probability_of_the_proposal_against_it(page):
+    """The alert is published once, the proposal again and again."""
+    feed, bus, clock = page
+    raised = Alert(uav=UAV, t=T, kind=AlertKind.CONFLICT, other=2, sentence="68% chance", probability=0.68)
+    bus.publish(raised, STAMP)
+    assert alert_sentence(raised, feed.get(UAV), clock()) == f"at {time_of_day(raised.t)}: {raised.sentence}"
+    for probability in (0.68, 1.0):
+        publish(page, n=1, t=raised.t + 1.0, probability=probability)
+        html = status_html(feed.get(UAV), DARK, clock()) + alerts_html([feed.get(UAV)], DARK, clock())
+        assert html.count(f"risk {100 * probability:.0f} % with the present plan") == 2
+        assert raised.sentence not in html
 
 
 def execution(state: ExecutionState, uav: int = 2, **fields) -> Execution:
