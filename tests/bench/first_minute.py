@@ -4,7 +4,8 @@
 
 `fleet up` runs in a pseudo-terminal of 120 columns on ports of its own. Seconds count from its start; with an empty
 compile cache the first of them show the compilation. For each time, OUT gets the text on the terminal (`10s.txt`) and
-the page of a browser that was opened as soon as its address was printed and served (`10s.png`; absent before that).
+the page of a browser that was opened as soon as its address was printed and served: its picture and all its visible
+texts (`10s.png`, `10s-page.txt`; absent before that). Three pictures a second are drawn, in software.
 """
 
 import argparse
@@ -23,7 +24,7 @@ from pathlib import Path
 
 from fleet.access.knock import accepts_connections
 
-from .viewing.page import Page
+from .viewing.page import FEW_FRAMES, Page
 from .viewing.process import free_port
 
 TIMES_S = (10.0, 30.0, 60.0, 120.0)
@@ -87,7 +88,7 @@ def main() -> int:
     command = [sys.executable, "-m", "fleet.cli", "up", "--uavs", str(args.uavs), "--port", str(port)]
     begun, ticks = time.monotonic(), threading.Event()
     terminal = Terminal([*command, "--router", router, "--mavlink", f"127.0.0.1:{free_port()}"])
-    with Page(args.chromium) as page:
+    with Page(args.chromium, FEW_FRAMES) as page:
         opened = False
         for at in TIMES_S:
             while (left := begun + at - time.monotonic()) > 0:
@@ -99,6 +100,7 @@ def main() -> int:
             name = f"{at:g}s"
             (args.out / f"{name}.txt").write_text(terminal.screen())
             if opened:
+                (args.out / f"{name}-page.txt").write_text(page.page.inner_text("body"))
                 page.picture(args.out / f"{name}.png")
             print(f"--- {name}, page {'open' if opened else 'not yet served'}\n{terminal.screen()}", flush=True)
     return terminal.end()

@@ -19,6 +19,7 @@ from conftest import ROOT, unused_port
 
 from fleet.bus.session import connect, open_router
 from fleet.contract import Array, Rows, Sample
+from tests.bench.viewing.page import FEW_FRAMES
 from tests.support.cable import Cable
 from tests.support.fake_link import untimed
 from tests.support.pretend_feed import HOSTILE, PretendFleet
@@ -28,14 +29,6 @@ UAVS, EVIL, LONG, NOWHERE, ABROAD = 20, 3, 17, 18, 19
 PLAIN = ["--headless=new", "--no-sandbox", "--disable-background-networking", "--disable-component-update"]
 PLAIN += ["--no-first-run"]
 ARGS = [*PLAIN, "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu-compositing"]
-FEW_FRAMES = """(() => {  // three a second: a renderer in software takes both cores at full rate
-  const next = window.requestAnimationFrame.bind(window), cancelled = new Set();
-  window.requestAnimationFrame = draw => {
-    const id = setTimeout(() => next(now => { if (!cancelled.delete(id)) draw(now); }), 300);
-    return id;
-  };
-  window.cancelAnimationFrame = id => cancelled.add(id);
-})()"""
 IN_SCENE = "window.__viserMutable && window.__viserMutable.nodeRefFromName['/fleet/vehicles']"
 NODES = "Object.keys(window.__viserMutable.nodeRefFromName).length"
 SHOWN = "name => [...document.querySelectorAll('.uav .head h1')].some(e => e.textContent === name)"

@@ -141,8 +141,10 @@ class MethodSelector:
         """Describe the errors of all methods; empty before enough scores."""
         if len(self.mean_error) < 2 or self.n_scored.get(method, 0.0) < _MIN_DESCRIBED:
             return ""
-        others = ", ".join(f"{name} {error:.1%}" for name, error in self.mean_error.items() if name != method)
-        return f"{method}: mean error {self.mean_error[method]:.1%} of path length ({others})"
+        errors = {name.replace("_", " "): f"{error:.1%}" for name, error in self.mean_error.items()}
+        name = method.replace("_", " ")
+        others = ", ".join(f"{other} {error}" for other, error in errors.items() if other != name)
+        return f"prediction method {name}: mean error {errors[name]} of path length; other methods: {others}"
 
 
 def _log_prior_error(method: str) -> float:

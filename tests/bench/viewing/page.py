@@ -18,6 +18,14 @@ ARGS = [
     "--disable-component-update",
     "--no-first-run",
 ]
+FEW_FRAMES = """(() => {  // three a second: a renderer in software takes both cores at full rate
+  const next = window.requestAnimationFrame.bind(window), cancelled = new Set();
+  window.requestAnimationFrame = draw => {
+    const id = setTimeout(() => next(now => { if (!cancelled.delete(id)) draw(now); }), 300);
+    return id;
+  };
+  window.cancelAnimationFrame = id => cancelled.add(id);
+})()"""
 IN_SCENE = "window.__viserMutable && window.__viserMutable.nodeRefFromName['{}']"
 NODES = "Object.keys(window.__viserMutable.nodeRefFromName).length"
 WATCH = """([name, began, speed]) => {
@@ -57,6 +65,16 @@ PLACES = """seconds => new Promise(done => {
   let frame = 0;
   const count = () => { frame++; if (performance.now() < until) requestAnimationFrame(count); };
   requestAnimationFrame(count);
+  const page = window.__viserMutable;
+  if (!page.labels) {  // texts of the labels as received; they are drawn with the next frame
+    page.labels = {};
+    const queue = page.messageQueue, push = queue.push;
+    queue.push = function (...messages) {
+      for (const {name, updates} of messages)
+        if (/labels\\/\\d+$/.test(name || '') && updates && updates.text) page.labels[name] = updates.text;
+      return push.apply(queue, messages);
+    };
+  }
   const ring = () => {  // centre of the ring at the horizon, scene [10 m]
     const node = window.__viserMutable.nodeRefFromName['/selected/horizon']; let starts = null;
     if (node) node.traverse(o => { starts = o.geometry?.attributes.instanceStart || starts; });
@@ -81,6 +99,7 @@ PLACES = """seconds => new Promise(done => {
         tile: [cards[0].textContent, cards[1].textContent, age ? age[1] : ''],
         alert: [short ? short[1] : '', silent ? silent[1] : ''],
         ring: ring(), name, frame,
+        label: Object.values(page.labels).filter(e => e.startsWith(name) || e.startsWith('horizon ')),
         state: row && [row.cells[2].textContent.replace(/ [\\d.]+ \\w+$/, ''), text(sheet, '.head b').slice(2)],
       });
     }
@@ -104,13 +123,27 @@ def differing(samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def drawn(samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the samples of `PLACES` whose row is as old as three frames: by then the scene is drawn as well."""
+def labels_differing(samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the samples of `drawn` whose labels state another fit, horizon or age than the row."""
+    return [one for one in samples if any(not _agrees(text, *one["row"]) for text in one["label"] if one["row"])]
+
+
+def _agrees(label: str, fit: str, horizon: str, age: str) -> bool:
+    if label.startswith("horizon "):
+        return label.startswith(f"horizon {horizon}:")
+    return f"link lost {age}" in label if age else f"  fit {fit}" in label and f"horizon {horizon}" in label
+
+
+def drawn(samples: list[dict[str, Any]], *, with_ring: bool = True) -> list[dict[str, Any]]:
+    """Return the samples of `PLACES` whose row is as old as three frames: by then the scene is drawn as well.
+
+    `with_ring`: only those with a ring at the horizon.
+    """
     found, since = [], samples[0] if samples else {}
     for one in samples:
         if (one["name"], one["row"]) != (since["name"], since["row"]):
             since = one
-        if one["frame"] >= since["frame"] + 3 and one["ring"] is not None:
+        if one["frame"] >= since["frame"] + 3 and not (with_ring and one["ring"] is None):
             found.append(one)
     return found
 
@@ -118,7 +151,7 @@ def drawn(samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
 class Page:
     """A browser with the page in it."""
 
-    def __init__(self, chromium: str) -> None:
+    def __init__(self, chromium: str, script: str = "") -> None:
         from playwright.sync_api import sync_playwright
 
         self._playwright = sync_playwright().start()
@@ -131,6 +164,7 @@ class Page:
             viewport={"width": 1280, "height": 720},
         )
         self.page = self._context.pages[0]
+        self.page.add_init_script(script)
         self.errors: list[str] = []
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
 
@@ -194,7 +228,7 @@ class Page:
 
     def picture(self, file: Path) -> None:
         """Keep what is on the screen."""
-        self.page.screenshot(path=str(file))
+        self.page.screenshot(path=str(file), timeout=120_000)
 
     def consistency(self, seconds: float) -> dict[str, int]:
         """Compare fit, horizon, state and age in the list with those in the tiles; give samples and differences."""

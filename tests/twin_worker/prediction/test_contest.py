@@ -34,7 +34,9 @@ def test_the_one_that_strays_least_is_used_once_enough_is_flown():
     follow(contest, {"hybrid": 1.0, "dynamics": 0.2, "both": 0.6}, 4)
     assert contest.best(("hybrid", "dynamics", "both")) == "dynamics"
     assert contest.mean_error["hybrid"] == pytest.approx(0.05, rel=0.1)  # 1 of 20 m/s
-    assert contest.describe("dynamics") == "dynamics: mean error 1.0% of path length (hybrid 5.0%, both 3.0%)"
+    assert contest.describe("dynamics") == (
+        "prediction method dynamics: mean error 1.0% of path length; other methods: hybrid 5.0%, both 3.0%"
+    )
 
 
 def test_a_model_that_fails_at_once_loses_within_seconds_to_the_simple_way():

@@ -1,5 +1,7 @@
 """The prediction region in the scene: a smooth surface that fades with its width, and time marks in order."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -18,6 +20,7 @@ from viewer.scene.selection.selected import (
     FAR_OPACITY,
     NEAR_OPACITY,
     band_opacities,
+    slice_times,
 )
 
 N = BANDS * BAND_STEPS + 1
@@ -84,3 +87,23 @@ def test_passes_through_one_place_are_counted() -> None:
     eight = np.stack([np.sin(np.linspace(0, 2 * np.pi, 300)), np.sin(np.linspace(0, 4 * np.pi, 300))], -1) * 30
     crossing = np.column_stack([eight, np.zeros(300)])
     assert pass_number(crossing, 150, 1.0) == 2 and pass_number(crossing, 100, 1.0) == 1
+
+
+def test_slices_follow_the_turns_of_a_path() -> None:
+    """A minute straight ahead, then two minutes of a circle flown six times: no chord turns by more than 30 degrees."""
+
+    def position_at(at: np.ndarray) -> np.ndarray:
+        turn = 2 * np.pi * 6 * np.clip(at - 60.0, 0.0, None) / 120.0
+        east = 1.5 * np.minimum(at, 60.0) + 4 * np.sin(turn)
+        return np.stack([east, 4 * (1 - np.cos(turn)), np.full(len(at), 10.0)], axis=-1)
+
+    def sharpest(at: np.ndarray) -> float:
+        legs = np.diff(position_at(at), axis=0)
+        course = np.unwrap(np.arctan2(legs[:, 1], legs[:, 0]))
+        return float(np.degrees(np.abs(np.diff(course)).max()))
+
+    at = slice_times(SimpleNamespace(position_at=position_at), 2.0, 180.0)
+    assert len(at) == N and at[0] == 2.0 and at[-1] == 180.0 and (np.diff(at) > 0).all()
+    assert sharpest(at) < 31.0 < sharpest(np.linspace(2.0, 180.0, N))
+    hovering = SimpleNamespace(position_at=lambda at: np.zeros((len(at), 3)))
+    assert np.allclose(slice_times(hovering, 0.0, 60.0), np.linspace(0.0, 60.0, N))

@@ -73,7 +73,8 @@ def hindcast(past: list[PastPrediction], trail: np.ndarray, clock: float) -> tup
     return lines, Tag("then", f"predicted {clock - prediction.t:.0f} s ago", prediction.position_at(0.4 * reach))
 
 
-BANDS, BAND_STEPS = 5, 14  # fading bands of the tube, slices per band
+BANDS, BAND_STEPS = 5, 20  # fading bands of the tube, slices per band
+FINE_STEPS, TURN_SHARE = 360, 0.65  # steps in which turns are measured; share of the slices that follows them [-]
 NEAR_OPACITY, FAR_OPACITY = 0.42, 0.05  # of the tube where it is narrow, and at least
 LATE_SHARE = 0.3  # of this opacity that remains at the horizon [-]
 TUBE_SHADE = 0.7  # share of the tube colour in its surface, as the lights of the scene brighten it
@@ -174,7 +175,7 @@ class Selection:
             self._hide_tube()
             return thin.append((_beyond_horizon(forecast, start), rgb(p.muted)))
         start = min(start, horizon_s - SHORTEST_S)
-        at = np.linspace(start, horizon_s, BANDS * BAND_STEPS + 1)
+        at = slice_times(forecast, start, horizon_s)
         path, axes = forecast.position_at(at), forecast.half_axes_at(at)
         sections = rings(path, axes, surface_sides(path, axes))
         opacities = band_opacities(axes, self._unit)
@@ -274,6 +275,19 @@ class Selection:
         leg.append((route.legs[route.ends == seq], rgb(p.route)))
         self._route.draw_parts(lines)
         self._leg.draw_parts(leg)
+
+
+def slice_times(forecast: ScenePrediction, start: float, end: float) -> np.ndarray:
+    """Return look-aheads of the slices of the tube, (BANDS BAND_STEPS + 1,) [s]: in turns they are closer together."""
+    at = np.linspace(start, end, FINE_STEPS + 1)
+    legs = np.diff(forecast.position_at(at), axis=0)
+    length = np.linalg.norm(legs, axis=1)
+    cosine = np.sum(legs[1:] * legs[:-1], axis=1) / np.maximum(length[1:] * length[:-1], 1e-9)
+    angle = np.zeros(FINE_STEPS)  # turned along each leg [rad]
+    angle[1:] = np.where(length[1:] * length[:-1] > 1e-9, np.arccos(np.clip(cosine, -1, 1)), 0.0)
+    weight = (1 - TURN_SHARE) / FINE_STEPS + TURN_SHARE * angle / max(float(angle.sum()), np.pi)
+    share = np.concatenate([[0.0], np.cumsum(weight)])
+    return np.interp(np.linspace(0, share[-1], BANDS * BAND_STEPS + 1), share, at)
 
 
 def band_opacities(axes: np.ndarray, unit: float) -> np.ndarray:
