@@ -23,6 +23,7 @@ from twin_worker.twin.steps.kinematic_prediction import (
     no_prediction,
     predict_without_model,
     recent_track,
+    update_battery_forecast,
 )
 from twin_worker.twin.steps.rollouts import BOTH, HYBRID, ensemble_spread, predict_route, select_method
 
@@ -52,6 +53,8 @@ def predict(twin: Twin, now: float) -> list[Message]:
     ahead = AHEAD + round(coast_s)
     if not recent.ok[-1] or (not coast_s and twin.telemetry.history.newest - recent.t[-1] > _STALE_S):
         return []
+    if twin.vehicle_class.is_rotorcraft and not coast_s and twin.prediction.override is None:
+        update_battery_forecast(twin, recent, now)
     path_forecast, t0 = _best_forecast(twin, recent, ahead)
     n = _count_finite(path_forecast.path)
     if path_forecast.path is None or not n:
@@ -79,6 +82,7 @@ def predict(twin: Twin, now: float) -> list[Message]:
         coast_s=coast_s,
         law=path_forecast.law,
         controller=_changed_controller(twin, path_forecast, now),
+        battery=twin.environment.battery_forecast,
         **_event_fields(twin),
     )
     twin.prediction.publish(prediction)
