@@ -161,12 +161,17 @@ def write(
             table,
             held_out={name: round(value, 4) for name, value in table.held_out.items() if np.isfinite(value)},
             alone=round(table.alone, 4),
+            log_score=_rounded(table.log_score),
         )
         for table in tables
     ]
     content = TableFile(FORMAT, date, command, tuple(sources), KNOTS.tolist(), tuple(rounded))
     text = msgspec.json.format(msgspec.json.encode(content, enc_hook=_four_digits), indent=1).decode()
     path.write_text(_INNERMOST.sub(lambda match: " ".join(match[0].split()), text) + "\n")
+
+
+def _rounded(scores: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+    return None if scores is None else (round(scores[0], 4), round(scores[1], 4), round(scores[2], 4))
 
 
 def _four_digits(values: np.ndarray) -> list:

@@ -26,6 +26,7 @@ _MIN_QUANTA = 2.0  # fall of the remaining share from which the charge is known 
 _CHARGE_STD = 0.1  # relative, of a charge from parameters [-]
 _SLOPE_SHARE = (0.15, 0.08)  # fall of the voltage from full to empty over the voltage: mean and standard deviation [-]
 _MIN_POWER_SHARE = 0.3  # of the largest power: less is not in flight [-]
+_MIN_ROWS = 20  # in flight before a forecast
 _MAX_STEP_S = 5.0  # between rows, for the charge used [s]
 _CAPACITY = ("BATT_CAPACITY", "BAT1_CAPACITY", "BAT_CAPACITY")  # [mAh]
 
@@ -156,7 +157,7 @@ class BatteryModel(msgspec.Struct):
             params: autopilot parameters, of which the capacity is used
         """
         k, k_std = self.charge(params)
-        if not (isfinite(k) and self.n):
+        if not isfinite(k) or self.n < _MIN_ROWS:
             return np.full(len(v), np.nan), np.full(len(v), np.nan)
         x, coefficients = power_features(v, wind), self.coefficients
         power = self.scale * np.maximum(x @ coefficients, 0.1)
@@ -172,7 +173,7 @@ class BatteryModel(msgspec.Struct):
         energy_variance = np.einsum("ni,ij,nj->n", mean_x, effective, mean_x)
         energy_variance += self.scatter**2 * 2.0 * _CORRELATION_S * time
         by_power = k * self.scale / voltage * np.sqrt(energy_variance)
-        std = np.sqrt(by_power**2 + (k_std / k * used) ** 2 + _QUANTUM**2 / 12.0)
+        std = np.sqrt(by_power**2 + (k_std / k * used) ** 2 + _QUANTUM**2 / 6.0)  # both shares are reported in steps
         return remaining, std
 
 
