@@ -1,4 +1,4 @@
-"""Configuration of a multirotor's autopilot: route, limits received or learnt, speed in force."""
+"""Configuration of a multirotor's autopilot: route, limits received or identified, speed in force."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -118,7 +118,7 @@ def multirotor_config(
         autopilot: as `Status.autopilot`
         since: last change of mission or parameters [s since 1970]
         options: `origin` of the twin's frame, `flown` track, `prefix` of the parameters, `reported` mission items in
-            the order of their reports, (n,), `learnt` as of `MultirotorModel`, `jumps_taken` by reported item number
+            the order of their reports, (n,), `identified` of `MultirotorModel`, `jumps_taken` by reported item number
     """
     origin, track, prefix = options["origin"], options["flown"], options.get("prefix", "")
     items = route_items(mission)
@@ -126,7 +126,7 @@ def multirotor_config(
     plans_legs, smooths_velocity = (autopilot == name and not prefix for name in ("ardupilot", "px4"))
     limit, absent = copter.limits(params, prefix, px4=smooths_velocity)
     if plans_legs or smooths_velocity:
-        limit, params = with_learnt(limit, params, absent, options.get("learnt", {}))
+        limit, params = with_identified(limit, params, absent, options.get("identified", {}))
     elif "speed" in absent and track is not None:
         limit = limit._replace(speed=_cruise_speed(track, limit.speed))
     items = numbered_from_one(items, origin) if seq_offset else items
@@ -139,14 +139,14 @@ def multirotor_config(
     return MultirotorConfig(items, seq_offset, params, limit, absent, since, origin, *law, speed, speed_before, jumps)
 
 
-def with_learnt(
-    limit: Limits, params: dict[str, float], absent: Sequence[str], learnt: Mapping[str, float]
+def with_identified(
+    limit: Limits, params: dict[str, float], absent: Sequence[str], identified: Mapping[str, float]
 ) -> tuple[Limits, dict[str, float]]:
-    """Replace limits and parameters that were not received by those learnt from flight."""
-    known = {name: value for name, value in learnt.items() if name in absent}
+    """Replace limits and parameters that were not received by those identified from flight."""
+    known = {name: value for name, value in identified.items() if name in absent}
     if "acc" in known and limit.acc_corner == 2.0 * limit.acc:
         known["acc_corner"] = 2.0 * known["acc"]
-    rate = {CIRCLE_RATE: learnt[CIRCLE_RATE]} if CIRCLE_RATE in learnt and CIRCLE_RATE not in params else {}
+    rate = {CIRCLE_RATE: identified[CIRCLE_RATE]} if CIRCLE_RATE in identified and CIRCLE_RATE not in params else {}
     return limit._replace(**known), params | rate
 
 

@@ -11,7 +11,7 @@ from math import isfinite
 import numpy as np
 
 from fleet.frames import G
-from twin_worker.prediction.multirotor.config import CIRCLE_RATE, MultirotorConfig, with_learnt
+from twin_worker.prediction.multirotor.config import CIRCLE_RATE, MultirotorConfig, with_identified
 from twin_worker.prediction.multirotor.copter_rollout import tilt_acceleration
 from twin_worker.prediction.multirotor.rollout import (
     MultirotorModel,
@@ -42,7 +42,7 @@ _TRIALS: tuple[tuple[str, tuple[float, ...]], ...] = (
 )  # one per call
 # cost of a fraction e times the limit, as a sum of errors [m]
 _PRIOR_COST_ASSUMED, _PRIOR_COST_RECEIVED = 20.0, 200.0
-_LEARNT_LIMITS = {"acc": (0.5, 8.0), "jerk": (0.3, 20.0), "radius": (0.5, 30.0)}  # fitted limits and their bounds
+_FITTED_LIMITS = {"acc": (0.5, 8.0), "jerk": (0.3, 20.0), "radius": (0.5, 30.0)}  # fitted limits and their bounds
 _RATIOS = (0.7, 0.85, 1.15, 1.4)  # tried values over the present one
 _COST_OF_CHANGE = 1.0  # of a limit, as a sum of errors [m]
 _WAYPOINT, _TURNS = 16, 18  # MAV_CMD
@@ -74,7 +74,7 @@ def fit_model(track: Track, seq: np.ndarray, config: MultirotorConfig, model: Mu
         return float(np.mean(errors)) + prior / len(starts)
 
     if config.has_law:
-        return _fit_limits(learn_speeds(track, seq, config, model), config, cost_of, len(starts))
+        return _fit_limits(identify_speeds(track, seq, config, model), config, cost_of, len(starts))
     name, trials = _TRIALS[model.n_comparisons % len(_TRIALS)]
     options = [replace(model, **{name: value}) for value in dict.fromkeys((getattr(model, name), *trials))]
     costs = [cost_of(option, config) for option in options]
@@ -86,42 +86,42 @@ def _fit_limits(
     model: MultirotorModel, config: MultirotorConfig, cost_of: Callable[..., float], n: int
 ) -> MultirotorModel:
     """Fit one limit that was not received, by trials around its present value; the others stay."""
-    names = [name for name in _LEARNT_LIMITS if name in config.absent]
+    names = [name for name in _FITTED_LIMITS if name in config.absent]
 
-    def adopt(learnt: Mapping[str, float]) -> MultirotorConfig:
-        limit, params = with_learnt(config.limit, config.params, config.absent, learnt)
+    def adopt(identified: Mapping[str, float]) -> MultirotorConfig:
+        limit, params = with_identified(config.limit, config.params, config.absent, identified)
         return replace(config, limit=limit, params=params)
 
-    options = [dict(model.learnt)]
+    options = [dict(model.identified)]
     if names:
         name = names[model.n_comparisons % len(names)]
-        present, (low, high) = getattr(adopt(model.learnt).limit, name), _LEARNT_LIMITS[name]
-        options += [{**model.learnt, name: float(np.clip(present * ratio, low, high))} for ratio in _RATIOS]
-    costs = [cost_of(model, adopt(learnt)) for learnt in options]
+        present, (low, high) = getattr(adopt(model.identified).limit, name), _FITTED_LIMITS[name]
+        options += [{**model.identified, name: float(np.clip(present * ratio, low, high))} for ratio in _RATIOS]
+    costs = [cost_of(model, adopt(identified)) for identified in options]
     best = int(np.argmin([cost + _COST_OF_CHANGE / n * (k > 0) for k, cost in enumerate(costs)]))
     comparisons = model.n_comparisons + 1
-    return replace(model, learnt=options[best], mean_error=costs[best], n_starts=n, n_comparisons=comparisons)
+    return replace(model, identified=options[best], mean_error=costs[best], n_starts=n, n_comparisons=comparisons)
 
 
-def learn_speeds(track: Track, seq: np.ndarray, config: MultirotorConfig, model: MultirotorModel) -> MultirotorModel:
+def identify_speeds(track: Track, seq: np.ndarray, config: MultirotorConfig, model: MultirotorModel) -> MultirotorModel:
     """Learn the speed of legs without a commanded one, and the rate of circles, if they were not received."""
-    learnt = dict(model.learnt)
+    identified = dict(model.identified)
     commands = {item.seq: item.command for item in config.items}
     command = np.array([commands.get(int(s) + config.seq_offset, 0) if isfinite(s) else 0 for s in seq])
     on_route = track.ok & (track.t > config.changed_t)
     speed, level = np.hypot(*track.v[:, :2].T), np.abs(track.v[:, 2]) < _LEVEL_SPEED
     cruise = speed[on_route & level & (command == _WAYPOINT) & (speed > _MIN_CRUISE)]
     if "speed" in config.absent and not config.speed and len(cruise) > _MIN_CRUISE_S / STEP:
-        learnt["speed"] = float(np.quantile(cruise, _CRUISE_QUANTILE))
+        identified["speed"] = float(np.quantile(cruise, _CRUISE_QUANTILE))
     circling = on_route & (command == _TURNS)
-    if CIRCLE_RATE not in config.params or CIRCLE_RATE in learnt:
+    if CIRCLE_RATE not in config.params or CIRCLE_RATE in identified:
         course = np.unwrap(np.arctan2(track.v[circling, 1], track.v[circling, 0]))
         rate = np.abs(course[_RATE_ROWS:] - course[:-_RATE_ROWS]) / (STEP * _RATE_ROWS)
         steady = rate[np.minimum(speed[circling][_RATE_ROWS:], speed[circling][:-_RATE_ROWS]) > _MIN_CIRCLE_SPEED]
         turning = steady[steady > _TURNING_SHARE * np.quantile(steady, 0.9)] if len(steady) else steady
         if len(turning) > _MIN_CIRCLE_S / STEP:  # the way to the circle does not turn
-            learnt[CIRCLE_RATE] = float(np.degrees(np.median(turning)))
-    return replace(model, learnt=learnt)
+            identified[CIRCLE_RATE] = float(np.degrees(np.median(turning)))
+    return replace(model, identified=identified)
 
 
 def _starts(track: Track, seq: np.ndarray, config: MultirotorConfig) -> list[int]:

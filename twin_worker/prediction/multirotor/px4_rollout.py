@@ -56,7 +56,7 @@ def parameters(limit: Limits, params: Mapping[str, float], airframe: Sequence[fl
     known = {name: value for name, value in params.items() if name in _DEFAULTS and isfinite(value) and value > 0}
     values = _DEFAULTS | known
     own = [values[name] for name in _DEFAULTS]
-    own[0], own[2] = limit.radius, limit.acc  # with what was learnt from flight
+    own[0], own[2] = limit.radius, limit.acc  # with what was identified from flight
     return np.array([*gains(_GAINS, limit, params, (0.0, *airframe)), *own, ground])
 
 

@@ -36,7 +36,7 @@ class MultirotorModel:
         speed_fraction: flown over allowed speed [-]
         accel_fraction: flown over allowed acceleration [-]
         stop_delay_s: delay at each stop in addition to the wait of the mission [s]
-        learnt: limits of ArduCopter or PX4 without a received parameter as of `Limits`, and CIRCLE_RATE, from flight
+        identified: limits of ArduCopter or PX4 that were not received, as of `Limits`, and CIRCLE_RATE
         drag: linear and quadratic drag over mass [1/s, 1/m]
         drag_std: their standard deviations; those of the prior before the first fit [1/s, 1/m]
         wind: NED, the direction it blows to, (2,) [m/s]
@@ -49,7 +49,7 @@ class MultirotorModel:
     speed_fraction: float = 1.0
     accel_fraction: float = 1.0
     stop_delay_s: float = 0.5
-    learnt: dict[str, float] = field(default_factory=dict)
+    identified: dict[str, float] = field(default_factory=dict)
     drag: tuple[float, float] = (0.25, 0.01)
     drag_std: tuple[float, float] = (0.15, 0.01)
     wind: tuple[float, float] = (0.0, 0.0)

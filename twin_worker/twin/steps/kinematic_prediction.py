@@ -113,7 +113,7 @@ def _multirotor_config(twin: Twin, recent: Track, override: RouteOverride | None
         origin=twin.telemetry.origin,
         flown=recent,
         prefix=twin.vehicle_class.rotor_prefix,
-        learnt=twin.models.multirotor.learnt,
+        identified=twin.models.multirotor.identified,
         jumps_taken=twin.onboard.jumps_taken if override is None else override.jumps_taken,
         reported=twin.telemetry.history.rows_since("leg", twin.onboard.plan_changed_t)[1][:, 0],
     )
