@@ -14,6 +14,7 @@ from twin_worker.numerics.prediction_errors import NOMINAL_COVERAGE
 
 ANY = "*"
 INCOMPLETE = "incomplete"
+UNCONFIRMED = "unconfirmed"
 _FAMILY = dict.fromkeys(("hybrid", "both", "dynamics"), "route")  # selected in flight; they share one ensemble
 _FAST_SPEED = 40.0  # usual speed above which a fixed wing forms a class of its own: well above small ones [m/s]
 
@@ -25,7 +26,8 @@ def group_name(method: str, law: str, airframe: str, parameters: str) -> str:
         method: as in `Prediction`
         law: controller twin, e.g. arduplane: L1 + TECS; only the part before the colon is used
         airframe: class of aircraft, from `airframe_class`
-        parameters: known, identified or absent; `INCOMPLETE` where mission items are missing
+        parameters: known, identified or absent; `INCOMPLETE` where mission items are missing; `UNCONFIRMED` where they
+            are known and the past flight does not follow the law
     """
     parts = (method, law.partition(":")[0], airframe, parameters)
     return "/".join(part.strip().replace("/", " ") or "none" for part in parts)

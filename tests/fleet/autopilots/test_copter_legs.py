@@ -42,8 +42,8 @@ def test_a_landing_is_fast_above_its_slow_part_and_slow_within(descent: float, l
     assert rate[(height > 15.0) & (height < 25.0)] == pytest.approx(descent, abs=0.05)
     assert rate[(height > 1.0) & (height < 0.5 * low)] == pytest.approx(land, abs=0.15)
     assert (np.diff(rate) / DT < 1.5).all() and height[-1] == pytest.approx(0.0, abs=0.1)
-    slowing = rate[(height > low) & (height < low + 4.0)]
-    assert np.diff(slowing).max() <= 1e-9  # the square root of the height: it brakes all the way down to there
+    near = (height > low) & (height < low + 4.0)
+    assert (rate[near] < np.sqrt(2.0 * (height[near] - low)) + land + 0.6).all()  # it brakes by the height that is left
 
 
 def test_a_speed_changed_on_a_leg_is_reached_after_the_acceleration_that_has_begun() -> None:

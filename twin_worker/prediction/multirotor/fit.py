@@ -62,7 +62,7 @@ def fit_model(track: Track, seq: np.ndarray, config: MultirotorConfig, model: Mu
         for k in starts
     }
 
-    def cost_of(candidate: MultirotorModel, configured: MultirotorConfig) -> float:
+    def cost_of(candidate: MultirotorModel, configured: MultirotorConfig) -> tuple[float, float]:
         twin = MultirotorTwin(configured, candidate)
         errors = [
             _rollout_error((track, seq), k, segments_of[k], int(seq[k]) + config.seq_offset, twin) for k in starts
@@ -71,19 +71,24 @@ def fit_model(track: Track, seq: np.ndarray, config: MultirotorConfig, model: Mu
             _PRIOR_COST_ASSUMED if name in config.absent else _PRIOR_COST_RECEIVED for name in ("speed", "acc")
         )
         prior = speed * abs(np.log(candidate.speed_fraction)) + 0.3 * accel * abs(np.log(candidate.accel_fraction))
-        return float(np.mean(errors)) + prior / len(starts)
+        return float(np.mean(errors)) + prior / len(starts), float(np.median(errors))
 
     if config.has_law:
         return _fit_limits(identify_speeds(track, seq, config, model), config, cost_of, len(starts))
     name, trials = _TRIALS[model.n_comparisons % len(_TRIALS)]
     options = [replace(model, **{name: value}) for value in dict.fromkeys((getattr(model, name), *trials))]
     costs = [cost_of(option, config) for option in options]
-    best = int(np.argmin(costs))
-    return replace(options[best], mean_error=costs[best], n_starts=len(starts), n_comparisons=model.n_comparisons + 1)
+    best = int(np.argmin([cost for cost, _ in costs]))
+    return _with_errors(options[best], costs[best], len(starts))
+
+
+def _with_errors(model: MultirotorModel, errors: tuple[float, float], n: int) -> MultirotorModel:
+    mean, median = errors
+    return replace(model, mean_error=mean, median_error=median, n_starts=n, n_comparisons=model.n_comparisons + 1)
 
 
 def _fit_limits(
-    model: MultirotorModel, config: MultirotorConfig, cost_of: Callable[..., float], n: int
+    model: MultirotorModel, config: MultirotorConfig, cost_of: Callable[..., tuple[float, float]], n: int
 ) -> MultirotorModel:
     """Fit one limit that was not received, by trials around its present value; the others stay."""
     names = [name for name in _FITTED_LIMITS if name in config.absent]
@@ -98,9 +103,8 @@ def _fit_limits(
         present, (low, high) = getattr(adopt(model.identified).limit, name), _FITTED_LIMITS[name]
         options += [{**model.identified, name: float(np.clip(present * ratio, low, high))} for ratio in _RATIOS]
     costs = [cost_of(model, adopt(identified)) for identified in options]
-    best = int(np.argmin([cost + _COST_OF_CHANGE / n * (k > 0) for k, cost in enumerate(costs)]))
-    comparisons = model.n_comparisons + 1
-    return replace(model, identified=options[best], mean_error=costs[best], n_starts=n, n_comparisons=comparisons)
+    best = int(np.argmin([cost + _COST_OF_CHANGE / n * (k > 0) for k, (cost, _) in enumerate(costs)]))
+    return _with_errors(replace(model, identified=options[best]), costs[best], n)
 
 
 def identify_speeds(track: Track, seq: np.ndarray, config: MultirotorConfig, model: MultirotorModel) -> MultirotorModel:

@@ -41,6 +41,7 @@ class MultirotorModel:
         drag_std: their standard deviations; those of the prior before the first fit [1/s, 1/m]
         wind: NED, the direction it blows to, (2,) [m/s]
         mean_error: mean error over 10 s of past flight [m]; nan before the first fit
+        median_error: the same, median over the rollouts [m]
         n_starts: number of rollouts in that mean
         n_comparisons: number of fits so far
     """
@@ -54,6 +55,7 @@ class MultirotorModel:
     drag_std: tuple[float, float] = (0.15, 0.01)
     wind: tuple[float, float] = (0.0, 0.0)
     mean_error: float = float("nan")
+    median_error: float = float("nan")
     n_starts: int = 0
     n_comparisons: int = 0
 

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 
 from fleet.contract import EVENT_TEXTS, Array, Controller, Event, Message, Outcome, Prediction, TwinState
-from twin_worker.confidence.table_files import INCOMPLETE, airframe_class, group_name
+from twin_worker.confidence.table_files import INCOMPLETE, UNCONFIRMED, airframe_class, group_name
 from twin_worker.confidence.tube_and_horizon import AHEAD, NOMINAL_COVERAGE, Confidence, PointForecast
 from twin_worker.identification.fixed_wing.plant import DYNAMICS
 from twin_worker.prediction.autopilot_parameters import IDENTIFIED, ControllerTwin
@@ -33,6 +33,7 @@ _REPORT_PERIOD_S = 10.0  # between reports of unchanged law and parameters [s]
 _STALE_S = 3.0  # maximum age of positions relative to other telemetry [s]
 _MAX_ABSENT = 2  # maximum number of absent autopilot parameters in the group of known parameters [-]
 _IDENTIFIED_METHODS = (BOTH, HYBRID, DYNAMICS)
+_MAX_LAW_ERROR_M = 0.5  # median over 10 s, of a multirotor that flies the law of the calibration flights: theirs [m]
 _IMM_LAW, _NO_LAW = "none: turn rate only", "none: on the ground"
 
 
@@ -224,6 +225,9 @@ def _group(twin: Twin, path_forecast: PathForecast, recent: Track) -> str:
     provenance = "known"
     if control is not None and len(control.default_names) > _MAX_ABSENT:
         provenance = "identified" if IDENTIFIED in control.provenance.values() else "absent"
+    follows_law = twin.models.multirotor.median_error < _MAX_LAW_ERROR_M
+    if path_forecast.method == "copter" and provenance == "known" and not follows_law:
+        provenance = UNCONFIRMED
     mission = twin.onboard.mission
     if path_forecast.method != "imm" and mission is not None and mission.items and not mission.complete:
         provenance = INCOMPLETE
