@@ -20,6 +20,7 @@ from twin_worker.twin.state.routes import ROUTE_MODES, failsafe_plan, present_ro
 from twin_worker.twin.state.state import Twin
 
 _FIT_WINDOW_S = 130.0  # flight time used to fit the kinematic models [s]
+_RETURN_COMMAND = 20  # MAV_CMD: NAV_RETURN_TO_LAUNCH
 _VTOL_COMMANDS = (84, 85)  # MAV_CMD: NAV_VTOL_TAKEOFF, NAV_VTOL_LAND
 _KNOWN_PATH_S = 5.0  # part of a path that is commanded point by point which its course tells: the distance of L1 [s]
 _WIND_MAX_AGE_S = 10.0  # maximum age of the autopilot's wind estimate [s]
@@ -187,7 +188,8 @@ def update_battery_forecast(twin: Twin, recent: Track, now: float) -> None:
         return
     config = _multirotor_config(twin, unbroken)
     seq = rollout.items_in_force(unbroken.t, twin.telemetry.history.rows_since("leg"), twin.onboard.mission)
-    if twin.no_route_reason() or twin.onboard.status is None or twin.onboard.status.mode in rollout.RETURN_MODES:
+    returns = status.mode in rollout.RETURN_MODES or active_command(twin) == _RETURN_COMMAND
+    if twin.no_route_reason() or returns:  # the end of a return is home
         seq = np.full(len(unbroken), np.nan)
     models = config, twin.models.multirotor, twin.environment.battery
     twin.environment.store_battery_forecast(forecast_battery(unbroken, seq, models, twin.received_params), now)
