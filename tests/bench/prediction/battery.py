@@ -30,9 +30,9 @@ def errors(path: Path) -> np.ndarray:
             was_armed = message.armed
         twin = twin or Twin.of(message.uav)
         for result in advance(twin, (message,)):
-            if isinstance(result, Prediction) and result.battery is not None and result.battery.end is not None:
-                if not forecasts or forecasts[-1][1] is not result.battery:
-                    forecasts.append((result.t, result.battery))
+            battery = result.battery if isinstance(result, Prediction) else None
+            if battery is not None and battery.end is not None and not (forecasts and forecasts[-1][1] is battery):
+                forecasts.append((result.t, battery))
     t, share = np.array(reported).T
     out = []
     for start, forecast in forecasts:
