@@ -110,6 +110,7 @@ COLUMNS: dict[str, tuple[tuple[str, str], ...]] = {
     "gnss": (("alt", "mm above mean sea level, as reported by the receiver"),),
     "height": (("above_home", "m"),),
     "bearing": (("target_bearing", "rad"),),
+    "battery": (("voltage", "V"), ("current", "A"), ("remaining", "0..1")),
 }
 """Columns of each `Rows` field of a `Sample`: name and unit, in wire order. Specific force and rates are FRD."""
 EXTRA_COLUMNS = {"servo": tuple((f"servo{i}", "us pulse width, 0: no output") for i in range(9, 17))}
@@ -119,7 +120,7 @@ ROW_WIDTHS: dict[str, tuple[int, ...]] = {
     for name, columns in COLUMNS.items()
 }
 """Possible numbers of columns of each field."""
-FIRST_OPTIONAL_COLUMN = {"command": 2}
+FIRST_OPTIONAL_COLUMN = {"command": 2, "battery": 1}
 """Index of the first column that is nan where the autopilot does not report it, by field."""
 
 
@@ -154,6 +155,7 @@ class Sample(Message, frozen=True, kw_only=True, gc=False):
     bearing: Annotated[Rows | None, about("to the guidance target, or course of the path that is followed [rad]")] = (
         None
     )
+    battery: Annotated[Rows | None, about("of the propulsion: voltage, current, remaining share")] = None
 
 
 class Link(StrEnum):
@@ -426,6 +428,22 @@ EVENT_TEXTS: dict[Event, str] = {
 """Text of each event."""
 
 
+class BatteryForecast(msgspec.Struct, frozen=True, kw_only=True):
+    """Predicted remaining share of a multirotor's battery; negative: it is empty before."""
+
+    remaining: Annotated[float, about("as reported, 0..1")]
+    power_w: Annotated[float, about("present power [W]")] = 0.0
+    end: Annotated[float | None, about("at the end of the mission; null: none is flown")] = None
+    end_sigma: Annotated[float | None, about("its standard deviation")] = None
+    end_s: Annotated[float | None, about("time to the end of the mission [s]")] = None
+    home: Annotated[float, about("on the ground at home if it returns now")] = 0.0
+    home_sigma: Annotated[float, about("its standard deviation")] = 0.0
+    last_item: Annotated[
+        int, about("last mission item after which it reaches home with 95 %; -1: every one, or none if `home` is short")
+    ] = -1
+    sentence: Annotated[str, about("e.g. lands with 12 ± 3 %; cannot reach home after item 9")] = ""
+
+
 class Prediction(Message, frozen=True, kw_only=True):
     """Predicted path of one aircraft, its prediction region and confidence horizon."""
 
@@ -480,6 +498,9 @@ class Prediction(Message, frozen=True, kw_only=True):
     controller: Annotated[
         Controller | None,
         about("active law and parameters; null: unchanged. Sent on change, every 10 s and to queries"),
+    ] = None
+    battery: Annotated[
+        BatteryForecast | None, about("of a multirotor whose battery current is received; null: not known")
     ] = None
 
     def ned_origin(self) -> Origin:
@@ -572,6 +593,7 @@ class AlertKind(StrEnum):
     GEOFENCE = "geofence"
     GROUND = "ground"
     NOT_ACHIEVABLE = "not_achievable"
+    BATTERY = "battery"
     SECOND_SENDER = "second_sender"
 
 
@@ -753,6 +775,7 @@ class FleetRow(msgspec.Struct, frozen=True, kw_only=True):
     alerts: Annotated[tuple[str, ...], about("texts of the active alerts")] = ()
     mismatch: Annotated[str, about("outcome and causes, e.g. named thrust_loss; empty: none")] = ""
     wind: Annotated[WindEstimate | None, about("by its own filter [m/s]; null without airspeed")] = None
+    battery: Annotated[str, about("remaining battery at the end of the mission and at home; empty: not known")] = ""
 
 
 class FleetState(msgspec.Struct, frozen=True, kw_only=True):

@@ -59,7 +59,7 @@ class Limits(NamedTuple):
 
 
 class LimitSpec(NamedTuple):
-    """One limit: default and parameter names, each with its factor to SI; the first available name is used."""
+    """One limit: default of ArduCopter and parameter names, each with its factor to SI; the first available is used."""
 
     default: float
     names: tuple[tuple[str, float], ...]
@@ -67,7 +67,7 @@ class LimitSpec(NamedTuple):
 
 _CM = 0.01
 TABLE = {
-    "speed": LimitSpec(8.0, (("WP_SPD", 1), ("WPNAV_SPEED", _CM), ("WP_SPEED", _CM), ("MPC_XY_CRUISE", 1))),
+    "speed": LimitSpec(10.0, (("WP_SPD", 1), ("WPNAV_SPEED", _CM), ("WP_SPEED", _CM), ("MPC_XY_CRUISE", 1))),
     "up": LimitSpec(2.5, (("WP_SPD_UP", 1), ("WPNAV_SPEED_UP", _CM), ("WP_SPEED_UP", _CM), ("MPC_Z_V_AUTO_UP", 1))),
     "down": LimitSpec(1.5, (("WP_SPD_DN", 1), ("WPNAV_SPEED_DN", _CM), ("WP_SPEED_DN", _CM), ("MPC_Z_V_AUTO_DN", 1))),
     "acc": LimitSpec(2.5, (("WP_ACC", 1), ("WPNAV_ACCEL", _CM), ("WP_ACCEL", _CM), ("MPC_ACC_HOR", 1))),
@@ -80,15 +80,17 @@ TABLE = {
         radians(30.0), (("ATC_ANGLE_MAX", radians(1.0)), ("ANGLE_MAX", radians(_CM)), ("MPC_TILTMAX_AIR", radians(1.0)))
     ),
 }
+_PX4_DEFAULTS = {"speed": 5.0, "up": 3.0, "acc": 3.0, "jerk": 4.0, "radius": 10.0, "land": 0.7, "tilt": radians(45.0)}
 _MIN_LIMIT, MAX_LIMIT = 0.02, 60.0  # values outside are rejected
 
 
-def limits(values: Mapping[str, float], prefix: str = "") -> tuple[Limits, tuple[str, ...]]:
+def limits(values: Mapping[str, float], prefix: str = "", *, px4: bool = False) -> tuple[Limits, tuple[str, ...]]:
     """Read the limits from autopilot parameters.
 
     Args:
         values: parameters in the names and units of the autopilot
         prefix: `Q_` for the rotors of a quadplane
+        px4: a limit without a parameter has the default of PX4, else that of ArduCopter
     Returns:
         limits, SI; names of the limits at their defaults for lack of a parameter
     """
@@ -96,7 +98,8 @@ def limits(values: Mapping[str, float], prefix: str = "") -> tuple[Limits, tuple
     for limit, spec in TABLE.items():
         candidates = [values[prefix + name] * factor for name, factor in spec.names if prefix + name in values]
         valid = [value for value in candidates if isfinite(value) and _MIN_LIMIT <= value <= MAX_LIMIT]
-        resolved[limit] = valid[0] if valid else spec.default
+        default = _PX4_DEFAULTS.get(limit, spec.default) if px4 else spec.default
+        resolved[limit] = valid[0] if valid else default
         if not valid and limit != "acc_corner":
             defaulted.append(limit)
     if not resolved["acc_corner"]:

@@ -26,6 +26,7 @@ RULES = {
     AlertKind.GROUND: AlertRule(0.5, 0.2, 2.0, 5.0, 0.15),
     AlertKind.GEOFENCE: AlertRule(0.5, 0.2, 2.0, 5.0, 0.15),
     AlertKind.NOT_ACHIEVABLE: AlertRule(0.9, 0.5, 5.0, 5.0),
+    AlertKind.BATTERY: AlertRule(0.5, 0.2, 5.0, 10.0),
 }
 
 

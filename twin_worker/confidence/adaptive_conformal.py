@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numba as nb
 import numpy as np
 
-from twin_worker.confidence.calibration_table import ATOMS, KNOTS, CalibrationTable
+from twin_worker.confidence.calibration_table import ATOMS, KNOTS, CalibrationTable, log_scores
 from twin_worker.confidence.prediction_log import EVERY_S, KNOT_OF, PredictionLog
 from twin_worker.confidence.weighted_quantile import censored_distribution, critical_factor, weighted_quantile
 from twin_worker.numerics.interpolation import interpolate_rows
@@ -31,7 +31,6 @@ _HORIZON_WEIGHT = EVERY_S / 30.0  # weight of a first passage [-]
 _TUBE_STEP, _HORIZON_STEP = 0.05, 0.02  # of the level, per independent miss [-]
 _MIN_LEVEL, _MAX_LEVEL = 0.5, 0.99
 _MEAN_LOG_ERROR = -0.500  # expected log |error / sigma| of Student's t with 4 degrees of freedom, as tables assume [-]
-_MIN_SCORE = 0.01  # smaller errors are as small as this [-]
 _MIN_FACTOR, _MAX_FACTOR = 0.1, 20.0
 _exact = nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath: results equal numpy's
 
@@ -130,8 +129,8 @@ def _axis_factors(ratios: np.ndarray, weight: np.ndarray, table: CalibrationTabl
         weight: of each, 0 where unknown, (s, 13)
         table: its half-axes are `table.factor` standard deviations
     """
-    expected = _MEAN_LOG_ERROR - np.log(table.factor)
-    excess = np.log(np.maximum(np.where(weight[..., None] > 0, ratios, 1.0), _MIN_SCORE)) - expected
+    expected = _MEAN_LOG_ERROR - np.log(table.factor) if table.log_score is None else np.array(table.log_score)
+    excess = log_scores(np.where(weight[..., None] > 0, ratios, 1.0)) - expected
     total = np.einsum("rk,rka->a", weight, excess) / len(KNOTS)
     return np.exp(total / (weight.sum() / len(KNOTS) + _TABLE_WEIGHT))
 

@@ -31,6 +31,7 @@ _GROWTH_LAW = {  # default spread along, cross, vertical: base [m], growth [m/s^
     "imm": ((1.0, 1.0, 0.5), (1.6, 1.6, 0.5), 1.4),
 }
 _LAG_TIME_S = 10.0  # the forecast revision is not informative below about this look-ahead [s]
+_MIN_SCORE = 0.01  # smaller errors over half-axes are as small as this [-]
 _MAX_SPREAD_M = 1e6  # larger spreads are invalid [m]
 
 
@@ -50,6 +51,8 @@ class CalibrationTable:
         risks: critical factors of the horizon, `ATOMS` quantiles [-]
         held_out: performance on held-out flights, by name
         alone: coverage of each half-axis by itself, `NOMINAL_COVERAGE` to its cube root [-]
+        log_score: mean logarithm of errors over half-axes along, cross, vertical, as of
+            `log_scores`; None: that of Student's t distribution
     """
 
     group: str
@@ -64,6 +67,7 @@ class CalibrationTable:
     risks: np.ndarray
     held_out: dict[str, float] = field(default_factory=dict)
     alone: float = _DEFAULT_ALONE
+    log_score: tuple[float, float, float] | None = None
 
     def sigma(self, features: "UncertaintyFeatures", ahead: np.ndarray) -> np.ndarray:
         """Return the expected error standard deviation, extrapolated beyond the last knot, (..., n, 3) [m]."""
@@ -105,6 +109,11 @@ class UncertaintyFeatures:
     spread: np.ndarray
     revision: np.ndarray
     path: np.ndarray
+
+
+def log_scores(scores: np.ndarray) -> np.ndarray:
+    """Return the logarithms of errors over half-axes; smaller ones count as `_MIN_SCORE`."""
+    return np.log(np.maximum(scores, _MIN_SCORE))
 
 
 def at_look_aheads(ahead: np.ndarray, rows: np.ndarray) -> np.ndarray:

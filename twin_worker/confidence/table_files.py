@@ -14,6 +14,7 @@ from twin_worker.numerics.prediction_errors import NOMINAL_COVERAGE
 
 ANY = "*"
 INCOMPLETE = "incomplete"
+UNCONFIRMED = "unconfirmed"
 _FAMILY = dict.fromkeys(("hybrid", "both", "dynamics"), "route")  # selected in flight; they share one ensemble
 _FAST_SPEED = 40.0  # usual speed above which a fixed wing forms a class of its own: well above small ones [m/s]
 
@@ -25,7 +26,8 @@ def group_name(method: str, law: str, airframe: str, parameters: str) -> str:
         method: as in `Prediction`
         law: controller twin, e.g. arduplane: L1 + TECS; only the part before the colon is used
         airframe: class of aircraft, from `airframe_class`
-        parameters: known, identified or absent; `INCOMPLETE` where mission items are missing
+        parameters: known, identified or absent; `INCOMPLETE` where mission items are missing; `UNCONFIRMED` where they
+            are known and the past flight does not follow the law
     """
     parts = (method, law.partition(":")[0], airframe, parameters)
     return "/".join(part.strip().replace("/", " ") or "none" for part in parts)
@@ -161,12 +163,17 @@ def write(
             table,
             held_out={name: round(value, 4) for name, value in table.held_out.items() if np.isfinite(value)},
             alone=round(table.alone, 4),
+            log_score=_rounded(table.log_score),
         )
         for table in tables
     ]
     content = TableFile(FORMAT, date, command, tuple(sources), KNOTS.tolist(), tuple(rounded))
     text = msgspec.json.format(msgspec.json.encode(content, enc_hook=_four_digits), indent=1).decode()
     path.write_text(_INNERMOST.sub(lambda match: " ".join(match[0].split()), text) + "\n")
+
+
+def _rounded(scores: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+    return None if scores is None else (round(scores[0], 4), round(scores[1], 4), round(scores[2], 4))
 
 
 def _four_digits(values: np.ndarray) -> list:

@@ -123,7 +123,12 @@ def _fixed_wing_controller(
 
 
 def multirotor_controller(
-    received: Mapping[str, float], prefix: str, limit: copter.Limits, overrides: Mapping[str, float] | None = None
+    received: Mapping[str, float],
+    prefix: str,
+    limit: copter.Limits,
+    overrides: Mapping[str, float] | None = None,
+    *,
+    px4: bool = False,
 ) -> ControllerTwin:
     """Return the controller twin of a hovering aircraft.
 
@@ -132,14 +137,15 @@ def multirotor_controller(
         prefix: `Q_` for the rotors of a quadplane
         limit: limits in use, SI; a limit that is neither received nor default is identified from flight
         overrides: parameters of a what-if query
+        px4: the autopilot is PX4
     """
     overrides = overrides or {}
     parameters = {**received, **overrides}
-    nominal, absent = copter.limits(parameters, prefix)
+    nominal, absent = copter.limits(parameters, prefix, px4=px4)
     values, provenance = {}, {}
     for name, row in copter.TABLE.items():
         names = [(prefix + alias, unit) for alias, unit in row.names]
-        parameter, factor = next((pair for pair in names if pair[0] in parameters), names[0])
+        parameter, factor = next((pair for pair in names if pair[0] in parameters), names[-1 if px4 else 0])
         values[parameter] = getattr(limit, name) / factor
         is_identified = getattr(limit, name) != getattr(nominal, name)
         source = OVERRIDDEN if parameter in overrides else RECEIVED

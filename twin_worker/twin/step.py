@@ -150,6 +150,8 @@ def _step(twin: Twin, now: float) -> list[Message]:
     results = _update_link(twin, now)
     twin.telemetry.learn_servo_map()
     twin.environment.update_wind(twin.telemetry.history)
+    if twin.vehicle_class.is_rotorcraft:
+        twin.environment.update_battery(twin.telemetry.history, twin.models.multirotor.wind)
     if twin.confidence.timer.due(now, _TICK_S):
         twin.confidence.timer.restart(now)
         twin.models.checkpoint(twin.environment.wind_t, twin.environment.wind, twin.identification.prior_model)
@@ -277,5 +279,6 @@ def fleet_row(twin: Twin, now: float, alerts: Iterable[Alert] = (), **claim: obj
         t10_n=n,
         alerts=tuple(alert.sentence for alert in alerts),
         wind=twin.wind_estimate,
+        battery=prediction.battery.sentence if prediction and prediction.battery else "",
         **claim,  # type: ignore[arg-type]
     )

@@ -48,8 +48,12 @@ def _cards(vehicle: Vehicle, record: StatusRecord, units: Units) -> str:
         "horizon": horizon_text(record),
         "airspeed": units.speed_text(vehicle.Va),
     }
+    battery = vehicle.prediction.battery if vehicle.prediction is not None else None
+    if battery is not None:
+        cards["battery"] = f"{100 * battery.remaining:.0f} %"
+    note = f'<div class="soft">Battery: {escape(battery.sentence[:200])}</div>' if battery is not None else ""
     html = "".join(f'<div class="card"><span class="soft">{k}</span><b>{v}</b></div>' for k, v in cards.items())
-    return f'<div class="cards">{html}</div><div class="soft">{escape(fit_and_horizon(vehicle, record))}</div>'
+    return f'<div class="cards">{html}</div><div class="soft">{escape(fit_and_horizon(vehicle, record))}</div>{note}'
 
 
 IDENTIFIED_METHODS = {  # methods that roll out identified models, and their kind

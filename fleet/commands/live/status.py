@@ -157,10 +157,10 @@ def fleet_table(rows: list[FleetRow]) -> Table:
         age = _number(row.prediction_age_s, 1)
         late = row.prediction_age_s is not None and row.prediction_age_s > LATE_S
         ages = _number(row.sample_age_s, 1), f"[red]{age}[/red]" if late else age
-        mismatch = [f"▲ mismatch: {escape(printable(row.mismatch))}"] if row.mismatch else []
-        details = "\n".join(
-            (*(f"! {escape(printable(alert))}" for alert in row.alerts), *mismatch, escape(printable(row.verdict)))
-        )
+        notes = [f"▲ mismatch: {escape(printable(row.mismatch))}"] if row.mismatch else []
+        notes += [f"battery: {escape(printable(row.battery))}"] if row.battery else []
+        alerts = [f"! {escape(printable(alert))}" for alert in row.alerts]
+        details = "\n".join((*alerts, *notes, escape(printable(row.verdict))))
         state = Text(row.state.value, STATE_COLOUR.get(row.state, ""))
         out.add_row(str(row.uav), state, fit, horizon, *ages, details)
     return out

@@ -21,6 +21,7 @@ from fleet.simulator.flight.mavlink_messages import (
 from fleet.simulator.vehicle.sensors import Estimate
 
 COPTER_MODES = {"STABILIZE": 0, "AUTO": 3, "GUIDED": 4, "LOITER": 5, "RTL": 6, "LAND": 9, "BRAKE": 17}
+FULL_CURRENT = 60.0  # of the battery at full power [A]
 _CELLS_MV = 12_600  # of a full battery [mV]
 _ENABLED = (
     mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mav.MAV_MODE_FLAG_STABILIZE_ENABLED | mav.MAV_MODE_FLAG_GUIDED_ENABLED
@@ -87,7 +88,7 @@ def _mission_current(f: MultirotorState) -> Any:
 def _sys_status(f: MultirotorState) -> Any:
     present = mav.MAV_SYS_STATUS_SENSOR_3D_GYRO | mav.MAV_SYS_STATUS_SENSOR_3D_ACCEL | mav.MAV_SYS_STATUS_AHRS
     volts = round(_CELLS_MV * (0.86 + 0.14 * f.charge - 0.08 * f.load))
-    rest = (round(6_000 * f.load), round(100 * f.charge), 0, 0, 0, 0, 0, 0)
+    rest = (round(100 * FULL_CURRENT * f.load), round(100 * f.charge), 0, 0, 0, 0, 0, 0)
     return mav.MAVLink_sys_status_message(present, present, present, 250, volts, *rest)
 
 

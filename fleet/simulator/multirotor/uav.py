@@ -24,7 +24,7 @@ from fleet.simulator.multirotor import tasks
 from fleet.simulator.multirotor.airframes import TYPES, draw_airframe
 from fleet.simulator.multirotor.attitude import AttitudeController, attitude_gains
 from fleet.simulator.multirotor.copter_guidance import CopterGuidance
-from fleet.simulator.multirotor.messages import DIALECTS, MultirotorEndpoint, MultirotorState
+from fleet.simulator.multirotor.messages import DIALECTS, FULL_CURRENT, MultirotorEndpoint, MultirotorState
 from fleet.simulator.multirotor.missions import MultirotorMission, draw_mission
 from fleet.simulator.multirotor.position import PositionController, Reference, position_gains
 from fleet.simulator.multirotor.px4_guidance import Px4Guidance
@@ -40,7 +40,10 @@ from fleet.simulator.vehicle.wind_field import CoherentWind, LocalWind
 DT = 1 / TICK_HZ
 _OUTER = 2  # position control at 50 Hz [ticks]
 _ARM_S, _REST_S = (2.0, 8.0), 15.0  # time on the ground before the first and before a later take-off [s]
-_ENDURANCE_S = 1800.0  # time of a battery at the power of hover [s]
+_ENDURANCE_S = (900.0, 1800.0)  # time of a full battery at a load of `_HOVER_LOAD` [s]
+_HOVER_LOAD = 0.3  # power of hover over full power, typical [-]
+_CAPACITY_ERROR = (0.95, 1.1)  # capacity in the parameters over the true one [-]
+_CAPACITY_NAMES = {"ardupilot": "BATT_CAPACITY", "px4": "BAT1_CAPACITY"}
 _MISSION_MODES = {"ardupilot": "AUTO", "px4": "MISSION"}
 _MODE_TASKS = {"RTL": tasks.RETURN, "LAND": tasks.LAND, "LOITER": tasks.HOLD, "BRAKE": tasks.HOLD, "GUIDED": tasks.HOLD}
 
@@ -86,7 +89,11 @@ class SimulatedMultirotor:
         self.uav_id, self.tick = uav_id, 0
         self.crashed = self.silent = self.link_lost = False
         self.boot_s = float(rng.uniform(60, 600))
-        self.params = tuned_parameters(aircraft_seed, autopilot, aircraft) | dict(extra_params)
+        battery = np.random.default_rng((aircraft_seed, 6))
+        self._endurance_s = float(battery.uniform(*_ENDURANCE_S))
+        capacity = FULL_CURRENT * _HOVER_LOAD * self._endurance_s / 3.6 * battery.uniform(*_CAPACITY_ERROR)  # [mAh]
+        self.params = tuned_parameters(aircraft_seed, autopilot, aircraft)
+        self.params |= {_CAPACITY_NAMES[autopilot]: round(capacity, -2)} | dict(extra_params)
         is_px4 = autopilot == "px4"
         cruise = self.params["MPC_XY_CRUISE"] if is_px4 else 0.01 * self.params["WPNAV_SPEED"]
         self.items, self.origin = mission or draw_mission(aircraft_seed, autopilot, cruise, origin)
@@ -189,7 +196,7 @@ class SimulatedMultirotor:
             frames += self._endpoint.item_changed(state())
         self._item_changed = False
         self.vehicle.step()
-        self._charge = max(self._charge - DT * self.vehicle.power / 0.3 / _ENDURANCE_S, 0.0)
+        self._charge = max(self._charge - DT * self.vehicle.power / _HOVER_LOAD / self._endurance_s, 0.0)
         self.tick += 1
         return frames
 

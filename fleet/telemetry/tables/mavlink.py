@@ -68,6 +68,14 @@ def _wind(m: Any) -> tuple[Any, ...]:
     return (-m.speed * np.cos(m.direction * DEG), -m.speed * np.sin(m.direction * DEG))
 
 
+_NO_VOLTAGE = 65535  # battery not measured
+
+
+def _battery(m: Any) -> tuple[Any, ...]:
+    current = np.where(m.current_battery < 0, np.nan, m.current_battery * 1e-2)  # -1: not measured
+    return (m.voltage_battery * 1e-3, current, np.where(m.battery_remaining < 0, np.nan, m.battery_remaining * 1e-2))
+
+
 TABLE: tuple[FieldSource, ...] = (
     FieldSource(
         "ATTITUDE",
@@ -162,6 +170,7 @@ TABLE: tuple[FieldSource, ...] = (
         BOOT,
         when=lambda m: m.press_abs != 0,  # 0: no barometer
     ),
+    FieldSource("SYS_STATUS", "battery", _battery, NONE, when=lambda m: m.voltage_battery < _NO_VOLTAGE),
     # time_usec is boot time or receiver time, depending on the autopilot: not usable for the shared clock
     FieldSource("GPS_RAW_INT", "gnss", lambda m: (m.alt,), NONE, when=lambda m: m.fix_type >= _FIX_3D),
 )

@@ -41,6 +41,7 @@ MAX_MAGNITUDE: dict[str, tuple[float, ...]] = {
     "gnss": _MAX_POSITION[2:],
     "height": (9e4,),
     "bearing": (7.0,),
+    "battery": (1e3, 1e3, 1.0),
 }
 """Maximum plausible magnitude per column in the units of `contract.COLUMNS`; other values are rejected."""
 

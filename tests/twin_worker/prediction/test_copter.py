@@ -48,7 +48,7 @@ def test_limits_come_in_the_autopilots_own_units():
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1e9, 0.0, 1e30])
 def test_absurd_limits_are_not_taken(value):
     got, absent = limits(dict.fromkeys(("WPNAV_SPEED", "WPNAV_ACCEL", "WPNAV_JERK"), value))
-    assert got.speed == 8.0 and {"speed", "acc", "jerk"} <= set(absent)
+    assert got.speed == 10.0 and {"speed", "acc", "jerk"} <= set(absent)
 
 
 def test_a_corner_is_the_slower_the_sharper():

@@ -10,8 +10,9 @@ from fleet.simulator.multirotor.uav import SimulatedMultirotor
 from tests.support.flights import HERE, item
 from twin_worker.numerics.prediction_errors import min_path_length
 from twin_worker.prediction.multirotor import copter_rollout
+from twin_worker.prediction.multirotor.config import multirotor_config, speed_in_force
 from twin_worker.prediction.multirotor.fit import fit_drag_and_wind
-from twin_worker.prediction.multirotor.rollout import MultirotorModel, fly_route, multirotor_config, speed_in_force
+from twin_worker.prediction.multirotor.rollout import MultirotorModel, fly_route
 from twin_worker.prediction.multirotor.route import limit_speeds, segments_from_mission
 from twin_worker.telemetry.track import STEP, Track
 

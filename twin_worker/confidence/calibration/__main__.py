@@ -40,7 +40,8 @@ def _fit(args: argparse.Namespace) -> int:
         bytes, CalibrationTable
     ] = {}  # by selected rows: a parent group with the same predictions has the same table
     tables = []
-    for group in dict.fromkeys(name for member in sorted(names) for name in group_chain(member)):
+    groups = dict.fromkeys(name for member in sorted(names) for name in group_chain(member))
+    for group in groups if args.only is None else [name for name in groups if name in args.only]:
         rows = scored.in_group(group)
         subset = scored.select(rows)
         if reason := _rejection_reason(scored, group):
@@ -52,7 +53,8 @@ def _fit(args: argparse.Namespace) -> int:
         tables.append(table)
     if not tables:
         raise ValueError(f"calibration: found no group of {MIN_STARTS} predictions; give more flights")
-    command = " ".join(["python -m twin_worker.confidence.calibration fit", *map(_short_name, args.files)])
+    only = [] if args.only is None else ["--only", *args.only]
+    command = " ".join(["python -m twin_worker.confidence.calibration fit", *map(_short_name, args.files), *only])
     write(args.out, tables, [_source(path) for path in args.files], date.today().isoformat(), command)
     print(f"{args.out.name}: {len(tables)} tables")
     return 0
@@ -113,6 +115,9 @@ def main(argv: list[str] | None = None) -> int:
         subparser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="scored predictions, .npz")
         if action == "fit":
             subparser.add_argument("--out", type=Path, required=True, metavar="FILE", help="tables to write, .json")
+            subparser.add_argument(
+                "--only", nargs="+", metavar="GROUP", help="groups to write (all, and those they belong to)"
+            )
         else:
             subparser.add_argument(
                 "--with", dest="tables", type=Path, metavar="FILE", help="tables (those of the package)"

@@ -10,6 +10,7 @@ from scipy.optimize import minimize
 
 from twin_worker.confidence.calibration.scored_predictions import ScoredPredictions
 from twin_worker.confidence.calibration_table import (
+    COLUMN,
     INDEPENDENT,
     KNOTS,
     LEVELS,
@@ -17,6 +18,7 @@ from twin_worker.confidence.calibration_table import (
     UncertaintyFeatures,
     at_look_aheads,
     default_table,
+    log_scores,
 )
 from twin_worker.confidence.weighted_quantile import (
     censored_quantile,
@@ -140,7 +142,19 @@ def fit(predictions: ScoredPredictions, group: str) -> CalibrationTable:
     table = replace(
         _unscaled_table(group, *sigma), factor=factor, starts=len(predictions), flights=flights, alone=axis_level
     )
+    table = replace(table, log_score=_log_score(table, ratio, weight))
     return _with_risks(replace(table, scores=_score_quantiles(table, ratio, weight)), predictions, weight)
+
+
+def _log_score(table: CalibrationTable, ratio: np.ndarray, weight: np.ndarray) -> tuple[float, float, float]:
+    """Return the mean logarithm of errors over half-axes at the knots, by axis.
+
+    Errors on route are small except at the begin of a turn, so their mean logarithm lies below that of Student's t.
+    """
+    logs = log_scores(np.abs(ratio[:, COLUMN]) / table.factor)
+    shares = np.where(np.isfinite(logs), weight[:, None, None], 0.0)
+    along, cross, vertical = (np.nansum(shares * np.nan_to_num(logs), axis=(0, 1)) / shares.sum(axis=(0, 1))).tolist()
+    return along, cross, vertical
 
 
 def _score_quantiles(table: CalibrationTable, ratio: np.ndarray, weight: np.ndarray) -> np.ndarray:

@@ -4,15 +4,16 @@ Drag and wind come from the tilt: horizontal thrust minus acceleration is drag, 
 Source: drag as in Faessler, Franchi & Scaramuzza 2018 (linear in airspeed) and its quadratic part.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from math import isfinite
 
 import numpy as np
 
 from fleet.frames import G
+from twin_worker.prediction.multirotor.config import CIRCLE_RATE, MultirotorConfig, with_identified
 from twin_worker.prediction.multirotor.copter_rollout import tilt_acceleration
 from twin_worker.prediction.multirotor.rollout import (
-    MultirotorConfig,
     MultirotorModel,
     MultirotorTwin,
     fly_segments,
@@ -41,6 +42,13 @@ _TRIALS: tuple[tuple[str, tuple[float, ...]], ...] = (
 )  # one per call
 # cost of a fraction e times the limit, as a sum of errors [m]
 _PRIOR_COST_ASSUMED, _PRIOR_COST_RECEIVED = 20.0, 200.0
+_FITTED_LIMITS = {"acc": (0.5, 8.0), "jerk": (0.3, 20.0), "radius": (0.5, 30.0)}  # fitted limits and their bounds
+_RATIOS = (0.7, 0.85, 1.15, 1.4)  # tried values over the present one
+_COST_OF_CHANGE = 1.0  # of a limit, as a sum of errors [m]
+_WAYPOINT, _TURNS = 16, 18  # MAV_CMD
+_LEVEL_SPEED, _MIN_CRUISE, _MIN_CRUISE_S, _CRUISE_QUANTILE = 0.3, 1.5, 5.0, 0.95  # [m/s, m/s, s, -]
+_MIN_CIRCLE_SPEED, _MIN_CIRCLE_S, _RATE_ROWS = 0.8, 5.0, 10  # [m/s, s, rows of one rate]
+_TURNING_SHARE = 0.7  # of the usual largest rate: less is not on the circle [-]
 
 
 def fit_model(track: Track, seq: np.ndarray, config: MultirotorConfig, model: MultirotorModel) -> MultirotorModel:
@@ -54,27 +62,70 @@ def fit_model(track: Track, seq: np.ndarray, config: MultirotorConfig, model: Mu
         for k in starts
     }
 
-    def cost_of(candidate: MultirotorModel) -> float:
+    def cost_of(candidate: MultirotorModel, configured: MultirotorConfig) -> tuple[float, float]:
+        twin = MultirotorTwin(configured, candidate)
         errors = [
-            _rollout_error(
-                (track, seq), k, segments_of[k], int(seq[k]) + config.seq_offset, MultirotorTwin(config, candidate)
-            )
-            for k in starts
+            _rollout_error((track, seq), k, segments_of[k], int(seq[k]) + config.seq_offset, twin) for k in starts
         ]
         speed, accel = (
             _PRIOR_COST_ASSUMED if name in config.absent else _PRIOR_COST_RECEIVED for name in ("speed", "acc")
         )
         prior = speed * abs(np.log(candidate.speed_fraction)) + 0.3 * accel * abs(np.log(candidate.accel_fraction))
-        return float(np.mean(errors)) + prior / len(starts)
+        return float(np.mean(errors)) + prior / len(starts), float(np.median(errors))
 
+    if config.has_law:
+        return _fit_limits(identify_speeds(track, seq, config, model), config, cost_of, len(starts))
     name, trials = _TRIALS[model.n_comparisons % len(_TRIALS)]
-    limit = {"speed_fraction": "speed", "accel_fraction": "acc"}.get(name)
-    if (config.plans_legs or config.smooths_velocity) and limit not in config.absent:
-        trials = ()  # these navigation laws have gains and stops of their own, and follow their limits
     options = [replace(model, **{name: value}) for value in dict.fromkeys((getattr(model, name), *trials))]
-    costs = [cost_of(option) for option in options]
-    best = int(np.argmin(costs))
-    return replace(options[best], mean_error=costs[best], n_starts=len(starts), n_comparisons=model.n_comparisons + 1)
+    costs = [cost_of(option, config) for option in options]
+    best = int(np.argmin([cost for cost, _ in costs]))
+    return _with_errors(options[best], costs[best], len(starts))
+
+
+def _with_errors(model: MultirotorModel, errors: tuple[float, float], n: int) -> MultirotorModel:
+    mean, median = errors
+    return replace(model, mean_error=mean, median_error=median, n_starts=n, n_comparisons=model.n_comparisons + 1)
+
+
+def _fit_limits(
+    model: MultirotorModel, config: MultirotorConfig, cost_of: Callable[..., tuple[float, float]], n: int
+) -> MultirotorModel:
+    """Fit one limit that was not received, by trials around its present value; the others stay."""
+    names = [name for name in _FITTED_LIMITS if name in config.absent]
+
+    def adopt(identified: Mapping[str, float]) -> MultirotorConfig:
+        limit, params = with_identified(config.limit, config.params, config.absent, identified)
+        return replace(config, limit=limit, params=params)
+
+    options = [dict(model.identified)]
+    if names:
+        name = names[model.n_comparisons % len(names)]
+        present, (low, high) = getattr(adopt(model.identified).limit, name), _FITTED_LIMITS[name]
+        options += [{**model.identified, name: float(np.clip(present * ratio, low, high))} for ratio in _RATIOS]
+    costs = [cost_of(model, adopt(identified)) for identified in options]
+    best = int(np.argmin([cost + _COST_OF_CHANGE / n * (k > 0) for k, (cost, _) in enumerate(costs)]))
+    return _with_errors(replace(model, identified=options[best]), costs[best], n)
+
+
+def identify_speeds(track: Track, seq: np.ndarray, config: MultirotorConfig, model: MultirotorModel) -> MultirotorModel:
+    """Learn the speed of legs without a commanded one, and the rate of circles, if they were not received."""
+    identified = dict(model.identified)
+    commands = {item.seq: item.command for item in config.items}
+    command = np.array([commands.get(int(s) + config.seq_offset, 0) if isfinite(s) else 0 for s in seq])
+    on_route = track.ok & (track.t > config.changed_t)
+    speed, level = np.hypot(*track.v[:, :2].T), np.abs(track.v[:, 2]) < _LEVEL_SPEED
+    cruise = speed[on_route & level & (command == _WAYPOINT) & (speed > _MIN_CRUISE)]
+    if "speed" in config.absent and not config.speed and len(cruise) > _MIN_CRUISE_S / STEP:
+        identified["speed"] = float(np.quantile(cruise, _CRUISE_QUANTILE))
+    circling = on_route & (command == _TURNS)
+    if CIRCLE_RATE not in config.params or CIRCLE_RATE in identified:
+        course = np.unwrap(np.arctan2(track.v[circling, 1], track.v[circling, 0]))
+        rate = np.abs(course[_RATE_ROWS:] - course[:-_RATE_ROWS]) / (STEP * _RATE_ROWS)
+        steady = rate[np.minimum(speed[circling][_RATE_ROWS:], speed[circling][:-_RATE_ROWS]) > _MIN_CIRCLE_SPEED]
+        turning = steady[steady > _TURNING_SHARE * np.quantile(steady, 0.9)] if len(steady) else steady
+        if len(turning) > _MIN_CIRCLE_S / STEP:  # the way to the circle does not turn
+            identified[CIRCLE_RATE] = float(np.degrees(np.median(turning)))
+    return replace(model, identified=identified)
 
 
 def _starts(track: Track, seq: np.ndarray, config: MultirotorConfig) -> list[int]:

@@ -56,7 +56,7 @@ def parameters(limit: Limits, params: Mapping[str, float], airframe: Sequence[fl
     known = {name: value for name, value in params.items() if name in _DEFAULTS and isfinite(value) and value > 0}
     values = _DEFAULTS | known
     own = [values[name] for name in _DEFAULTS]
-    own[2] = limit.acc  # with what was learnt from flight
+    own[0], own[2] = limit.radius, limit.acc  # with what was identified from flight
     return np.array([*gains(_GAINS, limit, params, (0.0, *airframe)), *own, ground])
 
 
@@ -92,6 +92,7 @@ def fly(track: Track, segments: np.ndarray, item: tuple[int, float], par: np.nda
     """Simulate the flight from the end of the track; arguments as of `copter_rollout.fly`, segments of `prepare`."""
     seq, since = item
     own = np.flatnonzero(segments[:, copter.SEQ] == seq)
+    own = own[np.cumprod(np.diff(own, prepend=own[:1] - 1) == 1).astype(bool)]  # not those after a jump back
     xva, out = present_motion(track, par), np.empty((int(ahead[-1] / STEP) + 2, 3))
     rows = round(since / STEP) if isfinite(since) and len(own) else _MAX_REPLAY
     state = _begin(track, segments, own, since, par)

@@ -4,39 +4,27 @@ The parameters are identified from flight, see `multirotor.fit`.
 Source: ArduCopter and PX4 limits as in `fleet.autopilots.copter`.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass, field
 from math import isfinite, sqrt, tan
 
 import numpy as np
 
-from fleet.autopilots import copter, copter_legs, px4_multirotor
+from fleet.autopilots import copter, copter_legs
 from fleet.autopilots.copter import Limits
-from fleet.contract import Item, Mission
-from fleet.frames import G, Origin
-from fleet.mission import SPEED, join_remarks, route_items
-from fleet.mission_jumps import JUMPS
+from fleet.contract import Mission
+from fleet.frames import G
+from fleet.mission import join_remarks
 from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.prediction.multirotor import copter_rollout, px4_rollout
-from twin_worker.prediction.multirotor.route import (
-    home_position,
-    limit_speeds,
-    numbered_from_one,
-    return_segments,
-    segments_from_mission,
-    stop_position,
-    stopping_segment,
-)
+from twin_worker.prediction.multirotor.config import MultirotorConfig
+from twin_worker.prediction.multirotor.route import home_position, limit_speeds, return_segments, stopping_segment
 from twin_worker.telemetry.track import STEP, Track
 
 HOLD_MODES = ("LOITER", "POSHOLD", "BRAKE", "AUTO.LOITER", "QLOITER", "HOLD", "POSCTL")
 RETURN_MODES = ("RTL", "AUTO.RTL", "SMART_RTL")
 _ZETA = 0.9
-_TRANSITION_ACCEL = 4.0  # acceleration of a quadplane in transition [m/s2]
 _ITEM_MAX_AGE_S = 15.0  # maximum age of a reported item [s]
 _STATIONARY_SPEED = 0.8  # stationary below this speed [m/s]
-_WAYPOINT, _TURNS, _LAST_NAV = 16, 18, 95  # MAV_CMD
 
 
 @dataclass(frozen=True)
@@ -48,10 +36,12 @@ class MultirotorModel:
         speed_fraction: flown over allowed speed [-]
         accel_fraction: flown over allowed acceleration [-]
         stop_delay_s: delay at each stop in addition to the wait of the mission [s]
+        identified: limits of ArduCopter or PX4 that were not received, as of `Limits`, and CIRCLE_RATE
         drag: linear and quadratic drag over mass [1/s, 1/m]
         drag_std: their standard deviations; those of the prior before the first fit [1/s, 1/m]
         wind: NED, the direction it blows to, (2,) [m/s]
         mean_error: mean error over 10 s of past flight [m]; nan before the first fit
+        median_error: the same, median over the rollouts [m]
         n_starts: number of rollouts in that mean
         n_comparisons: number of fits so far
     """
@@ -60,10 +50,12 @@ class MultirotorModel:
     speed_fraction: float = 1.0
     accel_fraction: float = 1.0
     stop_delay_s: float = 0.5
+    identified: dict[str, float] = field(default_factory=dict)
     drag: tuple[float, float] = (0.25, 0.01)
     drag_std: tuple[float, float] = (0.15, 0.01)
     wind: tuple[float, float] = (0.0, 0.0)
     mean_error: float = float("nan")
+    median_error: float = float("nan")
     n_starts: int = 0
     n_comparisons: int = 0
 
@@ -74,139 +66,6 @@ class MultirotorModel:
             f"lag {self.wn:.1f} rad/s, {self.speed_fraction:.0%} of the speed limit, mean error "
             f"{self.mean_error:.1f} m over 10 s"
         )
-
-
-@dataclass(frozen=True)
-class MultirotorConfig:
-    """Route and parameters of a multirotor's autopilot.
-
-    Attributes:
-        items: mission, item 0 is home
-        seq_offset: offset added to every item number, so that item 0 is home
-        params: parameters
-        limit: limits from the parameters
-        absent: limits without a received parameter
-        changed_t: last change of route, mode or parameters [s since 1970]
-        origin: of the twin's frame
-        plans_legs: flies jerk-limited legs as ArduCopter does
-        smooths_velocity: flies a jerk-limited velocity as PX4 does; with neither, the general law of `copter`
-        speed: commanded before the current item, for all but a return; 0 if none [m/s]
-        speed_before: the same before the item flown before
-    """
-
-    items: tuple[Item, ...]
-    seq_offset: int
-    params: dict[str, float]
-    limit: Limits
-    absent: tuple[str, ...]
-    changed_t: float
-    origin: Origin
-    plans_legs: bool = False
-    smooths_velocity: bool = False
-    speed: float = 0.0
-    speed_before: float = 0.0
-
-    @property
-    def law(self) -> str:
-        """Return the name of the law."""
-        return copter_legs.LAW if self.plans_legs else px4_multirotor.LAW if self.smooths_velocity else copter.LAW
-
-    def segments(self, track: Track, seq: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
-        """Return the route from the current item on, for ArduCopter from the leg before it; and the mission's problems.
-
-        Args:
-            track: newest flight
-            seq: reported mission item of each row
-        """
-        item = int(seq[-1]) + self.seq_offset
-        route, problems = self._segments_from(item, track, self.speed)
-        if not self.plans_legs or not len(route):
-            return route, problems
-        before = self._previous(item, seq)
-        if before is None:
-            return route, problems
-        if before.command == _WAYPOINT and not before.param1 > 0 and before.seq < item:
-            longer, more = self._segments_from(before.seq, track, self.speed_before)
-            k = np.flatnonzero(longer[:, copter.SEQ] == item)
-            return (longer, more) if len(k) and k[0] <= 1 else (route, problems)
-        changed = int(np.flatnonzero(seq != seq[-1])[-1]) if (seq != seq[-1]).any() else None
-        if before.command == _TURNS and changed is not None:
-            par = copter_rollout.parameters(self.limit, self.params, (0.0, 0.0, 0.0, 0.0))
-            route[0, copter.A_N : copter.A_N + 3] = copter_rollout.stopping_point(
-                track.p[changed], track.v[changed], par
-            )
-        elif (start := stop_position(self.items, before.seq, self.origin)) is not None:
-            route[0, copter.A_N : copter.A_N + 3] = start
-        return route, problems
-
-    def _segments_from(self, item: int, track: Track, speed: float) -> tuple[np.ndarray, tuple[str, ...]]:
-        p, arcs = track.p[-1], self.plans_legs
-        return segments_from_mission(self.items, item, self.origin, p, self.params, arcs=arcs, speed=speed)
-
-    def _previous(self, item: int, seq: np.ndarray) -> Item | None:
-        """Return the navigation item before the current one: the one reported before, else the one listed before."""
-        other = np.flatnonzero(np.isfinite(seq) & (seq != seq[-1]))
-        number = int(seq[other[-1]]) + self.seq_offset if len(other) else item
-        listed = [i for i in self.items if 0 < i.seq < item and 0 < i.command < _LAST_NAV]
-        reported = [i for i in self.items if i.seq == number and 0 < i.command < _LAST_NAV]
-        return reported[0] if reported and number != item else (listed[-1] if listed else None)
-
-
-def multirotor_config(
-    mission: Mission | None, params: dict[str, float], autopilot: str, since: float, **options
-) -> MultirotorConfig:
-    """Return the configuration of a multirotor's autopilot.
-
-    Args:
-        mission, params: as received
-        autopilot: as `Status.autopilot`
-        since: last change of mission or parameters [s since 1970]
-        options: `origin` of the twin's frame, `flown` track, `prefix` of the parameters, `reported` mission items in
-            the order of their reports, (n,)
-    """
-    origin, track, prefix = options["origin"], options["flown"], options.get("prefix", "")
-    items = route_items(mission)
-    seq_offset = int(autopilot == "px4" and bool(items))
-    limit, absent = copter.limits(params, prefix)
-    if "speed" in absent and track is not None:
-        limit = limit._replace(speed=_cruise_speed(track, limit.speed))
-    items = numbered_from_one(items, origin) if seq_offset else items
-    reported = options.get("reported", np.empty(0)) + seq_offset
-    other = np.flatnonzero(reported != reported[-1:])
-    earlier = reported[: int(other[-1]) + 1 if len(other) else 0]
-    speed, speed_before = speed_in_force(items, reported), speed_in_force(items, earlier)
-    plans_legs, smooths_velocity = (autopilot == name and not prefix for name in ("ardupilot", "px4"))
-    law = plans_legs, smooths_velocity
-    return MultirotorConfig(items, seq_offset, params, limit, absent, since, origin, *law, speed, speed_before)
-
-
-def speed_in_force(items: Sequence[Item], reported: np.ndarray) -> float:
-    """Return the ground speed of the last DO_CHANGE_SPEED that was executed [m/s]; 0 if none.
-
-    It outlasts a jump to an earlier item, before which the mission has no such command.
-
-    Args:
-        items: mission, item 0 is home
-        reported: current items in the order of their reports, (n,)
-    """
-    changes = reported[np.flatnonzero(np.diff(reported, prepend=np.nan))].tolist()
-    ordered, speed = sorted(items, key=lambda item: item.seq), 0.0
-    for before, after in pairwise(changes):
-        for item in ordered:
-            if item.seq <= before or (after > before and item.seq >= after):
-                continue
-            if item.command in JUMPS and after < before:
-                break
-            if item.command == SPEED and item.param1 in (0, 1) and 0 < item.param2 < copter.MAX_LIMIT:
-                speed = item.param2
-    return speed
-
-
-def _cruise_speed(track: Track, default: float) -> float:
-    """Return the cruise speed from flight, the 90 % quantile of the ground speed."""
-    level = np.hypot(*track.v[track.ok, :2].T)
-    moving = level[level > 1.5]
-    return float(np.quantile(moving, 0.9)) if len(moving) > 5.0 / STEP else default
 
 
 def fly_route(
@@ -258,11 +117,16 @@ class MultirotorTwin:
     model: MultirotorModel
 
     @property
+    def speed_fraction(self) -> float:
+        """Return the flown over the commanded speed [-]; ArduCopter and PX4 fly what is commanded."""
+        return 1.0 if self.config.has_law else self.model.speed_fraction
+
+    @property
     def limit(self) -> Limits:
         """Return the limits scaled by the identified fractions."""
-        limit, speed_fraction, accel_fraction = self.config.limit, self.model.speed_fraction, self.model.accel_fraction
+        limit, accel_fraction = self.config.limit, 1.0 if self.config.has_law else self.model.accel_fraction
         return limit._replace(
-            speed=limit.speed * speed_fraction,
+            speed=limit.speed * self.speed_fraction,
             acc=limit.acc * accel_fraction,
             acc_corner=limit.acc_corner * accel_fraction,
         )
@@ -301,15 +165,14 @@ def fly_segments(
     """
     segments = limit_speeds(commanded, twin.limit)
     stops = (segments[:, copter.HOLD] > 0) & np.isfinite(segments[:, copter.HOLD])
-    stops_by_law = twin.config.plans_legs or twin.config.smooths_velocity
-    segments[stops, copter.HOLD] += 0.0 if stops_by_law else twin.model.stop_delay_s
-    segments[:, copter.SPEED] *= np.where(commanded[:, copter.SPEED] > 0, twin.model.speed_fraction, 1.0)
+    segments[stops, copter.HOLD] += 0.0 if twin.config.has_law else twin.model.stop_delay_s
+    segments[:, copter.SPEED] *= np.where(commanded[:, copter.SPEED] > 0, twin.speed_fraction, 1.0)
     if segments.shape[1] == copter_legs.N_COLUMNS:
         segments = copter_rollout.prepare(segments, commanded, twin.config.items, twin.config.params, twin.limit)
         par = copter_rollout.parameters(twin.limit, twin.config.params, twin.airframe)
         return copter_rollout.fly(track, segments, (seq, since), par, ahead)
     if twin.config.smooths_velocity:
-        config, cruise = twin.config, (twin.limit.speed, twin.model.speed_fraction)
+        config, cruise = twin.config, (twin.limit.speed, twin.speed_fraction)
         segments = px4_rollout.prepare(segments, commanded, config.items, cruise)
         ground = float(home_position(config.items, config.origin)[2])
         par = px4_rollout.parameters(twin.limit, config.params, twin.airframe, ground)
@@ -377,14 +240,3 @@ def describe(config: MultirotorConfig, model: MultirotorModel) -> str:
     """Describe the model and its missing limits."""
     absent = f"; {len(config.absent)} limits not received ({', '.join(config.absent[:3])} …)" if config.absent else ""
     return f"route flown by a kinematic twin: {model}{absent}"
-
-
-def with_wing_limits(config: MultirotorConfig) -> MultirotorConfig:
-    """Set the limits of a quadplane to fixed-wing flight between take-off and landing."""
-    airspeeds = [config.params[name] for name in ("AIRSPEED_CRUISE", "TRIM_ARSPD_CM") if name in config.params]
-    speed = next((v * (0.01 if v > 300 else 1.0) for v in airspeeds if isfinite(v) and v > 0), config.limit.speed)
-    radius = config.params.get("WP_RADIUS", 60.0)
-    limit = config.limit._replace(
-        speed=min(max(speed, 3.0), 60.0), acc=_TRANSITION_ACCEL, acc_corner=6.0, radius=radius if radius > 1 else 60.0
-    )
-    return replace(config, limit=limit)

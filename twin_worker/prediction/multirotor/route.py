@@ -15,8 +15,8 @@ from fleet.frames import Origin, to_ned
 
 STOP_WAIT_S = 1e-3  # minimal wait that marks a stop [s]
 _NUDGE_E7 = 108  # 1.2 m north [1e-7 deg]
-_MAX_LEGS = 24  # maximum legs of the route
-_MAX_SEGMENTS = 90  # maximum segments
+MAX_LEGS = 24  # maximum legs of the route
+_SEGMENTS_PER_LEG = 4  # maximum segments of the route over its maximum legs
 _CIRCLE_SEGMENTS = 12  # segments of one circle
 _SLOW_LANDING_M = 10.0  # height below which a landing is slow [m]
 _RETURN, _JUMP, _DELAY = 20, 177, 93  # MAV_CMD
@@ -75,6 +75,8 @@ def segments_from_mission(
     *,
     arcs: bool = False,
     speed: float = 0.0,
+    jumps_taken: Mapping[int, int] | None = None,
+    max_legs: int = MAX_LEGS,
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Convert the route from item `seq` on to segments with the commanded speed, 0 if there is none.
 
@@ -86,10 +88,15 @@ def segments_from_mission(
         params: autopilot parameters
         arcs: a circle is one segment with the columns of `copter_legs`
         speed: commanded before the current item, for all but landing and return; 0 if none [m/s]
+        jumps_taken: jumps taken so far at each jump, as for `unroll_route`
+        max_legs: maximum legs of the route
     Returns:
         segments (n, N_SEGMENT), and the problems of the mission
     """
-    mission_route = m.unroll_route(_separate_vertical(items), seq=seq, origin=origin, params=params, limit=_MAX_LEGS)
+    separated = _separate_vertical(items)
+    mission_route = m.unroll_route(
+        separated, seq=seq, origin=origin, params=params, limit=max_legs, jumps_taken=jumps_taken
+    )
     if (
         len(mission_route.legs)
         and int(mission_route.legs[0, m.KIND]) == m.LAND
@@ -103,7 +110,7 @@ def segments_from_mission(
     builder = _SegmentBuilder(start, [], arcs)
     home = home_position(items, origin)
     for leg in mission_route.legs:
-        if leg[m.SEQ] < 0 or len(builder.rows) > _MAX_SEGMENTS:
+        if leg[m.SEQ] < 0 or len(builder.rows) > _SEGMENTS_PER_LEG * max_legs:
             break  # a multirotor holds position after the last item
         if int(leg[m.KIND]) != m.LAND:
             leg[m.VA_C] = leg[m.VA_C] or speed

@@ -8,14 +8,16 @@ import numpy as np
 from fleet.airframes.airframe import ASSUMED, ServoMap, servo_map
 from fleet.airframes.servo_learning import MIN_ROWS, learn_servo_map
 from fleet.autopilots.modes import ModeEntry
-from fleet.contract import Item, Mission, Params, Sample, Status, WindField
+from fleet.contract import BatteryForecast, Item, Mission, Params, Sample, Status, WindField
 from fleet.frames import Origin
 from fleet.mission_jumps import JUMPS, count_jumps, resets_counters
+from twin_worker.estimation.battery import BatteryModel
 from twin_worker.estimation.wind_filter import WindFilter, update_from_history
 from twin_worker.prediction.autopilot_identification import AutopilotEstimate
 from twin_worker.prediction.replay_window import ControllerMemory, JumpCounts
 from twin_worker.telemetry.history import ArrivalDelay, TelemetryHistory
 from twin_worker.telemetry.resample import Resampler
+from twin_worker.twin.state.budget import Timer
 from twin_worker.twin.state.flight_phase import FlightPhase
 
 _MODE_CHANGES = 64  # stored changes of the mode
@@ -27,6 +29,7 @@ _LEARN_FROM = ("servo", "attitude", "command", "air", "velocity")
 _LEARN_S, _LEARN_PERIOD_S = 160.0, 20.0  # flight time that the servo map is learnt from, and between two attempts [s]
 _FLYING_AIRSPEED = 8.0  # or ground speed [m/s]
 _WIND_MAX_AGE_S = 10.0  # maximum age of the autopilot's wind estimate, and of the airspeed that replaces it [s]
+_MIN_VELOCITIES = 2  # for the velocity at a row of the battery
 _LATE_S = 10.0  # velocities older than this come too late for the wind [s]
 
 
@@ -250,6 +253,9 @@ class Environment(msgspec.Struct):
         flight_phase: flying, landed, landing
         autopilot: law and parameters identified from flight
         wind_field: newest wind field of all aircraft; None: not known
+        battery: power and charge, of a multirotor
+        battery_forecast: newest; None: not known
+        battery_timer: of forecasts
     """
 
     wind: WindFilter = msgspec.field(default_factory=WindFilter)
@@ -258,6 +264,9 @@ class Environment(msgspec.Struct):
     flight_phase: FlightPhase = msgspec.field(default_factory=FlightPhase)
     autopilot: AutopilotEstimate = msgspec.field(default_factory=AutopilotEstimate)
     wind_field: WindField | None = None
+    battery: BatteryModel = msgspec.field(default_factory=BatteryModel)
+    battery_forecast: BatteryForecast | None = None
+    battery_timer: Timer = msgspec.field(default_factory=Timer)
 
     def set_wind_field(self, wind_field: WindField | None) -> None:
         """Store the wind field for the next predictions; it must be valid, see `SharedWind`."""
@@ -282,6 +291,20 @@ class Environment(msgspec.Struct):
             self.wind.reset_wind(float(t[-1]), np.append(reported[-1], 0.0))
             self.reported_wind_t = self.wind.t
 
+    def update_battery(self, history: TelemetryHistory, wind: tuple[float, float]) -> None:
+        """Update the battery model with new rows; `wind`: north and east [m/s]."""
+        t, rows = history.rows_since("battery", max(self.battery.t, history.newest - _LATE_S))
+        times, v = history.rows_since("velocity", history.newest - _LATE_S)
+        if not len(t) or len(times) < _MIN_VELOCITIES:
+            return
+        at = np.column_stack([np.interp(t, times, column, left=np.nan) for column in v.T])
+        self.battery.update(t, rows, at, np.array(wind))
+
+    def store_battery_forecast(self, forecast: BatteryForecast | None, t: float) -> None:
+        """Store the forecast of `t` [s since 1970]."""
+        self.battery_forecast = forecast
+        self.battery_timer.restart(t)
+
     def set_wind(self, wind: WindFilter, t: float) -> None:
         """Replace the wind filter by one that has used the rows up to `t` [s since 1970]."""
         self.wind, self.wind_t = wind, t
@@ -291,8 +314,11 @@ class Environment(msgspec.Struct):
         self.wind.t = self.wind_t = self.reported_wind_t = -np.inf
         self.wind_field = None
         self.flight_phase = FlightPhase()
+        self.battery.t = -np.inf
+        self.battery_timer.expire()
 
     def shift_clock(self, step: float) -> None:
         """Date the wind `step` later [s]."""
         self.wind.t, self.wind_t = self.wind.t + step, self.wind_t + step
         self.reported_wind_t += step
+        self.battery.t += step

@@ -1,6 +1,7 @@
 """Alerts of a single aircraft: link, ground, geofence, short horizon, infeasible mission."""
 
 import numpy as np
+from scipy.special import ndtr
 
 from fleet.contract import Alert, AlertKind, Prediction
 from fleet.frames import Origin, to_ned
@@ -49,6 +50,7 @@ def prediction_alerts(twin: Twin, now: float, prediction: Prediction | None) -> 
     gaussian = to_gaussian(prediction) if prediction is not None else None
     _update_home_fallback(twin)
     twin.alerts.update_turn_rate(now, only=gaussian is not None and gaussian.prediction.method == "imm")
+    hazards = [] if prediction is None else [battery_hazard(prediction)]
     findings = [_not_predicted(kind) for kind in (AlertKind.GROUND, AlertKind.GEOFENCE)]
     if gaussian is not None:
         turn_rate_only = (
@@ -57,6 +59,7 @@ def prediction_alerts(twin: Twin, now: float, prediction: Prediction | None) -> 
             and now - twin.alerts.turn_rate_only_since < _TURN_RATE_GRACE_S
         )
         findings = [] if turn_rate_only else limit_hazards(twin, gaussian)
+    findings += hazards
     if not twin.telemetry.link_lost:
         findings.append(_short_horizon(prediction))
         if twin.alerts.feasibility_timer.due(now, _FEASIBILITY_PERIOD_S):
@@ -130,6 +133,17 @@ def _short_horizon(prediction: Prediction | None) -> HazardEstimate:
     probability = prediction.early_exceedance if prediction is not None and is_scored else 0.0
     sentence = f"predictions exceed an error of 10 % within 10 s with a probability of {probability:.0%}"
     return HazardEstimate(AlertKind.SHORT_HORIZON, probability, sentence, "predictions hold 10 s again")
+
+
+def battery_hazard(prediction: Prediction) -> HazardEstimate:
+    """Evaluate whether the battery is empty before the end of the mission or before home."""
+    clear, forecast = "the battery is sufficient again", prediction.battery
+    if forecast is None:
+        return HazardEstimate(AlertKind.BATTERY, 0.0, "", clear)
+    probability = float(ndtr(-forecast.home / forecast.home_sigma)) if forecast.home_sigma > 0 else 0.0
+    if forecast.end is not None and forecast.end_sigma:
+        probability = max(probability, float(ndtr(-forecast.end / forecast.end_sigma)))
+    return HazardEstimate(AlertKind.BATTERY, probability, f"battery: {forecast.sentence}", clear)
 
 
 def mission_feasibility(twin: Twin, now: float) -> HazardEstimate:

@@ -12,12 +12,15 @@ from twin_worker.prediction import kinematic
 from twin_worker.prediction.autopilot_parameters import ControllerTwin, RouteOverride, multirotor_controller
 from twin_worker.prediction.method_selection import STEP, imm_with_variance
 from twin_worker.prediction.multirotor import fit, rollout
+from twin_worker.prediction.multirotor.config import MultirotorConfig, multirotor_config, with_wing_limits
+from twin_worker.prediction.multirotor.endurance import forecast_battery
 from twin_worker.telemetry.track import SETTLING_S, Track, hovering_mask, resample_track
 from twin_worker.twin.state.reported_path import ReportedPath, reported_path
 from twin_worker.twin.state.routes import ROUTE_MODES, failsafe_plan, present_route
 from twin_worker.twin.state.state import Twin
 
 _FIT_WINDOW_S = 130.0  # flight time used to fit the kinematic models [s]
+_RETURN_COMMAND = 20  # MAV_CMD: NAV_RETURN_TO_LAUNCH
 _VTOL_COMMANDS = (84, 85)  # MAV_CMD: NAV_VTOL_TAKEOFF, NAV_VTOL_LAND
 _KNOWN_PATH_S = 5.0  # part of a path that is commanded point by point which its course tells: the distance of L1 [s]
 _WIND_MAX_AGE_S = 10.0  # maximum age of the autopilot's wind estimate [s]
@@ -26,6 +29,8 @@ _TURN_NAMES = {  # parameters of L1 with other autopilots, by their names with A
     "NAVL1_DAMPING": ("NAVL1_DAMPING", "FW_L1_DAMPING"),
     "ROLL_LIMIT_DEG": ("ROLL_LIMIT_DEG", "FW_R_LIM"),
 }
+_BATTERY_PERIOD_S = 15.0  # between forecasts of the battery [s]
+_MIN_ROWS = 20  # of an unbroken track that a prediction begins with
 _VELOCITY_ROWS = 11  # rows used for a multirotor's velocity and acceleration
 _MANUAL_AFTER_S = 6.0  # a multirotor in a hold mode that still moves after this time is under manual control [s]
 
@@ -92,7 +97,7 @@ def active_command(twin: Twin) -> int:
     return next((item.command for item in items if item.seq == seq), 0) if isfinite(seq) else 0
 
 
-def _multirotor_config(twin: Twin, recent: Track, override: RouteOverride | None = None) -> rollout.MultirotorConfig:
+def _multirotor_config(twin: Twin, recent: Track, override: RouteOverride | None = None) -> MultirotorConfig:
     params, mission, autopilot = (
         twin.received_params,
         twin.onboard.mission,
@@ -101,7 +106,7 @@ def _multirotor_config(twin: Twin, recent: Track, override: RouteOverride | None
     if override is not None:
         params = params | dict(override.parameters)
         mission = Mission(uav=twin.config.uav, t=twin.telemetry.history.newest, items=override.items, seq=override.seq)
-    config = rollout.multirotor_config(
+    config = multirotor_config(
         mission,
         params,
         autopilot,
@@ -109,9 +114,11 @@ def _multirotor_config(twin: Twin, recent: Track, override: RouteOverride | None
         origin=twin.telemetry.origin,
         flown=recent,
         prefix=twin.vehicle_class.rotor_prefix,
+        identified=twin.models.multirotor.identified,
+        jumps_taken=twin.onboard.jumps_taken if override is None else override.jumps_taken,
         reported=twin.telemetry.history.rows_since("leg", twin.onboard.plan_changed_t)[1][:, 0],
     )
-    return rollout.with_wing_limits(config) if twin.vehicle_class.rotor_prefix else config
+    return with_wing_limits(config) if twin.vehicle_class.rotor_prefix else config
 
 
 def fixed_wing_config(twin: Twin) -> kinematic.KinematicConfig:
@@ -171,10 +178,27 @@ def fit_kinematic_models(twin: Twin) -> None:
         twin.models.store_kinematic(model)
 
 
+def update_battery_forecast(twin: Twin, recent: Track, now: float) -> None:
+    """Predict the remaining battery of a multirotor in flight at the end of its mission and at home, if it is due."""
+    if not twin.environment.battery_timer.due(now, _BATTERY_PERIOD_S):
+        return
+    unbroken, status = recent.with_attitude(twin.telemetry.history).unbroken_tail(), twin.onboard.status
+    if status is None or not status.armed or twin.environment.flight_phase.landed or len(unbroken) < _MIN_ROWS:
+        twin.environment.store_battery_forecast(None, now)
+        return
+    config = _multirotor_config(twin, unbroken)
+    seq = rollout.items_in_force(unbroken.t, twin.telemetry.history.rows_since("leg"), twin.onboard.mission)
+    returns = status.mode in rollout.RETURN_MODES or active_command(twin) == _RETURN_COMMAND
+    if twin.no_route_reason() or returns:  # the end of a return is home
+        seq = np.full(len(unbroken), np.nan)
+    models = config, twin.models.multirotor, twin.environment.battery
+    twin.environment.store_battery_forecast(forecast_battery(unbroken, seq, models, twin.received_params), now)
+
+
 def predict_without_model(twin: Twin, recent: Track, ahead: np.ndarray) -> PathForecast:
     """Predict the path on the route with the kinematic model of this vehicle class."""
     unbroken = recent.unbroken_tail()
-    if len(unbroken) < 20:
+    if len(unbroken) < _MIN_ROWS:
         return no_prediction("less than 2 s of unbroken positions")
     if is_hovering(twin):
         return _predict_multirotor(twin, unbroken, ahead)
@@ -231,7 +255,13 @@ def _predict_multirotor(twin: Twin, recent: Track, ahead: np.ndarray) -> PathFor
     mode = twin.onboard.status.mode if twin.onboard.status else ""
     config = _multirotor_config(twin, recent, twin.prediction.override)
     overridden = twin.prediction.override.parameters if twin.prediction.override else {}
-    control = multirotor_controller(twin.received_params, twin.vehicle_class.rotor_prefix, config.limit, overridden)
+    control = multirotor_controller(
+        twin.received_params,
+        twin.vehicle_class.rotor_prefix,
+        config.limit,
+        overridden,
+        px4=config.smooths_velocity,
+    )
     if twin.onboard.status is None or not twin.onboard.status.armed:
         return no_prediction("not armed")
     if mode in rollout.HOLD_MODES:

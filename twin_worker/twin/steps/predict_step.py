@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 
 from fleet.contract import EVENT_TEXTS, Array, Controller, Event, Message, Outcome, Prediction, TwinState
-from twin_worker.confidence.table_files import INCOMPLETE, airframe_class, group_name
+from twin_worker.confidence.table_files import INCOMPLETE, UNCONFIRMED, airframe_class, group_name
 from twin_worker.confidence.tube_and_horizon import AHEAD, NOMINAL_COVERAGE, Confidence, PointForecast
 from twin_worker.identification.fixed_wing.plant import DYNAMICS
 from twin_worker.prediction.autopilot_parameters import IDENTIFIED, ControllerTwin
@@ -23,6 +23,7 @@ from twin_worker.twin.steps.kinematic_prediction import (
     no_prediction,
     predict_without_model,
     recent_track,
+    update_battery_forecast,
 )
 from twin_worker.twin.steps.rollouts import BOTH, HYBRID, ensemble_spread, predict_route, select_method
 
@@ -32,6 +33,7 @@ _REPORT_PERIOD_S = 10.0  # between reports of unchanged law and parameters [s]
 _STALE_S = 3.0  # maximum age of positions relative to other telemetry [s]
 _MAX_ABSENT = 2  # maximum number of absent autopilot parameters in the group of known parameters [-]
 _IDENTIFIED_METHODS = (BOTH, HYBRID, DYNAMICS)
+_MAX_LAW_ERROR_M = 0.5  # median over 10 s, of a multirotor that flies the law of the calibration flights: theirs [m]
 _IMM_LAW, _NO_LAW = "none: turn rate only", "none: on the ground"
 
 
@@ -52,6 +54,8 @@ def predict(twin: Twin, now: float) -> list[Message]:
     ahead = AHEAD + round(coast_s)
     if not recent.ok[-1] or (not coast_s and twin.telemetry.history.newest - recent.t[-1] > _STALE_S):
         return []
+    if twin.vehicle_class.is_rotorcraft and not coast_s and twin.prediction.override is None:
+        update_battery_forecast(twin, recent, now)
     path_forecast, t0 = _best_forecast(twin, recent, ahead)
     n = _count_finite(path_forecast.path)
     if path_forecast.path is None or not n:
@@ -79,6 +83,7 @@ def predict(twin: Twin, now: float) -> list[Message]:
         coast_s=coast_s,
         law=path_forecast.law,
         controller=_changed_controller(twin, path_forecast, now),
+        battery=twin.environment.battery_forecast,
         **_event_fields(twin),
     )
     twin.prediction.publish(prediction)
@@ -220,6 +225,9 @@ def _group(twin: Twin, path_forecast: PathForecast, recent: Track) -> str:
     provenance = "known"
     if control is not None and len(control.default_names) > _MAX_ABSENT:
         provenance = "identified" if IDENTIFIED in control.provenance.values() else "absent"
+    follows_law = twin.models.multirotor.median_error < _MAX_LAW_ERROR_M
+    if path_forecast.method == "copter" and provenance == "known" and not follows_law:
+        provenance = UNCONFIRMED
     mission = twin.onboard.mission
     if path_forecast.method != "imm" and mission is not None and mission.items and not mission.complete:
         provenance = INCOMPLETE

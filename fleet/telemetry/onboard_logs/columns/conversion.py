@@ -52,6 +52,7 @@ WIDTHS = {
     "gnss": (1,),
     "height": (1,),
     "bearing": (1,),
+    "battery": (3,),
     "mode": (1,),
     "armed": (1,),
 }

@@ -12,7 +12,7 @@ from tests.support.dataflash_writer import read
 
 NAME = "s01_nominal_calm"
 STEPS = ("leg", "servo")  # not to be interpolated
-RADIO_ONLY = {"height", "bearing"}  # above home; to the path
+RADIO_ONLY = {"height", "bearing", "battery"}  # above home; to the path; of the propulsion
 
 
 def test_the_log_says_what_the_radio_said(recordings: Path) -> None:
