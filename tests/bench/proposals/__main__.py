@@ -70,28 +70,24 @@ def main() -> None:
     args = parser.parse_args()
     warm_up()
     results: list[Result] = []
-    for kind in KINDS:
-        for k in range(getattr(args, ARGUMENTS[kind][2:])):
-            began = time.monotonic()
-            one = judged(kind, args.seed + k)
-            results.append(one)
-            print(f"{kind} {args.seed + k}: alert at {one.alert_s} s, {time.monotonic() - began:.0f} s of computing")
-            for approval in one.approvals:
-                model = "with" if approval.with_models else "without"
-                print(
-                    f"  {approval.waited_s:.1f} s after {approval.alert_s:.0f} s, {model} model: {approval.sentences}"
-                )
-                print(f"    flown {approval.flown!r}, cleared {approval.cleared}, before: {approval.reasons}")
-            print(
-                f"  happened {one.happened}, created {one.created}, unneeded {one.unneeded} {one.reasons}", flush=True
-            )
-            figures = {
-                "seed": args.seed,
-                "summary": {name: summary([o for o in results if o.name == name]) for name in KINDS},
-                "cases": [asdict(one) for one in results],
-            }
-            if args.json:
-                args.json.write_text(json.dumps(figures, indent=1) + "\n")
+    wanted = {kind: getattr(args, ARGUMENTS[kind][2:]) for kind in KINDS}
+    for kind, k in sorted(((name, k) for name in KINDS for k in range(wanted[name])), key=lambda one: one[1]):
+        began = time.monotonic()
+        one = judged(kind, args.seed + k)
+        results.append(one)
+        print(f"{kind} {args.seed + k}: alert at {one.alert_s} s, {time.monotonic() - began:.0f} s of computing")
+        for approval in one.approvals:
+            model = "with" if approval.with_models else "without"
+            print(f"  {approval.waited_s:.1f} s after {approval.alert_s:.0f} s, {model} model: {approval.sentences}")
+            print(f"    flown {approval.flown!r}, cleared {approval.cleared}, before: {approval.reasons}")
+        print(f"  happened {one.happened}, created {one.created}, unneeded {one.unneeded} {one.reasons}", flush=True)
+        figures = {
+            "seed": args.seed,
+            "summary": {name: summary([o for o in results if o.name == name]) for name in KINDS},
+            "cases": [asdict(one) for one in results],
+        }
+        if args.json:
+            args.json.write_text(json.dumps(figures, indent=1) + "\n")
     print(json.dumps({name: summary([o for o in results if o.name == name]) for name in KINDS}, indent=1))
 
 
