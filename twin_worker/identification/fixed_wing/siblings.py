@@ -50,6 +50,7 @@ _FLOOR = 0.02  # least spread, of the standard deviation of the airframe's prior
 _EXCESS_SIGMA = 2.0  # of the airframe's prior of the excess [m/s2]
 _LAPSE = 2.5  # thrust lapse, so that X_u = -(2 + lapse) D / (m U), as in `fleet.airframes`
 _STEPS = 40  # of EM
+_SILENT = 1e-9  # share of the siblings' covariance, which keeps that of a deviation without any data regular
 _WEAK = 100.0  # factor on the siblings' covariance in the estimate of one aircraft from its data
 
 
@@ -194,7 +195,7 @@ class _Type:
         information, weak = self.information[k], np.linalg.inv(_WEAK * S)
         V = np.linalg.inv(weak + information)
         d, W = V @ (self.score[k] - information @ mu), V @ information
-        covariance = W @ S @ W.T + W @ V
+        covariance = W @ S @ W.T + W @ V + _SILENT * S
         return d * self.scale, 0.5 * (covariance + covariance.T) * self.scale[:, None] * self.scale
 
 
