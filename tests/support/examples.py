@@ -378,11 +378,7 @@ MESSAGES = (
                 throttle=0.5,
                 mean=Array.of(np.arange(30) * 0.5, "<f8"),
                 covariance=Array.of(0.25 * np.eye(30), "<f8"),
-                differences=(
-                    SiblingDifference(
-                        uav=8, group="drag", ratio=0.15, p=0.0005, sentence="uav-8: drag 15 % above its 2 siblings"
-                    ),
-                ),
+                differences=(SiblingDifference(uav=8, group="drag", ratio=0.15, p=0.0005, sentence="uav-8: drag"),),
             ),
         ),
     ),

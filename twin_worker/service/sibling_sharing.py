@@ -62,9 +62,9 @@ class SiblingSharing(SharedEstimate[Siblings]):
         self.forget_if_old()
         types = self.latest.types if self.latest is not None else ()
         kind = airframe_type(owned.twin) if types else ""
-        found = next((one for one in types if one.airframe_type == kind), None)
-        if owned.twin.identification.siblings is not found:
-            owned.twin.identification.set_siblings(found)
+        siblings = next((one for one in types if one.airframe_type == kind), None)
+        if owned.twin.identification.siblings is not siblings:
+            owned.twin.identification.set_siblings(siblings)
 
     def check(self, message: Siblings) -> None:
         """Check distributions received from the bus.

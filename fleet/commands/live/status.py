@@ -75,9 +75,7 @@ def watch(bus: Bus, stop: threading.Event, console: Console) -> int:
     return 0 if rows else 1
 
 
-def _overview(
-    rows: list[FleetRow], running: list[tuple[str, str, str, str]], shared: Sequence[str]
-) -> RenderableType:
+def _overview(rows: list[FleetRow], running: list[tuple[str, str, str, str]], shared: Sequence[str]) -> RenderableType:
     """Return the tables of aircraft and processes, and what the aircraft share."""
     empty = Text("no UAV known yet: is a gateway running and an aircraft connected?")
     parts: list[RenderableType] = [fleet_table(rows) if rows else empty]
@@ -102,10 +100,10 @@ def wind_text(bus: Bus) -> str:
 
 def sibling_texts(bus: Bus) -> list[str]:
     """Query what aircraft of each type share; describe each type, and the aircraft that differ."""
-    found = [(stamp, one) for one, stamp in bus.get(Siblings) if stamp and is_plausible_epoch(stamp.epoch)]
-    if not found:
+    replies = [(stamp, one) for one, stamp in bus.get(Siblings) if stamp and is_plausible_epoch(stamp.epoch)]
+    if not replies:
         return []
-    types = max(found, key=lambda pair: pair[0])[1].types
+    types = max(replies, key=lambda pair: pair[0])[1].types
     texts = [f"{printable(one.airframe_type)}: {len(one.uavs)} aircraft share what they have learnt" for one in types]
     return texts + [printable(difference.sentence) for one in types for difference in one.differences]
 

@@ -68,11 +68,11 @@ def sibling_data(model: DerivativesModel, throttle: float, airframe_type: str) -
     back = np.eye(len(NAMES))  # par of (par with X at trim in place of X_0)
     back[_X_0, _X_DT] = -throttle
     data, score = back.T @ data @ back, back.T @ score
-    kept = np.append(_SHARED, _X_0)
+    terms = np.append(_SHARED, _X_0)
     rest = data[np.ix_(_REST, _REST)] + nominal_precision[np.ix_(_REST, _REST)]
-    gain = np.linalg.solve(rest, data[np.ix_(_REST, kept)]).T
-    score = score[kept] - gain @ (score[_REST] + nominal_precision[np.ix_(_REST, _REST)] @ nominal[_REST])
-    information = data[np.ix_(kept, kept)] - gain @ data[np.ix_(_REST, kept)]
+    gain = np.linalg.solve(rest, data[np.ix_(_REST, terms)]).T
+    score = score[terms] - gain @ (score[_REST] + nominal_precision[np.ix_(_REST, _REST)] @ nominal[_REST])
+    information = data[np.ix_(terms, terms)] - gain @ data[np.ix_(_REST, terms)]
     score = score - information[:, -1] * G * model.trim_velocity[1] / model.trim_velocity[0]  # X at trim to the excess
     values, vectors = np.linalg.eigh(0.5 * (information + information.T))
     information = (vectors * np.maximum(values, 0.0)) @ vectors.T
@@ -229,7 +229,7 @@ def estimate_type(data: Mapping[int, SiblingData], airframe: Airframe) -> Siblin
     uavs = tuple(sorted(data))
     one = _Type.of([data[uav] for uav in uavs], airframe)
     population = one.population()
-    differences = [found for k, uav in enumerate(uavs) for found in _differences(one, k, uav)]
+    differences = [difference for k, uav in enumerate(uavs) for difference in _differences(one, k, uav)]
     return SiblingType(
         airframe_type=data[uavs[0]].airframe_type,
         uavs=uavs,
@@ -246,7 +246,7 @@ def _differences(one: _Type, k: int, uav: int) -> list[SiblingDifference]:
     others = one.without(k)
     population = others.population()
     d, covariance = one.deviation(k, population)
-    found = []
+    differences = []
     for group, names in GROUPS.items():
         rows = [TERMS.index(name) for name in names]
         dg, cov = d[rows], covariance[np.ix_(rows, rows)]
@@ -255,8 +255,10 @@ def _differences(one: _Type, k: int, uav: int) -> list[SiblingDifference]:
             continue
         ratio = -d[-1] / population.drag if group == "drag" else d[rows[0]] / population.mean[rows[0]]
         text = f"{group} {abs(ratio):.0%} {'above' if ratio > 0 else 'below'} its {len(others.score)} siblings"
-        found.append(SiblingDifference(uav=uav, group=group, ratio=float(ratio), p=p, sentence=f"uav-{uav}: {text}"))
-    return found
+        differences.append(
+            SiblingDifference(uav=uav, group=group, ratio=float(ratio), p=p, sentence=f"uav-{uav}: {text}")
+        )
+    return differences
 
 
 def type_defect(message: SiblingType) -> str:
