@@ -17,6 +17,7 @@
     parauav/@fleet/state/{writer}        FleetState   worker   one row per UAV; also queryable
     parauav/@fleet/prediction/{writer}   Predictions  worker   query only: the newest prediction of all its aircraft
     parauav/@world/wind/{writer}         WindField    worker   one wind field from all aircraft; also queryable
+    parauav/@world/siblings/{writer}     Siblings     worker   what aircraft of one type share; also queryable
     parauav/@gateway/{writer}            GatewayCounters gateway counters of one gateway; also queryable
     parauav/@claim/{writer}              Claim        worker   aircraft it writes for; every 0.25 s; also queryable
     parauav/@handover/{writer}           Handover     worker   query only, with a `HandoverRequest`: copies of twins
@@ -321,6 +322,19 @@ class LinearModel(msgspec.Struct, frozen=True, kw_only=True):
     dt_s: Annotated[float, about("sample time [s]")]
 
 
+class SiblingData(msgspec.Struct, frozen=True, kw_only=True):
+    """What the data of one aircraft alone say about the terms that aircraft of its type share.
+
+    The terms are those of `SiblingType`; likelihood of them theta: exp(-theta' information theta / 2 + score' theta).
+    """
+
+    airframe_type: Annotated[str, about("type: vehicle, airframe file or parameter, mass class")]
+    airspeed: Annotated[float, about("of the derivatives [m/s]")]
+    throttle: Annotated[float, about("mean delta_t [-]")]
+    information: Annotated[Array, about("(k, k) <f8")]
+    score: Annotated[Array, about("(k,) <f8")]
+
+
 class Derivatives(msgspec.Struct, frozen=True, kw_only=True):
     """Coupled model: specific force [m/s2], angular acceleration [rad/s2] per unit of each term, and wind.
 
@@ -338,6 +352,8 @@ class Derivatives(msgspec.Struct, frozen=True, kw_only=True):
     window_t0: Annotated[float, about("first instant of the identification window [s since 1970]")] = 0.0
     window_s: Annotated[float, about("length of the identification window [s]")] = 0.0
     sentence: Annotated[str, about("parameters identified from the data and those set by the prior")] = ""
+    data: Annotated[SiblingData | None, about("for aircraft of its type; null: its type is not known")] = None
+    siblings: Annotated[int, about("aircraft of its type that the prior was learnt from; 0: none")] = 0
 
 
 class Model(Message, frozen=True, kw_only=True):
@@ -819,6 +835,38 @@ class WindField(msgspec.Struct, frozen=True, kw_only=True):
     drifts: Annotated[Array, about("of each aircraft, north, east, variance, (n, 3) [m/s, m2/s2]")]
 
 
+class SiblingDifference(msgspec.Struct, frozen=True, kw_only=True):
+    """One aircraft deviates from all others of its type by more than chance."""
+
+    uav: int
+    group: Annotated[str, about("drag, lift, pitch, roll or yaw")]
+    ratio: Annotated[float, about("relative deviation of the first term of the group [-]")]
+    p: Annotated[float, about("probability of such a deviation by chance, 0..1")]
+    sentence: str
+
+
+class SiblingType(msgspec.Struct, frozen=True, kw_only=True):
+    """Distribution of the derivatives of one type of aircraft: those without offsets, and thrust minus drag at last."""
+
+    airframe_type: str
+    uavs: Annotated[tuple[int, ...], about("aircraft it was learnt from")]
+    airspeed: Annotated[float, about("of the derivatives [m/s]")]
+    throttle: Annotated[float, about("delta_t of the last term [-]")]
+    mean: Annotated[Array, about("(k,) <f8")]
+    covariance: Annotated[Array, about("of a further aircraft: spread, and uncertainty of the mean, (k, k) <f8")]
+    differences: tuple[SiblingDifference, ...] = ()
+
+
+class Siblings(msgspec.Struct, frozen=True, kw_only=True):
+    """What aircraft of each type share, estimated from all of them by one worker at a time."""
+
+    topic: ClassVar[str] = "@world/siblings"
+    version: ClassVar[int] = 1
+
+    t: Annotated[float, about("time of the estimate [s since 1970]")]
+    types: tuple[SiblingType, ...] = ()
+
+
 class Predictions(msgspec.Struct, frozen=True, kw_only=True):
     """The newest prediction of every aircraft of one worker, in one answer."""
 
@@ -928,7 +976,7 @@ PER_UAV: tuple[type[Message], ...] = (
     *(Sample, Status, Mission, Params, History),
     *(Model, Prediction, Mismatch, Alert, Proposal, Approval, Execution),
 )
-CONTROL: tuple[type, ...] = (FleetState, Predictions, WindField, GatewayCounters, Claim, Handover)
+CONTROL: tuple[type, ...] = (FleetState, Predictions, WindField, Siblings, GatewayCounters, Claim, Handover)
 QUERIES: dict[type, type] = {Prediction: WhatIf, Handover: HandoverRequest}  # optional payload of a query on a key
 TOPICS: dict[str, type] = {c.topic: c for c in (*PER_UAV, *CONTROL)}  # type: ignore[attr-defined]
 

@@ -46,6 +46,7 @@ TOPIC_RULES: dict[str, TopicRule] = {
     "@fleet/state": TopicRule((WORKER,), MB),
     "@fleet/prediction": TopicRule((WORKER,), 32 * MB),  # 4 KB for each of its aircraft
     "@world/wind": TopicRule((WORKER,), MB),
+    "@world/siblings": TopicRule((WORKER,), MB),
     "@gateway": TopicRule((GATEWAY,), MB),
     "@claim": TopicRule((WORKER,), MB),
     "@handover": TopicRule((WORKER,), 32 * MB, queriers=(WORKER,)),  # the complete twin of an aircraft

@@ -15,6 +15,7 @@ PAIR = (0, 1)
 """Aircraft that meet, see `fleet.simulator.flight.story`."""
 HORIZONTAL_M, VERTICAL_M = 50.0, 20.0  # separation minima of `twin_worker`
 _AFTER_S = 15.0  # flight after the predicted time that is measured [s]
+_LOST_S = 30.0  # later, the scene ends although one of them has no positions
 _STEP_S = 0.1
 
 
@@ -99,7 +100,8 @@ class ConflictStory:
         if sample.position is not None and sample.position.t.shape[0]:
             rows = sample.position.t.numpy(), sample.position.x.numpy().astype(float)
             self._positions[sample.uav].append(rows)
-            if min(self._newest(uav) for uav in PAIR) > (self._alert.predicted_t or 0.0) + _AFTER_S:
+            newest, end = sorted(self._newest(uav) for uav in PAIR), (self._alert.predicted_t or 0.0) + _AFTER_S
+            if newest[0] > end or newest[1] > end + _LOST_S:
                 self._end()
 
     def _newest(self, uav: int) -> float:
@@ -109,6 +111,11 @@ class ConflictStory:
     def _end(self) -> None:
         """Announce the closest approach."""
         self.ended = True
+        lost_uav = min(PAIR, key=self._newest)
+        if self._newest(lost_uav) < (self._alert.predicted_t if self._alert and self._alert.predicted_t else 0.0):
+            self._add(f"step 5 of 5: UAV {lost_uav} sent no positions at the predicted time: the result is not known.")
+            self._positions.clear()
+            return
         horizontal, vertical, lost = self.closest_approach()
         distances = f"{horizontal:.0f} m apart horizontally and {vertical:.0f} m vertically"
         if lost:

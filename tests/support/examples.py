@@ -42,6 +42,10 @@ from fleet.contract import (
     ProposedPath,
     Rows,
     Sample,
+    SiblingData,
+    SiblingDifference,
+    Siblings,
+    SiblingType,
     Status,
     TwinState,
     Verdict,
@@ -98,6 +102,14 @@ DERIVATIVES = Derivatives(
     window_t0=T - 40.0,
     window_s=20.0,
     sentence="1 of 2 parameters told by the data",
+    data=SiblingData(
+        airframe_type="fixed_wing, generic small fixed wing, 2100, mass unknown",
+        airspeed=22.0,
+        throttle=0.5,
+        information=Array.of(4.0 * np.eye(30), "<f8"),
+        score=Array.of(np.arange(30) * 0.5, "<f8"),
+    ),
+    siblings=9,
 )
 ITEM = Item(
     seq=1, command=16, frame=3, param1=5.0, param2=60.0, param3=1.0, param4=0.5, lat_e7=1, lon_e7=2, alt_m=100.0
@@ -367,6 +379,20 @@ MESSAGES = (
         values=Array.of([[0.5, -0.25], [0.0, 0.25]]),
         covariance=Array.of(0.25 * np.eye(4)),
         drifts=Array.of([[0.125, 0.0, 0.0625], [0.0, 0.25, 0.0625], [0.0, 0.0, 0.0625]]),
+    ),
+    Siblings(
+        t=T,
+        types=(
+            SiblingType(
+                airframe_type="fixed_wing, generic small fixed wing, 2100, mass unknown",
+                uavs=(UAV, 8, 9),
+                airspeed=22.0,
+                throttle=0.5,
+                mean=Array.of(np.arange(30) * 0.5, "<f8"),
+                covariance=Array.of(0.25 * np.eye(30), "<f8"),
+                differences=(SiblingDifference(uav=8, group="drag", ratio=0.15, p=0.0005, sentence="uav-8: drag"),),
+            ),
+        ),
     ),
     Claim(
         t=T,

@@ -211,7 +211,7 @@ class _Extremes(NamedTuple):
 def _extremes(twin: Twin, forecast: GaussianForecast) -> _Extremes:
     """Return the extremes of a forecast within the look-ahead of the ground and geofence alerts."""
     assert twin.home is not None
-    until = forecast.prediction.t + reach_s(forecast.prediction)
+    until = forecast.prediction.t + reach_s(twin, forecast.prediction)
     k = max(int(np.searchsorted(forecast.t, until, side="right")), 1)
     home = to_ned(forecast.prediction.ned_origin(), *(np.array([float(x)]) for x in twin.home))[0]
     distance = np.hypot(*(forecast.path[:k] - home)[:, :2].T)

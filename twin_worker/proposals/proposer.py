@@ -26,6 +26,7 @@ PROPOSED = (AlertKind.CONFLICT, AlertKind.GROUND, AlertKind.GEOFENCE, AlertKind.
 """Alerts that are answered with a proposal."""
 RENEW_S = 5.0
 """Time after which a proposal is renewed while its alert lasts [s]."""
+_RENEW_WITHOUT_MODEL_S = 2.0  # the same while an aircraft is predicted without a model, which may come at any time [s]
 VALID_S = 15.0
 """Time for which a version of a proposal may be approved; the upload takes the rest of `DECISION_S` [s]."""
 _EARLY_S = 2.0  # the earliest start of a change: approved at once [s]
@@ -74,10 +75,11 @@ class AvoidedEvent:
 
 @dataclass(frozen=True)
 class Current:
-    """A published proposal, and the changes that its options consist of."""
+    """A published proposal, and the changes that its options consist of; `has_models`: of all aircraft concerned."""
 
     proposal: Proposal
     choices: tuple[tuple[Candidate, ...], ...]
+    has_models: bool = True
 
 
 @dataclass
@@ -97,6 +99,7 @@ class Proposer:
     def __post_init__(self) -> None:
         self._current: dict[tuple[int, AlertKey], Current] = {}
         self._computed_t: dict[tuple[int, AlertKey], float] = {}  # data time of the last attempt [s since 1970]
+        self._renew_s: dict[tuple[int, AlertKey], float] = {}  # until the next attempt [s]
         self._offered: OrderedDict[tuple[str, str], Option] = OrderedDict()  # by id of the proposal and digest
         self._executing: dict[int, float] = {}  # data time until which a change is executed, by UAV [s since 1970]
 
@@ -106,7 +109,7 @@ class Proposer:
 
     def discard(self, uav: int) -> None:
         """Forget the proposals of an aircraft that is no longer owned."""
-        for stored in (self._current, self._computed_t):
+        for stored in (self._current, self._computed_t, self._renew_s):
             for key in [key for key in tuple(stored) if key[0] == uav]:
                 stored.pop(key, None)  # type: ignore[attr-defined]
 
@@ -115,6 +118,7 @@ class Proposer:
         raised, withdrawn = {alert.about for alert in active}, []
         for key in [key for key in self._computed_t if key[0] == uav and key[1] not in raised]:
             del self._computed_t[key]
+            self._renew_s.pop(key, None)
         for key in [key for key in self._current if key[0] == uav and key[1] not in raised]:
             before = self._current.pop(key).proposal
             withdrawn.append(_without_options(before, now, "no longer predicted: the alert was cleared"))
@@ -124,7 +128,8 @@ class Proposer:
         """Return whether the proposal against an active alert is to be computed at data time `now` [s since 1970]."""
         if max(self._executing.get(uav, -inf) for uav in (alert.uav, alert.other)) > now:
             return False
-        return alert.kind in PROPOSED and not 0.0 <= now - self.computed_t(alert) < RENEW_S
+        renew_s = self._renew_s.get((alert.uav, alert.about), RENEW_S)
+        return alert.kind in PROPOSED and not 0.0 <= now - self.computed_t(alert) < renew_s
 
     def computed_t(self, alert: Alert) -> float:
         """Return when the proposal against an alert was last computed [s since 1970]; -inf: never."""
@@ -141,6 +146,7 @@ class Proposer:
         computed = self.compute(AvoidedEvent.of(alert), now, () if previous is None else previous.choices)
         if computed is None:
             return None
+        self._renew_s[key] = RENEW_S if computed.has_models else _RENEW_WITHOUT_MODEL_S
         if previous is not None:
             computed = replace(computed, proposal=msgspec.structs.replace(computed.proposal, id=previous.proposal.id))
         self._current[key] = computed
@@ -232,9 +238,6 @@ class Proposer:
         probability = problem.probability()
         if probability < RULES[event.kind].clear_below:
             return Current(_proposal(event, t, (), probability, "not predicted with the present plan"), ())
-        if without := [uav for uav in plans if not _has_model(plans[uav].twin)]:
-            text = f"uav-{without[0]} has no model yet: no change of plan is tried"
-            return Current(_proposal(event, t, (), probability, text), ())
         retained = _retained(problem, plans, previous)
         experiments: dict[int, list[PlanExperiment]] = {}
 
@@ -250,10 +253,12 @@ class Proposer:
         options = tuple(to_option(problem, solution, advantage, plans, t) for solution, advantage in chosen)
         choices = tuple(_choice(solution) for solution, _ in chosen)
         text = f"{_count(len(options))} it" if options else "no change that was tried avoids it"
+        if without := [uav for uav in plans if not _has_model(plans[uav].twin)]:
+            text += f"; uav-{without[0]} has no model yet and is predicted from its route alone"
         proposal = _proposal(event, t, options, probability, text)
         changed = sorted({change.uav for option in options for change in option.changes})
         paths = tuple(to_path(problem.present[uav], t) for uav in changed)
-        return Current(msgspec.structs.replace(proposal, present=paths), choices)
+        return Current(msgspec.structs.replace(proposal, present=paths), choices, not without)
 
     # --- inputs ------------------------------------------------------------------------------------------------------
 
@@ -327,7 +332,7 @@ def _retained(
 
 def _has_model(twin: Twin) -> bool:
     """Return whether a twin predicts with a model of its aircraft; the model of rotors is kinematic."""
-    return is_hovering(twin) or twin.models.active_model is not None or twin.models.point_mass is not None
+    return is_hovering(twin) or twin.models.has_model
 
 
 def _timely(problem: Problem, plans: dict[int, Plan], solutions: list[Solution]) -> list[tuple[Solution, str]]:

@@ -151,10 +151,10 @@ class Problem:
         """Return whether a change avoids the event of the aircraft, and creates no ground or geofence event."""
         before = self.present[experiment.uav].hazards
         for kind in LIMITS:
-            limit = RULES[kind].clear_below
-            if kind is not self.kind or experiment.uav != self.uav:
-                limit = max(limit, before.get(kind, 0.0))
-            if experiment.hazards.get(kind, 0.0) >= max(limit, 1e-9) and experiment.hazards.get(kind, 0.0) > 0.0:
+            probability = experiment.hazards.get(kind, 0.0)
+            is_avoided = kind is self.kind and experiment.uav == self.uav
+            may_remain = not is_avoided and probability <= before.get(kind, 0.0)  # as with the present plan
+            if probability >= RULES[kind].clear_below and not may_remain:
                 return False
         return True
 
@@ -166,7 +166,7 @@ class Problem:
         for pair, probability in after.items():
             if pair <= self.cluster and self.kind is AlertKind.CONFLICT:
                 remaining[pair] = probability
-            elif probability >= max(_CONFLICT.clear_below, self._before(pair)):
+            elif probability >= _CONFLICT.clear_below and probability > self._before(pair):
                 return None
         return remaining
 

@@ -42,6 +42,7 @@ from twin_worker.service.busy_fallback import (
 from twin_worker.service.identification_thread import CpuShareLimiter, IdentificationThread
 from twin_worker.service.proposal_thread import ProposalThread
 from twin_worker.service.queries import QueryHandlers, copy_twin
+from twin_worker.service.sibling_sharing import SiblingSharing
 from twin_worker.service.wind_sharing import WindSharing
 from twin_worker.service.work_rates import WorkRates
 from twin_worker.twin.state.budget import ComputeBudget, Schedule, Work
@@ -96,6 +97,7 @@ class Worker:
         self.proposals = ProposalThread(self, self.proposer, self.cpu_share)
         self.ownership = OwnershipProtocol(bus, uavs, self._twins)
         self.wind_sharing = WindSharing(bus, self.ownership)
+        self.sibling_sharing = SiblingSharing(bus, self.ownership, self.airframe)
         self._wakeup = threading.Event()
         self._fallback_lock = threading.Lock()  # in use while fallback predictions are published; the sweep waits
 
@@ -127,6 +129,7 @@ class Worker:
         self.bus.declare_queryable(Proposal, lambda uav, *_: handlers.proposals(uav, self.proposer))
         self.bus.declare_queryable(FleetState, lambda *_: [(self.state(), None)])
         self.wind_sharing.connect()
+        self.sibling_sharing.connect()
         for status, _ in self.bus.get(Status):
             self.ownership.on_aircraft(status.uav)
 
@@ -215,6 +218,7 @@ class Worker:
                     self.publish(prediction, owned)
                 continue
             self.wind_sharing.apply(owned)
+            self.sibling_sharing.apply(owned)
             try:
                 for result in _advance_all(owned, waiting, self.traffic):
                     if not is_superseded(result, owned):
@@ -314,7 +318,13 @@ class Worker:
         """Connect, sweep until `stop` is set, publish the fleet table once a second; then hand everything over."""
         self.ownership.threaded, self.quota.offloaded = True, frozenset({Work.IDENTIFY})
         self.connect()
-        loops = (self.ownership.run, self.identifier.run, self.proposals.run, self.wind_sharing.run)
+        loops = (
+            self.ownership.run,
+            self.identifier.run,
+            self.proposals.run,
+            self.wind_sharing.run,
+            self.sibling_sharing.run,
+        )
         threads = [threading.Thread(target=run, args=(stop,), daemon=True) for run in (*loops, self._publish_fallbacks)]
         for thread in threads:
             thread.start()

@@ -180,9 +180,13 @@ def _gram_matrices(model: DerivativesModel, window: Window, runs: np.ndarray) ->
 
 
 def _identified_information(model: DerivativesModel) -> np.ndarray:
-    """Return the information on each group in the identification window, in the unit of held-out data, (groups,)."""
+    """Return the information on each group in the unit of held-out data, (groups,).
+
+    It is that of the identification window and, where the prior was learnt from aircraft of one type, of the prior.
+    """
     D = model.par[:, None] * MASK
-    information = model.fisher_information / EFFECTIVE_FRACTION
+    identified = model.fisher_information + (model.prior_precision if model.siblings else 0.0)
+    information = identified / EFFECTIVE_FRACTION
     cross = information[list(_NUISANCE)] @ D
     by_nuisance = _solve(information[np.ix_(_NUISANCE, _NUISANCE)], cross)
     return np.einsum("ag,ab,bg->g", D, information, D) - np.einsum("ng,ng->g", cross, by_nuisance)

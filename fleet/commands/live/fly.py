@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
     faulty = faults_of(args, args.uavs)
     uavs: list[drive.SimulatedAircraft] = []
     if args.story:
-        uavs += story_aircraft(len(args.uavs), args.seed, args.autopilot)
+        uavs += story_aircraft(len(args.uavs), args.seed, **options)
     for uav, aircraft in () if args.story else zip(args.uavs, aircraft_types(args.aircraft, args.uavs), strict=True):
         if aircraft in MULTIROTORS:
             uavs.append(_multirotor_class()(uav, args.seed, aircraft=aircraft, **options))

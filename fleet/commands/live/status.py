@@ -5,6 +5,7 @@ import json
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from math import atan2, degrees, hypot, isfinite
 
 import msgspec
@@ -18,7 +19,7 @@ from fleet.bus.codec import is_plausible_epoch
 from fleet.bus.session import Bus, connect
 from fleet.cli import stop_on_signal
 from fleet.config import bus_config_from, router_arguments
-from fleet.contract import Claim, FleetRow, FleetState, GatewayCounters, Status, TwinState, WindField
+from fleet.contract import Claim, FleetRow, FleetState, GatewayCounters, Siblings, Status, TwinState, WindField
 from fleet.process.sanitise import printable
 from fleet.report.report_text import id_ranges
 
@@ -54,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
             json.dump(as_objects(rows), sys.stdout, indent=1)
             print()
         else:
-            Console().print(_overview(rows, processes(bus), wind_text(bus)))
+            Console().print(_overview(rows, processes(bus), (wind_text(bus), *sibling_texts(bus))))
     return 0 if rows else 1
 
 
@@ -65,7 +66,7 @@ def watch(bus: Bus, stop: threading.Event, console: Console) -> int:
         while not stop.is_set():
             rows = fleet_rows(bus)
             heading = Text(f"{time.strftime('%H:%M:%S')}, every {WATCH_S:g} s until Ctrl-C", style="dim")
-            view = Group(heading, _overview(rows, processes(bus), wind_text(bus)))
+            view = Group(heading, _overview(rows, processes(bus), (wind_text(bus), *sibling_texts(bus))))
             if console.is_terminal:
                 live.update(view, refresh=True)
             else:
@@ -74,11 +75,12 @@ def watch(bus: Bus, stop: threading.Event, console: Console) -> int:
     return 0 if rows else 1
 
 
-def _overview(rows: list[FleetRow], running: list[tuple[str, str, str, str]], wind: str) -> RenderableType:
-    """Return the tables of aircraft and processes, and the wind."""
+def _overview(rows: list[FleetRow], running: list[tuple[str, str, str, str]], shared: Sequence[str]) -> RenderableType:
+    """Return the tables of aircraft and processes, and what the aircraft share."""
     empty = Text("no UAV known yet: is a gateway running and an aircraft connected?")
     parts: list[RenderableType] = [fleet_table(rows) if rows else empty]
-    parts += [Text(""), Text(wind)] if wind else []
+    texts = [Text(text) for text in shared if text]
+    parts += [Text(""), *texts] if texts else []
     return Group(*parts, Text(""), machines(running)) if running else Group(*parts)
 
 
@@ -94,6 +96,16 @@ def wind_text(bus: Bus) -> str:
         f"wind field: {hypot(north, east):.1f} m/s from {direction:.0f}° at 100 m, ± {newest.wind_sigma:.1f} m/s, "
         f"estimated from {len(newest.uavs)} aircraft"
     )
+
+
+def sibling_texts(bus: Bus) -> list[str]:
+    """Query what aircraft of each type share; describe each type, and the aircraft that differ."""
+    replies = [(stamp, one) for one, stamp in bus.get(Siblings) if stamp and is_plausible_epoch(stamp.epoch)]
+    if not replies:
+        return []
+    types = max(replies, key=lambda pair: pair[0])[1].types
+    texts = [f"{printable(one.airframe_type)}: {len(one.uavs)} aircraft share what they have learnt" for one in types]
+    return texts + [printable(difference.sentence) for one in types for difference in one.differences]
 
 
 def fleet_rows(bus: Bus) -> list[FleetRow]:

@@ -93,6 +93,7 @@ def make(told: Told, plan: Plan, radius: float = 0.0) -> SimulatedUav:
 def fly(told: Told, plan: Plan, seconds: float) -> Flight:
     """Fly it alone; give what physics says of it."""
     uav, rows, seq = make(told, plan), [], []
+    uav.silent = True
     for t in np.arange(0.0, seconds, STEP_S):
         uav.step(float(t))
         rows.append(uav.aircraft.truth().p)

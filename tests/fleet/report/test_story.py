@@ -105,3 +105,17 @@ def test_a_refusal_is_told_and_other_executions_are_not() -> None:
 def test_commands_are_allowed_for_simulated_aircraft_only(arguments: tuple[str, ...], capsys) -> None:
     assert main(list(arguments)) == 2
     assert "--story: found" in capsys.readouterr().err
+
+
+def test_the_scene_ends_although_an_aircraft_stops_sending() -> None:
+    story = ConflictStory()
+    story.begin()
+    story.on_alert(alert())
+    for second in range(int(MEET_S) + 120):
+        t = second + np.arange(0.0, 1.0, 0.1)
+        x = to_geodetic(HOME, np.column_stack([t, t, -t])).astype(np.int64)
+        rows = Rows(Array.of(T + t, "<f8"), Array.of(x, "<f8"))
+        for uav in (0,) if second > 5 else (0, 1):
+            story.on_sample(Sample(uav=uav, t=T + float(t[-1]), position=rows))
+    assert story.ended and "UAV 1 sent no positions" in story.sentences[-1]
+    assert not any(story._positions.values())

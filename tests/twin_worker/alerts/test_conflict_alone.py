@@ -17,7 +17,7 @@ from twin_worker.alerts.feasibility import FlightLimits, MissionState, feasibili
 from twin_worker.alerts.gaussian_forecast import axis_z, to_gaussian
 from twin_worker.alerts.geofence import GeofenceLimits, geofence_hazard, ground_hazard, read_geofence
 from twin_worker.alerts.hysteresis import RULES, AlertState, HazardEstimate
-from twin_worker.twin.step import Twin, advance
+from twin_worker.twin.state.state import Twin, ingest
 from twin_worker.twin.steps.alerts import prediction_alerts
 
 NAN, INF = float("nan"), float("inf")
@@ -233,11 +233,12 @@ def test_hostile_missions_are_judged_with_a_probability(items, wind) -> None:
 # --- the watch of a twin --------------------------------------------------------------------------------------------
 
 
-def flying(**changes) -> Twin:
-    """A twin above home whose aircraft is on its mission."""
+def flying(seconds: float = 61.0, **changes) -> Twin:
+    """A twin above home whose aircraft is on its mission, and which has no model."""
     twin = Twin.of(7)
-    for message in f.messages(f.turn(3.0), uav=7):
-        advance(twin, (message,))
+    for message in f.messages(f.turn(seconds), uav=7):
+        ingest(twin, message)
+    twin.telemetry.advance(f.T0 + seconds)
     status = Status(uav=7, t=f.T0, mode="AUTO", armed=True, autopilot="ardupilot", vehicle="fixed_wing")
     twin.onboard.status = msgspec.structs.replace(status, **changes)
     twin.onboard.mission = Mission(
@@ -317,6 +318,14 @@ def test_a_fence_from_parameters_is_watched() -> None:
     twin.onboard.params = Params(uav=7, t=T, values={"FENCE_ENABLE": 1.0, "FENCE_TYPE": 2.0, "FENCE_RADIUS": 1500.0})
     (alert,) = told(twin, straight(7))
     assert alert.kind is AlertKind.GEOFENCE and alert.predicted_t == pytest.approx(T + 75, abs=4)
+
+
+def test_a_new_aircraft_is_warned_of_what_is_near_until_it_has_a_model() -> None:
+    twin, far = flying(20.0), straight(7, p=(0.0, 0.0, -75.0), v=(20.0, 0.0, 1.0), seq=1)
+    near = straight(7, p=(0.0, 0.0, -45.0), v=(20.0, 0.0, 1.0), seq=1)
+    assert told(twin, far) == []
+    assert [a.kind for a in told(flying(20.0), near)] == [AlertKind.GROUND]
+    assert [a.kind for a in told(flying(61.0), far)] == [AlertKind.GROUND]
 
 
 def test_home_is_item_0_or_where_it_stood() -> None:

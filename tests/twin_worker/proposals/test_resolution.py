@@ -90,6 +90,17 @@ def test_a_hazard_of_its_own_excludes_a_change():
     assert solve(given, {1: [low]}.__getitem__) == []
 
 
+def test_a_hazard_of_the_present_plan_may_remain_but_not_grow():
+    present = along(1, 0.0)
+    present.hazards[AlertKind.NOT_ACHIEVABLE] = 0.9
+    given = problem([present, along(2, 1.5)], (1,))
+    same, worse = along(1, 0.0, 40.0), along(1, 0.0, 60.0)
+    same.hazards[AlertKind.NOT_ACHIEVABLE] = 0.9
+    worse.hazards[AlertKind.NOT_ACHIEVABLE] = 0.95
+    (solution,) = solve(given, {1: [same, worse]}.__getitem__)
+    assert solution.experiments == (same,)
+
+
 def test_the_front_has_no_solution_that_another_surpasses():
     given = problem([along(1, 0.0), along(2, 1.5)], (1, 2))
     offered = {1: [along(1, 0.0, 40.0), along(1, 0.0, 60.0), along(1, 0.0, speed=14.0)], 2: [along(2, 1.5, 50.0)]}

@@ -4,8 +4,10 @@ Exact kinematics and the mean wind in body axes couple both axes; the linearised
 The information of the last verified model, partly discounted, is the prior of the next window.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import cos
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -59,9 +61,7 @@ def prior(
         floor |= {n: _SIGMA_FLOOR[n] * l for n in ("M_0", "M_dt", "L_0", "N_0")}
     else:
         mean |= derivatives(airframe, float(trim_velocity[0]))
-    mean["X_0"] = G * trim_velocity[1] / trim_velocity[0] - mean["X_dt"] * trim[3] - mean["X_de"] * trim[1]
-    mean["Z_0"] = -G * cos(trim_velocity[1] / trim_velocity[0]) - mean["Z_de"] * trim[1]
-    mean["M_0"] = -mean["M_de"] * trim[1] - mean["M_dt"] * trim[3]
+    _set_offsets(mean, trim_velocity, trim)
     for name, (main, fraction) in _CROSS_TERMS.items():
         floor[name] += fraction * abs(mean[main])
     par = np.array([mean[name] for name in NAMES])
@@ -70,6 +70,13 @@ def prior(
     sigma = airframe.value["doubt"] * (magnitude + [floor.get(name, 0.0) for name in NAMES])
     par[-2:], sigma[-2:] = wind[:2], _WIND_SIGMA
     return par, sigma
+
+
+def _set_offsets(mean: dict[str, float], trim_velocity: np.ndarray, trim: np.ndarray) -> None:
+    """Set the offsets such that level flight at trim is an equilibrium."""
+    mean["X_0"] = G * trim_velocity[1] / trim_velocity[0] - mean["X_dt"] * trim[3] - mean["X_de"] * trim[1]
+    mean["Z_0"] = -G * cos(trim_velocity[1] / trim_velocity[0]) - mean["Z_de"] * trim[1]
+    mean["M_0"] = -mean["M_de"] * trim[1] - mean["M_dt"] * trim[3]
 
 
 def _scale(name: str, k: float, l: float) -> float:
@@ -105,6 +112,7 @@ class DerivativesModel:
         airframe_prior: mean and precision from the airframe alone
         t0, t1: identification window [s since 1970]
         steps: search steps
+        siblings: aircraft of its type that the prior was learnt from; 0: none
     """
 
     par: np.ndarray
@@ -117,6 +125,7 @@ class DerivativesModel:
     t0: float
     t1: float
     steps: int
+    siblings: int = 0
 
     @property
     def covariance(self) -> np.ndarray:
@@ -135,12 +144,26 @@ class DerivativesModel:
         return out
 
 
+class TypePrior(NamedTuple):
+    """Prior learnt from aircraft of one type.
+
+    Attributes:
+        siblings: number of aircraft
+        at: returns indices, mean and covariance of some parameters at an airspeed [m/s], (k,), (k,), (k, k)
+    """
+
+    siblings: int
+    at: Callable[[float], tuple[np.ndarray, np.ndarray, np.ndarray]]
+
+
 def identify(
     window: Window,
     wind: np.ndarray,
     airframe: Airframe,
     prior_model: DerivativesModel | None = None,
     warm_start: DerivativesModel | None = None,
+    *,
+    of_type: TypePrior | None = None,
 ) -> DerivativesModel:
     """Identify a derivatives model from one window.
 
@@ -150,6 +173,7 @@ def identify(
         airframe: prior of the aircraft or of its class
         prior_model: the last verified model; its information from before this window is the prior
         warm_start: model of a similar window that starts the search; not a prior
+        of_type: prior learnt from other aircraft of its type, where `prior_model` is None
     Raises:
         ValueError: if the window has too few gap-free rows, or the search fails; wait for more data.
     """
@@ -157,7 +181,11 @@ def identify(
     if not len(segments):
         raise ValueError("identify: found no 2 s of unbroken data, needs them; wait")
     y, delta = window.over_ground, lagged(window.u, window.dt, TAU)
-    mean, precision, trim_velocity, nominal = _prior_from(window, wind, airframe, prior_model)
+    if prior_model is None:
+        mean, precision, trim_velocity = _first_prior(window, wind, airframe, of_type)
+        nominal = mean, precision
+    else:
+        mean, precision, trim_velocity, nominal = _continued_prior(window, prior_model)
     problem = EstimationProblem(y, delta, segments, trim_velocity, window.dt, EFFECTIVE_FRACTION)
     result = None
     if warm_start is not None:
@@ -180,6 +208,7 @@ def identify(
         float(t[0]),
         float(t[-1]),
         result.steps,
+        prior_model.siblings if prior_model is not None else of_type.siblings if of_type is not None else 0,
     )
 
 
@@ -189,20 +218,31 @@ def _is_finite(result: EstimationResult) -> bool:
     )
 
 
-def _prior_from(
-    window: Window, wind: np.ndarray, airframe: Airframe, prior_model: DerivativesModel | None
+def _first_prior(
+    window: Window, wind: np.ndarray, airframe: Airframe, of_type: TypePrior | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return prior mean and precision of the parameters from the airframe and from aircraft of its type, and U0 W0."""
+    ok = window.ok
+    air, trim = window.x[ok, :3].mean(axis=0), window.u[ok].mean(axis=0)
+    trim_velocity = np.array([max(np.linalg.norm(window.x[ok, :3], axis=1).mean(), 1.0), air[2]])
+    mean, sigma = prior(airframe, trim_velocity, trim, wind)
+    precision = np.diag(sigma**-2.0)
+    if of_type is not None:
+        rows, values, covariance = of_type.at(float(trim_velocity[0]))
+        mean[rows], precision[np.ix_(rows, rows)] = values, np.linalg.inv(covariance)
+        known = dict(zip(NAMES, mean, strict=True))
+        _set_offsets(known, trim_velocity, trim)
+        mean = np.array([known[name] for name in NAMES])
+    return mean, precision, trim_velocity
+
+
+def _continued_prior(
+    window: Window, prior_model: DerivativesModel
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Return prior mean and precision of the parameters, U0 W0, and the prior from the airframe alone.
+    """Return prior mean and precision of the parameters, U0 W0, and the prior of the first window.
 
     Only the information of the last model from before this window counts, discounted, so that no data count twice.
     """
-    if prior_model is None:
-        ok = window.ok
-        air = window.x[ok, :3].mean(axis=0)
-        trim_velocity = np.array([max(np.linalg.norm(window.x[ok, :3], axis=1).mean(), 1.0), air[2]])
-        mean, sigma = prior(airframe, trim_velocity, window.u[ok].mean(axis=0), wind)
-        precision = np.diag(sigma**-2.0)
-        return mean, precision, trim_velocity, (mean, precision)
     nominal, nominal_precision = prior_model.airframe_prior
     elapsed = float(np.clip((window.t[0] - prior_model.t0) / (prior_model.t1 - prior_model.t0), 0.0, 1.0))
     root = np.sqrt(_RETENTION_VECTOR**elapsed)

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 import msgspec
 import numpy as np
 
-from fleet.contract import Model, Outcome, TwinState, Verdict
+from fleet.contract import Model, Outcome, SiblingType, TwinState, Verdict
 from twin_worker.estimation.wind_filter import WindFilter
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
 from twin_worker.identification.fixed_wing.plant import Plant
@@ -74,6 +74,7 @@ class Identification(msgspec.Struct):
         verdict: on the newest model
         warm_start: newest model, verified or not: the next search begins there
         prior_model: newest verified model: the prior of the next
+        siblings: what aircraft of its type share; None: not known
         message: newest model published
         shrinkage: weights of model and persistence, by look-ahead
         data_from: telemetry before is not used [s since 1970]
@@ -86,6 +87,7 @@ class Identification(msgspec.Struct):
     verdict: Verdict
     warm_start: DerivativesModel | None = None
     prior_model: DerivativesModel | None = None
+    siblings: SiblingType | None = None
     message: Model | None = None
     shrinkage: Shrinkage = msgspec.field(default_factory=Shrinkage)
     data_from: float = -np.inf
@@ -107,6 +109,10 @@ class Identification(msgspec.Struct):
     def store(self, model: DerivativesModel) -> None:
         """Store the newest model."""
         self.warm_start = model
+
+    def set_siblings(self, siblings: SiblingType | None) -> None:
+        """Store what aircraft of its type share, for the first models; it must be valid, see `type_defect`."""
+        self.siblings = siblings
 
     def store_prior(self, model: DerivativesModel | None) -> None:
         """Store the newest verified model."""
@@ -213,6 +219,11 @@ class ModelBank(msgspec.Struct):
             return TwinState.WAITING
         plausible = self.active_verdict is not None and self.active_verdict.outcome is Outcome.PLAUSIBLE
         return TwinState.PLAUSIBLE if plausible else TwinState.VERIFIED
+
+    @property
+    def has_model(self) -> bool:
+        """Return whether an identified model or a point mass can predict."""
+        return self.active_model is not None or self.point_mass is not None
 
     def add(self, candidate: VerifiedModel) -> None:
         """Add a candidate."""

@@ -25,7 +25,8 @@ from twin_worker.twin.steps.kinematic_prediction import is_hovering
 _MIN_SCORED = 30  # minimum number of scored predictions; below it, the 90 % horizon comes from the prior table [-]
 _TURN_RATE_REACH_S = 15.0  # ground and geofence look-ahead of turn-rate predictions [s]
 _REACH_S = 90.0  # maximum look-ahead; beyond it, the tube is wider than usual geofence margins [s]
-_DEFAULT_REACH_S = 30.0  # look-ahead for an uncalibrated tube [s]
+_DEFAULT_REACH_S = 30.0  # look-ahead for an uncalibrated tube, and for a new aircraft without a model [s]
+_NEW_S = 60.0  # flight after which an aircraft is no longer new; the tubes are calibrated on longer ones [s]
 _TURN_RATE_GRACE_S = (
     20.0  # on a mission, turn-rate predictions raise alerts only after this time without a better method [s]
 )
@@ -87,7 +88,7 @@ def limit_hazards(twin: Twin, gaussian: GaussianForecast) -> list[HazardEstimate
         return [_not_predicted(AlertKind.GROUND), _not_predicted(AlertKind.GEOFENCE)]
     margin = MIN_HEIGHT_ROTORS_M if on_rotors else MIN_HEIGHT_WINGS_M
     twin.alerts.climbed_to(float(height_above_home(gaussian, home_origin)[0]))
-    until = gaussian.prediction.t + reach_s(gaussian.prediction)
+    until = gaussian.prediction.t + reach_s(twin, gaussian.prediction)
     findings = [_not_predicted(AlertKind.GROUND)]
     near_ground = twin.alerts.max_height_m <= margin or _is_landing(
         twin, on_rotors
@@ -105,11 +106,17 @@ def limit_hazards(twin: Twin, gaussian: GaussianForecast) -> list[HazardEstimate
     ]
 
 
-def reach_s(prediction: Prediction) -> float:
-    """Return the look-ahead up to which a prediction is used for ground and geofence alerts [s]."""
+def reach_s(twin: Twin, prediction: Prediction) -> float:
+    """Return the look-ahead up to which a prediction is used for ground and geofence alerts [s].
+
+    A new aircraft without a model is predicted with a wind that is hardly known yet.
+    """
     if prediction.method == "imm":
         return _TURN_RATE_REACH_S
-    return _DEFAULT_REACH_S if prediction.calibration.startswith(UNCALIBRATED) else _REACH_S
+    t, _ = twin.telemetry.history.rows("position")
+    is_new = not len(t) or twin.telemetry.history.newest - t[0] < _NEW_S
+    is_uncertain = is_new and not twin.models.has_model and not is_hovering(twin)
+    return _DEFAULT_REACH_S if is_uncertain or prediction.calibration.startswith(UNCALIBRATED) else _REACH_S
 
 
 def _is_landing(twin: Twin, on_rotors: bool) -> bool:

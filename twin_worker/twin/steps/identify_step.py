@@ -1,5 +1,8 @@
 """Identification step: requirements, window, identification, verification on held-out data, selection, publication."""
 
+from functools import partial
+from math import log2
+
 import msgspec
 import numpy as np
 
@@ -10,8 +13,9 @@ from fleet.physics.wrench import NAMES
 from fleet.process.sanitise import format_below
 from fleet.window import LONGEST_GAP, MAX_GAP_S, Window
 from twin_worker.identification.fixed_wing import derivatives_model
-from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel, linearise
+from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel, TypePrior, linearise
 from twin_worker.identification.fixed_wing.plant import PAPER, Plant
+from twin_worker.identification.fixed_wing.siblings import prior_of_type, sibling_data
 from twin_worker.identification.linear.linear_model import AXES, identify_axis
 from twin_worker.prediction.closed_loop import InitialCondition, fly_from, synchronise_controller
 from twin_worker.prediction.replay_window import Rollout
@@ -35,6 +39,9 @@ def model_message(twin: Twin, window: Window) -> Model:
     axes: tuple[LinearModel | None, LinearModel | None] = (None, None)
     if isinstance(plant, DerivativesModel):
         axes, derivatives = linearise(plant, window), derivatives_message(plant, twin.config.airframe.name)
+        kind, throttle = airframe_type(twin), float(window.u[window.ok, 3].mean())
+        data = sibling_data(plant, throttle, kind) if kind else None
+        derivatives = msgspec.structs.replace(derivatives, data=data, siblings=plant.siblings)
     elif plant is not None:
         axes = plant[0].linear(), plant[1].linear()
     return Model(
@@ -82,6 +89,41 @@ def _describe(data_share: np.ndarray, airframe: str) -> str:
     from_prior = [name for name, share in zip(NAMES, data_share, strict=True) if share <= _MIN_DATA_SHARE]
     suffix = f"; from the prior: {' '.join(from_prior)}" if from_prior else ""
     return f"{by_data} of {len(NAMES)} parameters determined by the data, prior {airframe}{suffix}"
+
+
+_MASS_PARAMETERS = ("WEIGHT_GROSS", "WEIGHT_BASE")  # of PX4 [kg]
+_MASS_CLASSES = 2.0  # per factor of 2 in mass
+_MAX_AIRSPEED_RATIO = 1.25  # of aircraft of one type: another wing loading is another type
+
+
+def airframe_type(twin: Twin) -> str:
+    """Return the type of aircraft: vehicle, airframe parameter or file, mass class; empty: it is not known.
+
+    An airframe file that describes a class of aircraft names no type, nor does an airframe parameter of 0.
+    """
+    airframe, params = twin.config.airframe, twin.received_params
+    autostart = int(params.get("SYS_AUTOSTART", 0.0))
+    if not twin.vehicle_class.has_wings or (airframe.scale and not autostart):
+        return ""
+    masses = [params[name] for name in _MASS_PARAMETERS if params.get(name, 0.0) > 0.0]
+    mass = masses[0] if masses else 0.0 if airframe.scale else airframe.value["mass"]
+    mass_class = (
+        f"{2.0 ** (round(_MASS_CLASSES * log2(mass)) / _MASS_CLASSES):.1f} kg" if mass > 0.0 else "mass unknown"
+    )
+    return f"{twin.vehicle}, {airframe.name}, {autostart}, {mass_class}"
+
+
+def _type_prior(twin: Twin, window: Window) -> TypePrior | None:
+    """Return the prior that aircraft of its type have learnt, for a first model; None: there is none that fits."""
+    siblings = twin.identification.siblings
+    if siblings is None or twin.identification.prior_model is not None or twin.config.method == PAPER:
+        return None
+    if siblings.airframe_type != airframe_type(twin):
+        return None
+    airspeed = float(np.linalg.norm(window.x[window.ok, :3], axis=1).mean()) if window.ok.any() else 0.0
+    if not 1.0 / _MAX_AIRSPEED_RATIO < airspeed / siblings.airspeed < _MAX_AIRSPEED_RATIO:
+        return None
+    return TypePrior(len(set(siblings.uavs) - {twin.config.uav}), partial(prior_of_type, siblings))
 
 
 SELECTION_PERIOD_S = 6.0  # between closed-loop runs of the same models [s]
@@ -172,6 +214,8 @@ def missing_telemetry(history: TelemetryHistory) -> str:
 
 
 MIN_WINDOW_S = 30.0  # shortest window for identification [s]
+_MIN_SIBLING_WINDOW_S = 14.0  # the same with a prior learnt from aircraft of its type [s]
+_SIBLING_TRAINING_S = 5.0  # of such a window that is not held out [s]
 MIN_WING_SPEED = 6.0  # forward airspeed below which no flight on wings is possible [m/s]
 _WINDOW_FACTOR = 17.0  # window length in U0 / g: faster aircraft have slower modes [-]
 _WINDOW_LIMITS_S = 35.0, 95.0  # limits of the window length [s]
@@ -199,10 +243,12 @@ def identify_and_verify(twin: Twin) -> list[Message]:
         return []
     if twin.models.active_model is None:
         twin.prediction.set_learning_state(TwinState.IDENTIFYING)
+    of_type = _type_prior(twin, window)
     fraction = _HOLD_OUT_FRACTION[twin.config.method != PAPER]
-    n_train = len(window) - int(np.clip(fraction * len(window), *_hold_out_limits(twin)))
+    held_out = fraction * len(window) if of_type is None else len(window) - _SIBLING_TRAINING_S / DT
+    n_train = len(window) - int(np.clip(held_out, *_hold_out_limits(twin)))
     try:
-        plant = _identify(twin, window.part(0, n_train))
+        plant = _identify(twin, window.part(0, n_train), of_type)
     except (ValueError, np.linalg.LinAlgError) as error:
         attempts, sentence = twin.identification.tries, f"{twin.name}: {error}"
         twin.identification.conclude(Verdict(outcome=Outcome.INSUFFICIENT_DATA, sentence=sentence, attempts=attempts))
@@ -259,7 +305,8 @@ def _insufficient_data(twin: Twin, window: Window | None) -> Verdict | None:
         sentence = f"{twin.name}: a {twin.vehicle} has no wings to identify; {twin.models.multirotor}"
         return Verdict(outcome=Outcome.NOT_IDENTIFIABLE, sentence=sentence)
     available_s = 0.0 if window is None else float(window.ok.sum() * DT)
-    if window is not None and available_s >= MIN_WINDOW_S:
+    needed_s = MIN_WINDOW_S if window is None or _type_prior(twin, window) is None else _MIN_SIBLING_WINDOW_S
+    if window is not None and available_s >= needed_s:
         return None
     condition = " on its wings" if twin.vehicle_class.is_vtol else ""
     missing = missing_telemetry(twin.telemetry.history) or "wait"
@@ -270,13 +317,17 @@ def _insufficient_data(twin: Twin, window: Window | None) -> Verdict | None:
     return Verdict(outcome=Outcome.INSUFFICIENT_DATA, sentence=sentence)
 
 
-def _identify(twin: Twin, training: Window) -> Plant:
-    """Identify the aircraft; each further attempt uses another initial value or another share of the window."""
+def _identify(twin: Twin, training: Window, of_type: TypePrior | None) -> Plant:
+    """Identify the aircraft; each further attempt uses another initial value or another share of the window.
+
+    What aircraft of its type have learnt is used in every other attempt, so that it cannot mislead for long.
+    """
     attempt, t_end = twin.identification.tries % len(_WINDOW_FRACTION), float(training.t[-1])
     if twin.config.method != PAPER and not twin.identification.fresh_start.due(t_end, _COLD_START_PERIOD_S):
         attempt = 0  # a cold start on nearly the same window would return the same result
     else:
         twin.identification.count_try()
+    of_type = None if attempt % 2 else of_type
     training = training.part(int(len(training) * (1 - _WINDOW_FRACTION[attempt])), len(training))
     if twin.config.method != PAPER:
         newest, prior_model = twin.identification.warm_start, twin.identification.prior_model
@@ -284,7 +335,9 @@ def _identify(twin: Twin, training: Window) -> Plant:
         if warm_start is None:
             twin.identification.fresh_start.restart(t_end)
         wind = twin.environment.wind.wind
-        model = derivatives_model.identify(training, wind, twin.config.airframe, prior_model, warm_start)
+        model = derivatives_model.identify(
+            training, wind, twin.config.airframe, prior_model, warm_start, of_type=of_type
+        )
         twin.identification.store(model)
         return model
     previous = twin.models.active_model if isinstance(twin.models.active_model, tuple) else (None, None)

@@ -175,8 +175,7 @@ def _best_forecast(twin: Twin, recent: Track, ahead: np.ndarray) -> tuple[PathFo
         _set_state(twin, twin.models.state)
         resting_path = np.tile(recent.p[-1], (len(ahead), 1))
         return PathForecast(resting_path, "imm", _NO_LAW, -1, EVENT_TEXTS[Event.TOUCH_DOWN]), float(recent.t[-1])
-    has_model = twin.models.active_model is not None or twin.models.point_mass is not None
-    if has_model and not is_hovering(twin) and reported_path(twin) is None:
+    if twin.models.has_model and not is_hovering(twin) and reported_path(twin) is None:
         model_forecast = no_prediction(twin.no_route_reason() or "telemetry has gaps: no initial state for the model")
         if window is not None and usable and not twin.no_route_reason():
             model_forecast = predict_route(twin, window, recent, ahead)

@@ -31,3 +31,10 @@ def test_the_others_are_far_away() -> None:
     for count in (1, MAX_UAVS + 1):
         with pytest.raises(ValueError, match="expected 2 to"):
             conflict_plans(count, 1)
+
+
+def test_the_scene_has_the_weather_of_the_fleet() -> None:
+    calm, windy = (story_aircraft(2, 1, "ardupilot", wind=wind, turbulence=0) for wind in (0.0, 8.0))
+    for one, other in zip(calm, windy, strict=True):
+        assert (one.setup.weather.mean, other.setup.weather.mean) == (0.0, 8.0)
+        assert one.setup.weather.severity == 0
