@@ -6,7 +6,7 @@ velocity through the air (u, v, w) = R' (V - wind):
     w_i' = (w_ic - w_i) / tau,   w_ic^2 = (1 - expo) u_i + expo u_i^2
     f_x  = -d sum(w_i) u - c |V| u + b_x,   f_y likewise with v
     f_z  = -k sum(w_i^2) - k_c sum(w_i) w - k_h (u^2 + v^2) + b_z
-    p'   = G_p sum(s_pi w_i^2) + p_0, q' and r' likewise; r' also with the change of rotor speed
+    p'   = sum(G_pi w_i^2) - d_p p, q' and r' likewise; r' also with the change of rotor speed
 
 Drag of rotors is linear in airspeed, that of the frame quadratic. Wind, lag and thrust curve enter nonlinearly and are
 searched for; the other parameters follow from them by linear least squares (variable projection).
@@ -18,6 +18,7 @@ drag); Svacha, Mohta & Kumar 2017 (drag and rotor speed); Golub & Pereyra 1973 (
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import solve_toeplitz
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
@@ -27,6 +28,9 @@ from fleet.frames import G
 # Roll, pitch and yaw moment of the thrust of each motor, (4, 3) [-]
 MIXER_X = np.array([[-1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, -1.0], [-1.0, -1.0, -1.0]])
 _BIAS_STD = 0.05  # accelerometer bias of a calibrated sensor [m/s2]
+_MEMORY_S = 0.3  # of the autoregression of the residuals [s]
+_WINDOW_S = 0.2  # over which moments are integrated [s]
+_PASSES = 3  # of the search, with the whitening of the previous one
 _MIN_S = 30.0  # shortest flight [s]
 _START = (0.0, 0.0, 0.05, 0.6)  # wind north, east [m/s], tau [s], expo [-]
 _BOUNDS = ((-20.0, -20.0, 0.005, 0.0), (20.0, 20.0, 0.3, 1.0))
@@ -52,8 +56,9 @@ class RotorModel(NamedTuple):
     d: float  # rotor drag [1/s]
     c: float  # frame drag [1/m]
     bias: np.ndarray  # of the specific force, (3,) [m/s2]
-    torque: np.ndarray  # angular acceleration per unit of mixed w^2, (3,) [rad/s2]
-    trim: np.ndarray  # angular acceleration at equal outputs, as of a CG offset, (3,) [rad/s2]
+    offset: float  # vertical acceleration that the velocities show beside the above, down [m/s2]
+    torque: np.ndarray  # angular acceleration about each axis by each motor at full speed, (4, 3) [rad/s2]
+    damping: np.ndarray  # of p, q, r, (3,) [1/s]
     spin: float  # yaw acceleration per change of mixed rotor speed [rad/s]
     wind: np.ndarray  # mean wind north, east [m/s]
     tau: float  # motor lag [s]
@@ -86,6 +91,9 @@ def rotor_speeds(outputs: np.ndarray, dt: float, tau: float, expo: float) -> np.
 def identify_rotors(data: RotorData) -> RotorModel:
     """Identify the rotor model of one flight.
 
+    The autopilot answers gusts with the outputs, so the residuals are not independent of them: equations and residuals
+    are whitened by an autoregression of the residuals, renewed after each search (generalised least squares).
+
     Raises:
         ValueError: when the flight is too short.
     """
@@ -93,63 +101,103 @@ def identify_rotors(data: RotorData) -> RotorModel:
     if seconds < _MIN_S:
         raise ValueError(f"rotor model: found {seconds:.0f} s of flight, expected {_MIN_S:.0f} s; record a longer one")
     R = rotation(data.attitude)
+    order = round(_MEMORY_S / data.dt)
+    whitening = [np.ones(1)] * 3
+    x = np.array(_START)
+    for _ in range(_PASSES):
 
-    def residual(x: np.ndarray) -> np.ndarray:
-        return np.concatenate([part[1] for part in _force_fits(data, R, x)])
+        def residual(x: np.ndarray, filters: list[np.ndarray] = whitening) -> np.ndarray:
+            return np.concatenate([fit.whitened for fit in _force_fits(data, R, x, filters)])
 
-    best = least_squares(residual, _START, bounds=_BOUNDS, x_scale=(1.0, 1.0, 0.01, 0.1), diff_step=1e-4)
-    (horizontal, _), (vertical, _) = _force_fits(data, R, best.x)
-    tau, expo = float(best.x[2]), float(best.x[3])
-    torque, trim, spin = _moments(data, rotor_speeds(data.outputs, data.dt, tau, expo))
-    d, c, b_x, b_y = horizontal
-    k, k_c, k_h, b_z = vertical
+        x = least_squares(residual, x, bounds=_BOUNDS, x_scale=(1.0, 1.0, 0.01, 0.1), diff_step=1e-4).x
+        horizontal, vertical = _force_fits(data, R, x, whitening)
+        raw = (*np.split(horizontal.raw, 2), vertical.raw)
+        whitening = [autoregression(r - r.mean(), order) for r in raw]
+    horizontal, vertical = _force_fits(data, R, x, whitening)
+    tau, expo = float(x[2]), float(x[3])
+    torque, damping, spin = _moments(data, rotor_speeds(data.outputs, data.dt, tau, expo))
+    d, c, b_x, b_y = horizontal.coefficients
+    k, k_c, k_h, b_z = vertical.coefficients
     bias = np.array([b_x, b_y, b_z])
-    return RotorModel(k, k_c, k_h, d, c, bias, torque, trim, spin, best.x[:2].copy(), tau, expo)
+    model = RotorModel(k, k_c, k_h, d, c, bias, 0.0, torque, damping, spin, x[:2].copy(), tau, expo)
+    return model._replace(offset=_vertical_offset(model, data, R))
 
 
-def _force_fits(data: RotorData, R: np.ndarray, x: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return coefficients and residuals of the horizontal and the vertical specific force, given wind, lag, curve."""
+def autoregression(r: np.ndarray, order: int) -> np.ndarray:
+    """Return the prediction error filter of a series, 1 - a_1 z^-1 ..., (order + 1,), by Yule-Walker."""
+    n = len(r)
+    covariance = np.array([r[: n - lag] @ r[lag:] for lag in range(order + 1)]) / n
+    a = solve_toeplitz(covariance[:-1], covariance[1:])
+    std = np.sqrt(max(covariance[0] - a @ covariance[1:], 1e-12))
+    return np.concatenate([[1.0], -a]) / std
+
+
+class _ForceFit(NamedTuple):
+    coefficients: np.ndarray
+    raw: np.ndarray  # residual [m/s2]
+    whitened: np.ndarray
+
+
+def specific_force(model: RotorModel, w: np.ndarray, air: np.ndarray) -> np.ndarray:
+    """Return the specific force without sensor bias at rotor speeds w (N, 4) [-] and air velocity (N, 3), in m/s2."""
+    total, speed = w.sum(axis=1), np.linalg.norm(air, axis=1)
+    f = -(model.d * total + model.c * speed)[:, None] * air
+    lift = model.k * (w**2).sum(axis=1) + model.k_h * (air[:, 0] ** 2 + air[:, 1] ** 2)
+    f[:, 2] = -lift - model.k_c * total * air[:, 2]
+    return f
+
+
+def _vertical_offset(model: RotorModel, data: RotorData, R: np.ndarray) -> float:
+    """Return the mean vertical acceleration that velocities show and the model lacks [m/s2]; free of sensor bias."""
+    w = rotor_speeds(data.outputs, data.dt, model.tau, model.expo)
+    air = np.einsum("nji,nj->ni", R, data.velocity - np.array([*model.wind, 0.0]))
+    modelled = np.einsum("nj,nj->n", R[:, 2], specific_force(model, w, air)) + G
+    seconds = (len(w) - 1) * data.dt
+    return float((data.velocity[-1, 2] - data.velocity[0, 2]) / seconds - modelled[:-1].mean())
+
+
+def _force_fits(data: RotorData, R: np.ndarray, x: np.ndarray, whitening: list[np.ndarray]) -> list[_ForceFit]:
+    """Return the fits of the horizontal and the vertical specific force, given wind, lag and thrust curve."""
     w = rotor_speeds(data.outputs, data.dt, x[2], x[3])
     air = np.einsum("nji,nj->ni", R, data.velocity - np.array([x[0], x[1], 0.0]))
     total, speed = w.sum(axis=1), np.linalg.norm(air, axis=1)
     zero, one = np.zeros(len(w)), np.ones(len(w))
-    horizontal = np.concatenate(
-        [
-            np.stack([-total * air[:, 0], -speed * air[:, 0], one, zero], axis=1),
-            np.stack([-total * air[:, 1], -speed * air[:, 1], zero, one], axis=1),
-        ]
-    )
+    forward = np.stack([-total * air[:, 0], -speed * air[:, 0], one, zero, data.force[:, 0]], axis=1)
+    right = np.stack([-total * air[:, 1], -speed * air[:, 1], zero, one, data.force[:, 1]], axis=1)
     square = air[:, 0] ** 2 + air[:, 1] ** 2
-    vertical = np.stack([-(w**2).sum(axis=1), -total * air[:, 2], -square, one], axis=1)
-    targets = (np.concatenate([data.force[:, 0], data.force[:, 1]]), data.force[:, 2])
+    down = np.stack([-(w**2).sum(axis=1), -total * air[:, 2], -square, one, data.force[:, 2]], axis=1)
     fits = []
-    for A, y, biases in ((horizontal, targets[0], 2), (vertical, targets[1], 1)):
-        prior = np.zeros((biases, A.shape[1]))
-        prior[:, -biases:] = np.eye(biases)
-        prior *= np.sqrt(len(y)) * 0.1 / _BIAS_STD  # the prior counts as 1 % of the flight at a noise of its size
-        coefficients = np.linalg.lstsq(np.vstack([A, prior]), np.concatenate([y, np.zeros(biases)]), rcond=None)[0]
-        fits.append((coefficients, y - A @ coefficients))
+    for blocks, filters, biases in (((forward, right), whitening[:2], 2), ((down,), whitening[2:], 1)):
+        raw = np.vstack(blocks)
+        white = np.vstack([lfilter(f, [1.0], b, axis=0)[len(f) :] for f, b in zip(filters, blocks, strict=True)])
+        prior = np.zeros((biases, raw.shape[1] - 1))
+        prior[:, -biases:] = np.eye(biases) / _BIAS_STD
+        A, y = np.vstack([white[:, :-1], prior]), np.concatenate([white[:, -1], np.zeros(biases)])
+        coefficients = np.linalg.lstsq(A, y, rcond=None)[0]
+        fits.append(_ForceFit(coefficients, raw[:, -1] - raw[:, :-1] @ coefficients, y - A @ coefficients))
     return fits
 
 
 def _moments(data: RotorData, w: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return torque effectiveness, trim and reaction to a change of rotor speed.
+    """Return torque effectiveness of each motor (4, 3), rate damping (3,) and reaction to a change of rotor speed.
 
-    The equation is integrated over windows, so that the gyros are not differentiated at their sampling rate.
+    The equation is integrated over windows, so that the gyros are not differentiated at their sampling rate. An offset
+    of the centre of gravity and differences between motors both appear as unequal effectiveness.
     """
-    n = max(round(0.2 / data.dt), 2)  # window [samples], 0.2 s
-    mixed, changed = w**2 @ MIXER_X, w @ MIXER_X[:, 2]
-    sums = np.vstack([np.zeros((1, 3)), np.cumsum(mixed, axis=0)])[:-1] * data.dt
-    torque, trim, spin = np.zeros(3), np.zeros(3), 0.0
+    n = max(round(_WINDOW_S / data.dt), 2)
+    changed = w @ MIXER_X[:, 2]
+    integrated = np.cumsum(np.hstack([w**2, data.rates]), axis=0) * data.dt
+    sums = integrated[n - 1 : -1] - np.vstack([np.zeros((1, 7)), integrated[: -n - 1]])
+    torque, damping, spin = np.zeros((4, 3)), np.zeros(3), 0.0
     step = data.rates[n:] - data.rates[:-n]
     for axis in range(3):
-        columns = [sums[n:, axis] - sums[:-n, axis], np.full(len(step), n * data.dt)]
+        columns = [sums[:, :4], -sums[:, 4 + axis, None]]
         if axis == 2:
-            columns.append(changed[n:] - changed[:-n])
-        fit = np.linalg.lstsq(np.stack(columns, axis=1), step[:, axis], rcond=None)[0]
-        torque[axis], trim[axis] = fit[:2]
-        spin = float(fit[2]) if axis == 2 else spin
-    return torque, trim, spin
+            columns.append((changed[n:] - changed[:-n])[:, None])
+        fit = np.linalg.lstsq(np.hstack(columns), step[:, axis], rcond=None)[0]
+        torque[:, axis], damping[axis] = fit[:4], fit[4]
+        spin = float(fit[5]) if axis == 2 else spin
+    return torque, damping, spin
 
 
 class FreeRun(NamedTuple):
@@ -167,8 +215,8 @@ def free_run(model: RotorModel, data: RotorData, horizon_s: float = 10.0, anchor
     that is at most `anchor_s` old.
     """
     w = rotor_speeds(data.outputs, data.dt, model.tau, model.expo)
-    mixed, total = w**2 @ MIXER_X * model.torque + model.trim, w.sum(axis=1)
-    mixed[1:, 2] += model.spin * np.diff(w @ MIXER_X[:, 2]) / data.dt
+    moment = w**2 @ model.torque
+    moment[1:, 2] += model.spin * np.diff(w @ MIXER_X[:, 2]) / data.dt
     wind = np.array([*model.wind, 0.0])
     length, anchor = round(horizon_s / data.dt), round(anchor_s / data.dt)
     n = len(w) // length * length
@@ -181,17 +229,14 @@ def free_run(model: RotorModel, data: RotorData, horizon_s: float = 10.0, anchor
             v_hat[i], e_hat[i] = v, e
             R = rotation(e[None])[0]
             air = R.T @ (v - wind)
-            speed = float(np.linalg.norm(air))
-            f = -(model.d * total[i] + model.c * speed) * air
-            lift = model.k * float(w[i] @ w[i]) + model.k_h * (air[0] ** 2 + air[1] ** 2)
-            f[2] = -lift - model.k_c * total[i] * air[2]
-            v = v + data.dt * (R @ (f + np.array([0.0, 0.0, model.bias[2]])) + np.array([0.0, 0.0, G]))
+            f = specific_force(model, w[i : i + 1], air[None])[0]
+            v = v + data.dt * (R @ f + np.array([0.0, 0.0, G + model.offset]))
             sf, cf, tt = np.sin(e[0]), np.cos(e[0]), np.tan(e[1])
             turn = sf * rates[1] + cf * rates[2]
             e = e + data.dt * np.array(
                 [rates[0] + tt * turn, cf * rates[1] - sf * rates[2], turn / max(np.cos(e[1]), 0.1)]
             )
-            rates = rates + data.dt * mixed[i]
+            rates = rates + data.dt * (moment[i] - model.damping * rates)
     return FreeRun(_fit(data.velocity[:n], v_hat), _fit(np.unwrap(data.attitude[:n], axis=0), e_hat, wrap=True))
 
 
