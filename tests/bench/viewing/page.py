@@ -66,13 +66,17 @@ PLACES = """seconds => new Promise(done => {
   const count = () => { frame++; if (performance.now() < until) requestAnimationFrame(count); };
   requestAnimationFrame(count);
   const page = window.__viserMutable;
-  if (!page.labels) {  // texts of the labels as received; they are drawn with the next frame
+  if (!page.labels) {  // texts of the labels, as the page takes them from its queue at a frame
     page.labels = {};
-    const queue = page.messageQueue, push = queue.push;
-    queue.push = function (...messages) {
-      for (const {name, updates} of messages)
-        if (/labels\\/\\d+$/.test(name || '') && updates && updates.text) page.labels[name] = updates.text;
-      return push.apply(queue, messages);
+    page.hidden = new Set();
+    const queue = page.messageQueue, splice = queue.splice;
+    queue.splice = function (...range) {
+      const messages = splice.apply(queue, range);
+      for (const {name, updates, visible} of messages.filter(one => /labels\\/\\d+$/.test(one.name || ''))) {
+        if (updates && updates.text) page.labels[name] = updates.text;
+        if (visible !== undefined) page.hidden[visible ? 'delete' : 'add'](name);
+      }
+      return messages;
     };
   }
   const ring = () => {  // centre of the ring at the horizon, scene [10 m]
@@ -99,7 +103,9 @@ PLACES = """seconds => new Promise(done => {
         tile: [cards[0].textContent, cards[1].textContent, age ? age[1] : ''],
         alert: [short ? short[1] : '', silent ? silent[1] : ''],
         ring: ring(), name, frame,
-        label: Object.values(page.labels).filter(e => e.startsWith(name) || e.startsWith('horizon ')),
+        label: Object.entries(page.labels).filter(
+          ([node, text]) => !page.hidden.has(node) && (text.startsWith(name) || text.startsWith('horizon '))
+        ).map(([node, text]) => text),
         state: row && [row.cells[2].textContent.replace(/ [\\d.]+ \\w+$/, ''), text(sheet, '.head b').slice(2)],
       });
     }
