@@ -12,7 +12,7 @@ Drag of rotors is linear in airspeed, that of the frame quadratic. Wind, lag and
 searched for; the other parameters follow from them by linear least squares (variable projection).
 The wind is one constant vector for the whole flight; where it varies, drag and wind take up the difference.
 
-Source: Beard & McLain 2012, ch. 14 (rotor thrust and torque); Faessler, Franchi & Scaramuzza 2018, eq. 2-5 (rotor
+Source: Beard & McLain 2012, ch. 14 (rotor thrust and torque); Faessler, Franchi & Scaramuzza 2018 (rotor
 drag); Svacha, Mohta & Kumar 2017 (drag and rotor speed); Golub & Pereyra 1973 (variable projection).
 """
 
