@@ -127,6 +127,7 @@ def _run(args: argparse.Namespace) -> int:
             airframe=airframe,
             separation=Separation(*args.separation),
             schedule=args.pace,
+            use_siblings=args.use_siblings,
             diagnosis=None if args.no_diagnosis else Coordinator(executor, baselines, adapt=not args.no_adapt),
         )
         _tune_runtime()
@@ -207,6 +208,9 @@ def main(argv: list[str] | None = None) -> int:
         metavar="WORK=S,…",
         help="periods of rollouts, identifications, ensembles, renewals (predict=1,identify=1,ensemble=10; no renew) "
         "and size and look-ahead of an ensemble (members=24,span=180)",
+    )
+    parser.add_argument(
+        "--use-siblings", action="store_true", help="first models with what aircraft of their type have learnt"
     )
     parser.add_argument("--no-adapt", action="store_true", help="diagnose, but do not adapt the prediction models")
     parser.add_argument("--no-diagnosis", action="store_true", help="disable the diagnosis")

@@ -1,5 +1,7 @@
 """One example of every message, with fixed values; a new class in the contract adds its own here."""
 
+from typing import Any
+
 import numpy as np
 from msgspec import Raw
 
@@ -90,6 +92,7 @@ VERDICT = Verdict(
     derivative_error={"roll_damping": -22.0},
     detectable_error={"aileron_effectiveness": 14.0},
 )
+OF_TYPE: dict[str, Any] = {"airframe_type": "fixed_wing, 2100, mass unknown", "airspeed": 22.0, "throttle": 0.5}
 DERIVATIVES = Derivatives(
     names=("X_0", "w_n"),
     value=Array.of([0.5, 3.0], "<f8"),
@@ -102,15 +105,12 @@ DERIVATIVES = Derivatives(
     window_t0=T - 40.0,
     window_s=20.0,
     sentence="1 of 2 parameters told by the data",
-    data=SiblingData(
-        airframe_type="fixed_wing, generic small fixed wing, 2100, mass unknown",
-        airspeed=22.0,
-        throttle=0.5,
-        information=Array.of(4.0 * np.eye(30), "<f8"),
-        score=Array.of(np.arange(30) * 0.5, "<f8"),
-    ),
+    data=SiblingData(**OF_TYPE, information=Array.of(np.eye(30), "<f8"), score=Array.of(np.arange(30) * 0.5, "<f8")),
     siblings=9,
 )
+DRAG = SiblingDifference(uav=8, group="drag", ratio=0.15, p=0.0005, sentence="uav-8: drag")
+_TERMS = {"mean": Array.of(np.arange(30) * 0.5, "<f8"), "covariance": Array.of(0.25 * np.eye(30), "<f8")}
+SIBLING_TYPE = SiblingType(**OF_TYPE, **_TERMS, uavs=(UAV, 8, 9), differences=(DRAG,))
 ITEM = Item(
     seq=1, command=16, frame=3, param1=5.0, param2=60.0, param3=1.0, param4=0.5, lat_e7=1, lon_e7=2, alt_m=100.0
 )
@@ -380,20 +380,7 @@ MESSAGES = (
         covariance=Array.of(0.25 * np.eye(4)),
         drifts=Array.of([[0.125, 0.0, 0.0625], [0.0, 0.25, 0.0625], [0.0, 0.0, 0.0625]]),
     ),
-    Siblings(
-        t=T,
-        types=(
-            SiblingType(
-                airframe_type="fixed_wing, generic small fixed wing, 2100, mass unknown",
-                uavs=(UAV, 8, 9),
-                airspeed=22.0,
-                throttle=0.5,
-                mean=Array.of(np.arange(30) * 0.5, "<f8"),
-                covariance=Array.of(0.25 * np.eye(30), "<f8"),
-                differences=(SiblingDifference(uav=8, group="drag", ratio=0.15, p=0.0005, sentence="uav-8: drag"),),
-            ),
-        ),
-    ),
+    Siblings(t=T, types=(SIBLING_TYPE,)),
     Claim(
         t=T,
         worker="00000000000000ab",

@@ -76,10 +76,11 @@ class Worker:
         separation: Separation | None = None,
         diagnosis: Coordinator | None = None,
         schedule: Schedule | None = None,
+        use_siblings: bool = False,
     ) -> None:
         self.bus, self.uavs, self.diagnosis = bus, uavs, diagnosis
         self.omega, self.method, self.airframe = omega, method, airframe or load(GENERIC)
-        self.schedule = schedule or Schedule()
+        self.schedule, self._use_siblings = schedule or Schedule(), use_siblings
         # short for frequent propagation
         self._late_after_s = min(max(_LATE_PERIODS * self.schedule.renew, _LATE_LIMITS_S[0]), _LATE_LIMITS_S[1])
         self.quota = ComputeBudget(max_limit=_HEAVY_SHARE * self._late_after_s)
@@ -218,7 +219,8 @@ class Worker:
                     self.publish(prediction, owned)
                 continue
             self.wind_sharing.apply(owned)
-            self.sibling_sharing.apply(owned)
+            if self._use_siblings:
+                self.sibling_sharing.apply(owned)
             try:
                 for result in _advance_all(owned, waiting, self.traffic):
                     if not is_superseded(result, owned):

@@ -112,7 +112,8 @@ def test_models_are_flown_now_and_then_not_every_hop(monkeypatch):
 def test_a_stretch_that_was_searched_from_afresh_is_gone_on_with_for_a_while(monkeypatch):
     afresh, twin = [], Twin.of(1)
 
-    def identify(window, wind, airframe, last, near):
+    def identify(window, wind, airframe, last, near, *, of_type):
+        assert of_type is None
         afresh.extend([round(window.t[-1] - WINDOW.t[-1])] if near is None else [])
         return known(aircraft(0), window.t[0], window.t[-1])
 

@@ -317,7 +317,7 @@ def _insufficient_data(twin: Twin, window: Window | None) -> Verdict | None:
     return Verdict(outcome=Outcome.INSUFFICIENT_DATA, sentence=sentence)
 
 
-def _identify(twin: Twin, training: Window, of_type: TypePrior | None) -> Plant:
+def _identify(twin: Twin, training: Window, of_type: TypePrior | None = None) -> Plant:
     """Identify the aircraft; each further attempt uses another initial value or another share of the window.
 
     What aircraft of its type have learnt is used in every other attempt, so that it cannot mislead for long.
