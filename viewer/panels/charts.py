@@ -81,7 +81,7 @@ class Charts:
         if units != self._units:
             self._units, self._alt[0].content = units, _heading(f"Altitude, {units.height}", self._alt_lines)
         if vehicle is None:
-            for chart in (self._band, self._error, self._fit, self._alt):
+            for chart in (self._band, self._error, self._fit, self._alt, self._profile):
                 _show(chart, None)
             return
         trail = store.trail(vehicle)
