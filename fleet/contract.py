@@ -846,7 +846,7 @@ class SiblingDifference(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SiblingType(msgspec.Struct, frozen=True, kw_only=True):
-    """Distribution of the derivatives of one type of aircraft: those without offsets, and thrust minus drag at last."""
+    """Distribution of the derivatives of one type of aircraft without offsets; last: thrust minus drag."""
 
     airframe_type: str
     uavs: Annotated[tuple[int, ...], about("aircraft it was learnt from")]
@@ -858,7 +858,7 @@ class SiblingType(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Siblings(msgspec.Struct, frozen=True, kw_only=True):
-    """What aircraft of each type share, estimated from all of them by one worker at a time."""
+    """What aircraft of each type share, estimated by one worker at a time."""
 
     topic: ClassVar[str] = "@world/siblings"
     version: ClassVar[int] = 1

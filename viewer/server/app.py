@@ -156,18 +156,17 @@ class App:
             draw_guarded(view, partial(self._draw, view, now, tick))
 
     def _draw(self, view: View, now: float, tick: int) -> None:
-        """Draw the content due on one page, panels and scene together: a page applies either without the other."""
-        with view.client.atomic():
-            if tick % TICKS_PER_S == view.offset or view.dirty:
-                self._terrain_layer.show(view.client, self.store.scene_frame, view.palette, self._ground_height)
-                self._terrain_layer.show_world(view.client.client_id, view.panels.world.value)
-                view.panels.ground_error = self._terrain_layer.sentence
-                view.scene.ground.grid.show(not self._terrain_layer.available)
-                view.draw_slow(self.fleet_arrays, now, self._ground_height)
-                if len(self._framing_points):
-                    view.frame_fleet(self._framing_points, self._framing_key(), self._ground_height)
-            if self.fleet_arrays.uavs:
-                view.draw_moving(self.fleet_arrays, now, tick)
+        """Draw the content due on one page."""
+        if tick % TICKS_PER_S == view.offset or view.dirty:
+            self._terrain_layer.show(view.client, self.store.scene_frame, view.palette, self._ground_height)
+            self._terrain_layer.show_world(view.client.client_id, view.panels.world.value)
+            view.panels.ground_error = self._terrain_layer.sentence
+            view.scene.ground.grid.show(not self._terrain_layer.available)
+            view.draw_slow(self.fleet_arrays, now, self._ground_height)
+            if len(self._framing_points):
+                view.frame_fleet(self._framing_points, self._framing_key(), self._ground_height)
+        if self.fleet_arrays.uavs:
+            view.draw_moving(self.fleet_arrays, now, tick)
 
     def draw_selections(self) -> None:
         """Draw new selections immediately; lists and charts follow at the next tick."""

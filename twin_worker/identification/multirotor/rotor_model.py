@@ -23,6 +23,7 @@ from scipy.linalg import solve_toeplitz
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
+from fleet.compiled_frames import wrap
 from fleet.frames import G
 
 # ArduCopter quadrotor X and PX4 quad x: motor 1 front right, 2 rear left, 3 front left, 4 rear right.
@@ -238,12 +239,12 @@ def free_run(model: RotorModel, data: RotorData, horizon_s: float = 10.0, anchor
                 [rates[0] + tt * turn, cf * rates[1] - sf * rates[2], turn / max(np.cos(e[1]), 0.1)]
             )
             rates = rates + data.dt * (moment[i] - model.damping * rates)
-    return FreeRun(_fit(data.velocity[:n], v_hat), _fit(np.unwrap(data.attitude[:n], axis=0), e_hat, wrap=True))
+    return FreeRun(_fit(data.velocity[:n], v_hat), _fit(np.unwrap(data.attitude[:n], axis=0), e_hat, angles=True))
 
 
-def _fit(y: np.ndarray, y_hat: np.ndarray, wrap: bool = False) -> np.ndarray:
+def _fit(y: np.ndarray, y_hat: np.ndarray, angles: bool = False) -> np.ndarray:
     """Return 100 (1 - |y - y_hat| / |y - mean|) per column [%]."""
     error = y - y_hat
-    if wrap:
-        error = (error + np.pi) % (2 * np.pi) - np.pi
+    if angles:
+        error = wrap(error)
     return 100 * (1 - np.linalg.norm(error, axis=0) / np.linalg.norm(y - y.mean(axis=0), axis=0))
