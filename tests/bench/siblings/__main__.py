@@ -4,7 +4,7 @@
 
 Aircraft of one type (PX4's law and parameters) are simulated by JSBSim, each with coefficients, thrust, payload and
 asymmetries of its own (`--spread` times the usual deviations of the simulator). Ten fly, and their distribution is
-estimated. Each `normal` aircraft flies afterwards; its telemetry is heard by a twin without and by one with that
+estimated. Each `normal` aircraft flies afterwards; its telemetry goes to a twin without and by one with that
 distribution, and the times of their first accepted and first verified models are compared. `dragged` aircraft have
 15 % more drag at trim than by their own draw. Each is then compared with the ten.
 """
@@ -39,7 +39,7 @@ T_0, _STEP_S = EPOCH_US * 1e-6, 0.25
 ACCEPTED = (Outcome.VERIFIED, Outcome.PLAUSIBLE)
 
 
-class Heard(NamedTuple):
+class FirstModels(NamedTuple):
     """What a twin learnt from one flight."""
 
     accepted_s: float  # first accepted model, since the start; inf: none
@@ -82,7 +82,7 @@ def recorded(uav: int, seed: int, kind: AircraftType, drag: float) -> list[Messa
     return out
 
 
-def heard(messages: list[Message], siblings: SiblingType | None = None) -> Heard:
+def first_models(messages: list[Message], siblings: SiblingType | None = None) -> FirstModels:
     """Let a twin hear a flight."""
     twin = Twin.of(messages[0].uav, schedule=SCHEDULE, airframe=AIRFRAME)
     twin.identification.set_siblings(siblings)
@@ -99,7 +99,7 @@ def heard(messages: list[Message], siblings: SiblingType | None = None) -> Heard
                 first["accepted"], model = min(first["accepted"], now), result
             if outcome is Outcome.VERIFIED:
                 first["verified"] = min(first["verified"], now)
-    return Heard(first["accepted"], first["verified"], model, count)
+    return FirstModels(first["accepted"], first["verified"], model, count)
 
 
 def data_of(model: Model | None) -> SiblingData | None:
@@ -119,7 +119,7 @@ def main() -> None:
     fly = partial(recorded, seed=args.seed, kind=kind_of(args.spread))
     known: dict[int, SiblingData] = {}
     for uav in range(SIBLINGS):
-        one = heard(fly(uav, drag=0.0))
+        one = first_models(fly(uav, drag=0.0))
         if (data := data_of(one.model)) is not None:
             known[uav] = data
         print(f"sibling {uav}: accepted {one.accepted_s:.0f} s, verified {one.verified_s:.0f} s", flush=True)
@@ -130,8 +130,8 @@ def main() -> None:
     for k in range(args.normal + args.dragged):
         uav, drag = SIBLINGS + k, 0.0 if k < args.normal else 0.15
         messages = fly(uav, drag=drag)
-        alone = heard(messages) if not drag else None
-        sooner = heard(messages, siblings)
+        alone = first_models(messages) if not drag else None
+        sooner = first_models(messages, siblings)
         data = data_of(sooner.model)
         found = estimate_type({**known, uav: data}, AIRFRAME) if data is not None else None
         differences = [one for one in found.differences if one.uav == uav] if found is not None else []
@@ -154,9 +154,9 @@ def main() -> None:
         before = np.median([one["alone_s"][index] for one in normal])
         after = np.median([one["with_siblings_s"][index] for one in normal])
         print(f"first {name} model: median {before:.0f} s alone, {after:.0f} s with siblings")
-    print(f"normal aircraft said to differ: {sum(bool(one['differs']) for one in normal)} of {len(normal)}")
+    print(f"normal aircraft reported as different: {sum(bool(one['differs']) for one in normal)} of {len(normal)}")
     by_drag = sum(any(group == "drag" and ratio > 0 for group, ratio, _ in one["differs"]) for one in dragged)
-    print(f"aircraft with 15 % more drag said to have it: {by_drag} of {len(dragged)}")
+    print(f"aircraft with 15 % more drag reported with it: {by_drag} of {len(dragged)}")
 
 
 if __name__ == "__main__":

@@ -248,7 +248,7 @@ def flying(seconds: float = 61.0, **changes) -> Twin:
     return twin
 
 
-def told(twin: Twin, made: Prediction | None, seconds: int = 20, start: float = 0.0) -> list[Alert]:
+def alerts_of(twin: Twin, made: Prediction | None, seconds: int = 20, start: float = 0.0) -> list[Alert]:
     return [a for k in range(seconds) for a in prediction_alerts(twin, T + start + k, made)]
 
 
@@ -257,10 +257,10 @@ SINKING = straight(7, v=(20.0, 0.0, 1.0), seq=1)
 
 def test_ground_is_told_once_and_taken_back_once() -> None:
     twin = flying()
-    (raised,) = told(twin, SINKING)
+    (raised,) = alerts_of(twin, SINKING)
     assert raised.kind is AlertKind.GROUND and raised.active and T + 5 < raised.t < T + 9
     assert raised.predicted_t == pytest.approx(T + 70, abs=2.1) and "terrain unknown" in raised.sentence
-    (over,) = told(twin, straight(7), start=20.0)
+    (over,) = alerts_of(twin, straight(7), start=20.0)
     assert not over.active and over.t == T + 25
 
 
@@ -280,52 +280,52 @@ def test_ground_is_told_once_and_taken_back_once() -> None:
 def test_a_landing_is_no_danger(excuse) -> None:
     twin = flying()
     excuse(twin)
-    assert told(twin, SINKING) == []
+    assert alerts_of(twin, SINKING) == []
 
 
 def test_an_aircraft_that_was_never_up_is_taking_off() -> None:
     low = straight(7, p=(0.0, 0.0, -10.0))
     twin = flying()
-    assert told(twin, low) == []
-    assert told(twin, straight(7), start=20.0) == []
-    (alert,) = told(twin, low, start=40.0)
+    assert alerts_of(twin, low) == []
+    assert alerts_of(twin, straight(7), start=20.0) == []
+    (alert,) = alerts_of(twin, low, start=40.0)
     assert alert.kind is AlertKind.GROUND
 
 
 def test_a_quadplane_that_leaves_its_rotors_below_the_height_of_wings_is_taking_off() -> None:
     twin = flying()
     twin.alerts.max_height_m = 20.0  # on rotors
-    assert told(twin, straight(7, p=(0.0, 0.0, -24.0))) == []
+    assert alerts_of(twin, straight(7, p=(0.0, 0.0, -24.0))) == []
 
 
 def test_a_turn_rate_says_nothing_of_far_ground_nor_of_its_own_horizon() -> None:
     twin = flying(mode="FBWA")
-    assert told(twin, msgspec.structs.replace(SINKING, method="imm", horizon_s=2.0, coverage_n=99)) == []
+    assert alerts_of(twin, msgspec.structs.replace(SINKING, method="imm", horizon_s=2.0, coverage_n=99)) == []
     near = straight(7, p=(0.0, 0.0, -40.0), v=(20.0, 0.0, 1.0), method="imm")
-    assert [a.kind for a in told(twin, near, start=30.0)] == [AlertKind.GROUND]
+    assert [a.kind for a in alerts_of(twin, near, start=30.0)] == [AlertKind.GROUND]
 
 
 def test_on_a_mission_a_turn_rate_waits_for_something_better() -> None:
     near = straight(7, p=(0.0, 0.0, -40.0), v=(20.0, 0.0, 1.0), method="imm")
     twin = flying()
-    assert told(twin, near, 20) == []  # the twin of its route is about to come
-    assert told(twin, straight(7), 1, start=20) == [] and told(twin, near, 20, start=21) == []
-    assert [a.kind for a in told(twin, near, 9, start=41)] == [AlertKind.GROUND]  # it does not come
+    assert alerts_of(twin, near, 20) == []  # the twin of its route is about to come
+    assert alerts_of(twin, straight(7), 1, start=20) == [] and alerts_of(twin, near, 20, start=21) == []
+    assert [a.kind for a in alerts_of(twin, near, 9, start=41)] == [AlertKind.GROUND]  # it does not come
 
 
 def test_a_fence_from_parameters_is_watched() -> None:
     twin = flying()
     twin.onboard.params = Params(uav=7, t=T, values={"FENCE_ENABLE": 1.0, "FENCE_TYPE": 2.0, "FENCE_RADIUS": 1500.0})
-    (alert,) = told(twin, straight(7))
+    (alert,) = alerts_of(twin, straight(7))
     assert alert.kind is AlertKind.GEOFENCE and alert.predicted_t == pytest.approx(T + 75, abs=4)
 
 
 def test_a_new_aircraft_is_warned_of_what_is_near_until_it_has_a_model() -> None:
     twin, far = flying(20.0), straight(7, p=(0.0, 0.0, -75.0), v=(20.0, 0.0, 1.0), seq=1)
     near = straight(7, p=(0.0, 0.0, -45.0), v=(20.0, 0.0, 1.0), seq=1)
-    assert told(twin, far) == []
-    assert [a.kind for a in told(flying(20.0), near)] == [AlertKind.GROUND]
-    assert [a.kind for a in told(flying(61.0), far)] == [AlertKind.GROUND]
+    assert alerts_of(twin, far) == []
+    assert [a.kind for a in alerts_of(flying(20.0), near)] == [AlertKind.GROUND]
+    assert [a.kind for a in alerts_of(flying(61.0), far)] == [AlertKind.GROUND]
 
 
 def test_home_is_item_0_or_where_it_stood() -> None:
@@ -334,19 +334,24 @@ def test_home_is_item_0_or_where_it_stood() -> None:
     twin.onboard.status = msgspec.structs.replace(twin.onboard.status, autopilot="px4")
     assert twin.home is None
     twin.onboard.status = msgspec.structs.replace(twin.onboard.status, armed=False)
-    told(twin, None, 1)
+    alerts_of(twin, None, 1)
     stood = twin.home
     assert stood is not None and abs(stood.alt_mm - HERE.alt_mm - 100_000) < 100
 
 
 def test_a_short_horizon_must_last_and_be_measured() -> None:
     short = straight(7, horizon_s=6.0, early_exceedance=0.7, coverage_n=40)
-    assert told(flying(), short, 15) == [] and told(flying(), msgspec.structs.replace(short, coverage_n=5), 60) == []
+    assert (
+        alerts_of(flying(), short, 15) == []
+        and alerts_of(flying(), msgspec.structs.replace(short, coverage_n=5), 60) == []
+    )
     twin = flying()
-    (alert,) = told(twin, short, 30)
+    (alert,) = alerts_of(twin, short, 30)
     assert alert.kind is AlertKind.SHORT_HORIZON and alert.t == T + 15 and "probability of 70%" in alert.sentence
-    assert told(twin, msgspec.structs.replace(short, early_exceedance=0.4), 30, start=30) == []  # not yet low enough
-    (over,) = told(twin, msgspec.structs.replace(short, early_exceedance=0.1), 30, start=60)
+    assert (
+        alerts_of(twin, msgspec.structs.replace(short, early_exceedance=0.4), 30, start=30) == []
+    )  # not yet low enough
+    (over,) = alerts_of(twin, msgspec.structs.replace(short, early_exceedance=0.1), 30, start=60)
     assert not over.active
 
 
@@ -356,16 +361,16 @@ def test_a_mission_against_the_wind_is_told() -> None:
     twin.onboard.mission = msgspec.structs.replace(twin.onboard.mission, items=steep)
     names = ("AIRSPEED_CRUISE", "AIRSPEED_MIN", "AIRSPEED_MAX", "TECS_CLMB_MAX", "TECS_SINK_MAX")
     twin.onboard.params = Params(uav=7, t=T, values=dict(zip(names, (20.0, 14.0, 28.0, 4.0, 4.0), strict=True)))
-    (alert,) = told(twin, straight(7), 30)
+    (alert,) = alerts_of(twin, straight(7), 30)
     assert alert.kind is AlertKind.NOT_ACHIEVABLE and "item 2" in alert.sentence and alert.lat is not None
     twin.onboard.mission = msgspec.structs.replace(twin.onboard.mission, items=steep[:2])
-    assert [a.active for a in told(twin, straight(7), 30, start=30)] == [False]
+    assert [a.active for a in alerts_of(twin, straight(7), 30, start=30)] == [False]
 
 
 def test_a_flight_without_predictions_withdraws_what_they_warned_of() -> None:
     twin = flying()
-    told(twin, SINKING)
-    (over,) = told(twin, None, start=20.0)
+    alerts_of(twin, SINKING)
+    (over,) = alerts_of(twin, None, start=20.0)
     assert over.kind is AlertKind.GROUND and not over.active and "no longer predicted" in over.sentence
 
 
@@ -377,7 +382,7 @@ def test_hostile_numbers_raise_nothing() -> None:
     broken = msgspec.structs.replace(
         SINKING, path=Array.of(np.full((3, 3), NAN)), horizon_s=NAN, early_exceedance=NAN, coverage_n=99
     )
-    assert told(twin, broken, 30) == []
+    assert alerts_of(twin, broken, 30) == []
 
 
 def test_a_pretend_flight_is_warned_of_nothing(flown) -> None:

@@ -116,11 +116,11 @@ def test_the_data_of_an_aircraft_are_told_whatever_its_prior() -> None:
     par = np.linalg.solve(fisher + precision, fisher @ truth + precision @ NOMINAL)
     one = sibling_data(model(fisher, par), THROTTLE, "x")
     assert one is not None
-    told = dict(zip(TERMS, np.linalg.solve(one.information.numpy(), one.score.numpy()), strict=True))
+    estimate = dict(zip(TERMS, np.linalg.solve(one.information.numpy(), one.score.numpy()), strict=True))
     for name in ("Z_w", "L_p", "M_q", "X_dt"):
-        assert told[name] == pytest.approx(truth[NAMES.index(name)], rel=1e-3)
+        assert estimate[name] == pytest.approx(truth[NAMES.index(name)], rel=1e-3)
     x_trim = truth[NAMES.index("X_0")] + THROTTLE * truth[NAMES.index("X_dt")]
-    assert told["excess"] == pytest.approx(x_trim - G * 1.1 / V, rel=1e-2)
+    assert estimate["excess"] == pytest.approx(x_trim - G * 1.1 / V, rel=1e-2)
 
 
 @pytest.mark.parametrize(

@@ -1,1 +1,0 @@
-"""Identification of the rotor model of a multirotor: thrust, drag, motor lag, torque effectiveness, wind."""
