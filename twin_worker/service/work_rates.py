@@ -64,7 +64,7 @@ class WorkRates:
 
     def overload_messages(self, schedule: Schedule, aircraft: int, now: float) -> list[str]:
         """Describe the work that is less frequent than scheduled; empty if there is none."""
-        scheduled = {Work.PREDICT: schedule.predict, Work.IDENTIFY: schedule.identify}
+        scheduled = {Work.PREDICT: schedule.longest_predict, Work.IDENTIFY: schedule.longest_identify}
         periods = {work: self.period(work, aircraft, now) for work in scheduled}
         late = [
             _period_text(work, periods[work], scheduled[work])

@@ -15,8 +15,8 @@ from twin_worker.twin.state.home import complete_home
 from twin_worker.twin.state.routes import failsafe_plan
 from twin_worker.twin.state.state import Twin, ingest
 from twin_worker.twin.steps.alerts import link_alerts, prediction_alerts
-from twin_worker.twin.steps.extrapolate import can_propagate, extrapolate, rollout_overdue
-from twin_worker.twin.steps.identify_step import identify_and_verify
+from twin_worker.twin.steps.extrapolate import can_propagate, departure, extrapolate, rollout_overdue
+from twin_worker.twin.steps.identify_step import identify_and_verify, update_information
 from twin_worker.twin.steps.kinematic_prediction import active_command
 from twin_worker.twin.steps.predict_step import LOOK_BACK_S, predict
 from twin_worker.twin.steps.rollouts import run_deferred_ensemble
@@ -158,10 +158,11 @@ def _step(twin: Twin, now: float) -> list[Message]:
         update_flight_phase(twin, active_command(twin))
         complete_home(twin)
         _score_predictions(twin)
-    schedule = twin.config.schedule
+        if twin.config.schedule.information and twin.vehicle_class.has_wings:
+            update_information(twin)
     if identify_due(twin) and twin.budget_allows(Work.IDENTIFY):
         results += identify(twin)
-    if twin.prediction.predict_timer.due(now, schedule.predict) and twin.budget_allows(Work.PREDICT):
+    if _rollout_due(twin, now) and twin.budget_allows(Work.PREDICT):
         twin.prediction.restart_periods(now)
         messages = predict(twin, now)
         prediction = twin.prediction.latest if messages else None
@@ -172,7 +173,10 @@ def _step(twin: Twin, now: float) -> list[Message]:
         results += [*messages, *prediction_alerts(twin, now, prediction)]
     elif _extrapolation_due(twin, now) and twin.budget_allows(Work.RENEW):
         twin.prediction.renew_timer.restart(now)
-        results += extrapolate(twin)
+        extrapolated = extrapolate(twin)
+        results += extrapolated
+        if extrapolated and twin.config.schedule.departure:
+            results += prediction_alerts(twin, now, twin.prediction.latest)
         if not twin.telemetry.link_lost and not can_propagate(twin, twin.telemetry.history.newest):
             _retry_prediction(twin, now)
     if (
@@ -188,6 +192,18 @@ def rollout_age_s(twin: Twin) -> float:
     """Return the time since the last rollout on the clock of the aircraft [s]; inf without a rollout or a step."""
     age = twin.telemetry.last_step_t - twin.prediction.predict_timer.last
     return age if isfinite(age) else inf
+
+
+def _rollout_due(twin: Twin, now: float) -> bool:
+    """Return whether a rollout is due: after its period, where the aircraft has departed from the last one."""
+    timer, schedule = twin.prediction.predict_timer, twin.config.schedule
+    if not timer.due(now, schedule.predict):
+        return False
+    if (
+        not schedule.departure or not isfinite(timer.last) or rollout_overdue(twin, now)
+    ):  # an event makes it due at once
+        return True
+    return _extrapolation_due(twin, now) and not departure(twin) < schedule.departure
 
 
 def _extrapolation_due(twin: Twin, now: float) -> bool:
@@ -210,7 +226,9 @@ def identify_due(twin: Twin) -> bool:
     """Return whether an identification is due at the data time of the last step."""
     telemetry = twin.telemetry
     has_data = telemetry.origin is not None and isfinite(telemetry.history.newest) and isfinite(telemetry.last_step_t)
-    due = twin.identification.timer.due(telemetry.last_step_t, twin.config.schedule.identify)
+    schedule, identification = twin.config.schedule, twin.identification
+    due = identification.timer.due(telemetry.last_step_t, schedule.identify)
+    due = due and not identification.information < schedule.information
     return has_data and not telemetry.link_lost and due
 
 

@@ -5,6 +5,7 @@ import os
 import sys
 import threading
 import time
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -23,6 +24,7 @@ from twin_worker.twin import step as loop
 from twin_worker.twin.state import budget as clocked
 from twin_worker.twin.state.budget import (
     LATE_CPU_FRACTION,
+    LIVE_SCHEDULE,
     MIN_WORK_S,
     WORK_PER_SWEEP_S,
     ComputeBudget,
@@ -34,9 +36,20 @@ from twin_worker.twin.step import Twin, advance
 
 
 def test_a_pace_is_read_and_refused_in_a_sentence() -> None:
-    assert parse_schedule("identify=5,renew=0.1") == Schedule(identify=5.0, renew=0.1)
-    assert parse_schedule("members=50,span=60") == Schedule(members=50, span=60.0)
-    for odd in ("", "identify", "identify=0", "identify=x", "identify=nan", "speed=5", "predict=1e9", "span=200"):
+    assert parse_schedule("identify=5,renew=0.1") == replace(LIVE_SCHEDULE, identify=5.0, renew=0.1)
+    assert parse_schedule("members=50,span=60") == replace(LIVE_SCHEDULE, members=50, span=60.0)
+    assert parse_schedule("departure=0,information=0") == Schedule(renew=1.0)
+    for odd in (
+        "",
+        "identify",
+        "identify=0",
+        "identify=x",
+        "identify=nan",
+        "speed=5",
+        "predict=1e9",
+        "span=200",
+        "departure=-1",
+    ):
         with pytest.raises(argparse.ArgumentTypeError, match=r"found .*, expected one of predict, identify"):
             parse_schedule(odd)
 
@@ -239,6 +252,7 @@ def test_what_is_shed_is_said() -> None:
         "too many UAVs for this worker: identify every 27.3 s instead of 5.0 s"
     ]
     assert rates.overload_messages(pace, 2, 60.0) == []
+    assert rates.overload_messages(replace(pace, information=0.1), 4, 60.0) == []  # an identification may be put off
     assert WorkRates().overload_messages(pace, 10, 60.0) == [] and rates.period(
         Work.IDENTIFY, 10, 60.0 + 2 * RATE_WINDOW_S
     ) == float("inf")

@@ -11,9 +11,15 @@ from fleet.frames import Origin, to_geodetic
 from tests.support import flights as f
 from twin_worker.confidence.tube_and_horizon import AHEAD
 from twin_worker.prediction.closed_loop import MIN_ROLLOUT_S
-from twin_worker.twin.state.budget import Schedule
+from twin_worker.twin.state.budget import LIVE_SCHEDULE, LONGEST_PERIOD_S, Schedule
 from twin_worker.twin.step import Twin, advance
-from twin_worker.twin.steps.extrapolate import MAX_OVERDUE_AGE_S, MAX_ROLLOUT_AGE_S, extrapolate, widen_tube
+from twin_worker.twin.steps.extrapolate import (
+    MAX_OVERDUE_AGE_S,
+    MAX_ROLLOUT_AGE_S,
+    departure,
+    extrapolate,
+    widen_tube,
+)
 
 
 def on(twin: Twin, seconds: float, off: np.ndarray) -> None:
@@ -84,6 +90,51 @@ def test_renewed_predictions_are_scored_and_their_coverage_is_published(heard: t
     assert (made[-1].coverage_propagated, made[-1].coverage_propagated_n) == pytest.approx((coverage, n))
     ages = [m.rollout_age_s for m in made]
     assert 6 <= ages.count(0.0) <= 10 and max(ages) > 4.0
+
+
+def test_a_departure_is_measured_in_half_axes_at_five_seconds(twin: Twin) -> None:
+    base = twin.prediction.latest
+    straight = np.outer(base.ahead.numpy(), [20.0, 0.0, 0.0])
+    half_axes = np.tile([10.0, 5.0, 2.0], (len(straight), 1))
+    twin.prediction.last_rollout = msgspec.structs.replace(
+        base, path=Array.of(straight), prediction_region_half_axes=Array.of(half_axes)
+    )
+    for off, wanted in (([0.0, 0.0, 0.0], 0.0), ([1.0, 0.0, 0.0], 0.1), ([0.0, 1.0, 0.0], 0.2), ([1.0, 1.0, 1.0], 0.5)):
+        one = copy.deepcopy(twin)
+        on(one, 2.0, np.array(off))
+        assert departure(one) == pytest.approx(wanted, abs=0.02)
+    twin.prediction.last_rollout = None
+    assert departure(twin) == np.inf
+
+
+def test_heavy_work_is_put_off_while_it_would_change_little_and_never_for_long(heard: tuple, twin: Twin) -> None:
+    rest = f.shifted([m for m in heard if isinstance(m, Sample) and m.t > heard[-1].t - 40.0], 40.0, 1e9)
+    counts = {}
+    for schedule in (Schedule(), LIVE_SCHEDULE):
+        one = copy.deepcopy(twin)
+        one.config = msgspec.structs.replace(one.config, schedule=schedule)
+        made, identified, longest = [], set(), 0.0
+        for message in rest:
+            made += [m for m in advance(one, (message,)) if isinstance(m, Prediction)]
+            identified.add(one.identification.timer.last)
+            longest = max(longest, one.telemetry.last_step_t - one.identification.timer.last)
+        gaps = np.diff([m.t for m in made])
+        assert len(made) > 36 and gaps.max() < 1.6
+        assert max(m.rollout_age_s for m in made) < LONGEST_PERIOD_S + 1.0 and longest < LONGEST_PERIOD_S + 1.0
+        counts[schedule.departure] = sum(m.rollout_age_s == 0.0 for m in made), len(identified)
+    (every, live), (rollouts, identified_live) = counts[0.0], counts[LIVE_SCHEDULE.departure]
+    assert rollouts < 0.6 * every and 3 <= identified_live < live
+
+
+def test_a_changed_plan_and_a_turn_off_the_path_end_the_delay(heard: tuple, twin: Twin) -> None:
+    twin.config = msgspec.structs.replace(twin.config, schedule=LIVE_SCHEDULE)
+    rest = f.shifted([m for m in heard if isinstance(m, Sample) and m.t > heard[-1].t - 40.0], 40.0, 1e9)
+    until = next(k for k, m in enumerate(rest) if m.t > rest[0].t + 20.0)
+    for message in rest[:until]:
+        advance(twin, (message,))
+    twin.prediction.predict_timer.expire()  # as an event does
+    made = [m for m in advance(twin, rest[until : until + 1]) if isinstance(m, Prediction)]
+    assert [m.rollout_age_s for m in made] == [0.0]
 
 
 def test_a_renewal_after_the_origin_has_moved_is_in_the_frame_of_its_path(twin: Twin) -> None:

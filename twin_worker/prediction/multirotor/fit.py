@@ -30,7 +30,7 @@ _MIN_HEIGHT = 2.0  # above home [m]
 _PRIOR = ((0.25, 0.01, 0.0, 0.0), (0.15, 0.01, 4.0, 4.0))  # drag and wind: mean and standard deviation
 _ITERATIONS, _MAX_WIND = 8, 25.0  # [-, m/s]
 _DRAG_STD = 0.3  # of a mean of the drag before its scatter is known [m/s2]
-_START_INTERVAL_S, _RUN_S = 4.0, 10.0  # interval of starts, length of a rollout [s]
+START_INTERVAL_S, _RUN_S = 4.0, 10.0  # interval of starts, length of a rollout [s]
 _LAG_VALUES = (0.7, 1.0, 1.4, 2.0, 2.8)  # tried natural frequencies [rad/s]
 _FRACTIONS = (0.6, 0.8, 0.9, 1.0, 1.1, 1.25)  # tried fractions of the limits
 _STOP_DELAYS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)  # tried delays at each stop [s]
@@ -130,7 +130,7 @@ def identify_speeds(track: Track, seq: np.ndarray, config: MultirotorConfig, mod
 
 def _starts(track: Track, seq: np.ndarray, config: MultirotorConfig) -> list[int]:
     """Return the start rows: on this route, moving, with ten seconds of flight after them."""
-    run_rows, interval_rows = int(_RUN_S / STEP), int(_START_INTERVAL_S / STEP)
+    run_rows, interval_rows = int(_RUN_S / STEP), int(START_INTERVAL_S / STEP)
     first = max(int(np.searchsorted(track.t, config.changed_t + _MIN_TRACK_S)), len(track) - int(_COMPARE_S / STEP), 20)
     rows = range(len(track) - 1 - run_rows, first, -interval_rows)
     return [

@@ -9,12 +9,13 @@ starts.
 import argparse
 import time
 from collections import Counter
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 
 import msgspec
 import numpy as np
 
+LONGEST_PERIOD_S = 10.0  # after which a rollout or identification that was put off is due [s]
 EARLY_FRACTION = 0.9  # share of a period after which dependent work is due, so that jitter does not skip a cycle [-]
 
 
@@ -38,6 +39,10 @@ class Schedule:
         renew: between predictions extrapolated from the newest position without a new rollout; inf: none [s]
         members: rollouts per ensemble
         span: look-ahead of ensemble rollouts; beyond it, the spread grows by the method's growth law [s]
+        departure: distance of the aircraft from the last rollout, in half-axes of its region, below which the next
+            rollout is put off; 0: a rollout in every period [-]
+        information: new information on the model, as a share of that of the last window, below which the next
+            identification is put off; 0: an identification in every period [-]
     """
 
     predict: float = 1.0
@@ -46,9 +51,25 @@ class Schedule:
     renew: float = float("inf")
     members: int = 24
     span: float = 180.0
+    departure: float = 0.0
+    information: float = 0.0
+
+    @property
+    def longest_predict(self) -> float:
+        """Return the longest period between rollouts [s]."""
+        return max(self.predict, LONGEST_PERIOD_S) if self.departure else self.predict
+
+    @property
+    def longest_identify(self) -> float:
+        """Return the longest period between identifications [s]."""
+        return max(self.identify, LONGEST_PERIOD_S) if self.information else self.identify
 
 
-_LIMITS = {"members": (12, 1000), "span": (10.0, 180.0)}  # of all other fields: `_PERIOD_LIMITS`
+LIVE_SCHEDULE = Schedule(renew=1.0, departure=0.1, information=0.1)
+"""Schedule of a worker: heavy work where it changes the result. Its loss of accuracy: `tests/bench/schedule.py`."""
+
+# of all other fields: `_PERIOD_LIMITS`
+_LIMITS = {"members": (12, 1000), "span": (10.0, 180.0), "departure": (0.0, 10.0), "information": (0.0, 10.0)}
 _PERIOD_LIMITS = (0.02, 3600.0)  # [s]
 
 
@@ -72,8 +93,8 @@ def parse_schedule(text: str) -> Schedule:
                 f"found {part!r}, expected one of {', '.join(names)}, {low:g} to {high:g}, e.g. identify=5; correct it"
             )
             raise argparse.ArgumentTypeError(error_text)
-    members = int(values.pop("members", Schedule.members))
-    return Schedule(**values, members=members)  # type: ignore[arg-type]
+    members = int(values.pop("members", LIVE_SCHEDULE.members))
+    return replace(LIVE_SCHEDULE, **values, members=members)  # type: ignore[arg-type]
 
 
 class Timer(msgspec.Struct):

@@ -79,6 +79,8 @@ class Identification(msgspec.Struct):
         shrinkage: weights of model and persistence, by look-ahead
         data_from: telemetry before is not used [s since 1970]
         tries: identifications since the last conclusive verdict
+        moments: mean, and sum of squares about it, of the states and inputs of the last window, (2, k); None: none
+        information: what telemetry since then adds to these sums, the largest share of a state or input [-]
         timer: of identifications
         fresh_start: of searches that do not begin at `warm_start`
         published: of messages that repeat a verdict
@@ -92,6 +94,8 @@ class Identification(msgspec.Struct):
     shrinkage: Shrinkage = msgspec.field(default_factory=Shrinkage)
     data_from: float = -np.inf
     tries: int = 0
+    moments: np.ndarray | None = None
+    information: float = np.inf
     timer: Timer = msgspec.field(default_factory=Timer)
     fresh_start: Timer = msgspec.field(default_factory=Timer)
     published: Timer = msgspec.field(default_factory=Timer)
@@ -109,6 +113,21 @@ class Identification(msgspec.Struct):
     def store(self, model: DerivativesModel) -> None:
         """Store the newest model."""
         self.warm_start = model
+
+    def used(self, data: np.ndarray) -> None:
+        """Store the moments of the states and inputs, (n, k), of the window used."""
+        mean = data.mean(axis=0)
+        self.moments, self.information = np.array([mean, ((data - mean) ** 2).sum(axis=0)]), 0.0
+
+    def expect_news(self) -> None:
+        """Make an identification due after its period."""
+        self.information = np.inf
+
+    def add_data(self, data: np.ndarray) -> None:
+        """Compare telemetry since the last window, (n, k), with that window."""
+        if self.moments is not None:
+            mean, squares = self.moments
+            self.information = float((((data - mean) ** 2).sum(axis=0) / np.maximum(squares, 1e-12)).max())
 
     def set_siblings(self, siblings: SiblingType | None) -> None:
         """Store what aircraft of its type share, for the first models; it must be valid, see `type_defect`."""
@@ -130,6 +149,7 @@ class Identification(msgspec.Struct):
     def restart(self, data_from: float, prior_model: DerivativesModel | None) -> None:
         """Use telemetry from `data_from` on only [s since 1970], with another prior."""
         self.data_from, self.prior_model, self.warm_start = data_from, prior_model, None
+        self.moments, self.information = None, np.inf
         self.published.expire()
 
     def reset_clock(self) -> None:
@@ -189,6 +209,7 @@ class ModelBank(msgspec.Struct):
         point_mass_holdout_error: end error over held-out flight, of the path length [-]
         active_holdout_error: the same of the active model, where the point mass was above the limit [-]
         newest_holdout_errors: of the newest rollouts of the point mass and of the active model [-]
+        kinematic_timer: of the fit of the kinematic models
         point_mass_timer: of its identification
         holdout_timer: of rollouts over held-out flight
         active_effect: missing physics that was added to the models
@@ -205,6 +226,7 @@ class ModelBank(msgspec.Struct):
     point_mass_holdout_error: float = float("nan")
     newest_holdout_errors: tuple[float, float] = (float("nan"), float("nan"))
     active_holdout_error: float = float("nan")
+    kinematic_timer: Timer = msgspec.field(default_factory=Timer)
     point_mass_timer: Timer = msgspec.field(default_factory=Timer)
     holdout_timer: Timer = msgspec.field(default_factory=Timer)
     active_effect: ActiveEffects | None = None
@@ -299,7 +321,7 @@ class ModelBank(msgspec.Struct):
 
     def reset_clock(self) -> None:
         """Forget checkpoints and times: the new time may be earlier than the old one."""
-        for timer in (self.scored, self.point_mass_timer, self.holdout_timer):
+        for timer in (self.scored, self.kinematic_timer, self.point_mass_timer, self.holdout_timer):
             timer.expire()
         self.active_effect = None
         self.checkpoints.clear()

@@ -1,6 +1,6 @@
 """Extrapolate a prediction between two rollouts: continue the last path from the newest position."""
 
-from math import exp, sqrt
+from math import exp, inf, sqrt
 
 import msgspec
 import numpy as np
@@ -8,10 +8,12 @@ import numpy as np
 from fleet.contract import Array, Message, Prediction
 from fleet.frames import to_ned
 from fleet.physics.kernel import kernel
+from twin_worker.numerics.prediction_errors import along_cross_down, track_frame
 from twin_worker.twin.state.state import Twin
 
 MAX_ROLLOUT_AGE_S = 10.0  # maximum age of the continued rollout [s]
 MAX_OVERDUE_AGE_S = 150.0  # the same while the next rollout is due and waits for CPU time [s]
+_NEAR_S = 5.0  # look-ahead whose region is the scale of a departure [s]
 _FADE_TIME_S = 10.0  # time constant of the return to the predicted path [s]
 
 
@@ -100,8 +102,30 @@ def can_propagate(twin: Twin, t: float) -> bool:
 
 
 def rollout_overdue(twin: Twin, t: float) -> bool:
-    """Return whether the next rollout is due at `t` but was not made because it waits for CPU time."""
-    return t >= twin.prediction.predict_timer.last + twin.config.schedule.predict
+    """Return whether the next rollout is due at `t`, whatever the departure, but waits for CPU time."""
+    return t >= twin.prediction.predict_timer.last + twin.config.schedule.longest_predict
+
+
+def departure(twin: Twin) -> float:
+    """Return the distance of the aircraft from its last rollout, along, cross and vertical in half-axes, the largest.
+
+    inf where it cannot be extrapolated, or where the aircraft is on another mission item than at the rollout.
+    """
+    rollout, history = twin.prediction.last_rollout, twin.telemetry.history
+    t, rows = history.rows_since("position", history.newest - 1.0)
+    if rollout is None or not len(t) or not can_propagate(twin, float(t[-1])):
+        return inf
+    leg_t, leg = history.rows_since("leg", rollout.t)
+    elapsed, ahead = float(t[-1]) - rollout.t, rollout.ahead.numpy()
+    k = int(ahead.searchsorted(elapsed, side="right"))
+    if not 0 < k < len(ahead) or (len(leg_t) and int(leg[-1, 0]) != int(leg[0, 0])):
+        return inf
+    part = slice(max(k - 2, 0), k + 1)
+    path, between = rollout.path.numpy()[part].astype(float), ahead[part].astype(float)
+    nominal = np.array([np.interp(elapsed, between, column) for column in path.T])
+    error = along_cross_down(track_frame(path, between)[-2], to_ned(rollout.ned_origin(), *rows[-1]) - nominal)
+    near = int(ahead.searchsorted(_NEAR_S))
+    return float(np.max(np.abs(error) / rollout.prediction_region_half_axes.numpy()[min(near, len(ahead) - 1)]))
 
 
 def propagate(twin: Twin, t: float, position: np.ndarray) -> Prediction | None:

@@ -22,6 +22,7 @@ from twin_worker.prediction.replay_window import Rollout
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.resample import DT
 from twin_worker.telemetry.track import SETTLING_S, hovering_mask
+from twin_worker.twin.state.budget import LONGEST_PERIOD_S
 from twin_worker.twin.state.models import VerifiedModel
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.kinematic_prediction import fit_kinematic_models
@@ -247,6 +248,7 @@ def identify_and_verify(twin: Twin) -> list[Message]:
     fraction = _HOLD_OUT_FRACTION[twin.config.method != PAPER]
     held_out = fraction * len(window) if of_type is None else len(window) - _SIBLING_TRAINING_S / DT
     n_train = len(window) - int(np.clip(held_out, *_hold_out_limits(twin)))
+    twin.identification.used(_regressors(window))
     try:
         plant = _identify(twin, window.part(0, n_train), of_type)
     except (ValueError, np.linalg.LinAlgError) as error:
@@ -276,6 +278,20 @@ def identify_and_verify(twin: Twin) -> list[Message]:
     message = model_message(twin, window)
     twin.identification.publish(message, float(window.t[-1]))
     return [message]
+
+
+def update_information(twin: Twin) -> None:
+    """Compare telemetry since the last identification with its window, from the first verified model on."""
+    since_s = twin.telemetry.last_step_t - twin.identification.timer.last
+    if twin.models.active_model is None or not 0.0 < since_s < LONGEST_PERIOD_S:
+        twin.identification.expect_news()
+    elif (window := twin.window(since_s)) is not None:
+        twin.identification.add_data(_regressors(window))
+
+
+def _regressors(window: Window) -> np.ndarray:
+    """Return what the derivatives multiply: airspeeds, rates and inputs of the measured rows, (n, 10)."""
+    return np.hstack([window.x[:, :6], window.u])[window.ok]
 
 
 def _outcome_changed(verdict: Verdict, previous: Verdict) -> bool:

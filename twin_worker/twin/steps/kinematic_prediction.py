@@ -20,6 +20,7 @@ from twin_worker.twin.state.routes import ROUTE_MODES, failsafe_plan, present_ro
 from twin_worker.twin.state.state import Twin
 
 _FIT_WINDOW_S = 130.0  # flight time used to fit the kinematic models [s]
+_TRIED_FIRST = 8  # fits of a multirotor in a row: each of its parameters twice
 _RETURN_COMMAND = 20  # MAV_CMD: NAV_RETURN_TO_LAUNCH
 _VTOL_COMMANDS = (84, 85)  # MAV_CMD: NAV_VTOL_TAKEOFF, NAV_VTOL_LAND
 _KNOWN_PATH_S = 5.0  # part of a path that is commanded point by point which its course tells: the distance of L1 [s]
@@ -166,9 +167,15 @@ def fit_kinematic_models(twin: Twin) -> None:
         and (not twin.vehicle_class.has_wings or twin.models.active_model is not None)
     ):
         return
+    newest = twin.telemetry.history.newest
+    if twin.models.multirotor.n_comparisons >= _TRIED_FIRST and not twin.models.kinematic_timer.due(
+        newest, fit.START_INTERVAL_S
+    ):
+        return
     recent = recent_track(twin)
     if recent is None or len(recent) < 100:
         return
+    twin.models.kinematic_timer.restart(newest)
     seq = rollout.items_in_force(recent.t, twin.telemetry.history.rows_since("leg"), twin.onboard.mission)
     if twin.vehicle_class.is_rotorcraft:
         config = _multirotor_config(twin, recent)
