@@ -195,13 +195,15 @@ def rollout_age_s(twin: Twin) -> float:
 
 
 def _rollout_due(twin: Twin, now: float) -> bool:
-    """Return whether a rollout is due: after its period, where the aircraft has departed from the last one."""
+    """Return whether a rollout is due: after its period, where the aircraft has departed from the last one.
+
+    An event makes it due at once. Before a model was compared with flight, each rollout knows more than the last.
+    """
     timer, schedule = twin.prediction.predict_timer, twin.config.schedule
     if not timer.due(now, schedule.predict):
         return False
-    if (
-        not schedule.departure or not isfinite(timer.last) or rollout_overdue(twin, now)
-    ):  # an event makes it due at once
+    may_wait = schedule.departure and isfinite(timer.last) and twin.models.is_compared
+    if not may_wait or rollout_overdue(twin, now):
         return True
     return _extrapolation_due(twin, now) and not departure(twin) < schedule.departure
 

@@ -243,6 +243,11 @@ class ModelBank(msgspec.Struct):
         return TwinState.PLAUSIBLE if plausible else TwinState.VERIFIED
 
     @property
+    def is_compared(self) -> bool:
+        """Return whether a model of this aircraft was compared with its flight."""
+        return self.has_model or self.multirotor.n_comparisons > 0
+
+    @property
     def has_model(self) -> bool:
         """Return whether an identified model or a point mass can predict."""
         return self.active_model is not None or self.point_mass is not None
