@@ -176,8 +176,18 @@ def _transition(rate: float) -> np.ndarray:
     )
 
 
+class _TurnFilter(KalmanFilter):  # type: ignore[misc]
+    """Kalman filter whose likelihood costs no decomposition: `update` has inverted the innovation covariance."""
+
+    @property
+    def log_likelihood(self) -> float:
+        """Return the logarithm of the density of the last innovation."""
+        _, log_det = np.linalg.slogdet(2.0 * np.pi * self.S)
+        return float(-0.5 * (log_det + self.y @ self.SI @ self.y))
+
+
 def _filter(rate: float, noise: float, start: np.ndarray) -> KalmanFilter:
-    filt = KalmanFilter(dim_x=4, dim_z=4)
+    filt = _TurnFilter(dim_x=4, dim_z=4)
     q = np.array([[STEP**4 / 4, STEP**3 / 2], [STEP**3 / 2, STEP**2]])
     filt.F, filt.H, filt.R = _transition(rate), np.eye(4), np.diag([0.5, 0.05, 0.5, 0.05])
     filt.Q, filt.x, filt.P = np.kron(np.eye(2), q) * noise, start.copy(), np.eye(4)
