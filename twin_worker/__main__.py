@@ -17,7 +17,7 @@ from fleet.config import bus_config_from, router_arguments
 from fleet.process.children import Children
 from fleet.process.logs import log_arguments, report_progress, report_status
 from fleet.process.malloc_trim import enable_malloc_trim
-from twin_worker.twin.state.budget import parse_schedule
+from twin_worker.twin.state.budget import LIVE_SCHEDULE, parse_schedule
 
 _POLL_S = 0.5
 _RESTART_DELAY_S = 5.0  # before a restart, so that an immediate failure does not loop at full load [s]
@@ -205,6 +205,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--pace",
         type=parse_schedule,
+        default=LIVE_SCHEDULE,
         metavar="WORK=S,…",
         help="shortest periods of rollouts, identifications, ensembles, renewals "
         "(predict=1,identify=1,ensemble=10,renew=1), changes below which rollouts and identifications wait up "

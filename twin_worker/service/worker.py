@@ -45,7 +45,7 @@ from twin_worker.service.queries import QueryHandlers, copy_twin
 from twin_worker.service.sibling_sharing import SiblingSharing
 from twin_worker.service.wind_sharing import WindSharing
 from twin_worker.service.work_rates import WorkRates
-from twin_worker.twin.state.budget import LIVE_SCHEDULE, ComputeBudget, Schedule, Work
+from twin_worker.twin.state.budget import ComputeBudget, Schedule, Work
 from twin_worker.twin.state.state import AUTO, Twin, TwinConfig
 from twin_worker.twin.step import advance, catch_up, fleet_row, rollout_age_s
 
@@ -80,7 +80,7 @@ class Worker:
     ) -> None:
         self.bus, self.uavs, self.diagnosis = bus, uavs, diagnosis
         self.omega, self.method, self.airframe = omega, method, airframe or load(GENERIC)
-        self.schedule, self._use_siblings = schedule or LIVE_SCHEDULE, use_siblings
+        self.schedule, self._use_siblings = schedule or Schedule(), use_siblings
         # short for frequent propagation
         self._late_after_s = min(max(_LATE_PERIODS * self.schedule.renew, _LATE_LIMITS_S[0]), _LATE_LIMITS_S[1])
         self.quota = ComputeBudget(max_limit=_HEAVY_SHARE * self._late_after_s)

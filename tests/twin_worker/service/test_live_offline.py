@@ -13,6 +13,8 @@ from tests.support.memory_bus import MemoryBus
 from twin_worker.evaluation.replay import run_offline
 from twin_worker.service import worker as live
 from twin_worker.service.worker import Worker
+from twin_worker.twin.state.budget import LIVE_SCHEDULE, Schedule
+from twin_worker.twin.step import Twin
 
 KINDS = (Model, Prediction, Alert)
 
@@ -25,12 +27,12 @@ def clock(monkeypatch) -> list[float]:
     return now
 
 
-def lived(heard: Iterable[Message], seed: int, most: int = 40) -> list[Message]:
+def lived(heard: Iterable[Message], seed: int, most: int = 40, schedule: Schedule | None = None) -> list[Message]:
     """What a worker publishes that hears the messages in bursts of any size."""
     rng, bus, told = np.random.default_rng(seed), MemoryBus(), []
     for kind in KINDS:
         bus.subscribe(kind, lambda message, _: told.append(message))
-    worker = Worker(bus, range(1, 256), omega=0.0)
+    worker = Worker(bus, range(1, 256), omega=0.0, schedule=schedule)
     worker.connect()
     left = 0
     for message in heard:
@@ -71,6 +73,12 @@ def same(one: list[Message], other: list[Message], uav: int) -> tuple[int, int]:
 def test_a_pretend_flight_in_bursts_is_answered_as_one_by_one(heard, flown, seed):
     n_models, n_made = same(lived(heard, seed), flown[1], 1)
     assert n_models > 5 and n_made > 60
+
+
+def test_work_that_is_put_off_is_put_off_alike_in_bursts(heard: tuple) -> None:
+    twins = {1: Twin.of(1, omega=0.0, schedule=LIVE_SCHEDULE)}
+    n_models, n_made = same(lived(heard[:900], 3, schedule=LIVE_SCHEDULE), list(run_offline(heard[:900], twins)), 1)
+    assert n_models and n_made > 40
 
 
 def test_a_multirotor_in_bursts_is_answered_as_one_by_one():

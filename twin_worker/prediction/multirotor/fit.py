@@ -57,10 +57,9 @@ def fit_model(track: Track, seq: np.ndarray, config: MultirotorConfig, model: Mu
     starts = _starts(track, seq, config)
     if len(starts) < 3:
         return model
-    segments_of = {
-        k: config.segments(track.part(max(k - _HISTORY_ROWS, 0), k + 1), seq[max(k - _HISTORY_ROWS, 0) : k + 1])[0]
-        for k in starts
-    }
+    if config.has_law and not config.absent:  # nothing to fit
+        return _compared(track, seq, MultirotorTwin(config, model), starts)
+    segments_of = {k: _segments_at(track, seq, config, k) for k in starts}
 
     def cost_of(candidate: MultirotorModel, configured: MultirotorConfig) -> tuple[float, float]:
         twin = MultirotorTwin(configured, candidate)
@@ -80,6 +79,27 @@ def fit_model(track: Track, seq: np.ndarray, config: MultirotorConfig, model: Mu
     costs = [cost_of(option, config) for option in options]
     best = int(np.argmin([cost for cost, _ in costs]))
     return _with_errors(options[best], costs[best], len(starts))
+
+
+def _segments_at(track: Track, seq: np.ndarray, config: MultirotorConfig, k: int) -> np.ndarray:
+    past = slice(max(k - _HISTORY_ROWS, 0), k + 1)
+    return config.segments(track.part(past.start, past.stop), seq[past])[0]
+
+
+def _compared(track: Track, seq: np.ndarray, twin: MultirotorTwin, starts: list[int]) -> MultirotorModel:
+    """Return the model with the errors over the last minute; only rollouts since the last comparison are flown."""
+    model, config, oldest = twin.model, twin.config, float(track.t[starts[-1]])
+    errors = [(t, error) for t, error in model.errors if t > oldest - 0.5 * START_INTERVAL_S]
+    newest = errors[-1][0] if errors else -np.inf
+    for k in sorted(starts):
+        if track.t[k] > newest + 0.5 * START_INTERVAL_S:
+            segments = _segments_at(track, seq, config, k)
+            error = _rollout_error((track, seq), k, segments, int(seq[k]) + config.seq_offset, twin)
+            errors.append((float(track.t[k]), error))
+    values = [error for _, error in errors]
+    return _with_errors(
+        replace(model, errors=tuple(errors)), (float(np.mean(values)), float(np.median(values))), len(errors)
+    )
 
 
 def _with_errors(model: MultirotorModel, errors: tuple[float, float], n: int) -> MultirotorModel:

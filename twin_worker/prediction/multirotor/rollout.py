@@ -42,6 +42,7 @@ class MultirotorModel:
         wind: NED, the direction it blows to, (2,) [m/s]
         mean_error: mean error over 10 s of past flight [m]; nan before the first fit
         median_error: the same, median over the rollouts [m]
+        errors: start [s since 1970] and mean error [m] of the rollouts of the last minute, where nothing is fitted
         n_starts: number of rollouts in that mean
         n_comparisons: number of fits so far
     """
@@ -56,6 +57,7 @@ class MultirotorModel:
     wind: tuple[float, float] = (0.0, 0.0)
     mean_error: float = float("nan")
     median_error: float = float("nan")
+    errors: tuple[tuple[float, float], ...] = ()
     n_starts: int = 0
     n_comparisons: int = 0
 
