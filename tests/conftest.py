@@ -100,7 +100,10 @@ def router() -> Iterator[str]:
 
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[LONG_FILES] = []
-    os.environ.setdefault("PARAUAV_ONBOARD", tempfile.mkdtemp(prefix="parauav-onboard-"))  # not the user's own
+    if "PARAUAV_ONBOARD" not in os.environ:  # not the user's own; processes of this run share it
+        folder = tempfile.TemporaryDirectory(prefix="parauav-onboard-")
+        config.add_cleanup(folder.cleanup)
+        os.environ["PARAUAV_ONBOARD"] = folder.name
     config.option.loadscopereorder = False  # pytest-xdist puts files of many tests first, which are the quick ones
 
 
