@@ -48,6 +48,30 @@ def drag(v_n: float, v_e: float, par: np.ndarray) -> tuple[float, float]:
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
+def drag_integrator(v: np.ndarray, tilt: np.ndarray, par: np.ndarray, step: float, largest: float) -> np.ndarray:
+    """Return drag at the last row and the velocity integrator after all rows, north and east, (2, 2) [m/s2].
+
+    In slow motion the velocity error is what the integrator lacks of the drag, over P: I' = K (drag - I) / P. At the
+    largest tilt it stays.
+
+    Args:
+        v: ground velocities, (n, 2) [m/s]; tilt: accelerations by tilt, nan unknown, (n, 2) [m/s2]
+        par: of the loop
+        step: between rows [s]
+        largest: acceleration by tilt from which it stays [m/s2]
+    """
+    out = np.empty((2, 2))
+    recovery = par[VEL_I] / par[VEL_P] * step
+    for k in range(len(v)):
+        out[0, 0], out[0, 1] = drag(v[k, 0], v[k, 1], par)
+        if k == 0:
+            out[1] = out[0]
+        if not sqrt(tilt[k, 0] ** 2 + tilt[k, 1] ** 2) > largest:
+            out[1] += recovery * (out[0] - out[1])
+    return out
+
+
+@nb.njit(cache=True, error_model="numpy", nogil=True)
 def _limit(c: np.ndarray, v: np.ndarray, par: np.ndarray) -> float:
     """Limit the horizontal command (3,) in place; return the command over the limit, at least 1.
 

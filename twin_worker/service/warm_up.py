@@ -94,6 +94,7 @@ def _run_multirotors() -> None:
     copter_legs.follow(np.zeros(copter_legs.N_STATE), segments, motion, par, 0.1, out)
     states, simulated = np.empty((5, copter_legs.N_STATE)), np.empty((5, 4, 3))
     copter_legs.simulated_states(segments, 1, par, 0.1, states, simulated)
+    position_loop.drag_integrator(np.zeros((2, 2)), np.zeros((2, 2)), par, 0.1, 1.0)
 
 
 def _run_traffic() -> None:

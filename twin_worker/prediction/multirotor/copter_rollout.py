@@ -5,7 +5,7 @@ that lies nearest to the newest positions and velocities.
 """
 
 from collections.abc import Mapping, Sequence
-from math import hypot, isfinite, pi, tan
+from math import isfinite, pi, tan
 
 import numpy as np
 
@@ -114,23 +114,15 @@ def stopping_point(p: np.ndarray, v: np.ndarray, par: np.ndarray) -> np.ndarray:
 
 
 def present_motion(track: Track, par: np.ndarray) -> np.ndarray:
-    """Return the newest position, velocity, acceleration by tilt, and integrator, (4, 3), as of `track_reference`.
-
-    In slow motion the velocity error is what the integrator lacks of the drag, over P: I' = K (drag - I) / P. At the
-    largest tilt it stays.
-    """
+    """Return the newest position, velocity, acceleration by tilt, and integrator, (4, 3), as of `track_reference`."""
     rows = min(_ACCELERATION_ROWS, len(track) - 1)
     v = track.v[-_VELOCITY_ROWS:].mean(axis=0)
     a = (track.v[-1] - track.v[-1 - rows]) / (STEP * rows) if rows else np.zeros(3)
-    drag = np.array([position_loop.drag(v_n, v_e, par) for v_n, v_e in track.v[-_DRAG_ROWS:, :2]])
-    tilt = tilt_acceleration(track.euler[-_DRAG_ROWS:])
-    recovery = par[position_loop.VEL_I] / par[position_loop.VEL_P] * STEP
-    integrator = drag[0].copy()
-    for wanted, tilted in zip(drag, tilt, strict=True):
-        if not hypot(*tilted) > _SATURATED * par[position_loop.ACC_MAX]:
-            integrator += recovery * (wanted - integrator)
+    tilt, largest = tilt_acceleration(track.euler[-_DRAG_ROWS:]), _SATURATED * par[position_loop.ACC_MAX]
+    recent = np.ascontiguousarray(track.v[-_DRAG_ROWS:, :2])
+    drag, integrator = position_loop.drag_integrator(recent, tilt, par, STEP, largest)
     f = np.clip(a, -5.0, 5.0)
-    f[:2] += drag[-1]
+    f[:2] += drag
     if len(tilt) >= _TILT_ROWS and np.isfinite(tilt[-_TILT_ROWS:]).all():
         f[:2] = tilt[-_TILT_ROWS:].mean(axis=0)
     return np.array([track.p[-1], v, f, [*integrator, 0.0]])
