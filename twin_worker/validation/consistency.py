@@ -22,7 +22,7 @@ from scipy.stats import t as student_t
 from fleet.physics.simulate import TAU, lagged
 from fleet.physics.wrench import NAMES, OFFSETS, WIND
 from fleet.window import Window
-from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
+from twin_worker.identification.fixed_wing.derivatives_model import EFFECTIVE_FRACTION, DerivativesModel
 from twin_worker.identification.fixed_wing.output_error import (
     GROUP,
     N_COLUMN,
@@ -174,7 +174,7 @@ def _gram_matrices(model: DerivativesModel, window: Window, runs: np.ndarray) ->
     grams = columns.T @ grams @ columns
     rest, by_start = slice(0, _N + _M + 1), slice(_N + _M + 1, None)
     cross, square = grams[:, by_start, rest], grams[:, by_start, by_start]
-    moves = np.linalg.solve(square + np.diag(SIGMA**-2.0) / model.effective_fraction, cross)
+    moves = np.linalg.solve(square + np.diag(SIGMA**-2.0) / EFFECTIVE_FRACTION, cross)
     removed = np.swapaxes(cross, 1, 2) @ moves
     return grams[:, rest, rest] - removed - np.swapaxes(removed, 1, 2) + np.swapaxes(moves, 1, 2) @ square @ moves
 
@@ -186,7 +186,7 @@ def _identified_information(model: DerivativesModel) -> np.ndarray:
     """
     D = model.par[:, None] * MASK
     identified = model.fisher_information + (model.prior_precision if model.siblings else 0.0)
-    information = identified / model.effective_fraction
+    information = identified / EFFECTIVE_FRACTION
     cross = information[list(_NUISANCE)] @ D
     by_nuisance = _solve(information[np.ix_(_NUISANCE, _NUISANCE)], cross)
     return np.einsum("ag,ab,bg->g", D, information, D) - np.einsum("ng,ng->g", cross, by_nuisance)

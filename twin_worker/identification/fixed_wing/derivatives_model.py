@@ -5,7 +5,7 @@ The information of the last verified model, partly discounted, is the prior of t
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import cos
 from typing import NamedTuple
 
@@ -90,7 +90,7 @@ def _scale(name: str, k: float, l: float) -> float:
     return power if force else power * l
 
 
-EFFECTIVE_FRACTION = 0.12  # effective fraction of residuals, one in four samples, before it is estimated [-]
+EFFECTIVE_FRACTION = 0.12  # effective fraction of residuals, one in four samples: gusts correlate them [-]
 COLD_STEPS, WARM_STEPS = 8, 1  # maximum steps of a first and of a repeated search
 # retained fraction of earlier information per window [-]
 _RETENTION, _RETENTION_OFFSETS, _RETENTION_WIND = 0.7, 0.5, 0.7
@@ -113,7 +113,6 @@ class DerivativesModel:
         t0, t1: identification window [s since 1970]
         steps: search steps
         siblings: aircraft of its type that the prior was learnt from; 0: none
-        effective_fraction: effective fraction of residuals in `fisher_information` [-]
     """
 
     par: np.ndarray
@@ -127,7 +126,6 @@ class DerivativesModel:
     t1: float
     steps: int
     siblings: int = 0
-    effective_fraction: float = EFFECTIVE_FRACTION
 
     @property
     def covariance(self) -> np.ndarray:
@@ -191,8 +189,7 @@ def identify(
     problem = EstimationProblem(y, delta, segments, trim_velocity, window.dt, EFFECTIVE_FRACTION)
     result = None
     if warm_start is not None:
-        similar = replace(problem, effective_fraction=warm_start.effective_fraction)
-        result = estimate(similar, warm_start.par, (mean, precision), WARM_STEPS, warm_start.weight)
+        result = estimate(problem, warm_start.par, (mean, precision), WARM_STEPS, warm_start.weight)
     if result is None or not _is_finite(result):
         result = estimate(problem, mean, (mean, precision), COLD_STEPS, None)
     if not _is_finite(result):
@@ -212,7 +209,6 @@ def identify(
         float(t[-1]),
         result.steps,
         prior_model.siblings if prior_model is not None else of_type.siblings if of_type is not None else 0,
-        result.effective_fraction,
     )
 
 

@@ -3,17 +3,9 @@
     J = f sum e' W e + (par - par0)' Lambda (par - par0) + sum_s (x_s - x_bar_s)' K (x_s - x_bar_s)
 
 over free-run segments; f is the effective fraction of residuals. The start states x_s are also unknown; every step
-eliminates them by their Schur complement. Damped Gauss-Newton steps; W and f are estimated from the residuals.
+eliminates them by their Schur complement. Damped Gauss-Newton steps; W is estimated from the residuals.
 
-Gusts and errors of the model correlate the residuals, the more the stronger they are, and feedback correlates them with
-the inputs. As the residual of a state is first-order autoregressive with coefficient rho, N of them count as f N:
-
-    f = (1 - rho) / (1 + rho)       median over the states, at least one residual per free run
-
-In calm air the data count, in turbulence the prior.
-
-Source: Jategaonkar 2015, chapter 4 (output error, multiple shots); Ljung 1999, section 10.2 (damping);
-Bartlett 1946 (information of autocorrelated samples).
+Source: Jategaonkar 2015, chapter 4 (output error, multiple shots); Ljung 1999, section 10.2 (damping).
 """
 
 from dataclasses import dataclass
@@ -159,7 +151,7 @@ class EstimationProblem:
         segments: first and last row of each, (m, 2)
         trim_velocity: U0, W0, (2,) [m/s]
         dt: sample time [s]
-        effective_fraction: effective fraction of residuals, in a cold search before it is estimated [-]
+        effective_fraction: effective fraction of residuals, which gusts correlate [-]
     """
 
     y: np.ndarray
@@ -178,7 +170,6 @@ class EstimationResult:
         par: parameters, (37,)
         fisher_information: information from the data, start states eliminated, (37, 37)
         weight: inverse residual variances, (9,)
-        effective_fraction: effective fraction of residuals in the information [-]
         steps: Gauss-Newton steps that descended
         cost: final cost; nan if the start or its sensitivities left the envelope
     """
@@ -186,7 +177,6 @@ class EstimationResult:
     par: np.ndarray
     fisher_information: np.ndarray
     weight: np.ndarray
-    effective_fraction: float
     steps: int
     cost: float
 
@@ -220,7 +210,6 @@ class _GaussNewton:
 
     def __init__(self, problem: EstimationProblem, par0: np.ndarray, Lambda: np.ndarray) -> None:
         self.problem, self.par0, self.Lambda = problem, par0, Lambda
-        self.effective_fraction = problem.effective_fraction
         measured = [problem.y[a:b] for a, b in problem.segments]
         self.start_prior = np.array([line_fit_start(y) for y in measured])
         self.state_std = np.concatenate(measured).std(axis=0)
@@ -239,14 +228,6 @@ class _GaussNewton:
         )
         return self.cost(squares, par, starts)
 
-    def estimated_fraction(self) -> float:
-        """Estimate the effective fraction from the residuals."""
-        power, product = (self.e**2).sum(axis=0), np.zeros(N_X)
-        for a, b in zip(self.bounds, self.bounds[1:], strict=False):
-            product += (self.e[a + 1 : b] * self.e[a : b - 1]).sum(axis=0)
-        rho = np.clip(product / np.maximum(power, 1e-30), 0.0, 1.0)
-        return max(float(np.median((1.0 - rho) / (1.0 + rho))), len(self.problem.segments) / len(self.e))
-
     def update_weights(self, W: np.ndarray) -> np.ndarray:
         """Estimate W from the residuals; rescale residuals and sensitivities."""
         W_new = 1.0 / np.maximum((self.e**2).mean(axis=0) / W, SIGMA**2)
@@ -258,7 +239,7 @@ class _GaussNewton:
     def cost(self, squares: float, par: np.ndarray, starts: np.ndarray) -> float:
         """Return the cost for a sum of squared residuals."""
         par_offset, start_offset = par - self.par0, starts - self.start_prior
-        return self.effective_fraction * squares + float(
+        return self.problem.effective_fraction * squares + float(
             par_offset @ self.Lambda @ par_offset + (self.K * start_offset**2).sum()
         )
 
@@ -267,7 +248,7 @@ class _GaussNewton:
 
         The back-substitution is the step of each start state and its derivative by the parameter step, (m, 9, 37 + 1).
         """
-        d = self.effective_fraction
+        d = self.problem.effective_fraction
         m = len(starts)
         HH, gg = np.empty((m, N_COLUMN, N_COLUMN)), np.empty((m, N_COLUMN))
         for s in range(m):
@@ -297,14 +278,13 @@ def estimate(
         par: start, (37,)
         prior: prior mean, (37,), and inverse covariance, (37, 37)
         steps: maximum steps that descend
-        weight: W of an earlier search on similar data, which also gave the effective fraction of the problem; None:
-            both from the data, updated twice
+        weight: W of an earlier search on similar data; None: from the data, updated twice
     """
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # sensitivities may overflow before the free run does
             return _descend(_GaussNewton(problem, *prior), par, steps, weight)
     except np.linalg.LinAlgError:
-        return EstimationResult(par, np.zeros((N_PAR, N_PAR)), SIGMA**-2, problem.effective_fraction, 0, float("nan"))
+        return EstimationResult(par, np.zeros((N_PAR, N_PAR)), SIGMA**-2, 0, float("nan"))
 
 
 def _descend(problem: _GaussNewton, par: np.ndarray, steps: int, weight: np.ndarray | None) -> EstimationResult:
@@ -319,8 +299,6 @@ def _descend(problem: _GaussNewton, par: np.ndarray, steps: int, weight: np.ndar
             return cost, H, H[0]
         if cold and count in _WEIGHT_UPDATES:
             W = problem.update_weights(W)
-            if count == _WEIGHT_UPDATES[-1]:  # earlier residuals are those of the prior
-                problem.effective_fraction = problem.estimated_fraction()
             cost = problem.cost(float((problem.e**2).sum()), *x)
         H, g, start_moves = problem.normal_equations(*x)
         return cost, H + problem.Lambda, g
@@ -338,9 +316,6 @@ def _descend(problem: _GaussNewton, par: np.ndarray, steps: int, weight: np.ndar
         mu=1e-3 if cold else 1e-5,
         converges_from=_WEIGHT_UPDATES[-1] + 1 if cold else 0,
     )
-    fraction = problem.effective_fraction
     if not cold and np.isfinite(cost):
         W = 1.0 / np.maximum(0.9 / W + 0.1 * (problem.e**2).mean(axis=0) / W, SIGMA**2)
-        fraction = 0.9 * fraction + 0.1 * problem.estimated_fraction()
-        H = H * (fraction / problem.effective_fraction)
-    return EstimationResult(par, H, W, fraction, steps_taken, cost if np.isfinite(cost) else float("nan"))
+    return EstimationResult(par, H, W, steps_taken, cost if np.isfinite(cost) else float("nan"))
