@@ -58,17 +58,26 @@ def _runs(result: Experiment, first: str, conditions: str) -> Figure:
         low, high = axis_limits(result.actual[:, k], min_range=0.02)
         ax.set_ylim(low - 0.5 * (high - low), high + 0.5 * (high - low))
         style_axes(ax, f"{name} [{_UNITS.get(name, 'rad')}]   fit {_listed(result.fit[:, k])} %")
-    _legend(figure)
     figure.supxlabel("unseen data [s]; fit: first step, refined, coupled model", fontsize=9, color=INK)
     title = f"{result.mode}, uav-{result.uav}, the median experiment of this mode; first step {first}; {conditions}"
-    figure.suptitle(title, fontsize=11, color=INK)
+    _add_title(figure, title)
     return figure
 
 
-def _legend(figure: Figure) -> None:
-    """Draw the legend of the first panel above all panels, where it covers no data."""
+def _add_title(figure: Figure, title: str) -> None:
+    """Draw the title, and under it the legend of the first panel, above all panels, where it covers no data."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=9)
+    figure.legend(
+        handles,
+        labels,
+        loc="outside upper center",
+        ncols=len(labels),
+        frameon=False,
+        fontsize=9,
+        title=title,
+        title_fontproperties={"size": 11},
+        labelcolor=INK,
+    )
 
 
 def _listed(fits: np.ndarray) -> str:
@@ -102,8 +111,7 @@ def _boxes(fits: dict[str, np.ndarray], title: str) -> Figure:
         style_axes(ax, f"{mode}: {len(fit)} experiments, median of the mean over states {medians} %")
     for ax in list(panels):
         ax.set_visible(False)
-    _legend(figure)
     figure.supylabel("fit of a free run, cut off at −100 [%]", fontsize=9, color=INK)
     figure.supxlabel(_MEANING, fontsize=8, color=MUTED)
-    figure.suptitle(title, fontsize=11, color=INK)
+    _add_title(figure, title)
     return figure
