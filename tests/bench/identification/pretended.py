@@ -127,7 +127,7 @@ class Replay(Aircraft):
             at, n: first row and number of rows
             wind: north and east, the direction it blows to, (2,) [m/s]
             start: state at the first row, u v w over the ground, (9,); None: the true one
-            gusts: seed of gusts with the statistics of the flight; None: no gusts
+            gusts: seed of gusts like those of the flight, which start at those of the run before; None: no gusts
         """
         self._place(at, wind, start, gusts)
         told = []
