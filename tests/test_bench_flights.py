@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from fleet.frames import body_to_ned
+from tests.bench import gust_limit
 from tests.bench.identification import gusty, pretended, recorded
-from tests.bench.identification.flight import Flight, true_airspeed
+from tests.bench.identification.flight import STATE_COLUMNS, Flight, true_airspeed
 from tests.bench.identification.score import fit_percent
 
 DT = 0.04
@@ -67,6 +68,35 @@ def test_the_true_airframe_without_gusts_flies_as_the_flight_did_in_still_air(tm
     each = case.oracle.kstep(300, 400, 25)
     assert np.isfinite(each[::10]).all() and np.isnan(each[1]).all()
     assert np.abs(each[0] - case.flight.x[325]).max() < 1.0
+
+
+def test_gusts_of_another_seed_change_the_run_and_gusts_of_the_same_seed_repeat_it(tmp_path, monkeypatch):
+    monkeypatch.setenv("PARAUAV_BENCH_CACHE", str(tmp_path))
+    for name, value in (("UAVS", 1), ("SECONDS", 84.0)):
+        monkeypatch.setattr(pretended, name, value)
+    case = pretended.cases(5)[0]
+    wind = case.oracle.mean_wind(1000, 1000)
+    # a fresh aircraft each: the gusts of a run start at those that the run before has left
+    calm, first, again, other = (
+        pretended.cases(5)[0].oracle.fly(1000, 1000, wind, gusts=seed) for seed in (None, 1, 1, 2)
+    )
+    assert np.array_equal(first, again) and np.array_equal(calm, case.oracle.forecast(1000, 1000))
+    assert 0.2 < (first - calm)[100:, 1].std() < 3.0 and 0.2 < (other - first)[100:, 1].std() < 3.0
+    moved = case.oracle.fly(1000, 10, wind, case.flight.x[1000])
+    assert np.abs(moved[0] - case.flight.x[1000]).max() < 0.02
+
+
+def test_the_bench_of_the_gust_limit_scores_every_method_in_every_window(tmp_path, monkeypatch):
+    monkeypatch.setenv("PARAUAV_BENCH_CACHE", str(tmp_path))
+    monkeypatch.setattr(gust_limit, "GUST_RUNS", 1)
+    for name, value in (("UAVS", 1), ("SECONDS", 84.0)):
+        monkeypatch.setattr(pretended, name, value)
+    fits = gust_limit.measure(pretended.cases(5), None, 5)
+    assert set(fits) == set(gust_limit.METHODS) and {fit.shape for fit in fits.values()} == {(1, 9)}
+    assert np.array_equal(fits["other gusts"], fits["one of them"])
+    table = gust_limit.summary(fits)
+    assert table["identified"]["identified - lon"] == 0.0
+    assert table["true start"]["lat"] == pytest.approx(fits["true start"][0, STATE_COLUMNS["lat"]].mean(), abs=0.1)
 
 
 @pytest.mark.recordings

@@ -3,8 +3,8 @@
 Three models of the same window:
 
 - first step: projection (as in the paper) or PBSID, 4 longitudinal and 5 lateral states, with bias;
-- refined: the same model after prediction-error refinement, start states and output biases estimated, with a ridge
-  towards the first step;
+- refined: the same model after prediction-error refinement over free runs of growing length, start states and output
+  biases estimated, with a ridge towards the result of the shorter runs, at first towards the first step;
 - coupled: the derivatives model of the twin, both axes in one model with exact kinematics.
 
 Source: Huang 2021, sections 3.1 and 4.2.
@@ -119,8 +119,9 @@ FIRST_STEPS: dict[str, Callable[..., StateSpace]] = {"projection": projection, "
 STATE_NAMES = tuple(name for axis in AXES for name in STATES[axis])
 MODELS = ("first", "refined", "coupled")
 _ORDER = [ALL.index(name) for name in STATE_NAMES]
-_RIDGE = 1e3  # precision of an entry of [A B c] about the first step, scaled units [-]
-_RUN_S = (2.0, 4.0)  # free-run lengths of the refinement, one after the other [s]
+# free-run lengths of the refinement, one after the other [s], and precision of an entry of [A B c] about the result
+# before, scaled units [-]; the first is low, because the projection is biased in closed loop
+_REFINEMENT = ((0.5, 1e2), (2.0, 1e3), (4.0, 1e3))
 SEEN_RUN_S = 8.0  # free run over the end of the identification data [s]
 START_S = 1.0  # data before the free run that determine its start [s]
 
@@ -194,8 +195,7 @@ def both_steps(axis: str, seen: Window, first: str) -> tuple[AxisModel, AxisMode
         y,
         u,
         ok,
-        lengths=tuple(round(run_s / seen.dt) for run_s in _RUN_S),
-        ridge=_RIDGE,
+        runs=[(round(run_s / seen.dt), ridge) for run_s, ridge in _REFINEMENT],
         errors=sensor_errors(states, scale[0]),
     )
     return replace(axis_model, D=start), replace(axis_model, D=refined)

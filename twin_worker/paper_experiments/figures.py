@@ -8,12 +8,15 @@ from matplotlib.figure import Figure
 
 from fleet.report.ink import BAD, GOOD, INK, LINES, MUTED, axis_limits
 from twin_worker.numerics.plot_style import style_axes
-from twin_worker.paper_experiments.experiment import MODELS, SEEN_RUN_S, STATE_NAMES, Experiment
+from twin_worker.paper_experiments.experiment import SEEN_RUN_S, STATE_NAMES, Experiment
 from twin_worker.telemetry.flight_phase import PHASES
 
 _STYLES = ((LINES[0], "first step"), (BAD, "refined"), (GOOD, "coupled model"))
 _UNITS = {"u": "m/s", "v": "m/s", "w": "m/s", "p": "rad/s", "q": "rad/s", "r": "rad/s"}
-_MEANING = "100 %: the run equals the measurement; 0 %: as good as its mean; boxes: quartiles, whiskers: 5 to 95 %"
+_MEANING = (
+    "100 %: the run equals the measurement; 0 %: as good as its mean; boxes: quartiles, whiskers: 5 to 95 %; "
+    "medians of the titles: first step, refined, coupled model"
+)
 
 
 def draw(folder: Path, first: str, results: Sequence[Experiment], conditions: str) -> list[Path]:
@@ -54,13 +57,32 @@ def _runs(result: Experiment, first: str, conditions: str) -> Figure:
         # scale to the measured line: a diverged run may leave the axes
         low, high = axis_limits(result.actual[:, k], min_range=0.02)
         ax.set_ylim(low - 0.5 * (high - low), high + 0.5 * (high - low))
-        fits = ", ".join(f"{fit:.0f}" for fit in result.fit[:, k])
-        style_axes(ax, f"{name} [{_UNITS.get(name, 'rad')}]   fit {fits} %")
-    figure.axes[0].legend(frameon=False, fontsize=8)
-    figure.supxlabel("unseen data [s]", fontsize=9, color=INK)
+        style_axes(ax, f"{name} [{_UNITS.get(name, 'rad')}]   fit {_listed(result.fit[:, k])} %")
+    figure.supxlabel("unseen data [s]; fit: first step, refined, coupled model", fontsize=9, color=INK)
     title = f"{result.mode}, uav-{result.uav}, the median experiment of this mode; first step {first}; {conditions}"
-    figure.suptitle(title, fontsize=11, color=INK)
+    _add_title(figure, title)
     return figure
+
+
+def _add_title(figure: Figure, title: str) -> None:
+    """Draw the title, and under it the legend of the first panel, above all panels, where it covers no data."""
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(
+        handles,
+        labels,
+        loc="outside upper center",
+        ncols=len(labels),
+        frameon=False,
+        fontsize=9,
+        title=title,
+        title_fontproperties={"size": 11},
+        labelcolor=INK,
+    )
+
+
+def _listed(fits: np.ndarray) -> str:
+    """List fits with minus signs of text, which are wider than hyphens."""
+    return ", ".join(f"{fit:.0f}" for fit in fits).replace("-", "\u2212")
 
 
 def _boxes(fits: dict[str, np.ndarray], title: str) -> Figure:
@@ -85,12 +107,11 @@ def _boxes(fits: dict[str, np.ndarray], title: str) -> Figure:
             ax.plot([], [], color=colour, lw=5, alpha=0.5, label=label)
         ax.axhline(0, color=MUTED, lw=0.8)
         ax.set_xticks(places, STATE_NAMES)
-        medians = ", ".join(f"{np.median(fit[:, i].mean(axis=1)):.0f}" for i in range(len(MODELS)))
-        style_axes(ax, f"{mode}, n {len(fit)}, median of the mean over states {medians} %")
+        medians = _listed(np.median(fit.mean(axis=2), axis=0))
+        style_axes(ax, f"{mode}: {len(fit)} experiments, median of the mean over states {medians} %")
     for ax in list(panels):
         ax.set_visible(False)
-    figure.axes[0].legend(frameon=False, fontsize=8, loc="lower left")
     figure.supylabel("fit of a free run, cut off at −100 [%]", fontsize=9, color=INK)
     figure.supxlabel(_MEANING, fontsize=8, color=MUTED)
-    figure.suptitle(title, fontsize=11, color=INK)
+    _add_title(figure, title)
     return figure

@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from fleet.frames import ned_to_body
+from fleet.frames import body_to_ned, ned_to_body
 from fleet.process import private_files
 from fleet.simulator.flight.uav import DT as TICK_S
 from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.jsbsim import Aircraft, Truth
 from fleet.simulator.vehicle.missions import HOME
 from fleet.simulator.vehicle.sensors import servo_commands
-from fleet.simulator.vehicle.weather import FT
+from fleet.simulator.vehicle.weather import FT, wind_at_20ft
 from fleet.window import STATES
 
 from .flight import Case, Flight, true_airspeed, unwrapped
@@ -97,7 +97,7 @@ def _sources() -> str:
 
     root = Path(fleet.__file__).parent
     digest = hashlib.sha256(Path(__file__).read_bytes())
-    for folder in ("pretend", "autopilots"):
+    for folder in ("simulator", "autopilots"):
         for path in sorted((root / folder).rglob("*.*")):
             if path.suffix in (".py", ".xml"):
                 digest.update(path.read_bytes())
@@ -112,8 +112,24 @@ class Replay(Aircraft):
         self._kept, self._flight = kept, flight
 
     def forecast(self, at: int, n: int) -> np.ndarray:
-        wind = self._kept["wind"][at : at + n].mean(axis=0)
-        self._place(at, wind)
+        return self.fly(at, n, self.mean_wind(at, n))
+
+    def mean_wind(self, at: int, n: int) -> np.ndarray:
+        """Give the true mean wind of rows at .. at + n, north and east, without gusts, (2,) [m/s]."""
+        return np.asarray(self._kept["wind"][at : at + n].mean(axis=0))
+
+    def fly(
+        self, at: int, n: int, wind: np.ndarray, start: np.ndarray | None = None, gusts: int | None = None
+    ) -> np.ndarray:
+        """Fly rows at .. at + n under the recorded inputs, (n, 9).
+
+        Args:
+            at, n: first row and number of rows
+            wind: north and east, the direction it blows to, (2,) [m/s]
+            start: state at the first row, u v w over the ground, (9,); None: the true one
+            gusts: seed of gusts like those of the flight, which start at those of the run before; None: no gusts
+        """
+        self._place(at, wind, start, gusts)
         told = []
         for k in range(at, at + n):
             told.append(self.truth())
@@ -130,11 +146,17 @@ class Replay(Aircraft):
             out[i] = self.forecast(start + i, k + 1)[k]
         return out
 
-    def _place(self, at: int, wind: np.ndarray) -> None:
-        """Put it into the true state of row `at`, its servos and motor where the commands before have left them."""
+    def _place(self, at: int, wind: np.ndarray, start: np.ndarray | None, gusts: int | None) -> None:
+        """Put it into a state at row `at`, its servos and motor where the commands before have left them."""
         kept, fdm = self._kept, self._fdm
         p, v, euler, rates = (kept[name][at] for name in ("p", "v", "euler", "rates"))
-        fdm["simulation/randomseed"] = 0
+        if start is not None:
+            rates, euler = start[3:6], start[6:9]
+            v = body_to_ned(*euler[:, None], start[None, :3])[0]
+        fdm["simulation/randomseed"] = gusts or 0
+        fdm["atmosphere/turb-type"] = 0 if gusts is None else 3
+        fdm["atmosphere/turbulence/milspec/windspeed_at_20ft_AGL-fps"] = wind_at_20ft(TURBULENCE)
+        fdm["atmosphere/turbulence/milspec/severity"] = float(TURBULENCE)
         fdm["ic/terrain-elevation-ft"] = HOME.alt_mm * 1e-3 / FT
         fdm["ic/lat-geod-deg"] = HOME.lat_e7 * 1e-7 + degrees(p[0] / self._per_rad[0])
         fdm["ic/long-gc-deg"] = HOME.lon_e7 * 1e-7 + degrees(p[1] / self._per_rad[1])

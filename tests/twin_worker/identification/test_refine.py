@@ -196,12 +196,14 @@ def test_multiple_shots_find_a_biased_model_despite_sensor_errors_that_drift():
     def distance(D: np.ndarray) -> float:
         return float(np.linalg.norm(D[:, :-1] - truth()[:, :-1]))
 
-    options = {"lengths": (50, 100), "errors": errors}
-    found = refine_with_starts(biased(), y, u, ok, ridge=1.0, **options)
+    found = refine_with_starts(biased(), y, u, ok, runs=[(50, 1.0), (100, 1.0)], errors=errors)
     no_bias = refined(biased(), y, u, length=100, effective_fraction=1.0)
     assert distance(found) < 0.3 * distance(biased()) and distance(found) < 0.5 * distance(no_bias)
-    kept = refine_with_starts(biased(), y, u, ok, ridge=1e12, **options)
+    kept = refine_with_starts(biased(), y, u, ok, runs=[(50, 1e12), (100, 1e12)], errors=errors)
     assert np.allclose(kept, biased(), atol=1e-4)
+    only_short = refine_with_starts(biased(), y, u, ok, runs=[(50, 1.0)], errors=errors)
+    held = refine_with_starts(biased(), y, u, ok, runs=[(50, 1.0), (100, 1e12)], errors=errors)
+    assert np.allclose(held, only_short, atol=1e-4) and distance(held) < distance(kept)
 
 
 def test_segments_avoid_gaps_and_none_is_an_error():
@@ -211,4 +213,4 @@ def test_segments_avoid_gaps_and_none_is_an_error():
     y, u = flight(100)
     errors = SensorErrors(np.full(4, 0.02), np.full(4, 0.2))
     with pytest.raises(ValueError, match="wait for more"):
-        refine_with_starts(biased(), y, u, np.zeros(100, bool), lengths=(50,), ridge=1.0, errors=errors)
+        refine_with_starts(biased(), y, u, np.zeros(100, bool), runs=[(50, 1.0)], errors=errors)

@@ -4,11 +4,13 @@
 
 over free-run segments s, W the inverse residual variances. The nuisance parameters z_s of a segment are its start state
 x_s, relative to the measured one, and a constant output bias b_s: sensor errors that drift slowly. Every Gauss-Newton
-step eliminates them by their Schur complement. Lambda is a ridge towards the first step.
+step eliminates them by their Schur complement. Free runs grow: the ridge Lambda draws the parameters to those that the
+shorter runs found, and the shortest runs to the first step.
 
 Source: Huang 2021, eq. 16-17 (prediction error); Jategaonkar 2015, chapter 4 (multiple shots, bias parameters).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numba as nb
@@ -177,19 +179,18 @@ def refine_with_starts(
     u: np.ndarray,
     ok: np.ndarray,
     *,
-    lengths: tuple[int, ...],
-    ridge: float,
+    runs: Sequence[tuple[int, float]],
     errors: SensorErrors,
 ) -> np.ndarray:
     """Refine [A B c] by free runs of increasing length; start states and output biases are estimated too.
 
-    Short runs come first: a poor first step diverges in long ones, and they have more local minima.
+    Short runs come first: a poor first step diverges in long ones, and they have more local minima. They also remove
+    the bias of a first step that ignores feedback, to which a ridge would otherwise draw the result of long runs.
 
     Args:
         first: model of the first step, scaled units, (n, n + m + 1)
         y, u, ok: scaled outputs (N, n) and inputs (N, m), measured rows (N,)
-        lengths: free-run lengths, one after the other [samples]
-        ridge: precision of every entry about the first step [-]
+        runs: free-run length [samples] and precision of every entry about the result before it [-], one after the other
         errors: sensor errors
     Returns:
         the refined [A B c]; a length in which no run stays finite leaves its start unchanged
@@ -197,11 +198,11 @@ def refine_with_starts(
         ValueError: if no segment is free of gaps; wait for more data.
     """
     D = first
-    for length in lengths:
+    for length, ridge in runs:
         segments = segments_of(ok, length)
         if not len(segments):
             raise ValueError(f"refine: found no {_MIN_SEGMENT} rows without a gap, needs them; wait for more")
-        problem = _Problem(y, u, segments, first, ridge=ridge, errors=errors)
+        problem = _Problem(y, u, segments, D, ridge=ridge, errors=errors)
         start = D.ravel().copy(), problem.measured.copy()
         (par, _), cost, _ = gauss_newton(
             start, problem.linearise, problem.move, steps=_STEPS, converges_from=_WEIGHT_UPDATES[-1] + 1
