@@ -256,7 +256,8 @@ def _lines(
 ) -> list[str]:
     count = {state: sum(row.state is state for row in rows) for state in TwinState}
     states = ", ".join(f"{n} {state.value}" for state, n in count.items() if n) or "waiting for the first sample"
-    lines = [f"fleet up · {len(rows)} UAVs · {elapsed:.0f} s since the first sample · {states}"]
+    since = f"{elapsed:.0f} s since the first sample" if elapsed else "workers are starting"
+    lines = [f"fleet up · {len(rows)} UAVs · {since} · {states}"]
     lines += [sentence] if sentence else []
     lines += children.last_lines()
     if args.replay and "gateway" in children.finished():
