@@ -1,0 +1,194 @@
+"""Calibration of the rotor model on nominal flights of one multirotor; model file."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from twin_worker.diagnosis.multirotor.flight import RotorFlight
+from twin_worker.diagnosis.multirotor.linearise import (
+    ORDER,
+    FlightFit,
+    LinearFlight,
+    ResidualNoise,
+    Solution,
+    autoregression,
+    solve,
+)
+from twin_worker.diagnosis.multirotor.model import CHANNELS, PARAMETERS
+
+FORMAT = "parauav.rotors.1"
+_PASSES = 3
+_START = dict(k=8.0, expo=0.6, tau=0.05, d=0.05, c=0.01, a_p=30.0, a_q=30.0, a_r=3.0)
+_FLOOR = np.array([0.01, 0.01, 1e-3, 0.02, 2e-4, 2e-3, 5e-4, *[2e-3] * 3, *[0.2] * 3, *[0.02] * 5, 0.01])
+"""Least standard deviation of the parameters between flights."""
+
+
+@dataclass(frozen=True)
+class RotorBaseline:
+    """Calibrated rotor model.
+
+    Attributes:
+        motors: number of motors
+        parameters: mean, (19,); spread: covariance between flights, (19, 19)
+        filters: noise of the channels, see `ResidualNoise`
+        chance: mean gain of one parameter on nominal flights that are left out, at least 1
+        excess: largest mean square of whitened residuals over 10 s on them, (13,)
+        explained: share of the variance of f_x f_y f_z p_dot q_dot r_dot that the model explains
+        flights: names
+    """
+
+    motors: int
+    parameters: np.ndarray
+    spread: np.ndarray
+    filters: np.ndarray
+    chance: float
+    excess: np.ndarray
+    explained: dict[str, float]
+    flights: tuple[str, ...]
+
+    @property
+    def noise(self) -> ResidualNoise:
+        """Return the noise of the channels."""
+        return ResidualNoise(self.filters)
+
+
+def calibrate_rotors(
+    flights: Sequence[RotorFlight], log: Callable[[str], None], gains: Callable[..., tuple[float, np.ndarray]]
+) -> RotorBaseline:
+    """Fit the rotor model to nominal flights, each with its own wind and biases.
+
+    Args:
+        flights: nominal flights of one aircraft
+        log: receives progress
+        gains: (flight, baseline) to the mean chance gain and the mean squares of the channels, see `search`
+    Raises:
+        ValueError: if there is no flight.
+    """
+    if not flights:
+        raise ValueError("found no flight of a multirotor, expected nominal flights; name their recordings")
+    parameters = np.array([_START.get(name, 0.0) for name in PARAMETERS])
+    noise: ResidualNoise | None = None
+    starts: list[FlightFit | None] = [None] * len(flights)
+    for k in range(_PASSES):
+        log(f"rotor model: pass {k + 1} of {_PASSES} over {len(flights)} flights")
+        solutions = []
+        for i, flight in enumerate(flights):
+            linear = LinearFlight(flight, noise, None if noise else _first_weights(flight))
+            start = starts[i] or linear.start(parameters)
+            solutions.append((linear, solve(linear, start.parameters, None, start, iterations=4 if k == 0 else 2)))
+        parameters, information = pooled(solutions)
+        noise = ResidualNoise(_filters([(linear, one.base) for linear, one in solutions]))
+        starts = [one.fit for _, one in solutions]
+    spread = between_flights(parameters, information, [one for _, one in solutions])
+    explained = _explained(solutions)
+    baseline = RotorBaseline(
+        *(flights[0].inputs.shape[1], parameters, spread, noise.filters, 1.0, np.ones(len(CHANNELS))),
+        *(explained, tuple(flight.name for flight in flights)),
+    )
+    chance, excess = [], []
+    for i, (flight, (_, own)) in enumerate(zip(flights, solutions, strict=True)):
+        log(f"rotor model: {flight.name} left out")
+        others = [pair for j, pair in enumerate(solutions) if j != i] or solutions
+        mean, without = pooled(others)
+        left_out = RotorBaseline(
+            *(baseline.motors, mean, between_flights(mean, without, [one for _, one in others])),
+            *(baseline.filters, 1.0, baseline.excess, explained, ()),
+        )
+        one_chance, squares = gains(flight, left_out)
+        chance.append(one_chance)
+        excess.append(squares)
+        del own
+    most = np.max(excess, axis=0)
+    return RotorBaseline(
+        *(baseline.motors, parameters, spread, noise.filters, max(float(np.mean(chance)), 1.0), most),
+        *(explained, baseline.flights),
+    )
+
+
+def _first_weights(flight: RotorFlight) -> np.ndarray:
+    """Return rough noise of the channels for the first pass."""
+    del flight
+    return np.array([0.15, 0.15, 0.25, 0.5, 0.5, 0.2, 0.15, 0.15, 0.15, 0.02, 0.02, 0.02, 1.0])
+
+
+def pooled(solutions: Sequence[tuple[LinearFlight, Solution]]) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return the mean of the parameters weighted by information, and the information of each flight."""
+    n = len(PARAMETERS)
+    information, total, weighted = [], 1e-8 * np.eye(n), np.zeros(n)
+    for _, one in solutions:
+        A = one.columns.reshape(-1, one.columns.shape[2])
+        H = A.T @ A + one.precision
+        info = H[:n, :n] - H[:n, n:] @ np.linalg.solve(H[n:, n:], H[n:, :n])
+        information.append(info)
+        total = total + info
+        weighted = weighted + info @ one.fit.parameters
+    return np.linalg.solve(total, weighted), information
+
+
+def between_flights(mean: np.ndarray, information: Sequence[np.ndarray], solutions: Sequence[Solution]) -> np.ndarray:
+    """Return the covariance of the parameters of another flight: spread beyond their own uncertainty, and of the mean.
+
+    The method of moments; with one flight the floor alone.
+    """
+    own = [np.diag(np.linalg.inv(info)) for info in information]
+    squares = np.mean([(one.fit.parameters - mean) ** 2 - var for one, var in zip(solutions, own, strict=True)], axis=0)
+    n = len(solutions)
+    beyond = np.maximum(squares, 0.0) * (n / max(n - 1, 1)) ** 2
+    mean_covariance = np.linalg.inv(np.sum(information, axis=0))
+    return np.asarray(np.diag(beyond + _FLOOR**2) + mean_covariance)
+
+
+def _filters(residuals: Sequence[tuple[LinearFlight, np.ndarray]]) -> np.ndarray:
+    rows = []
+    for c in range(len(CHANNELS)):
+        series = [base[linear.ok, c] - base[linear.ok, c].mean() for linear, base in residuals]
+        rows.append(autoregression(np.concatenate(series)) if np.ptp(series[0]) > 0 else np.eye(ORDER + 1)[0])
+    return np.array(rows)
+
+
+def _explained(solutions: Sequence[tuple[LinearFlight, Solution]]) -> dict[str, float]:
+    from twin_worker.diagnosis.multirotor.model import residuals
+
+    out = {}
+    left, total = np.zeros(6), np.zeros(6)
+    for linear, one in solutions:
+        nothing = residuals(linear.flight, np.zeros(len(PARAMETERS)), np.zeros((len(linear.flight.t), 2)), {})
+        rows = linear.ok
+        left += one.base[rows, :6].var(axis=0) * rows.sum()
+        total += nothing[rows, :6].var(axis=0) * rows.sum()
+    for c in range(6):
+        out[CHANNELS[c]] = float(1 - left[c] / total[c])
+    return out
+
+
+def save_rotors(path: Path, baseline: RotorBaseline) -> None:
+    """Write the model file."""
+    values = msgspec.to_builtins(baseline, enc_hook=np.ndarray.tolist)
+    path.write_text(json.dumps({"format": FORMAT, **values}, indent=1) + "\n")
+
+
+def load_rotors(path: Path, document: dict[str, Any]) -> RotorBaseline:
+    """Read a model from the values of its file.
+
+    Raises:
+        ValueError: if it is no valid model; the message names the fault.
+    """
+    try:
+        baseline = msgspec.convert(document, RotorBaseline, dec_hook=lambda _, x: np.array(x, float))
+        n, c = len(PARAMETERS), len(CHANNELS)
+        for array, shape in (
+            *((baseline.parameters, (n,)), (baseline.spread, (n, n))),
+            *((baseline.filters, (c, ORDER + 1)), (baseline.excess, (c,))),
+        ):
+            if array.shape != shape or not np.isfinite(array).all():
+                raise ValueError(f"shape {array.shape} or non-finite numbers, expected finite numbers of shape {shape}")
+    except (KeyError, TypeError, ValueError, msgspec.ValidationError) as error:
+        raise ValueError(
+            f"{path.name}: found {error!r}, expected a complete model; make it with `fleet calibrate`"
+        ) from None
+    return baseline
