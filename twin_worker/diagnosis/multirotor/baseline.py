@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from scipy.signal import lfilter
 
 from twin_worker.diagnosis.multirotor.flight import RotorFlight
 from twin_worker.diagnosis.multirotor.linearise import (
@@ -24,7 +25,7 @@ from twin_worker.diagnosis.multirotor.model import CHANNELS, PARAMETERS
 FORMAT = "parauav.rotors.1"
 _PASSES = 3
 _START = dict(k=8.0, expo=0.6, tau=0.05, d=0.05, c=0.01, a_p=30.0, a_q=30.0, a_r=3.0)
-_FLOOR = np.array([0.01, 0.01, 1e-3, 0.02, 2e-4, 2e-3, 5e-4, *[2e-3] * 3, *[0.2] * 3, *[0.02] * 5, 0.01])
+_FLOOR = np.array([0.01, 0.01, 1e-3, 0.02, 2e-4, 2e-3, 5e-4, *[2e-3] * 3, *[0.2] * 3, *[0.02] * 5, 0.01, *[2e-3] * 3])
 """Least standard deviation of the parameters between flights."""
 
 
@@ -34,10 +35,11 @@ class RotorBaseline:
 
     Attributes:
         motors: number of motors
-        parameters: mean, (19,); spread: covariance between flights, (19, 19)
+        parameters: mean, (22,); spread: covariance between flights, (22, 22)
         filters: noise of the channels, see `ResidualNoise`
-        chance: mean gain of one parameter on nominal flights that are left out, at least 1
-        excess: largest mean square of whitened residuals over 10 s on them, (13,)
+        chance: by effect, largest gain on nominal flights that are left out over that of white noise, at least 1
+        sizes: by effect, root mean square of its values on them
+        excess: largest scale of the whitened residuals of each channel on them, (13,)
         explained: share of the variance of f_x f_y f_z p_dot q_dot r_dot that the model explains
         flights: names
     """
@@ -46,7 +48,8 @@ class RotorBaseline:
     parameters: np.ndarray
     spread: np.ndarray
     filters: np.ndarray
-    chance: float
+    chance: dict[str, float]
+    sizes: dict[str, float]
     excess: np.ndarray
     explained: dict[str, float]
     flights: tuple[str, ...]
@@ -58,14 +61,14 @@ class RotorBaseline:
 
 
 def calibrate_rotors(
-    flights: Sequence[RotorFlight], log: Callable[[str], None], gains: Callable[..., tuple[float, np.ndarray]]
+    flights: Sequence[RotorFlight], log: Callable[[str], None], gains: Callable[..., tuple[dict[str, float], dict[str, float], np.ndarray]]
 ) -> RotorBaseline:
     """Fit the rotor model to nominal flights, each with its own wind and biases.
 
     Args:
         flights: nominal flights of one aircraft
         log: receives progress
-        gains: (flight, baseline) to the mean chance gain and the mean squares of the channels, see `search`
+        gains: (flight, baseline) to the gains and sizes of the effects and the scales of the channels, `search.nominal_gains`
     Raises:
         ValueError: if there is no flight.
     """
@@ -87,25 +90,28 @@ def calibrate_rotors(
     spread = between_flights(parameters, information, [one for _, one in solutions])
     explained = _explained(solutions)
     baseline = RotorBaseline(
-        *(flights[0].inputs.shape[1], parameters, spread, noise.filters, 1.0, np.ones(len(CHANNELS))),
+        *(flights[0].inputs.shape[1], parameters, spread, noise.filters, {}, {}, np.ones(len(CHANNELS))),
         *(explained, tuple(flight.name for flight in flights)),
     )
-    chance, excess = [], []
-    for i, (flight, (_, own)) in enumerate(zip(flights, solutions, strict=True)):
+    chance: dict[str, float] = {}
+    squares: dict[str, list[float]] = {}
+    excess = []
+    for i, flight in enumerate(flights):
         log(f"rotor model: {flight.name} left out")
         others = [pair for j, pair in enumerate(solutions) if j != i] or solutions
         mean, without = pooled(others)
         left_out = RotorBaseline(
             *(baseline.motors, mean, between_flights(mean, without, [one for _, one in others])),
-            *(baseline.filters, 1.0, baseline.excess, explained, ()),
+            *(baseline.filters, {}, {}, baseline.excess, explained, ()),
         )
-        one_chance, squares = gains(flight, left_out)
-        chance.append(one_chance)
-        excess.append(squares)
-        del own
+        by_effect, sizes, scales = gains(flight, left_out)
+        excess.append(scales)
+        for name, gain in by_effect.items():
+            chance[name] = max(chance.get(name, 1.0), gain)
+            squares.setdefault(name, []).append(sizes[name] ** 2)
     most = np.max(excess, axis=0)
     return RotorBaseline(
-        *(baseline.motors, parameters, spread, noise.filters, max(float(np.mean(chance)), 1.0), most),
+        *(baseline.motors, parameters, spread, noise.filters, chance, {name: float(np.mean(x)) ** 0.5 for name, x in squares.items()}, most),
         *(explained, baseline.flights),
     )
 
@@ -133,21 +139,32 @@ def pooled(solutions: Sequence[tuple[LinearFlight, Solution]]) -> tuple[np.ndarr
 def between_flights(mean: np.ndarray, information: Sequence[np.ndarray], solutions: Sequence[Solution]) -> np.ndarray:
     """Return the covariance of the parameters of another flight: spread beyond their own uncertainty, and of the mean.
 
-    The method of moments; with one flight the floor alone.
+    The spread has the shape of that uncertainty; its size is that of the mean square of the deviations.
     """
-    own = [np.diag(np.linalg.inv(info)) for info in information]
-    squares = np.mean([(one.fit.parameters - mean) ** 2 - var for one, var in zip(solutions, own, strict=True)], axis=0)
     n = len(solutions)
-    beyond = np.maximum(squares, 0.0) * (n / max(n - 1, 1)) ** 2
     mean_covariance = np.linalg.inv(np.sum(information, axis=0))
-    return np.asarray(np.diag(beyond + _FLOOR**2) + mean_covariance)
+    own = np.mean([np.linalg.inv(info) for info in information], axis=0)
+    squares = [float(d @ info @ d) / len(d) for d, info in _deviations(mean, information, solutions)]
+    excess = max(float(np.mean(squares)) * n / max(n - 1, 1) - 1.0, 0.0)
+    return np.asarray(np.diag(_FLOOR**2) + excess * own + mean_covariance)
+
+
+def _deviations(
+    mean: np.ndarray, information: Sequence[np.ndarray], solutions: Sequence[Solution]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    return [(one.fit.parameters - mean, info) for one, info in zip(solutions, information, strict=True)]
 
 
 def _filters(residuals: Sequence[tuple[LinearFlight, np.ndarray]]) -> np.ndarray:
     rows = []
     for c in range(len(CHANNELS)):
         series = [base[linear.ok, c] - base[linear.ok, c].mean() for linear, base in residuals]
-        rows.append(autoregression(np.concatenate(series)) if np.ptp(series[0]) > 0 else np.eye(ORDER + 1)[0])
+        if np.ptp(series[0]) == 0:
+            rows.append(np.eye(ORDER + 1)[0])
+            continue
+        taps = autoregression(np.concatenate(series))
+        white = np.concatenate([lfilter(taps, [1.0], x)[ORDER:] for x in series])
+        rows.append(taps / max(float(np.median(np.abs(white))) / 0.6745, 0.1))
     return np.array(rows)
 
 

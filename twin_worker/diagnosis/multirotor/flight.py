@@ -148,6 +148,7 @@ def rotor_flight(name: str, history: TelemetryHistory, params: Mapping[str, floa
     attitude = np.column_stack([attitude[:, :2], np.unwrap(attitude[:, 2])])
     imu = on_grid(*series["imu"])
     height, position, limitations = _heights(history, t, t_start)
+    height -= np.median(height)  # of the day's pressure and of the geoid
     flying = inputs.mean(axis=1) > _MIN_INPUT
     if np.isfinite(position[:, 2]).any():
         flying &= position[:, 2] > _MIN_HEIGHT_M

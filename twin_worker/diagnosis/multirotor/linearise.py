@@ -13,14 +13,15 @@ from scipy.linalg import cho_factor, cho_solve, solve_toeplitz
 from scipy.signal import lfilter
 
 from twin_worker.diagnosis.multirotor.effects import RotorEffect, coordinate_steps, rotor_effects
-from twin_worker.diagnosis.multirotor.flight import DT, RotorFlight
+from twin_worker.diagnosis.multirotor.flight import RotorFlight
 from twin_worker.diagnosis.multirotor.model import CHANNELS, PARAMETERS, STEP, residuals
 
 ORDER = 8  # of the autoregression of the residuals
 _KNOT_S = 5.0  # between the knots of the wind [s]
 _WIND_STD, _GUST_STD, _GUST_S = 6.0, 1.0, 25.0  # of the mean wind and of its changes [m/s]; correlation time [s]
+_UNKNOWN_STD = np.array([*[1e4] * 7, *[0.1] * 3, *[1e4] * 9, *[0.03] * 3])  # of parameters before any flight
 _LIMIT = 5.0  # standard deviations at which a whitened residual is limited (Huber)
-_STEPS = np.array([0.05, 0.02, 0.005, 0.02, 0.001, 0.005, 0.002, *[0.01] * 3, *[0.5] * 3, *[0.05] * 5, 0.05])
+_STEPS = np.array([0.05, 0.02, 0.005, 0.02, 0.001, 0.005, 0.002, *[0.01] * 3, *[0.5] * 3, *[0.05] * 5, 0.05, *[0.01] * 3])
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,7 @@ class LinearFlight:
         """Return the precision of the nuisances, (p, p); `spread`: covariance of the parameters, None: unknown."""
         n, K = len(PARAMETERS), len(self.knots)
         out = np.zeros((n + 2 * K + len(self.nominal),) * 2)
-        out[:n, :n] = 1e-8 * np.eye(n) if spread is None else np.linalg.inv(spread)
+        out[:n, :n] = np.diag(_UNKNOWN_STD**-2.0) if spread is None else np.linalg.inv(spread)
         lags = np.abs(self.knots[:, None] - self.knots)
         wind = np.linalg.inv(_WIND_STD**2 + _GUST_STD**2 * np.exp(-lags / _GUST_S) + 1e-6 * np.eye(K))
         for axis in range(2):
@@ -201,21 +202,33 @@ def solve(
     linear: LinearFlight,
     mean: np.ndarray,
     spread: np.ndarray | None,
-    start: FlightFit,
+    start: "FlightFit | Solution",
     active: Sequence[ActiveEffect] = (),
     iterations: int = 3,
 ) -> Solution:
-    """Fit nuisances and the values of the active effects by Gauss-Newton with Huber weights."""
-    fit, active = start, tuple(active)
+    """Fit nuisances and the values of the active effects by Gauss-Newton with Huber weights.
+
+    Args:
+        linear: flight
+        mean, spread: prior of the rotor parameters
+        start: a fit, or a solution whose derivatives by the nuisances are used again
+        active: effects with their first values
+        iterations: steps
+    """
+    known = start if isinstance(start, Solution) else None
+    fit = start.fit if isinstance(start, Solution) else start
+    active = tuple(active)
     precision = linear.prior_precision(spread)
     p = len(precision)
+    base = linear.residuals(fit, active)
+    columns = known.columns if known is not None else np.zeros(0)
     for k in range(iterations + 1):
-        base = linear.residuals(fit, active)
         white = linear.whitened(base)
         nuisance = linear.vector(fit, mean)
         cost = huber(white) + float(nuisance @ precision @ nuisance)
-        columns = linear.whitened(linear.nuisance_columns(fit, active, base))
-        effects = _effect_derivatives(linear, fit, active, base)
+        if known is None and k < 3:
+            columns = linear.whitened(linear.nuisance_columns(fit, active, base))
+        effects = effect_derivatives(linear, fit, active, base)
         A = np.concatenate([columns, effects], axis=2).reshape(-1, p + effects.shape[2])
         r = white.reshape(-1)
         weight = np.minimum(1.0, _LIMIT / np.maximum(np.abs(r), 1e-9))
@@ -226,12 +239,13 @@ def solve(
         values = np.concatenate([one.values for one in active]) if active else np.zeros(0)
         H = A.T @ (weight[:, None] * A) + prior
         factor = cho_factor(H + 1e-9 * np.diag(np.diag(H)))
-        covariance = cho_solve(factor, np.eye(len(H)))[p:, p:]
         if k == iterations:
+            covariance = cho_solve(factor, np.eye(len(H)))[p:, p:]
             break
         step = -cho_solve(factor, A.T @ (weight * r) + prior @ np.concatenate([nuisance, values]))
         fit = linear.moved(fit, step[:p])
         active = _moved_effects(active, step[p:])
+        base = linear.residuals(fit, active)
     return Solution(fit, active, covariance, cost, white, columns, precision, base)
 
 
@@ -241,9 +255,10 @@ def huber(white: np.ndarray) -> float:
     return float(np.where(a < _LIMIT, a**2, 2 * _LIMIT * a - _LIMIT**2).sum())
 
 
-def _effect_derivatives(
+def effect_derivatives(
     linear: LinearFlight, fit: FlightFit, active: Sequence[ActiveEffect], base: np.ndarray
 ) -> np.ndarray:
+    """Return the whitened derivatives by the values of the active effects, (N, 13, m)."""
     columns = []
     for k, one in enumerate(active):
         for i in range(len(one.values)):
@@ -272,6 +287,3 @@ def autoregression(r: np.ndarray) -> np.ndarray:
     a = solve_toeplitz(covariance[:-1], covariance[1:])
     std = np.sqrt(max(covariance[0] - a @ covariance[1:], 1e-12))
     return np.concatenate([[1.0], -a]) / std
-
-
-__all__ = ["DT", "ORDER", "ActiveEffect", "FlightFit", "LinearFlight", "ResidualNoise", "Solution", "solve"]

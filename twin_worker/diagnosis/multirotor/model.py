@@ -1,7 +1,7 @@
 """Rotor model of a multirotor with effects, and its residuals.
 
 Specific force and angular acceleration, mass-normalised, with w_i the relative speed of rotor i, its relative thrust
-T_i = (1 - loss_i) w_i^2, and the velocity through the air (u, v, w) = R' (V - wind):
+T_i = (1 + m_p roll_i + m_q pitch_i + m_r yaw_i) (1 - loss_i) w_i^2, and the velocity through the air (u, v, w) = R' (V - wind):
 
     w_i' = (w_ic - w_i) / tau,   w_ic^2 = (1 - expo) u_i + expo u_i^2
     f_x  = -(d sum w_i + c Va) u,   f_y likewise with v
@@ -28,10 +28,10 @@ from twin_worker.diagnosis.multirotor.flight import DT, RotorFlight
 
 PARAMETERS = (
     *("k", "expo", "tau", "k_c", "k_h", "d", "c", "x_c", "y_c", "n_c"),
-    *("a_p", "a_q", "a_r", "d_p", "d_q", "d_r", "j_p", "j_q", "spin"),
+    *("a_p", "a_q", "a_r", "d_p", "d_q", "d_r", "j_p", "j_q", "spin", "m_p", "m_q", "m_r"),
 )
 """k [m/s2], expo [-], tau [s], k_c [1/s], k_h [1/m], d [1/s], c [1/m], x_c y_c n_c [-], a [rad/s2], d_* [1/s], j [-],
-spin [rad/s]."""
+spin [rad/s], m [-]."""
 CHANNELS = (
     *("f_x", "f_y", "f_z", "p_dot", "q_dot", "r_dot"),
     *("v_n_dot", "v_e_dot", "v_d_dot", "phi_dot", "theta_dot", "psi_dot", "baro"),
@@ -66,7 +66,7 @@ def residuals(flight: RotorFlight, parameters: np.ndarray, wind: np.ndarray, eff
 
     Args:
         flight: measurements
-        parameters: as in `PARAMETERS`, (19,)
+        parameters: as in `PARAMETERS`, (22,)
         wind: north and east, the direction it blows to, (n, 2) [m/s]
         effects: coordinates as in `effects.COORDINATES`
     """
@@ -130,10 +130,10 @@ def _rotors(flight: RotorFlight, p: Mapping[str, float], effects: Profiles) -> t
         most = float(added[np.argmax(np.abs(added))])
         share = added / most if most else np.zeros(len(added))
         w = w + share[:, None] * (rotor_speeds(flight.inputs, p["tau"] + most, p["expo"]) - w)
-    healthy = np.ones(w.shape)
+    healthy = np.ones(w.shape) + flight.frame.mixer @ np.array([p["m_p"], p["m_q"], p["m_r"]])
     for i in range(w.shape[1]):
         if (loss := effects.get(f"motor{i + 1}")) is not None:
-            healthy[:, i] = 1 - loss
+            healthy[:, i] *= 1 - loss
     return w * np.sqrt(np.clip(healthy, 0.0, None)), w**2 * healthy
 
 

@@ -4,7 +4,9 @@ The gain of an effect with onset t0 is the drop of the penalised sum of squares.
 products with the nuisances follow for all onsets from cumulative sums. With a Gaussian prior of precision P for m
 coordinates and information H,
 
-    log evidence = G / (2 chance) + log|P| / 2 - log|H + P| / 2 - log(number of onsets)   relative to no effect
+    log evidence = G / (2 c) + log|P| / 2 - log|H + P| / 2 - log(number of onsets)   relative to no effect,
+
+where c is the gain of this effect on nominal flights that are left out, over that of white noise, at least 1.
 
 Source: MacKay 2003, ch. 28 (Laplace's method, Occam factor).
 """
@@ -17,15 +19,20 @@ import numpy as np
 from twin_worker.diagnosis.multirotor.baseline import RotorBaseline
 from twin_worker.diagnosis.multirotor.effects import RotorEffect
 from twin_worker.diagnosis.multirotor.flight import RotorFlight
-from twin_worker.diagnosis.multirotor.linearise import ActiveEffect, LinearFlight, Solution, huber, solve
-from twin_worker.diagnosis.multirotor.model import CHANNELS, STEP_S
+from twin_worker.diagnosis.multirotor.linearise import (
+    ActiveEffect,
+    LinearFlight,
+    Solution,
+    effect_derivatives,
+    huber,
+    solve,
+)
+from twin_worker.diagnosis.multirotor.model import CHANNELS
 
 _ONSET_STEP_S = 2.0
 _MARGIN_S = 8.0  # of onsets from the ends of the flight
-_BLOCK_S = 10.0
 _REFINED, _EXTENDED = 6, 3  # single effects that are refined; of them, extended by a second one
 _PRIOR_NONE, _PRIOR_SINGLE, _PRIOR_PAIR = 0.6, 0.3, 0.1
-_MODEL_ERROR = 0.02  # share of a gain by which the model itself is uncertain [-]
 
 
 @dataclass(frozen=True)
@@ -55,26 +62,42 @@ class _Scan:
 
 
 def search(linear: LinearFlight, baseline: RotorBaseline) -> list[Explanation]:
-    """Return the explanations of a flight, best first; one of them is none."""
+    """Return the explanations of a flight, best first; one of them is none.
+
+    The noise of each channel in this flight is that of nominal flights or larger. It is taken from the residuals
+    without effects, and again from those of the best explanation.
+    """
     start = linear.start(baseline.parameters)
+    linear.weights = np.ones(len(CHANNELS))
     none = solve(linear, baseline.parameters, baseline.spread, start, iterations=4)
-    linear.weights = np.maximum(_scales(none.white, linear) * linear.weights, 1.0)
-    none = solve(linear, baseline.parameters, baseline.spread, none.fit, iterations=1)
+    scales = channel_scales(none.white, linear)
+    none = _reweighted(linear, baseline, none, scales)
+    explanations = _explanations(linear, baseline, none)
+    best = explanations[0]
+    if best.active and (smaller := scales * np.maximum(channel_scales(best.solution.white, linear), 0.0)).min() < np.inf:
+        better = np.maximum(smaller, 1.0)
+        if (better < 0.9 * linear.weights).any():
+            none = _reweighted(linear, baseline, none, better)
+            explanations = _explanations(linear, baseline, none)
+    return explanations
+
+
+def _explanations(linear: LinearFlight, baseline: RotorBaseline, none: Solution) -> list[Explanation]:
     n = len(linear.catalogue)
     explanations = [Explanation((), np.log(_PRIOR_NONE), none, 0.0)]
+    nothing = Explanation((), 0.0, none, 0.0)
     singles = []
-    for scan in _best(scan_effects(linear, none, baseline.chance), _REFINED):
-        found = _refined(linear, baseline, none, (), scan)
+    for scan in _best(scan_effects(linear, none, baseline), _REFINED):
+        found = _refined(linear, baseline, nothing, scan)
         singles.append(replace(found, evidence=found.evidence + np.log(_PRIOR_SINGLE / n)))
     singles.sort(key=lambda one: -one.evidence)
-    explanations += singles
     for single in [one for one in singles if one.evidence > explanations[0].evidence][:_EXTENDED]:
-        used = {one.one.effect.name for one in single.active}
-        scans = [s for s in scan_effects(linear, single.solution, baseline.chance) if s.one.effect.name not in used]
+        used = {one.one.label for one in single.active}
+        scans = [s for s in scan_effects(linear, single.solution, baseline) if s.one.label not in used]
         for scan in _best(scans, 2):
-            found = _refined(linear, baseline, none, single.active, scan)
-            explanations.append(replace(found, evidence=found.evidence + np.log(_PRIOR_PAIR / n**2)))
-    return sorted(explanations, key=lambda one: -one.evidence)
+            found = _refined(linear, baseline, single, scan)
+            explanations.append(replace(found, evidence=found.evidence + np.log(_PRIOR_PAIR / _PRIOR_SINGLE / n)))
+    return sorted(explanations + singles, key=lambda one: -one.evidence)
 
 
 def _best(scans: Sequence[_Scan], number: int) -> list[_Scan]:
@@ -82,15 +105,22 @@ def _best(scans: Sequence[_Scan], number: int) -> list[_Scan]:
     return sorted(scans, key=lambda one: -one.evidence)[:number]
 
 
-def _scales(white: np.ndarray, linear: LinearFlight) -> np.ndarray:
-    """Return the robust scale of the whitened residuals of each channel, (13,)."""
-    rows = white[linear.valid]
-    scales = np.median(np.abs(rows), axis=0) / 0.6745
-    scales[~linear.channels] = 1.0
-    return np.asarray(scales)
+def channel_scales(white: np.ndarray, linear: LinearFlight) -> np.ndarray:
+    """Return the robust scale of the whitened residuals of each channel, (13,); 1 where a channel is absent."""
+    scales = np.median(np.abs(white[linear.valid]), axis=0) / 0.6745
+    return np.asarray(np.where(linear.channels, scales, 1.0))
 
 
-def scan_effects(linear: LinearFlight, solution: Solution, chance: float) -> list[_Scan]:
+def _reweighted(linear: LinearFlight, baseline: RotorBaseline, solution: Solution, scales: np.ndarray) -> Solution:
+    """Fit again with larger noise of each channel, (13,), and the same derivatives."""
+    weights = np.maximum(scales, 1.0)
+    columns = solution.columns * (linear.weights / weights)[:, None]
+    linear.weights = weights
+    again = replace(solution, columns=columns, active=())
+    return solve(linear, baseline.parameters, baseline.spread, again, iterations=2)
+
+
+def scan_effects(linear: LinearFlight, solution: Solution, baseline: RotorBaseline) -> list[_Scan]:
     """Return for every effect its best onset in the linear search."""
     columns = linear.effect_columns(solution.fit, solution.active, solution.base)
     nuisance = solution.columns
@@ -99,14 +129,17 @@ def scan_effects(linear: LinearFlight, solution: Solution, chance: float) -> lis
     A = nuisance.reshape(-1, nuisance.shape[2])
     H = A.T @ A + solution.precision
     active = _active_columns(linear, solution)
-    gradient = np.einsum("ncp,nc->p", nuisance, limited)
+    pull = solution.precision @ linear.vector(solution.fit, baseline.parameters)
     if active is not None:
         full = np.concatenate([nuisance, active], axis=2)
         A = full.reshape(-1, full.shape[2])
         precision = np.zeros((full.shape[2],) * 2)
         precision[: len(H), : len(H)] = solution.precision
-        H, nuisance = A.T @ A + precision + 1e-9 * np.eye(full.shape[2]), full
-        gradient = np.einsum("ncp,nc->p", nuisance, limited)
+        scales = np.array([one.one.scale for one in solution.active for _ in one.values])
+        values = np.concatenate([one.values for one in solution.active])
+        precision[len(H) :, len(H) :] = np.diag(scales**-2.0)
+        H, nuisance, pull = A.T @ A + precision, full, np.concatenate([pull, values / scales**2])
+    gradient = np.einsum("ncp,nc->p", nuisance, limited) + pull
     inverse = np.linalg.inv(H)
     valid_t = linear.t[linear.valid]
     grid = np.arange(valid_t[0] + _MARGIN_S, valid_t[-1] - _MARGIN_S, _ONSET_STEP_S)
@@ -125,7 +158,7 @@ def scan_effects(linear: LinearFlight, solution: Solution, chance: float) -> lis
             cross = with_nuisance[min(row, rows - 1)]
             b = with_residual[min(row, rows - 1)] - cross @ inverse @ gradient
             information = with_self[min(row, rows - 1)] - cross @ inverse @ cross.T
-            found = _scored(one, onset, b, information, chance, len(grid))
+            found = _scored(one, onset, b, information, baseline, len(grid))
             if found is not None and (best is None or found.evidence > best.evidence):
                 best = found
         if best is not None:
@@ -134,11 +167,9 @@ def scan_effects(linear: LinearFlight, solution: Solution, chance: float) -> lis
 
 
 def _active_columns(linear: LinearFlight, solution: Solution) -> np.ndarray | None:
-    from twin_worker.diagnosis.multirotor.linearise import _effect_derivatives
-
     if not solution.active:
         return None
-    return _effect_derivatives(linear, solution.fit, solution.active, solution.base)
+    return effect_derivatives(linear, solution.fit, solution.active, solution.base)
 
 
 def _tails(x: np.ndarray) -> np.ndarray:
@@ -147,9 +178,15 @@ def _tails(x: np.ndarray) -> np.ndarray:
 
 
 def _scored(
-    one: RotorEffect, onset: float | None, b: np.ndarray, information: np.ndarray, chance: float, n_onsets: int
+    one: RotorEffect,
+    onset: float | None,
+    b: np.ndarray,
+    information: np.ndarray,
+    baseline: RotorBaseline,
+    n_onsets: int,
 ) -> _Scan | None:
     """Return the score of one onset; None where the value has the wrong sign or no information."""
+    chance = baseline.chance.get(one.effect.name, 1.0)
     precision = np.eye(len(b)) / one.scale**2
     try:
         values = -np.linalg.solve(information + chance * precision, b)
@@ -158,44 +195,41 @@ def _scored(
     if not np.isfinite(values).all() or (values < one.low).any():
         return None
     gain = float(-b @ values)
-    return _Scan(one, onset, values, gain, _evidence(one, onset, gain, information, chance, n_onsets))
+    active = ActiveEffect(one, onset, values)
+    return _Scan(one, onset, values, gain, _evidence(active, gain, information, baseline, n_onsets))
 
 
 def _evidence(
-    one: RotorEffect, onset: float | None, gain: float, information: np.ndarray, chance: float, n_onsets: int
+    active: ActiveEffect, gain: float, information: np.ndarray, baseline: RotorBaseline, n_onsets: int
 ) -> float:
-    precision = np.eye(len(information)) / one.scale**2
+    """Return the log evidence of one effect; its values vary on nominal flights too.
+
+    G' = 1 / (c / G + s^2 / |x|^2)   with the root mean square s of such values on nominal flights
+    """
+    name = active.one.effect.name
+    chance, nominal = baseline.chance.get(name, 1.0), baseline.sizes.get(name, 0.0)
+    square = max(float(active.values @ active.values), 1e-12)
+    effective = 1.0 / (chance / max(gain, 1e-9) + nominal**2 / square)
+    precision = np.eye(len(information)) / active.one.scale**2
     ratio = np.eye(len(information)) + np.linalg.solve(precision, information / chance)
     occam = 0.5 * float(np.linalg.slogdet(ratio)[1])
-    return gain / (2 * (chance + _MODEL_ERROR * gain / 100)) - occam - np.log(2.0 if onset is None else 2.0 * n_onsets)
+    return effective / 2 - occam - float(np.log(2.0 if active.onset is None else 2.0 * n_onsets))
 
 
-def _refined(
-    linear: LinearFlight,
-    baseline: RotorBaseline,
-    none: Solution,
-    active: tuple[ActiveEffect, ...],
-    scan: _Scan,
-) -> Explanation:
-    """Fit a set of effects by Gauss-Newton, with the onset of the last one moved to its best time."""
-    trial = (*active, ActiveEffect(scan.one, scan.onset, scan.values))
-    start = none.fit
-    solution = solve(linear, baseline.parameters, baseline.spread, start, trial, iterations=3)
+def _refined(linear: LinearFlight, baseline: RotorBaseline, before: Explanation, scan: _Scan) -> Explanation:
+    """Add an effect to an explanation and fit all by Gauss-Newton, with its onset moved to the best time."""
+    trial = (*before.active, ActiveEffect(scan.one, scan.onset, scan.values))
+    solution = solve(linear, baseline.parameters, baseline.spread, before.solution, trial, iterations=3)
     if scan.onset is not None:
         solution = _with_onset(linear, baseline, solution)
-    gain = max(none.cost - solution.cost, 0.0)
+    gain = max(before.solution.cost - solution.cost, 0.0)
     n_onsets = max(int((linear.t[-1] - 2 * _MARGIN_S) / _ONSET_STEP_S), 2)
-    evidence, k = 0.0, 0
-    for one in solution.active:
-        m = len(one.values)
-        covariance = solution.covariance[k : k + m, k : k + m]
-        precision = np.eye(m) / one.one.scale**2
-        information = np.linalg.inv(covariance) - precision
-        evidence += _evidence(one.one, one.onset, 0.0, information, baseline.chance, n_onsets)
-        k += m
-    penalty = sum(float((one.values**2).sum()) / one.one.scale**2 for one in solution.active)
-    evidence += gain / (2 * baseline.chance) - 0.5 * penalty
-    return Explanation(solution.active, evidence, solution, gain)
+    last = solution.active[-1]
+    m = len(last.values)
+    information = np.linalg.inv(solution.covariance[-m:, -m:]) - np.eye(m) / last.one.scale**2
+    penalty = float((last.values**2).sum()) / last.one.scale**2
+    evidence = _evidence(last, gain, information, baseline, n_onsets) - 0.5 * penalty
+    return Explanation(solution.active, before.evidence + evidence, solution, before.gain + gain)
 
 
 def _with_onset(linear: LinearFlight, baseline: RotorBaseline, solution: Solution) -> Solution:
@@ -209,29 +243,24 @@ def _with_onset(linear: LinearFlight, baseline: RotorBaseline, solution: Solutio
         if trial < cost:
             best, cost = float(onset), trial
     moved = (*solution.active[:-1], replace(last, onset=best))
-    return solve(linear, baseline.parameters, baseline.spread, solution.fit, moved, iterations=2)
+    return solve(linear, baseline.parameters, baseline.spread, solution, moved, iterations=2)
 
 
-def block_squares(white: np.ndarray, linear: LinearFlight) -> np.ndarray:
-    """Return the mean square of the whitened residuals over blocks of 10 s, (blocks, 13); nan without valid rows."""
-    n = round(_BLOCK_S / STEP_S)
-    blocks = []
-    for begin in range(0, len(white), n):
-        rows = slice(begin, begin + n)
-        good = linear.valid[rows]
-        enough = good.sum() > n // 2
-        blocks.append((white[rows][good] ** 2).mean(axis=0) if enough else np.full(len(CHANNELS), np.nan))
-    return np.array(blocks)
+def nominal_gains(flight: RotorFlight, baseline: RotorBaseline) -> tuple[dict[str, float], dict[str, float], np.ndarray]:
+    """Return the gain of each effect over that of chance, its size, and the scale of each channel, (13,).
 
-
-def nominal_gains(flight: RotorFlight, baseline: RotorBaseline) -> tuple[float, np.ndarray]:
-    """Return the mean gain of one coordinate throughout, and the largest mean square over 10 s of each channel."""
+    The best of n onsets gains about 2 ln n by chance.
+    """
     linear = LinearFlight(flight, baseline.noise)
     start = linear.start(baseline.parameters)
     none = solve(linear, baseline.parameters, baseline.spread, start, iterations=4)
-    linear.weights = np.maximum(_scales(none.white, linear), 1.0)
-    none = solve(linear, baseline.parameters, baseline.spread, none.fit, iterations=1)
-    scans = scan_effects(linear, none, 1.0)
-    gains = [scan.gain / len(scan.one.coordinates) for scan in scans]
-    expected = 2 * np.log(1 + linear.t[-1] / _ONSET_STEP_S) / 2  # of the best of many onsets, roughly
-    return float(np.mean(gains) / expected), np.nanmax(block_squares(none.white, linear), axis=0)
+    scales = channel_scales(none.white, linear)
+    none = _reweighted(linear, baseline, none, scales)
+    expected = 2 * np.log(max(linear.t[-1] / _ONSET_STEP_S, 3.0))
+    gains: dict[str, float] = {}
+    sizes: dict[str, float] = {}
+    for scan in scan_effects(linear, none, baseline):
+        name = scan.one.effect.name
+        gains[name] = max(gains.get(name, 0.0), scan.gain / len(scan.one.coordinates) / expected)
+        sizes[name] = max(sizes.get(name, 0.0), float(np.linalg.norm(scan.values)))
+    return gains, sizes, scales
