@@ -73,6 +73,7 @@ ORDER = (  # a folder, or a module in the root of a package, imports only from i
     ("twin_worker.diagnosis.inference.validation",),
     ("twin_worker.diagnosis.inference",),
     ("twin_worker.diagnosis.baseline",),
+    ("twin_worker.diagnosis.multirotor",),
     ("twin_worker.diagnosis.output",),
     ("twin_worker.diagnosis",),
     ("twin_worker.twin.state",),

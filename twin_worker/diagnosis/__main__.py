@@ -11,6 +11,7 @@ from twin_worker.diagnosis.baseline.own_past import OwnPast, check
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.learn import calibrate_recordings, card_or_unknown, log_progress
 from twin_worker.diagnosis.model.baseline import Baseline
+from twin_worker.diagnosis.multirotor.recordings import calibrate_multirotor, holds_rotorcraft
 from twin_worker.diagnosis.output import keep
 from twin_worker.diagnosis.share import RecordingTask, Reference, diagnose_all
 
@@ -25,7 +26,12 @@ def _run(args: argparse.Namespace) -> int:
         card = card_or_unknown(args.airframe)
         options = RecordingOptions.of(args)
         past = args.against_own_past
-        reference = calibrate_recordings(args.against, card, options=options) if args.against else OwnPast(past, card)
+        if not args.against:
+            reference = OwnPast(past, card)
+        elif holds_rotorcraft(args.against[0], options):
+            reference = calibrate_multirotor(args.against, log_progress, options=options)
+        else:
+            reference = calibrate_recordings(args.against, card, options=options)
     reports: list[Report] = []
     refused: list[tuple[str, str]] = []
     tasks = [RecordingTask(path, RecordingOptions.of(args)) for path in args.file]

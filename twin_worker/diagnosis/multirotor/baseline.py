@@ -39,7 +39,7 @@ class RotorBaseline:
         filters: noise of the channels, see `ResidualNoise`
         chance: by effect, largest gain on nominal flights that are left out over that of white noise, at least 1
         sizes: by effect, root mean square of its values on them
-        excess: largest scale of the whitened residuals of each channel on them, (13,)
+        excess: largest scale of the whitened residuals of each channel over 20 s on them, (13,)
         explained: share of the variance of f_x f_y f_z p_dot q_dot r_dot that the model explains
         flights: names
     """

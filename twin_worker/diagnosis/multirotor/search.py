@@ -27,10 +27,11 @@ from twin_worker.diagnosis.multirotor.linearise import (
     huber,
     solve,
 )
-from twin_worker.diagnosis.multirotor.model import CHANNELS
+from twin_worker.diagnosis.multirotor.model import CHANNELS, STEP_S
 
 _ONSET_STEP_S = 2.0
 _MARGIN_S = 8.0  # of onsets from the ends of the flight
+_BLOCK_S = 20.0
 _REFINED, _EXTENDED = 6, 3  # single effects that are refined; of them, extended by a second one
 _PRIOR_NONE, _PRIOR_SINGLE, _PRIOR_PAIR = 0.6, 0.3, 0.1
 
@@ -93,6 +94,7 @@ def _explanations(linear: LinearFlight, baseline: RotorBaseline, none: Solution)
     singles.sort(key=lambda one: -one.evidence)
     for single in [one for one in singles if one.evidence > explanations[0].evidence][:_EXTENDED]:
         used = {one.one.label for one in single.active}
+        used |= {one.names[0] for one in singles if one.evidence > single.evidence}  # extended by this one already
         scans = [s for s in scan_effects(linear, single.solution, baseline) if s.one.label not in used]
         for scan in _best(scans, 2):
             found = _refined(linear, baseline, single, scan)
@@ -109,6 +111,18 @@ def channel_scales(white: np.ndarray, linear: LinearFlight) -> np.ndarray:
     """Return the robust scale of the whitened residuals of each channel, (13,); 1 where a channel is absent."""
     scales = np.median(np.abs(white[linear.valid]), axis=0) / 0.6745
     return np.asarray(np.where(linear.channels, scales, 1.0))
+
+
+def block_scales(white: np.ndarray, linear: LinearFlight) -> tuple[np.ndarray, np.ndarray]:
+    """Return the robust scale of each channel over blocks of 20 s, (b, 13), nan without rows, and their limits [s]."""
+    n = round(_BLOCK_S / STEP_S)
+    blocks = []
+    edges = np.arange(0, len(white), n)
+    for begin in edges:
+        rows = white[begin : begin + n][linear.valid[begin : begin + n]]
+        enough = len(rows) > n // 2
+        blocks.append(np.median(np.abs(rows), axis=0) / 0.6745 if enough else np.full(len(CHANNELS), np.nan))
+    return np.array(blocks), np.append(linear.t[edges], linear.t[-1])
 
 
 def _reweighted(linear: LinearFlight, baseline: RotorBaseline, solution: Solution, scales: np.ndarray) -> Solution:
@@ -263,4 +277,5 @@ def nominal_gains(flight: RotorFlight, baseline: RotorBaseline) -> tuple[dict[st
         name = scan.one.effect.name
         gains[name] = max(gains.get(name, 0.0), scan.gain / len(scan.one.coordinates) / expected)
         sizes[name] = max(sizes.get(name, 0.0), float(np.linalg.norm(scan.values)))
-    return gains, sizes, scales
+    again = solve(linear, baseline.parameters, baseline.spread, none, iterations=0)
+    return gains, sizes, np.nan_to_num(np.nanmax(block_scales(again.white, linear)[0], axis=0), nan=1.0)

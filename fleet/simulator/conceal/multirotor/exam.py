@@ -24,7 +24,7 @@ from fleet.simulator.flight.drive import write
 _HOME = Origin(536_500_000, 80_500_000, 5_000)  # [1e-7 deg, 1e-7 deg, mm]
 _SETTLE_S, _SECONDS = 20.0, 120.0  # flown before the recording starts, recorded
 _ONSET_S = (40.0, 80.0)  # since the start of the recording
-_NOMINAL_FLIGHTS = 4
+_NOMINAL_FLIGHTS = 3
 _WIND, _TURBULENCE = (0.5, 5.0), (1, 2)  # mean at 100 m [m/s]; severity, MIL-F-8785C
 _ATTEMPTS = 25
 _MIN_OVER_NOISE = 2.0  # rms over the noise

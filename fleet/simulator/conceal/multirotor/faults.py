@@ -138,7 +138,7 @@ PHYSICS: dict[str, Callable[[Airframe, Fault, float, float], Airframe]] = {
 }
 """(airframe, fault, intensity, time [s]) to the airframe with the fault."""
 
-_NOISE = np.array([0.05] * 3 + [0.1] * 3 + [0.2] * 4)  # of `RotorBody.accelerations`, up to some hertz
+_NOISE = np.array([0.05] * 3 + [0.1] * 3 + [0.05] * 4)  # of `RotorBody.accelerations`, up to some hertz
 _SENSOR_NOISE: dict[str, np.ndarray] = {
     "rates": np.full(3, 0.003),
     "force": np.full(3, 0.07),
