@@ -109,7 +109,7 @@ def _diagnose_rotors(
     return [diagnose_recording(one, past, progress) for one in read_rotorcraft(recording.path, recording.options)]
 
 
-def with_detection_limits(report: Report, flight: FlightData, reference: Reference) -> Report:
+def with_detection_limits(report: Report, flight: FlightData, reference: Baseline | OwnPast) -> Report:
     """Return the report with the limits of detection measured on the nearest aircraft with such telemetry."""
     own_past = isinstance(reference, OwnPast)
     vane = flight.vane if isinstance(reference, OwnPast) else reference.vane
@@ -119,7 +119,7 @@ def with_detection_limits(report: Report, flight: FlightData, reference: Referen
     return replace(report, detection_limits=report_sentences(source, named))
 
 
-def _flights_of(task: Path | RecordingTask | FlightData, reference: Reference) -> list[FlightData]:
+def _flights_of(task: Path | RecordingTask | FlightData, reference: Baseline | OwnPast) -> list[FlightData]:
     if isinstance(task, FlightData):
         return [task]
     if isinstance(task, RecordingTask):

@@ -24,7 +24,13 @@ from fleet.simulator.multirotor import tasks
 from fleet.simulator.multirotor.airframes import TYPES, draw_airframe
 from fleet.simulator.multirotor.attitude import AttitudeController, attitude_gains
 from fleet.simulator.multirotor.copter_guidance import CopterGuidance
-from fleet.simulator.multirotor.messages import DIALECTS, FULL_CURRENT, ONBOARD_DIALECTS, MultirotorEndpoint, MultirotorState
+from fleet.simulator.multirotor.messages import (
+    DIALECTS,
+    FULL_CURRENT,
+    ONBOARD_DIALECTS,
+    MultirotorEndpoint,
+    MultirotorState,
+)
 from fleet.simulator.multirotor.missions import MultirotorMission, draw_mission
 from fleet.simulator.multirotor.position import PositionController, Reference, position_gains
 from fleet.simulator.multirotor.px4_guidance import Px4Guidance

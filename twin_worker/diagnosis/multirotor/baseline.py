@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +20,12 @@ from twin_worker.diagnosis.multirotor.linearise import (
     autoregression,
     solve,
 )
-from twin_worker.diagnosis.multirotor.model import CHANNELS, PARAMETERS
+from twin_worker.diagnosis.multirotor.model import CHANNELS, PARAMETERS, residuals
 
 FORMAT = "parauav.rotors.1"
 _PASSES = 3
-_START = dict(k=8.0, expo=0.6, tau=0.05, d=0.05, c=0.01, a_p=30.0, a_q=30.0, a_r=3.0)
+NominalGains = Callable[[RotorFlight, "RotorBaseline"], tuple[dict[str, float], dict[str, float], np.ndarray]]
+_START = {"k": 8.0, "expo": 0.6, "tau": 0.05, "d": 0.05, "c": 0.01, "a_p": 30.0, "a_q": 30.0, "a_r": 3.0}
 _FLOOR = np.array([0.01, 0.01, 1e-3, 0.02, 2e-4, 2e-3, 5e-4, *[2e-3] * 3, *[0.2] * 3, *[0.02] * 5, 0.01, *[2e-3] * 3])
 """Least standard deviation of the parameters between flights."""
 
@@ -60,15 +61,13 @@ class RotorBaseline:
         return ResidualNoise(self.filters)
 
 
-def calibrate_rotors(
-    flights: Sequence[RotorFlight], log: Callable[[str], None], gains: Callable[..., tuple[dict[str, float], dict[str, float], np.ndarray]]
-) -> RotorBaseline:
+def calibrate_rotors(flights: Sequence[RotorFlight], log: Callable[[str], None], gains: NominalGains) -> RotorBaseline:
     """Fit the rotor model to nominal flights, each with its own wind and biases.
 
     Args:
         flights: nominal flights of one aircraft
         log: receives progress
-        gains: (flight, baseline) to the gains and sizes of the effects and the scales of the channels, `search.nominal_gains`
+        gains: (flight, baseline) to gains and sizes of the effects and scales of the channels, `search.nominal_gains`
     Raises:
         ValueError: if there is no flight.
     """
@@ -81,45 +80,52 @@ def calibrate_rotors(
         log(f"rotor model: pass {k + 1} of {_PASSES} over {len(flights)} flights")
         solutions = []
         for i, flight in enumerate(flights):
-            linear = LinearFlight(flight, noise, None if noise else _first_weights(flight))
+            linear = LinearFlight(flight, noise, None if noise else _FIRST_STD)
             start = starts[i] or linear.start(parameters)
             solutions.append((linear, solve(linear, start.parameters, None, start, iterations=4 if k == 0 else 2)))
         parameters, information = pooled(solutions)
         noise = ResidualNoise(_filters([(linear, one.base) for linear, one in solutions]))
         starts = [one.fit for _, one in solutions]
-    spread = between_flights(parameters, information, [one for _, one in solutions])
-    explained = _explained(solutions)
-    baseline = RotorBaseline(
-        *(flights[0].inputs.shape[1], parameters, spread, noise.filters, {}, {}, np.ones(len(CHANNELS))),
-        *(explained, tuple(flight.name for flight in flights)),
+    assert noise is not None
+    first = RotorBaseline(
+        motors=flights[0].inputs.shape[1],
+        parameters=parameters,
+        spread=between_flights(parameters, information, [one for _, one in solutions]),
+        filters=noise.filters,
+        chance={},
+        sizes={},
+        excess=np.ones(len(CHANNELS)),
+        explained=_explained(solutions),
+        flights=tuple(flight.name for flight in flights),
     )
+    return _with_chance(first, flights, solutions, gains)
+
+
+def _with_chance(
+    first: RotorBaseline,
+    flights: Sequence[RotorFlight],
+    solutions: Sequence[tuple[LinearFlight, Solution]],
+    gains: NominalGains,
+) -> RotorBaseline:
+    """Return the baseline with what nominal flights show that are left out."""
     chance: dict[str, float] = {}
     squares: dict[str, list[float]] = {}
     excess = []
     for i, flight in enumerate(flights):
-        log(f"rotor model: {flight.name} left out")
         others = [pair for j, pair in enumerate(solutions) if j != i] or solutions
-        mean, without = pooled(others)
-        left_out = RotorBaseline(
-            *(baseline.motors, mean, between_flights(mean, without, [one for _, one in others])),
-            *(baseline.filters, {}, {}, baseline.excess, explained, ()),
-        )
-        by_effect, sizes, scales = gains(flight, left_out)
+        mean, information = pooled(others)
+        spread = between_flights(mean, information, [one for _, one in others])
+        by_effect, sizes, scales = gains(flight, replace(first, parameters=mean, spread=spread))
         excess.append(scales)
         for name, gain in by_effect.items():
             chance[name] = max(chance.get(name, 1.0), gain)
             squares.setdefault(name, []).append(sizes[name] ** 2)
-    most = np.max(excess, axis=0)
-    return RotorBaseline(
-        *(baseline.motors, parameters, spread, noise.filters, chance, {name: float(np.mean(x)) ** 0.5 for name, x in squares.items()}, most),
-        *(explained, baseline.flights),
-    )
+    means = {name: float(np.mean(x)) ** 0.5 for name, x in squares.items()}
+    return replace(first, chance=chance, sizes=means, excess=np.max(excess, axis=0))
 
 
-def _first_weights(flight: RotorFlight) -> np.ndarray:
-    """Return rough noise of the channels for the first pass."""
-    del flight
-    return np.array([0.15, 0.15, 0.25, 0.5, 0.5, 0.2, 0.15, 0.15, 0.15, 0.02, 0.02, 0.02, 1.0])
+_FIRST_STD = np.array([0.15, 0.15, 0.25, 0.5, 0.5, 0.2, 0.15, 0.15, 0.15, 0.02, 0.02, 0.02, 1.0])
+"""Rough noise of the channels for the first pass."""
 
 
 def pooled(solutions: Sequence[tuple[LinearFlight, Solution]]) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -169,8 +175,6 @@ def _filters(residuals: Sequence[tuple[LinearFlight, np.ndarray]]) -> np.ndarray
 
 
 def _explained(solutions: Sequence[tuple[LinearFlight, Solution]]) -> dict[str, float]:
-    from twin_worker.diagnosis.multirotor.model import residuals
-
     out = {}
     left, total = np.zeros(6), np.zeros(6)
     for linear, one in solutions:

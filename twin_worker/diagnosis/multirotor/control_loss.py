@@ -1,10 +1,10 @@
 """Loss of control of a multirotor, from its attitude and motor outputs alone.
 
-The moments of the outputs predict the angular acceleration over a short window: a regression on the rows of calm flight,
-with its usual error. Control is lost where the rotation is fast, its acceleration deviates from this prediction over
-the window, and the aircraft falls over within two seconds. If the specific force shows an impact then, the outputs had been answered until that impact. A
-motor without thrust turns the frame towards its place although its output is raised; an impact elsewhere on the frame
-is a moment of any direction that ends.
+The moments of the outputs predict the angular acceleration over a short window: a regression on the rows of calm
+flight, with its usual error. Control is lost where the rotation is fast, its acceleration deviates from this prediction
+against what the outputs demand, and the aircraft falls over within two seconds. If the specific force shows an impact
+then, the outputs had been answered until that impact. A motor without thrust turns the frame towards its place although
+its output is raised; the working motors explain what follows.
 """
 
 from collections.abc import Mapping
@@ -69,7 +69,7 @@ def unjudged(history: TelemetryHistory, params: Mapping[str, float]) -> str:
         if len(t) < _MIN_ROWS:
             return f"no {word} recorded"
         if (hertz := 1.0 / float(np.median(np.diff(t)))) < 0.95 * MIN_HZ:
-            return f"{word} at {hertz:.1f} Hz, slower than the {MIN_HZ:.0f} Hz that show the answer of the frame to its motors"
+            return f"{word} at {hertz:.1f} Hz; below {MIN_HZ:.0f} Hz they do not show how the frame answers its motors"
     return ""
 
 
@@ -164,8 +164,8 @@ def _impact(history: TelemetryHistory, begin: float) -> ControlLoss | None:
     return ControlLoss(
         t,
         (),
-        f"impact at {t:.1f} s: the specific force reaches {most / G:.0f} g within {_IMPACT_S:.1f} s; until then the frame "
-        "turned as its motor outputs demand, so no motor failed before it; what follows cannot be told from damage",
+        f"impact at {t:.1f} s: the specific force reaches {most / G:.0f} g; until then the frame turned as its motor "
+        "outputs demand, so no motor failed before it; what follows cannot be told from damage",
     )
 
 
@@ -177,7 +177,8 @@ def _motor(rotation: _Rotation, deviation: np.ndarray, frame: RotorFrame, event:
     towards = -frame.mixer[:, :2] / np.linalg.norm(frame.mixer[:, :2], axis=1)[:, None]
     cosine = towards @ direction / max(float(np.linalg.norm(direction)), 1e-9)
     motors = tuple(sorted({int(np.argmax(cosine)), _best_without(rotation, frame, begin)}))
-    what = f"loss of control since {begin:.1f} s: it turns {_turned(direction)} at {rate:.0f} deg/s against its motor outputs"
+    turns = f"it turns {_turned(direction)} at {rate:.0f} deg/s against its motor outputs"
+    what = f"loss of control since {begin:.1f} s: {turns}"
     places = [f"motor {k + 1} ({frame.sides[k]})" for k in motors]
     rows = (rotation.t > begin) & (rotation.t < begin + _COURSE_S)
     raised = [f"{x:.0%}" for x in rotation.inputs[rows].max(axis=0)[list(motors)]]

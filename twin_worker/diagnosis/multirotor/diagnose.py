@@ -1,9 +1,9 @@
 """Decision and report of one multirotor.
 
 The posterior of the explanations gives the probability of every effect. A class is the smallest set of effects that
-holds 95 % of the probability of one place in the best explanation. An effect is named if its class is that probable. Where a
-channel remains noisier than on any nominal flight although the best explanation is part of the model, the outcome is
-unknown, with that channel and time.
+holds 95 % of the probability of one place in the best explanation. An effect is named if its class is that probable.
+Where a channel remains noisier than on any nominal flight although the best explanation is part of the model, the
+outcome is unknown, with that channel and time.
 """
 
 import time
@@ -37,7 +37,9 @@ _FORCE_HZ = np.full(3, 2.0)
 _WORDS = {
     **dict.fromkeys(("f_x", "f_y"), "horizontal specific force"),
     "f_z": "vertical specific force",
-    **{"p_dot": "roll moment", "q_dot": "pitch moment", "r_dot": "yaw moment"},
+    "p_dot": "roll moment",
+    "q_dot": "pitch moment",
+    "r_dot": "yaw moment",
     **dict.fromkeys(("v_n_dot", "v_e_dot", "v_d_dot"), "velocity against force"),
     **dict.fromkeys(("phi_dot", "theta_dot", "psi_dot"), "attitude against rates"),
     "baro": "pressure height",
@@ -255,5 +257,7 @@ def loss_report(name: str, loss: ControlLoss | None, limitations: tuple[str, ...
     nan = float("nan")
     return Report(
         *(name, outcome, sentence, findings, {}, {}, nan, nan, nan, nan, nan, nan, where, {}, (), limitations),
-        series=FigureSeries(np.zeros(0), np.zeros(0, bool), vectors, empty, empty, vectors, vectors, vectors, np.zeros(0, bool)),
+        series=FigureSeries(
+            np.zeros(0), np.zeros(0, bool), vectors, empty, empty, vectors, vectors, vectors, np.zeros(0, bool)
+        ),
     )

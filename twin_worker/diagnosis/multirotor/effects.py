@@ -109,10 +109,7 @@ _BARO = _BARO.__class__(**{**_BARO.__dict__, "onsets": (Onset.STEP,)})
 def rotor_effects(motors: int) -> tuple[RotorEffect, ...]:
     """Return the catalogue for a number of motors."""
     return (
-        *(
-            RotorEffect(_MOTOR, f"motor{i + 1}", (f"motor{i + 1}",), 0.2, 0.02, low=0.0)
-            for i in range(motors)
-        ),
+        *(RotorEffect(_MOTOR, f"motor{i + 1}", (f"motor{i + 1}",), 0.2, 0.02, low=0.0) for i in range(motors)),
         RotorEffect(_THRUST, "", ("thrust",), 0.15, 0.02, low=0.0),
         RotorEffect(_LAG, "", ("lag",), 0.06, 0.01, low=0.0, in_forces=False),
         RotorEffect(_MASS, "", ("mass",), 0.15, 0.02),

@@ -137,7 +137,9 @@ def rotor_flight(name: str, history: TelemetryHistory, params: Mapping[str, floa
     end = min(float(rows[0][-1]) for rows in series.values()) - t_start
     t = np.arange(np.ceil(begin / DT), np.floor(end / DT)) * DT
     if len(t) * DT < _MIN_FLIGHT_S:
-        raise ValueError(f"{name}: found {max(end - begin, 0):.0f} s, expected {_MIN_FLIGHT_S:.0f} s of flight at least")
+        raise ValueError(
+            f"{name}: found {max(end - begin, 0):.0f} s, expected {_MIN_FLIGHT_S:.0f} s of flight at least"
+        )
 
     def on_grid(times: np.ndarray, x: np.ndarray) -> np.ndarray:
         return np.stack([np.interp(t, times - t_start, column) for column in x.T], axis=1)

@@ -1,8 +1,8 @@
 """Residuals of one flight, whitened by the noise of nominal flights, with their derivatives.
 
 Unknowns beside the effects: the rotor parameters with the spread of nominal flights, the wind as an
-Ornstein-Uhlenbeck process at knots, and the biases of the sensors within data-sheet limits. All have Gaussian priors, so
-that the gain of an effect is a difference of penalised sums of squares.
+Ornstein-Uhlenbeck process at knots, and the biases of the sensors within data-sheet limits. All have Gaussian priors,
+so that the gain of an effect is a difference of penalised sums of squares.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,9 @@ _KNOT_S = 5.0  # between the knots of the wind [s]
 _WIND_STD, _GUST_STD, _GUST_S = 6.0, 1.0, 25.0  # of the mean wind and of its changes [m/s]; correlation time [s]
 _UNKNOWN_STD = np.array([*[1e4] * 7, *[0.1] * 3, *[1e4] * 9, *[0.03] * 3])  # of parameters before any flight
 _LIMIT = 5.0  # standard deviations at which a whitened residual is limited (Huber)
-_STEPS = np.array([0.05, 0.02, 0.005, 0.02, 0.001, 0.005, 0.002, *[0.01] * 3, *[0.5] * 3, *[0.05] * 5, 0.05, *[0.01] * 3])
+_STEPS = np.array(
+    [0.05, 0.02, 0.005, 0.02, 0.001, 0.005, 0.002, *[0.01] * 3, *[0.5] * 3, *[0.05] * 5, 0.05, *[0.01] * 3]
+)
 
 
 @dataclass(frozen=True)
@@ -97,9 +99,7 @@ class LinearFlight:
 
     def residuals(self, fit: FlightFit, active: Sequence[ActiveEffect] = ()) -> np.ndarray:
         """Return the residuals, (N, 13)."""
-        return residuals(
-            self.flight, fit.parameters, self.hats @ fit.wind, combined(active, fit.biases, self.flight.t)
-        )
+        return residuals(self.flight, fit.parameters, self.hats @ fit.wind, combined(active, fit.biases, self.flight.t))
 
     def whitened(self, x: np.ndarray) -> np.ndarray:
         """Whiten the rows of each channel, (N, 13, ...), to (N', 13, ...); invalid rows and channels become 0."""
@@ -133,9 +133,7 @@ class LinearFlight:
             columns.append((self.residuals(FlightFit(fit.parameters, fit.wind, biases), active) - base) / steps[name])
         return np.stack(columns, axis=2)
 
-    def effect_columns(
-        self, fit: FlightFit, active: Sequence[ActiveEffect], base: np.ndarray
-    ) -> dict[str, np.ndarray]:
+    def effect_columns(self, fit: FlightFit, active: Sequence[ActiveEffect], base: np.ndarray) -> dict[str, np.ndarray]:
         """Return the derivatives of the residuals by every effect coordinate throughout, (N, 13) each."""
         out, ones = {}, np.ones(len(self.flight.t))
         current = combined(active, fit.biases, self.flight.t)

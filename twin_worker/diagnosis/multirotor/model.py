@@ -1,7 +1,8 @@
 """Rotor model of a multirotor with effects, and its residuals.
 
 Specific force and angular acceleration, mass-normalised, with w_i the relative speed of rotor i, its relative thrust
-T_i = (1 + m_p roll_i + m_q pitch_i + m_r yaw_i) (1 - loss_i) w_i^2, and the velocity through the air (u, v, w) = R' (V - wind):
+T_i = (1 + m_p roll_i + m_q pitch_i + m_r yaw_i) (1 - loss_i) w_i^2, and the velocity through the air
+(u, v, w) = R' (V - wind):
 
     w_i' = (w_ic - w_i) / tau,   w_ic^2 = (1 - expo) u_i + expo u_i^2
     f_x  = -(d sum w_i + c Va) u,   f_y likewise with v

@@ -19,7 +19,6 @@ from twin_worker.diagnosis.multirotor.search import nominal_gains
 from twin_worker.telemetry.history import TelemetryHistory
 
 
-
 @dataclass
 class RotorRecording:
     """Telemetry and parameters of one multirotor as recorded."""

@@ -32,6 +32,7 @@ from twin_worker.diagnosis.multirotor.model import CHANNELS, STEP_S
 _ONSET_STEP_S = 2.0
 _MARGIN_S = 8.0  # of onsets from the ends of the flight
 _BLOCK_S = 20.0
+_QUIETER = 0.9  # noise with the best explanation over that without, below which the search is repeated
 _REFINED, _EXTENDED = 6, 3  # single effects that are refined; of them, extended by a second one
 _PRIOR_NONE, _PRIOR_SINGLE, _PRIOR_PAIR = 0.6, 0.3, 0.1
 
@@ -75,11 +76,10 @@ def search(linear: LinearFlight, baseline: RotorBaseline) -> list[Explanation]:
     none = _reweighted(linear, baseline, none, scales)
     explanations = _explanations(linear, baseline, none)
     best = explanations[0]
-    if best.active and (smaller := scales * np.maximum(channel_scales(best.solution.white, linear), 0.0)).min() < np.inf:
-        better = np.maximum(smaller, 1.0)
-        if (better < 0.9 * linear.weights).any():
-            none = _reweighted(linear, baseline, none, better)
-            explanations = _explanations(linear, baseline, none)
+    quieter = np.maximum(linear.weights * channel_scales(best.solution.white, linear), 1.0)
+    if best.active and (quieter < _QUIETER * linear.weights).any():
+        none = _reweighted(linear, baseline, none, quieter)
+        explanations = _explanations(linear, baseline, none)
     return explanations
 
 
@@ -121,7 +121,8 @@ def block_scales(white: np.ndarray, linear: LinearFlight) -> tuple[np.ndarray, n
     for begin in edges:
         rows = white[begin : begin + n][linear.valid[begin : begin + n]]
         enough = len(rows) > n // 2
-        blocks.append(np.median(np.abs(rows), axis=0) / 0.6745 if enough else np.full(len(CHANNELS), np.nan))
+        scale = linear.weights * np.median(np.abs(rows), axis=0) / 0.6745 if enough else np.full(len(CHANNELS), np.nan)
+        blocks.append(scale)
     return np.array(blocks), np.append(linear.t[edges], linear.t[-1])
 
 
@@ -260,7 +261,9 @@ def _with_onset(linear: LinearFlight, baseline: RotorBaseline, solution: Solutio
     return solve(linear, baseline.parameters, baseline.spread, solution, moved, iterations=2)
 
 
-def nominal_gains(flight: RotorFlight, baseline: RotorBaseline) -> tuple[dict[str, float], dict[str, float], np.ndarray]:
+def nominal_gains(
+    flight: RotorFlight, baseline: RotorBaseline
+) -> tuple[dict[str, float], dict[str, float], np.ndarray]:
     """Return the gain of each effect over that of chance, its size, and the scale of each channel, (13,).
 
     The best of n onsets gains about 2 ln n by chance.
@@ -277,5 +280,4 @@ def nominal_gains(flight: RotorFlight, baseline: RotorBaseline) -> tuple[dict[st
         name = scan.one.effect.name
         gains[name] = max(gains.get(name, 0.0), scan.gain / len(scan.one.coordinates) / expected)
         sizes[name] = max(sizes.get(name, 0.0), float(np.linalg.norm(scan.values)))
-    again = solve(linear, baseline.parameters, baseline.spread, none, iterations=0)
-    return gains, sizes, np.nan_to_num(np.nanmax(block_scales(again.white, linear)[0], axis=0), nan=1.0)
+    return gains, sizes, np.nan_to_num(np.nanmax(block_scales(none.white, linear)[0], axis=0), nan=1.0)

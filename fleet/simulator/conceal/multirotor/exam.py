@@ -76,7 +76,10 @@ def draw_rotor_jobs(seed: int, flights: int) -> list[RotorJob]:
             requests += [(airframe, role, names) for names in _names(rng, role, (count + (i + k) % 2) // 2)]
     names = sorted(f"rec_{int(x):08x}" for x in rng.choice(2**32, len(requests), replace=False))
     shuffled = [requests[i] for i in rng.permutation(len(requests))]
-    jobs = [RotorJob(name, *request, number) for number, (name, request) in enumerate(zip(names, shuffled, strict=True))]
+    jobs = [
+        RotorJob(name, airframe, role, hidden, number)
+        for number, (name, (airframe, role, hidden)) in enumerate(zip(names, shuffled, strict=True))
+    ]
     nominal = [
         RotorJob(f"cal_{airframe}_{k}", airframe, "nominal", (), 1_000 + 10 * i + k)
         for i, airframe in enumerate(AIRFRAMES)
