@@ -55,7 +55,8 @@ class RotorBody:
         return self._motors
 
     def set_parameters(self, kind: MultirotorType, motors: np.ndarray) -> None:
-        """Change the parameters, and the relative rotor speed of each motor, (4,) [-]; the state stays."""
+        """Change the parameters, and the relative rotor speed of each motor, (4,) [-]; state and inputs stay."""
+        self._command *= motors / self._motors
         self.kind, self._motors = kind, motors
         self._model = Multirotor(rotorpy_parameters(kind), enable_ground=True)
 

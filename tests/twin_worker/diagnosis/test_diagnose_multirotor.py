@@ -124,7 +124,7 @@ def tumbling(lost: int | None, rate_hz: float = 50.0) -> TelemetryHistory:
         torque = np.clip(2.0 * (wanted - angles) - 0.4 * rates, -0.25, 0.25)
         u = np.clip(0.5 + mixer @ torque, 0.05, 1.0)
         working = np.arange(4) != (lost if lost is not None and now > LOST_S else -1)
-        rates = rates + dt * 25.0 * (u * working) @ mixer
+        rates = rates + dt * 60.0 * (u * working) @ mixer
         angles = angles + dt * rates
         attitude.append([*angles, 0.0, *rates, 0.0])
         pulses.append([*(1000 + 1000 * u), 0, 0, 0, 0])

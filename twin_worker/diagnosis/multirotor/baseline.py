@@ -56,6 +56,11 @@ class RotorBaseline:
     flights: tuple[str, ...]
 
     @property
+    def temper(self) -> float:
+        """Return the rows per independent sample, as the median of the chance gains shows."""
+        return max(float(np.median(list(self.chance.values()))), 1.0) if self.chance else 1.0
+
+    @property
     def noise(self) -> ResidualNoise:
         """Return the noise of the channels."""
         return ResidualNoise(self.filters)
@@ -189,7 +194,7 @@ def _explained(solutions: Sequence[tuple[LinearFlight, Solution]]) -> dict[str, 
 
 def save_rotors(path: Path, baseline: RotorBaseline) -> None:
     """Write the model file."""
-    values = msgspec.to_builtins(baseline, enc_hook=np.ndarray.tolist)
+    values = msgspec.to_builtins(baseline, enc_hook=lambda x: x.tolist())
     path.write_text(json.dumps({"format": FORMAT, **values}, indent=1) + "\n")
 
 

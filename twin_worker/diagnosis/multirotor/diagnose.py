@@ -8,6 +8,7 @@ outcome is unknown, with that channel and time.
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -89,7 +90,8 @@ def diagnose_rotors(flight: RotorFlight, baseline: RotorBaseline) -> Report:
         seconds=time.process_time() - begun,
         posterior=posterior,
     )
-    return with_sentence(report)
+    text = with_sentence(report).sentence.replace("on held-out blocks ", "").replace(" on held-out data", "")
+    return replace(report, sentence=text)  # nothing is held out: the evidence carries its own penalty
 
 
 def _posterior(explanations: Sequence[Explanation]) -> dict[str, float]:
@@ -176,7 +178,7 @@ def _unusual(
 ) -> tuple[str, tuple[tuple[float, float], ...]]:
     """Return the channel that is noisier than on nominal flights, and when; empty if there is none."""
     blocks, times = block_scales(best.solution.white, linear)
-    ratio = blocks / (_UNUSUAL * baseline.excess)
+    ratio = blocks / (_UNUSUAL * np.maximum(baseline.excess, 1.0))
     if not (np.nanmax(ratio) > 1.0):
         return "", ()
     c = int(np.argmax(np.nanmax(ratio, axis=0)))

@@ -20,6 +20,7 @@ ORDER = 8  # of the autoregression of the residuals
 _KNOT_S = 5.0  # between the knots of the wind [s]
 _WIND_STD, _GUST_STD, _GUST_S = 6.0, 1.0, 25.0  # of the mean wind and of its changes [m/s]; correlation time [s]
 _UNKNOWN_STD = np.array([*[1e4] * 7, *[0.1] * 3, *[1e4] * 9, *[0.03] * 3])  # of parameters before any flight
+_ENOUGH = 0.5  # drop of the cost
 _LIMIT = 5.0  # standard deviations at which a whitened residual is limited (Huber)
 _STEPS = np.array(
     [0.05, 0.02, 0.005, 0.02, 0.001, 0.005, 0.002, *[0.01] * 3, *[0.5] * 3, *[0.05] * 5, 0.05, *[0.01] * 3]
@@ -211,7 +212,7 @@ def solve(
         mean, spread: prior of the rotor parameters
         start: a fit, or a solution whose derivatives by the nuisances are used again
         active: effects with their first values
-        iterations: steps
+        iterations: most steps; it ends before where the cost falls by less than `_ENOUGH`
     """
     known = start if isinstance(start, Solution) else None
     fit = start.fit if isinstance(start, Solution) else start
@@ -220,10 +221,13 @@ def solve(
     p = len(precision)
     base = linear.residuals(fit, active)
     columns = known.columns if known is not None else np.zeros(0)
+    previous = np.inf
     for k in range(iterations + 1):
         white = linear.whitened(base)
         nuisance = linear.vector(fit, mean)
         cost = huber(white) + float(nuisance @ precision @ nuisance)
+        is_last = k == iterations or (k > 1 and previous - cost < _ENOUGH)
+        previous = cost
         if known is None and k < 3:
             columns = linear.whitened(linear.nuisance_columns(fit, active, base))
         effects = effect_derivatives(linear, fit, active, base)
@@ -237,7 +241,7 @@ def solve(
         values = np.concatenate([one.values for one in active]) if active else np.zeros(0)
         H = A.T @ (weight[:, None] * A) + prior
         factor = cho_factor(H + 1e-9 * np.diag(np.diag(H)))
-        if k == iterations:
+        if is_last:
             covariance = cho_solve(factor, np.eye(len(H)))[p:, p:]
             break
         step = -cho_solve(factor, A.T @ (weight * r) + prior @ np.concatenate([nuisance, values]))

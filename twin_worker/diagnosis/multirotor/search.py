@@ -4,9 +4,10 @@ The gain of an effect with onset t0 is the drop of the penalised sum of squares.
 products with the nuisances follow for all onsets from cumulative sums. With a Gaussian prior of precision P for m
 coordinates and information H,
 
-    log evidence = G / (2 c) + log|P| / 2 - log|H + P| / 2 - log(number of onsets)   relative to no effect,
+    log evidence = G' / (2 T) + log|P| / 2 - log|H + P| / 2 - log(number of onsets)   relative to no effect,
 
-where c is the gain of this effect on nominal flights that are left out, over that of white noise, at least 1.
+where G' is the gain beyond that of this effect on nominal flights that are left out, and T the median over the effects
+of that gain over the one in white noise, at least 1.
 
 Source: MacKay 2003, ch. 28 (Laplace's method, Occam factor).
 """
@@ -30,10 +31,13 @@ from twin_worker.diagnosis.multirotor.linearise import (
 from twin_worker.diagnosis.multirotor.model import CHANNELS, STEP_S
 
 _ONSET_STEP_S = 2.0
+_ONSET_GRIDS = (np.arange(-3.0, 3.01, 0.5), np.arange(-0.4, 0.41, 0.1))  # around the best onset so far [s]
 _MARGIN_S = 8.0  # of onsets from the ends of the flight
 _BLOCK_S = 20.0
+_NOMINAL_SIGMAS = 2.0  # standard deviations within which an effect occurs on nominal flights
 _QUIETER = 0.9  # noise with the best explanation over that without, below which the search is repeated
-_REFINED, _EXTENDED = 6, 3  # single effects that are refined; of them, extended by a second one
+_ITERATIONS = 10  # at most: rows beyond the limit of Huber's function enter one after the other
+_REFINED, _EXTENDED = 4, 2  # single effects that are refined; of them, extended by a second one
 _PRIOR_NONE, _PRIOR_SINGLE, _PRIOR_PAIR = 0.6, 0.3, 0.1
 
 
@@ -132,7 +136,7 @@ def _reweighted(linear: LinearFlight, baseline: RotorBaseline, solution: Solutio
     columns = solution.columns * (linear.weights / weights)[:, None]
     linear.weights = weights
     again = replace(solution, columns=columns, active=())
-    return solve(linear, baseline.parameters, baseline.spread, again, iterations=2)
+    return solve(linear, baseline.parameters, baseline.spread, again, iterations=4)
 
 
 def scan_effects(linear: LinearFlight, solution: Solution, baseline: RotorBaseline) -> list[_Scan]:
@@ -201,10 +205,9 @@ def _scored(
     n_onsets: int,
 ) -> _Scan | None:
     """Return the score of one onset; None where the value has the wrong sign or no information."""
-    chance = baseline.chance.get(one.effect.name, 1.0)
     precision = np.eye(len(b)) / one.scale**2
     try:
-        values = -np.linalg.solve(information + chance * precision, b)
+        values = -np.linalg.solve(information + precision, b)
     except np.linalg.LinAlgError:
         return None
     if not np.isfinite(values).all() or (values < one.low).any():
@@ -217,24 +220,27 @@ def _scored(
 def _evidence(
     active: ActiveEffect, gain: float, information: np.ndarray, baseline: RotorBaseline, n_onsets: int
 ) -> float:
-    """Return the log evidence of one effect; its values vary on nominal flights too.
+    """Return the log evidence of one effect beyond what nominal flights show of it.
 
-    G' = 1 / (c / G + s^2 / |x|^2)   with the root mean square s of such values on nominal flights
+    G' = G - max(2 c ln n, k^2 s^2 / |x|^2 G)   with the root mean square s of such values on nominal flights, k = 2
     """
     name = active.one.effect.name
     chance, nominal = baseline.chance.get(name, 1.0), baseline.sizes.get(name, 0.0)
     square = max(float(active.values @ active.values), 1e-12)
-    effective = 1.0 / (chance / max(gain, 1e-9) + nominal**2 / square)
+    usual = max(2 * chance * float(np.log(n_onsets)), gain * (_NOMINAL_SIGMAS * nominal) ** 2 / square)
     precision = np.eye(len(information)) / active.one.scale**2
-    ratio = np.eye(len(information)) + np.linalg.solve(precision, information / chance)
+    ratio = np.eye(len(information)) + np.linalg.solve(precision, information)
     occam = 0.5 * float(np.linalg.slogdet(ratio)[1])
-    return effective / 2 - occam - float(np.log(2.0 if active.onset is None else 2.0 * n_onsets))
+    return (
+        (gain - usual) / (2 * baseline.temper) - occam - float(np.log(2.0 if active.onset is None else 2.0 * n_onsets))
+    )
 
 
 def _refined(linear: LinearFlight, baseline: RotorBaseline, before: Explanation, scan: _Scan) -> Explanation:
     """Add an effect to an explanation and fit all by Gauss-Newton, with its onset moved to the best time."""
     trial = (*before.active, ActiveEffect(scan.one, scan.onset, scan.values))
-    solution = solve(linear, baseline.parameters, baseline.spread, before.solution, trial, iterations=3)
+    start = before.solution if before.active else before.solution.fit  # a first effect changes the derivatives
+    solution = solve(linear, baseline.parameters, baseline.spread, start, trial, iterations=_ITERATIONS)
     if scan.onset is not None:
         solution = _with_onset(linear, baseline, solution)
     gain = max(before.solution.cost - solution.cost, 0.0)
@@ -251,14 +257,15 @@ def _with_onset(linear: LinearFlight, baseline: RotorBaseline, solution: Solutio
     """Move the onset of the last effect on a finer grid, with the other unknowns held, then fit again."""
     last = solution.active[-1]
     assert last.onset is not None
-    best, cost = last.onset, np.inf
-    for onset in last.onset + np.arange(-3.0, 3.01, 0.5):
-        moved = (*solution.active[:-1], replace(last, onset=float(onset)))
-        trial = huber(linear.whitened(linear.residuals(solution.fit, moved)))
-        if trial < cost:
-            best, cost = float(onset), trial
+    best = last.onset
+    for steps in _ONSET_GRIDS:
+        costs = []
+        for onset in best + steps:
+            moved = (*solution.active[:-1], replace(last, onset=float(onset)))
+            costs.append(huber(linear.whitened(linear.residuals(solution.fit, moved))))
+        best = float(best + steps[int(np.argmin(costs))])
     moved = (*solution.active[:-1], replace(last, onset=best))
-    return solve(linear, baseline.parameters, baseline.spread, solution, moved, iterations=2)
+    return solve(linear, baseline.parameters, baseline.spread, solution, moved, iterations=_ITERATIONS)
 
 
 def nominal_gains(
@@ -273,7 +280,7 @@ def nominal_gains(
     none = solve(linear, baseline.parameters, baseline.spread, start, iterations=4)
     scales = channel_scales(none.white, linear)
     none = _reweighted(linear, baseline, none, scales)
-    expected = 2 * np.log(max(linear.t[-1] / _ONSET_STEP_S, 3.0))
+    expected = float(2 * np.log(max(linear.t[-1] / _ONSET_STEP_S, 3.0)))
     gains: dict[str, float] = {}
     sizes: dict[str, float] = {}
     for scan in scan_effects(linear, none, baseline):
