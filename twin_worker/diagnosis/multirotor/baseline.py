@@ -14,9 +14,9 @@ from twin_worker.diagnosis.multirotor.flight import RotorFlight
 from twin_worker.diagnosis.multirotor.linearise import (
     ORDER,
     FlightFit,
+    FlightSolution,
     LinearFlight,
     ResidualNoise,
-    Solution,
     autoregression,
     solve,
 )
@@ -87,7 +87,7 @@ def calibrate_rotors(flights: Sequence[RotorFlight], log: Callable[[str], None],
         for i, flight in enumerate(flights):
             linear = LinearFlight(flight, noise, None if noise else _FIRST_STD)
             start = starts[i] or linear.start(parameters)
-            solutions.append((linear, solve(linear, start.parameters, None, start, iterations=4 if k == 0 else 2)))
+            solutions.append((linear, solve(linear, start.parameters, None, start, iterations=8 if k == 0 else 3)))
         parameters, information = pooled(solutions)
         noise = ResidualNoise(_filters([(linear, one.base) for linear, one in solutions]))
         starts = [one.fit for _, one in solutions]
@@ -109,7 +109,7 @@ def calibrate_rotors(flights: Sequence[RotorFlight], log: Callable[[str], None],
 def _with_chance(
     first: RotorBaseline,
     flights: Sequence[RotorFlight],
-    solutions: Sequence[tuple[LinearFlight, Solution]],
+    solutions: Sequence[tuple[LinearFlight, FlightSolution]],
     gains: NominalGains,
 ) -> RotorBaseline:
     """Return the baseline with what nominal flights show that are left out."""
@@ -133,7 +133,7 @@ _FIRST_STD = np.array([0.15, 0.15, 0.25, 0.5, 0.5, 0.2, 0.15, 0.15, 0.15, 0.02, 
 """Rough noise of the channels for the first pass."""
 
 
-def pooled(solutions: Sequence[tuple[LinearFlight, Solution]]) -> tuple[np.ndarray, list[np.ndarray]]:
+def pooled(solutions: Sequence[tuple[LinearFlight, FlightSolution]]) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return the mean of the parameters weighted by information, and the information of each flight."""
     n = len(PARAMETERS)
     information, total, weighted = [], 1e-8 * np.eye(n), np.zeros(n)
@@ -147,7 +147,9 @@ def pooled(solutions: Sequence[tuple[LinearFlight, Solution]]) -> tuple[np.ndarr
     return np.linalg.solve(total, weighted), information
 
 
-def between_flights(mean: np.ndarray, information: Sequence[np.ndarray], solutions: Sequence[Solution]) -> np.ndarray:
+def between_flights(
+    mean: np.ndarray, information: Sequence[np.ndarray], solutions: Sequence[FlightSolution]
+) -> np.ndarray:
     """Return the covariance of the parameters of another flight: spread beyond their own uncertainty, and of the mean.
 
     The spread has the shape of that uncertainty; its size is that of the mean square of the deviations.
@@ -161,7 +163,7 @@ def between_flights(mean: np.ndarray, information: Sequence[np.ndarray], solutio
 
 
 def _deviations(
-    mean: np.ndarray, information: Sequence[np.ndarray], solutions: Sequence[Solution]
+    mean: np.ndarray, information: Sequence[np.ndarray], solutions: Sequence[FlightSolution]
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(one.fit.parameters - mean, info) for one, info in zip(solutions, information, strict=True)]
 
@@ -179,7 +181,7 @@ def _filters(residuals: Sequence[tuple[LinearFlight, np.ndarray]]) -> np.ndarray
     return np.array(rows)
 
 
-def _explained(solutions: Sequence[tuple[LinearFlight, Solution]]) -> dict[str, float]:
+def _explained(solutions: Sequence[tuple[LinearFlight, FlightSolution]]) -> dict[str, float]:
     out = {}
     left, total = np.zeros(6), np.zeros(6)
     for linear, one in solutions:

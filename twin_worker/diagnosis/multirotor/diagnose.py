@@ -29,11 +29,12 @@ from twin_worker.diagnosis.multirotor.effects import rotor_effects
 from twin_worker.diagnosis.multirotor.flight import RotorFlight
 from twin_worker.diagnosis.multirotor.linearise import ActiveEffect, LinearFlight, combined
 from twin_worker.diagnosis.multirotor.model import CHANNELS, STEP, modelled_force, smoothed
-from twin_worker.diagnosis.multirotor.search import Explanation, block_scales, search
+from twin_worker.diagnosis.multirotor.search import EffectSet, block_scales, search
 
 NAMED, SUSPECTED = 0.95, 0.1  # probability of a class
 _UNUSUAL = 1.5  # scale of a channel over the largest one of nominal flights that makes the outcome unknown
 _MAX_CLASS = 4
+_EXPLAINED = 0.6  # share of the excess noise that effects explain which leaves no unknown
 _FORCE_HZ = np.full(3, 2.0)
 _WORDS = {
     **dict.fromkeys(("f_x", "f_y"), "horizontal specific force"),
@@ -55,17 +56,17 @@ def diagnose_rotors(flight: RotorFlight, baseline: RotorBaseline) -> Report:
     """
     begun = time.process_time()
     if flight.inputs.shape[1] != baseline.motors:
-        found = flight.inputs.shape[1]
-        raise ValueError(f"{flight.name}: found {found} motors, expected {baseline.motors} like the model; use its own")
+        count = flight.inputs.shape[1]
+        raise ValueError(f"{flight.name}: found {count} motors, expected {baseline.motors} like the model; use its own")
     linear = LinearFlight(flight, baseline.noise)
     explanations = search(linear, baseline)
     best = explanations[0]
     posterior = _posterior(explanations)
     findings, outcome = _findings(linear, baseline, explanations, posterior)
-    channel, segments = _unusual(linear, baseline, best)
+    none = next(one for one in explanations if not one.active)
+    channel, segments = _unusual(linear, baseline, none, best)
     if channel:
         outcome = ReportOutcome.UNKNOWN
-    none = next(one for one in explanations if not one.active)
     before, after = _rms(none, linear), _rms(best, linear)
     series, force = _series(linear, baseline, none, best)
     ratios = [{n: float(x) for n, x in zip(CHANNELS, _squares(one, linear), strict=True)} for one in (none, best)]
@@ -94,7 +95,7 @@ def diagnose_rotors(flight: RotorFlight, baseline: RotorBaseline) -> Report:
     return replace(report, sentence=text)  # nothing is held out: the evidence carries its own penalty
 
 
-def _posterior(explanations: Sequence[Explanation]) -> dict[str, float]:
+def _posterior(explanations: Sequence[EffectSet]) -> dict[str, float]:
     """Return the probability of each set of effects; sets of the same effects count as one."""
     evidence = np.array([one.evidence for one in explanations])
     weights = np.exp(evidence - evidence.max())
@@ -106,7 +107,7 @@ def _posterior(explanations: Sequence[Explanation]) -> dict[str, float]:
 
 
 def _findings(
-    linear: LinearFlight, baseline: RotorBaseline, explanations: Sequence[Explanation], posterior: dict[str, float]
+    linear: LinearFlight, baseline: RotorBaseline, explanations: Sequence[EffectSet], posterior: dict[str, float]
 ) -> tuple[list[DiagnosisFinding], ReportOutcome]:
     best = explanations[0]
     if not best.active:
@@ -174,11 +175,13 @@ def _finding(
 
 
 def _unusual(
-    linear: LinearFlight, baseline: RotorBaseline, best: Explanation
+    linear: LinearFlight, baseline: RotorBaseline, none: EffectSet, best: EffectSet
 ) -> tuple[str, tuple[tuple[float, float], ...]]:
     """Return the channel that is noisier than on nominal flights, and when; empty if there is none."""
     blocks, times = block_scales(best.solution.white, linear)
-    ratio = blocks / (_UNUSUAL * np.maximum(baseline.excess, 1.0))
+    usual = np.maximum(baseline.excess, 1.0)
+    excess = block_scales(none.solution.white, linear)[0] - usual
+    ratio = np.where(blocks - usual > (1 - _EXPLAINED) * excess, blocks / (_UNUSUAL * usual), 0.0)
     if not (np.nanmax(ratio) > 1.0):
         return "", ()
     c = int(np.argmax(np.nanmax(ratio, axis=0)))
@@ -186,16 +189,16 @@ def _unusual(
     return _WORDS[CHANNELS[c]], tuple((float(times[k]), float(times[k + 1])) for k in rows)
 
 
-def _squares(one: Explanation, linear: LinearFlight) -> np.ndarray:
+def _squares(one: EffectSet, linear: LinearFlight) -> np.ndarray:
     return np.asarray((one.solution.white[linear.valid] ** 2).mean(axis=0))
 
 
-def _rms(one: Explanation, linear: LinearFlight) -> float:
+def _rms(one: EffectSet, linear: LinearFlight) -> float:
     return float(np.sqrt(_squares(one, linear)[linear.channels].mean()))
 
 
 def _series(
-    linear: LinearFlight, baseline: RotorBaseline, none: Explanation, best: Explanation
+    linear: LinearFlight, baseline: RotorBaseline, none: EffectSet, best: EffectSet
 ) -> tuple[FigureSeries, tuple[float, float]]:
     """Return the series of the figures, and the rms error of the predicted force before and after [m/s2].
 
@@ -225,7 +228,7 @@ def _series(
     return series, (error[0], error[1])
 
 
-def _ranking(explanations: Sequence[Explanation]) -> tuple[RankedCandidate, ...]:
+def _ranking(explanations: Sequence[EffectSet]) -> tuple[RankedCandidate, ...]:
     rows = []
     for one in explanations:
         if one.active:

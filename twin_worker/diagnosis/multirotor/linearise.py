@@ -20,6 +20,10 @@ ORDER = 8  # of the autoregression of the residuals
 _KNOT_S = 5.0  # between the knots of the wind [s]
 _WIND_STD, _GUST_STD, _GUST_S = 6.0, 1.0, 25.0  # of the mean wind and of its changes [m/s]; correlation time [s]
 _UNKNOWN_STD = np.array([*[1e4] * 7, *[0.1] * 3, *[1e4] * 9, *[0.03] * 3])  # of parameters before any flight
+_MOST_STEP = np.array([2.0, 0.2, 0.02, *[np.inf] * 19])  # of k, expo, tau in one iteration
+_LOW = np.array([0.5, 0.0, 0.005, *[-np.inf] * 19])  # least k, expo, tau: without lag there is no derivative by it
+_HIGH = np.array([200.0, 1.5, 0.5, *[np.inf] * 19])
+_DERIVATIVES = 6  # iterations with new derivatives by the nuisances
 _ENOUGH = 0.5  # drop of the cost
 _LIMIT = 5.0  # standard deviations at which a whitened residual is limited (Huber)
 _STEPS = np.array(
@@ -165,7 +169,9 @@ class LinearFlight:
         """Return the fit after a step of the nuisances, (p,)."""
         n, K = len(PARAMETERS), len(self.knots)
         biases = {name: x + d for (name, x), d in zip(fit.biases.items(), step[n + 2 * K :].tolist(), strict=True)}
-        return FlightFit(fit.parameters + step[:n], fit.wind + step[n : n + 2 * K].reshape(2, K).T, biases)
+        limited = np.clip(step[:n], -_MOST_STEP, _MOST_STEP)
+        parameters = np.clip(fit.parameters + limited, _LOW, _HIGH)
+        return FlightFit(parameters, fit.wind + step[n : n + 2 * K].reshape(2, K).T, biases)
 
 
 def replace_parameter(fit: FlightFit, k: int, step: float) -> FlightFit:
@@ -176,7 +182,7 @@ def replace_parameter(fit: FlightFit, k: int, step: float) -> FlightFit:
 
 
 @dataclass(frozen=True)
-class Solution:
+class FlightSolution:
     """Result of the Gauss-Newton iterations.
 
     Attributes:
@@ -201,10 +207,11 @@ def solve(
     linear: LinearFlight,
     mean: np.ndarray,
     spread: np.ndarray | None,
-    start: "FlightFit | Solution",
+    start: "FlightFit | FlightSolution",
     active: Sequence[ActiveEffect] = (),
+    *,
     iterations: int = 3,
-) -> Solution:
+) -> FlightSolution:
     """Fit nuisances and the values of the active effects by Gauss-Newton with Huber weights.
 
     Args:
@@ -214,8 +221,8 @@ def solve(
         active: effects with their first values
         iterations: most steps; it ends before where the cost falls by less than `_ENOUGH`
     """
-    known = start if isinstance(start, Solution) else None
-    fit = start.fit if isinstance(start, Solution) else start
+    known = start if isinstance(start, FlightSolution) else None
+    fit = start.fit if isinstance(start, FlightSolution) else start
     active = tuple(active)
     precision = linear.prior_precision(spread)
     p = len(precision)
@@ -228,7 +235,7 @@ def solve(
         cost = huber(white) + float(nuisance @ precision @ nuisance)
         is_last = k == iterations or (k > 1 and previous - cost < _ENOUGH)
         previous = cost
-        if known is None and k < 3:
+        if known is None and k < _DERIVATIVES:
             columns = linear.whitened(linear.nuisance_columns(fit, active, base))
         effects = effect_derivatives(linear, fit, active, base)
         A = np.concatenate([columns, effects], axis=2).reshape(-1, p + effects.shape[2])
@@ -248,7 +255,7 @@ def solve(
         fit = linear.moved(fit, step[:p])
         active = _moved_effects(active, step[p:])
         base = linear.residuals(fit, active)
-    return Solution(fit, active, covariance, cost, white, columns, precision, base)
+    return FlightSolution(fit, active, covariance, cost, white, columns, precision, base)
 
 
 def huber(white: np.ndarray) -> float:

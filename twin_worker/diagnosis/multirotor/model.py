@@ -115,7 +115,9 @@ def _raw(
     modelled = _specific_force(p, w, air, T, effects)
     raw = np.empty((n, len(CHANNELS)))
     raw[:, :3] = force - modelled
-    raw[:, 3:6] = np.gradient(rates, DT, axis=0) - _angular_acceleration(p, w, T, rates, flight.frame.mixer, effects)
+    raw[:, 3:6] = np.gradient(rates, DT, axis=0) - _angular_acceleration(
+        p, w, T, rates, effects, mixer=flight.frame.mixer
+    )
     raw[:, 6:9] = np.gradient(velocity, DT, axis=0) - np.einsum("nij,nj->ni", R, force)
     raw[:, 8] -= G
     raw[:, 9:12] = np.gradient(attitude, DT, axis=0) - _euler_rates(attitude, rates)
@@ -151,7 +153,7 @@ def _specific_force(
 
 
 def _angular_acceleration(
-    p: Mapping[str, float], w: np.ndarray, T: np.ndarray, rates: np.ndarray, mixer: np.ndarray, effects: Profiles
+    p: Mapping[str, float], w: np.ndarray, T: np.ndarray, rates: np.ndarray, effects: Profiles, *, mixer: np.ndarray
 ) -> np.ndarray:
     total, moments = T.sum(axis=1), T @ mixer
     thrust = 1 - effects.get("thrust", 0.0)

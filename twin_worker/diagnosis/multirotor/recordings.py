@@ -61,10 +61,10 @@ def read_rotorcraft(path: Path, options: RecordingOptions = NO_OPTIONS) -> list[
             one.params.update(message.values)
         elif isinstance(message, Status) and vehicle_class(message.vehicle).is_rotorcraft:
             rotors.add(message.uav)
-    found = [one for uav, one in sorted(recordings.items()) if uav in rotors]
-    if not found:
+    rotorcraft = [one for uav, one in sorted(recordings.items()) if uav in rotors]
+    if not rotorcraft:
         raise ValueError(f"{stem}: found no multirotor, expected one; use a model of its own vehicle class")
-    return [replace(one, name=stem) for one in found] if len(recordings) == 1 else found
+    return [replace(one, name=stem) for one in rotorcraft] if len(recordings) == 1 else rotorcraft
 
 
 def calibrate_multirotor(

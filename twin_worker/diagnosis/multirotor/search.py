@@ -22,8 +22,8 @@ from twin_worker.diagnosis.multirotor.effects import RotorEffect
 from twin_worker.diagnosis.multirotor.flight import RotorFlight
 from twin_worker.diagnosis.multirotor.linearise import (
     ActiveEffect,
+    FlightSolution,
     LinearFlight,
-    Solution,
     effect_derivatives,
     huber,
     solve,
@@ -42,12 +42,12 @@ _PRIOR_NONE, _PRIOR_SINGLE, _PRIOR_PAIR = 0.6, 0.3, 0.1
 
 
 @dataclass(frozen=True)
-class Explanation:
+class EffectSet:
     """A set of effects with its log evidence relative to none, prior included."""
 
     active: tuple[ActiveEffect, ...]
     evidence: float
-    solution: Solution
+    solution: FlightSolution
     gain: float
 
     @property
@@ -67,7 +67,7 @@ class _Scan:
     evidence: float
 
 
-def search(linear: LinearFlight, baseline: RotorBaseline) -> list[Explanation]:
+def search(linear: LinearFlight, baseline: RotorBaseline) -> list[EffectSet]:
     """Return the explanations of a flight, best first; one of them is none.
 
     The noise of each channel in this flight is that of nominal flights or larger. It is taken from the residuals
@@ -87,22 +87,22 @@ def search(linear: LinearFlight, baseline: RotorBaseline) -> list[Explanation]:
     return explanations
 
 
-def _explanations(linear: LinearFlight, baseline: RotorBaseline, none: Solution) -> list[Explanation]:
+def _explanations(linear: LinearFlight, baseline: RotorBaseline, none: FlightSolution) -> list[EffectSet]:
     n = len(linear.catalogue)
-    explanations = [Explanation((), np.log(_PRIOR_NONE), none, 0.0)]
-    nothing = Explanation((), 0.0, none, 0.0)
+    explanations = [EffectSet((), np.log(_PRIOR_NONE), none, 0.0)]
+    nothing = EffectSet((), 0.0, none, 0.0)
     singles = []
     for scan in _best(scan_effects(linear, none, baseline), _REFINED):
-        found = _refined(linear, baseline, nothing, scan)
-        singles.append(replace(found, evidence=found.evidence + np.log(_PRIOR_SINGLE / n)))
+        fitted = _refined(linear, baseline, nothing, scan)
+        singles.append(replace(fitted, evidence=fitted.evidence + np.log(_PRIOR_SINGLE / n)))
     singles.sort(key=lambda one: -one.evidence)
     for single in [one for one in singles if one.evidence > explanations[0].evidence][:_EXTENDED]:
         used = {one.one.label for one in single.active}
         used |= {one.names[0] for one in singles if one.evidence > single.evidence}  # extended by this one already
         scans = [s for s in scan_effects(linear, single.solution, baseline) if s.one.label not in used]
         for scan in _best(scans, 2):
-            found = _refined(linear, baseline, single, scan)
-            explanations.append(replace(found, evidence=found.evidence + np.log(_PRIOR_PAIR / _PRIOR_SINGLE / n)))
+            fitted = _refined(linear, baseline, single, scan)
+            explanations.append(replace(fitted, evidence=fitted.evidence + np.log(_PRIOR_PAIR / _PRIOR_SINGLE / n)))
     return sorted(explanations + singles, key=lambda one: -one.evidence)
 
 
@@ -130,7 +130,9 @@ def block_scales(white: np.ndarray, linear: LinearFlight) -> tuple[np.ndarray, n
     return np.array(blocks), np.append(linear.t[edges], linear.t[-1])
 
 
-def _reweighted(linear: LinearFlight, baseline: RotorBaseline, solution: Solution, scales: np.ndarray) -> Solution:
+def _reweighted(
+    linear: LinearFlight, baseline: RotorBaseline, solution: FlightSolution, scales: np.ndarray
+) -> FlightSolution:
     """Fit again with larger noise of each channel, (13,), and the same derivatives."""
     weights = np.maximum(scales, 1.0)
     columns = solution.columns * (linear.weights / weights)[:, None]
@@ -139,7 +141,7 @@ def _reweighted(linear: LinearFlight, baseline: RotorBaseline, solution: Solutio
     return solve(linear, baseline.parameters, baseline.spread, again, iterations=4)
 
 
-def scan_effects(linear: LinearFlight, solution: Solution, baseline: RotorBaseline) -> list[_Scan]:
+def scan_effects(linear: LinearFlight, solution: FlightSolution, baseline: RotorBaseline) -> list[_Scan]:
     """Return for every effect its best onset in the linear search."""
     columns = linear.effect_columns(solution.fit, solution.active, solution.base)
     nuisance = solution.columns
@@ -177,15 +179,15 @@ def scan_effects(linear: LinearFlight, solution: Solution, baseline: RotorBaseli
             cross = with_nuisance[min(row, rows - 1)]
             b = with_residual[min(row, rows - 1)] - cross @ inverse @ gradient
             information = with_self[min(row, rows - 1)] - cross @ inverse @ cross.T
-            found = _scored(one, onset, b, information, baseline, len(grid))
-            if found is not None and (best is None or found.evidence > best.evidence):
-                best = found
+            fitted = _scored(one, onset, b, information, baseline, n_onsets=len(grid))
+            if fitted is not None and (best is None or fitted.evidence > best.evidence):
+                best = fitted
         if best is not None:
             out.append(best)
     return out
 
 
-def _active_columns(linear: LinearFlight, solution: Solution) -> np.ndarray | None:
+def _active_columns(linear: LinearFlight, solution: FlightSolution) -> np.ndarray | None:
     if not solution.active:
         return None
     return effect_derivatives(linear, solution.fit, solution.active, solution.base)
@@ -202,6 +204,7 @@ def _scored(
     b: np.ndarray,
     information: np.ndarray,
     baseline: RotorBaseline,
+    *,
     n_onsets: int,
 ) -> _Scan | None:
     """Return the score of one onset; None where the value has the wrong sign or no information."""
@@ -236,7 +239,7 @@ def _evidence(
     )
 
 
-def _refined(linear: LinearFlight, baseline: RotorBaseline, before: Explanation, scan: _Scan) -> Explanation:
+def _refined(linear: LinearFlight, baseline: RotorBaseline, before: EffectSet, scan: _Scan) -> EffectSet:
     """Add an effect to an explanation and fit all by Gauss-Newton, with its onset moved to the best time."""
     trial = (*before.active, ActiveEffect(scan.one, scan.onset, scan.values))
     start = before.solution if before.active else before.solution.fit  # a first effect changes the derivatives
@@ -250,10 +253,10 @@ def _refined(linear: LinearFlight, baseline: RotorBaseline, before: Explanation,
     information = np.linalg.inv(solution.covariance[-m:, -m:]) - np.eye(m) / last.one.scale**2
     penalty = float((last.values**2).sum()) / last.one.scale**2
     evidence = _evidence(last, gain, information, baseline, n_onsets) - 0.5 * penalty
-    return Explanation(solution.active, before.evidence + evidence, solution, before.gain + gain)
+    return EffectSet(solution.active, before.evidence + evidence, solution, before.gain + gain)
 
 
-def _with_onset(linear: LinearFlight, baseline: RotorBaseline, solution: Solution) -> Solution:
+def _with_onset(linear: LinearFlight, baseline: RotorBaseline, solution: FlightSolution) -> FlightSolution:
     """Move the onset of the last effect on a finer grid, with the other unknowns held, then fit again."""
     last = solution.active[-1]
     assert last.onset is not None
