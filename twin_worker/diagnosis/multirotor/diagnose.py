@@ -34,7 +34,7 @@ from twin_worker.diagnosis.multirotor.search import EffectSet, block_scales, sea
 NAMED, SUSPECTED = 0.95, 0.1  # probability of a class
 _UNUSUAL = 1.5  # scale of a channel over the largest one of nominal flights that makes the outcome unknown
 _MAX_CLASS = 4
-_EXPLAINED = 0.6  # share of the excess noise that effects explain which leaves no unknown
+_EXPLAINED = 0.6  # share of the excess variance of all channels that effects explain which leaves no unknown
 _FORCE_HZ = np.full(3, 2.0)
 _WORDS = {
     **dict.fromkeys(("f_x", "f_y"), "horizontal specific force"),
@@ -180,9 +180,12 @@ def _unusual(
     """Return the channel that is noisier than on nominal flights, and when; empty if there is none."""
     blocks, times = block_scales(best.solution.white, linear)
     usual = np.maximum(baseline.excess, 1.0)
-    excess = block_scales(none.solution.white, linear)[0] - usual
-    ratio = np.where(blocks - usual > (1 - _EXPLAINED) * excess, blocks / (_UNUSUAL * usual), 0.0)
-    if not (np.nanmax(ratio) > 1.0):
+    ratio = blocks / (_UNUSUAL * usual)
+    before, after = (
+        float(np.nansum(np.maximum((scales / usual) ** 2 - 1.0, 0.0)))
+        for scales in (block_scales(none.solution.white, linear)[0], blocks)
+    )
+    if not (np.nanmax(ratio) > 1.0) or after < (1 - _EXPLAINED) * before:
         return "", ()
     c = int(np.argmax(np.nanmax(ratio, axis=0)))
     rows = np.flatnonzero(ratio[:, c] > 1.0)
