@@ -63,11 +63,18 @@ def _load_baselines(options: list[str]) -> "dict[int, Baseline]":
     """
     if not options:
         return {}
+    from twin_worker.diagnosis.multirotor.baseline import RotorBaseline
     from twin_worker.diagnosis.output.keep import load as load_baseline
     from twin_worker.mismatch.coordinator import ALL_UAVS
 
     pairs = [text.partition("=") if text.partition("=")[0].isdecimal() else ("", "", text) for text in options]
-    return {int(uav) if uav else ALL_UAVS: load_baseline(Path(path))[0] for uav, _, path in pairs}
+    baselines = {}
+    for uav, _, path in pairs:
+        baseline, _ = load_baseline(Path(path))
+        if isinstance(baseline, RotorBaseline):
+            raise ValueError(f"{path}: found a rotor model, expected one of a fixed wing; use it with `fleet diagnose`")
+        baselines[int(uav) if uav else ALL_UAVS] = baseline
+    return baselines
 
 
 def _tune_runtime() -> None:

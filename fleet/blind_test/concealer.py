@@ -9,6 +9,7 @@ from fleet.blind_test.seal import encrypt
 from fleet.cli import run_command
 from fleet.process.logs import report_progress
 from fleet.simulator.conceal.exam import simulate_exam
+from fleet.simulator.conceal.multirotor.exam import simulate_rotor_exam
 
 _REPORT_EVERY = 10
 
@@ -20,7 +21,10 @@ def _progress(name: str, done: int, total: int) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    labels = simulate_exam(args.seed, args.flights, args.out, _progress, args.jobs, smallest=args.smallest)
+    if args.aircraft == "quad":
+        labels = simulate_rotor_exam(args.seed, args.flights, args.out, _progress, args.jobs)
+    else:
+        labels = simulate_exam(args.seed, args.flights, args.out, _progress, args.jobs, smallest=args.smallest)
     encrypt(json.dumps(labels, sort_keys=True).encode(), args.sealed, args.key)
     return 0
 
@@ -32,6 +36,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--flights", type=int, required=True)
     parser.add_argument("--jobs", type=int, required=True)
     parser.add_argument("--smallest", type=float, default=1.0)
+    parser.add_argument("--aircraft", choices=("wing", "quad"), default="wing")
     for name in ("out", "sealed", "key"):
         parser.add_argument(f"--{name}", type=Path, required=True)
     return run_command("prove", _run, parser.parse_args(argv))

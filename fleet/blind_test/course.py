@@ -59,6 +59,7 @@ class BlindTestConfig:
         write_pages: also write figures and a page for every flight
         injected: recordings that faults are concealed in; none: simulated flights
         smallest: magnitudes of simulated effects as a share of the usual ones, from this to 1
+        aircraft: class of the simulated aircraft, wing or quad
     """
 
     seed: int
@@ -68,6 +69,7 @@ class BlindTestConfig:
     write_pages: bool
     injected: InjectedFlights | None = None
     smallest: float = 1.0
+    aircraft: str = "wing"
 
     @property
     def sealed_labels(self) -> Path:
@@ -96,7 +98,7 @@ def run_blind_test(config: BlindTestConfig, stop: Event, log: LogFunction) -> Bl
         settings: dict[str, object] = {"seed": config.seed, "flights": config.flights}
         settings |= {"out": config.folder, "sealed": config.sealed_labels, "key": key}
         if config.injected is None:
-            settings |= {"jobs": config.jobs, "smallest": config.smallest}
+            settings |= {"jobs": config.jobs, "smallest": config.smallest, "aircraft": config.aircraft}
             _run_step(stop, "fleet.blind_test.concealer", *_options(settings))
         else:
             settings |= {"airframe": config.injected.airframe, "model": config.injected.model}
@@ -105,7 +107,7 @@ def run_blind_test(config: BlindTestConfig, stop: Event, log: LogFunction) -> Bl
         labels_hash, key_bytes = digest(config.sealed_labels), consume_key(key)
     log(f"labels encrypted, key only in this process: sha256 {labels_hash}")
     if config.injected is None:
-        folders = sorted(path.parent for path in config.folder.glob("*/*.card.json"))
+        folders = sorted({path.parent for path in config.folder.glob("*/cal_*.tlog")})
         report_paths = [_diagnose_simulated(config, folder, stop, log) for folder in folders]
     else:
         folders = sorted(path.parent for path in config.folder.glob("*/source.json"))
@@ -144,8 +146,8 @@ def _diagnose_simulated(config: BlindTestConfig, folder: Path, stop: Event, log:
     nominal, test_flights = (sorted(map(str, folder.glob(f"{prefix}_*.tlog"))) for prefix in ("cal", "rec"))
     model = folder / "model.json"
     log(f"{folder.name}: calibrating on {len(nominal)} nominal flights")
-    card = folder / f"{folder.name}.card.json"
-    _run_step(stop, "twin_worker.diagnosis.learn", f"--airframe={card}", f"--out={model}", "--", *nominal)
+    cards = [f"--airframe={card}" for card in folder.glob("*.card.json")]  # multirotors need none
+    _run_step(stop, "twin_worker.diagnosis.learn", *cards, f"--out={model}", "--", *nominal)
     log(f"{folder.name}: diagnosing {len(test_flights)} flights without labels")
     return _diagnose(config, folder, stop, [f"--model={model}"])
 

@@ -39,6 +39,7 @@ CHANNELS: Mapping[str, tuple[str, ...]] = {  # effect: correct channels
     "accel_bias": ("accel", "imu"),
     "heading_bias": ("heading",),
     "baro_bias": ("baro",),
+    **dict.fromkeys(("motor_thrust_loss", "motor_lag"), ("actuator", "thrust")),
 }
 _DIRECTION_SCALE_DEG = 45.0  # direction error that counts as an error of 100 %
 _MIN_RATIO_CHANGE = {"density_ratio": 0.01, "scale": 0.01}  # smallest |ratio - 1| used as denominator

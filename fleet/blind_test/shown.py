@@ -21,6 +21,7 @@ def as_json_values(config: BlindTestConfig, outcome: BlindTestResult, scores: Ma
         "seed": config.seed,
         "flights": config.flights,
         "smallest": config.smallest,
+        "aircraft": config.aircraft,
         "injected": _injected(config),
         "labels_sha256": outcome.labels_sha256,
         "reports_sha256": outcome.reports_sha256,

@@ -10,7 +10,8 @@ from fleet.telemetry.recording.options import RecordingOptions
 from twin_worker.diagnosis.baseline.own_past import OwnPast, check
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.learn import calibrate_recordings, card_or_unknown, log_progress
-from twin_worker.diagnosis.model.baseline import Baseline
+from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline
+from twin_worker.diagnosis.multirotor.recordings import calibrate_multirotor, holds_rotorcraft
 from twin_worker.diagnosis.output import keep
 from twin_worker.diagnosis.share import RecordingTask, Reference, diagnose_all
 
@@ -25,7 +26,12 @@ def _run(args: argparse.Namespace) -> int:
         card = card_or_unknown(args.airframe)
         options = RecordingOptions.of(args)
         past = args.against_own_past
-        reference = calibrate_recordings(args.against, card, options=options) if args.against else OwnPast(past, card)
+        if not args.against:
+            reference = OwnPast(past, card)
+        elif holds_rotorcraft(args.against[0], options):
+            reference = calibrate_multirotor(args.against, log_progress, options=options)
+        else:
+            reference = calibrate_recordings(args.against, card, options=options)
     reports: list[Report] = []
     refused: list[tuple[str, str]] = []
     tasks = [RecordingTask(path, RecordingOptions.of(args)) for path in args.file]
@@ -52,6 +58,10 @@ def _page(reports: list[Report], reference: Reference, folder: Path) -> None:
     from twin_worker.diagnosis.output.page import write
 
     folder.mkdir(exist_ok=True)
+    rotors = [report for report in reports if not set(CHANNELS) <= report.ratio_before.keys()]
+    if rotors:
+        log_progress(f"found {len(rotors)} reports of multirotors, which have no figures; use --json")
+    reports = [report for report in reports if report not in rotors]
     for report, stem in zip(reports, stems([report.flight for report in reports]), strict=True):
         if report.outcome is ReportOutcome.NAMED and isinstance(reference, Baseline):
             keep.save(folder / f"{stem}.model.json", reference, report.findings)

@@ -6,6 +6,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from fleet.cli import make_parser, run_command
 from fleet.commands.offline.calibrate import EXAMPLES, arguments
 from fleet.process.logs import report_progress
@@ -16,6 +18,8 @@ from twin_worker.diagnosis.data.card import UNKNOWN, AircraftCard, read_card
 from twin_worker.diagnosis.data.flight import FlightData, read_flights
 from twin_worker.diagnosis.inference.diagnose import uncovered_axes
 from twin_worker.diagnosis.model.baseline import Baseline
+from twin_worker.diagnosis.multirotor.baseline import save_rotors
+from twin_worker.diagnosis.multirotor.recordings import calibrate_multirotor, holds_rotorcraft
 from twin_worker.diagnosis.output.keep import save
 
 
@@ -62,13 +66,23 @@ def calibrate_recordings(
 def _run(args: argparse.Namespace) -> int:
     if not args.out.absolute().parent.is_dir():
         raise ValueError(f"--out: found no folder {str(args.out.parent)!r}, expected one; make it first")
-    base = calibrate_recordings(args.file, card_or_unknown(args.airframe), args.until, RecordingOptions.of(args))
+    options = RecordingOptions.of(args)
+    if holds_rotorcraft(args.file[0], options):
+        rotors = calibrate_multirotor(args.file, log_progress, np.inf if args.until is None else args.until, options)
+        save_rotors(args.out, rotors)
+        _summarise(args, rotors.flights, rotors.explained, rotors.chance)
+        return 0
+    base = calibrate_recordings(args.file, card_or_unknown(args.airframe), args.until, options)
     save(args.out, base)
-    explained = ", ".join(f"{name} {x:.0%}" for name, x in base.r2.items())
-    print(f"{args.out.name}: calibrated on {len(base.flights)} flights; variance explained: {explained}")
-    if args.json:
-        args.json.write_text(json.dumps({"flights": base.flights, "r2": base.r2, "chance": base.chance}, indent=1))
+    _summarise(args, base.flights, base.r2, base.chance)
     return 0
+
+
+def _summarise(args: argparse.Namespace, flights: Sequence[str], r2: dict[str, float], chance: object) -> None:
+    explained = ", ".join(f"{name} {x:.0%}" for name, x in r2.items())
+    print(f"{args.out.name}: calibrated on {len(flights)} flights; variance explained: {explained}")
+    if args.json:
+        args.json.write_text(json.dumps({"flights": flights, "r2": r2, "chance": chance}, indent=1))
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -11,15 +11,17 @@ from typing import NamedTuple
 import numpy as np
 
 from fleet.report.detection_limits import find_source, load_table, report_sentences
-from fleet.telemetry.recording.options import RecordingOptions
+from fleet.telemetry.recording.options import NO_OPTIONS, RecordingOptions
 from twin_worker.diagnosis.baseline.own_past import OwnPast, conceal_channels, exclude_concealed, with_output_faults
 from twin_worker.diagnosis.data.flight import FlightData, read_flights
 from twin_worker.diagnosis.inference.diagnose import diagnose
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.model.baseline import Baseline
+from twin_worker.diagnosis.multirotor.baseline import RotorBaseline
+from twin_worker.diagnosis.multirotor.recordings import diagnose_recording, holds_rotorcraft, read_rotorcraft
 
 ReportProgress = Callable[[str], None]
-Reference = Baseline | OwnPast
+Reference = Baseline | RotorBaseline | OwnPast
 
 
 class RecordingTask(NamedTuple):
@@ -65,6 +67,9 @@ def _diagnose_task(
 ) -> TaskResult:
     reports: list[Report] = []
     try:
+        if isinstance(reference, RotorBaseline) or _is_multirotor(task, reference):
+            return _diagnose_rotors(task, reference, conceal, progress), ""
+        assert not isinstance(reference, RotorBaseline)
         for flight in _flights_of(task, reference):
             progress(f"{flight.name}: {flight.seconds:.0f} s of flight")
             if isinstance(reference, OwnPast):
@@ -79,7 +84,32 @@ def _diagnose_task(
     return reports, ""
 
 
-def with_detection_limits(report: Report, flight: FlightData, reference: Reference) -> Report:
+def _is_multirotor(task: Path | RecordingTask | FlightData, reference: Reference) -> bool:
+    """Return whether a task with its own past as reference is a recording of a multirotor."""
+    if isinstance(task, FlightData) or not isinstance(reference, OwnPast):
+        return False
+    recording = task if isinstance(task, RecordingTask) else RecordingTask(task, NO_OPTIONS)
+    return holds_rotorcraft(recording.path, recording.options)
+
+
+def _diagnose_rotors(
+    task: Path | RecordingTask | FlightData, reference: Reference, conceal: Sequence[str], progress: ReportProgress
+) -> list[Report]:
+    """Diagnose every multirotor of a recording.
+
+    Raises:
+        ValueError: if the recording has no usable multirotor, or channels are to be concealed.
+    """
+    if isinstance(task, FlightData) or isinstance(reference, Baseline):
+        raise TypeError("found flight data of a fixed wing, expected a recording of a multirotor")
+    if conceal:
+        raise ValueError(f"--conceal: found {conceal[0]!r} for a multirotor, expected none; leave it out")
+    recording = task if isinstance(task, RecordingTask) else RecordingTask(task, NO_OPTIONS)
+    past = reference if isinstance(reference, RotorBaseline) else reference.until
+    return [diagnose_recording(one, past, progress) for one in read_rotorcraft(recording.path, recording.options)]
+
+
+def with_detection_limits(report: Report, flight: FlightData, reference: Baseline | OwnPast) -> Report:
     """Return the report with the limits of detection measured on the nearest aircraft with such telemetry."""
     own_past = isinstance(reference, OwnPast)
     vane = flight.vane if isinstance(reference, OwnPast) else reference.vane
@@ -89,7 +119,7 @@ def with_detection_limits(report: Report, flight: FlightData, reference: Referen
     return replace(report, detection_limits=report_sentences(source, named))
 
 
-def _flights_of(task: Path | RecordingTask | FlightData, reference: Reference) -> list[FlightData]:
+def _flights_of(task: Path | RecordingTask | FlightData, reference: Baseline | OwnPast) -> list[FlightData]:
     if isinstance(task, FlightData):
         return [task]
     if isinstance(task, RecordingTask):

@@ -12,6 +12,7 @@ from fleet.telemetry.recording.options import RecordingOptions, add_recording_ar
 EXAMPLES = """
   fleet prove --flights 12                                  a demonstration of some minutes
   fleet prove --seed 7 --flights 12 --report proof          store recordings, reports and a page for every flight
+  fleet prove --aircraft quad --flights 30                  multirotors on RotorPy
   fleet prove --seed 9001 --flights 140 --json proof.json   the complete test
   fleet prove --inject monday/*.tlog --flights 40           faults in your own healthy flights, against their own past
   fleet prove --inject a.tlog b.tlog c.tlog --against a.tlog b.tlog c.tlog    each against the other two
@@ -23,6 +24,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--seed", type=int, default=1, help="random seed of aircraft, missions, weather, effects (1)")
     parser.add_argument("--flights", type=int, default=12, metavar="N", help="flights, on two airframes (12)")
+    parser.add_argument(
+        "--aircraft", choices=("wing", "quad"), default="wing", help="class of the simulated aircraft (wing)"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write scores, marks and hashes")
     parser.add_argument("--report", type=Path, metavar="DIR", help="store recordings, reports and pages in DIR")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
@@ -73,7 +77,7 @@ def _run_test(args: argparse.Namespace, folder: Path) -> int:
         against = tuple(args.against or ())
         injected = InjectedFlights(tuple(args.inject), args.model, against, args.airframe, options)
     setup = BlindTestConfig(
-        args.seed, args.flights, folder, args.jobs, args.report is not None, injected, smallest=args.smallest
+        args.seed, args.flights, folder, args.jobs, args.report is not None, injected, args.smallest, args.aircraft
     )
     try:
         result = run_blind_test(setup, stop_on_signal(), _report)
@@ -101,6 +105,8 @@ def _check(args: argparse.Namespace) -> None:
         raise ValueError(f"--jobs: found {args.jobs}, expected 1..64; change it")
     if not 0.01 <= args.smallest <= 1.0:
         raise ValueError(f"--smallest: found {args.smallest:g}, expected 0.01..1; change it")
+    if args.aircraft == "quad" and args.smallest < 1.0:
+        raise ValueError("--smallest: found it with --aircraft quad, expected wings; leave one out")
     check_parent("--json", args.json)
     check_parent("--report", args.report)
     if args.report and args.report.exists() and any(args.report.iterdir()):
@@ -117,6 +123,8 @@ def _check_recordings(args: argparse.Namespace) -> None:
         return
     if args.model and (args.against or args.airframe):
         raise ValueError("expected one of --model and --against, and --airframe without --model; leave one out")
+    if args.aircraft == "quad":
+        raise ValueError("--aircraft: found quad with --inject, expected simulated flights; leave one out")
     if args.smallest < 1.0:
         raise ValueError("--smallest: found it with --inject, expected simulated flights; leave it out")
     stems = [path.name.split(".")[0] for path in args.inject]

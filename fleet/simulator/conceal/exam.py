@@ -5,7 +5,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from math import ceil, degrees
 from pathlib import Path
 from typing import Any
@@ -160,7 +160,7 @@ def simulate_exam(
         (out / airframe).mkdir(parents=True, exist_ok=True)
         (out / airframe / f"{airframe}.card.json").write_text(json.dumps(card(airframe), indent=1) + "\n")
     labels: Labels = {}
-    for name, label in _fly_all([(job, seed, out) for job in flight_jobs], processes):
+    for name, label in fly_all(_fly_job, [(job, seed, out) for job in flight_jobs], processes):
         labels[name] = label
         progress(name, len(labels), len(flight_jobs))
     return dict(sorted(labels.items()))
@@ -201,13 +201,15 @@ def _names(rng: np.random.Generator, role: str, airframe: str, count: int) -> li
     return drawn[:count]
 
 
-def _fly_all(tasks: list[tuple[FlightJob, int, Path]], processes: int) -> Iterator[tuple[str, Label]]:
-    """Simulate in this process, or in several processes that end with this one."""
+def fly_all(
+    fly_job: Callable[[Any], tuple[str, Label]], tasks: Sequence[Any], processes: int
+) -> Iterator[tuple[str, Label]]:
+    """Simulate flights by `fly_job(task)` in this process, or in several processes that end with this one."""
     if processes == 1:
-        yield from map(_fly_job, tasks)
+        yield from map(fly_job, tasks)
         return
     with multiprocessing.get_context("spawn").Pool(processes, _init_process, (os.getpid(),)) as pool:
-        yield from pool.imap(_fly_job, tasks)
+        yield from pool.imap(fly_job, tasks)
         pool.close()
         pool.join()
 

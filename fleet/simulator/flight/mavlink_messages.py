@@ -220,6 +220,15 @@ TELEMETRY_ONBOARD: MessageSchedule = (  # onboard log, without the bandwidth lim
     (1, 11, _mission_current),
     (1, 23, _heartbeat),
 )
+ONBOARD_SENSORS: MessageSchedule = (  # of a multirotor, whose motors answer faster than servos
+    (50, 0, _attitude),
+    (50, 0, _imu),
+    (50, 0, _servos),
+    (10, 0, _position),
+    (10, 5, _hud),
+    (10, 6, _pressure),
+    (5, 8, _gps_raw),
+)
 _INTEGER_PARAMS = ("PWM_MAIN_", "CA_SV_CS", "FW_ARSP_SCALE_EN", "NPFG_LB_PERIOD")  # PX4, name prefixes
 
 

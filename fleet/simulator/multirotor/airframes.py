@@ -28,6 +28,7 @@ class MultirotorType(NamedTuple):
     drag: tuple[float, float, float]  # of the frame, quadratic in airspeed [kg/m]
     tau_m: float  # time constant of motors [s]
     expo: float  # thrust curve of motor and propeller: thrust = (1 - expo) u + expo u^2 [-]
+    cg: tuple[float, float] = (0.0, 0.0)  # centre of gravity, forward and left of the centre of the rotors [m]
 
 
 TYPES = {
@@ -63,6 +64,7 @@ def rotorpy_parameters(kind: MultirotorType) -> dict:
     """Return the parameters as RotorPy takes them; forward, left, up."""
     Ixx, Iyy, Izz = kind.inertia
     c_Dx, c_Dy, c_Dz = kind.drag
+    centre = np.array([*kind.cg, 0.0])
     return {
         "mass": kind.mass,
         "Ixx": Ixx,
@@ -74,7 +76,7 @@ def rotorpy_parameters(kind: MultirotorType) -> dict:
         "num_rotors": 4,
         "rotor_directions": np.array(SPINS),
         "rotor_speed_min": 0.0,
-        "rotor_pos": {f"r{k + 1}": kind.arm * np.array([*arm, 0.0]) for k, arm in enumerate(ARMS)},
+        "rotor_pos": {f"r{k + 1}": kind.arm * np.array([*arm, 0.0]) - centre for k, arm in enumerate(ARMS)},
         "rotor_speed_max": kind.top_speed,
         "k_eta": kind.k_eta,
         "k_m": kind.k_m,

@@ -11,6 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from fleet.simulator.flight.mavlink import MavlinkEndpoint
 from fleet.simulator.flight.mavlink_messages import (
     COMMON,
+    ONBOARD_SENSORS,
     PX4_AUTO,
     PX4_MODES,
     MavlinkDialect,
@@ -125,6 +126,11 @@ DIALECTS = {
         ("PWM_MAIN_", "CA_ROTOR_COUNT", "CA_AIRFRAME", "MPC_POS_MODE", "MPC_YAW_MODE"),
         is_px4=True,
     ),
+}
+
+ONBOARD_DIALECTS = {  # onboard log, without the bandwidth limit of a radio
+    name: dialect._replace(telemetry=(*ONBOARD_SENSORS, *(row for row in dialect.telemetry if row not in COMMON)))
+    for name, dialect in DIALECTS.items()
 }
 
 

@@ -49,6 +49,22 @@ class RotorBody:
         self._gust = self._gust_std(_MIN_GUST_HEIGHT) * rng.standard_normal(3)
         self._force = np.array([0.0, 0.0, G])  # specific force, forward left up [m/s2]
 
+    @property
+    def motors(self) -> np.ndarray:
+        """Return the relative rotor speed of each motor, (4,) [-]."""
+        return self._motors
+
+    def set_parameters(self, kind: MultirotorType, motors: np.ndarray) -> None:
+        """Change the parameters, and the relative rotor speed of each motor, (4,) [-]; state and inputs stay."""
+        self._command *= motors / self._motors
+        self.kind, self._motors = kind, motors
+        self._model = Multirotor(rotorpy_parameters(kind), enable_ground=True)
+
+    def accelerations(self) -> np.ndarray:
+        """Return the linear, angular and relative rotor accelerations at this instant, (10,) [m/s2, rad/s2, 1/s]."""
+        rate = self._model._s_dot_fn(0.0, self._s, self._command)
+        return np.concatenate([rate[3:6], rate[10:13], rate[16:] / self.kind.top_speed])
+
     def set_wind(self, north: float, east: float) -> None:
         """Set the mean wind, direction it blows to [m/s]."""
         self._mean_wind[:] = (north, -east, 0.0)

@@ -24,7 +24,13 @@ from fleet.simulator.multirotor import tasks
 from fleet.simulator.multirotor.airframes import TYPES, draw_airframe
 from fleet.simulator.multirotor.attitude import AttitudeController, attitude_gains
 from fleet.simulator.multirotor.copter_guidance import CopterGuidance
-from fleet.simulator.multirotor.messages import DIALECTS, FULL_CURRENT, MultirotorEndpoint, MultirotorState
+from fleet.simulator.multirotor.messages import (
+    DIALECTS,
+    FULL_CURRENT,
+    ONBOARD_DIALECTS,
+    MultirotorEndpoint,
+    MultirotorState,
+)
 from fleet.simulator.multirotor.missions import MultirotorMission, draw_mission
 from fleet.simulator.multirotor.position import PositionController, Reference, position_gains
 from fleet.simulator.multirotor.px4_guidance import Px4Guidance
@@ -64,6 +70,7 @@ class SimulatedMultirotor:
         mission: MultirotorMission | None = None,
         extra_params: Mapping[str, float] = MappingProxyType({}),
         wind_field: CoherentWind | None = None,
+        flight_seed: int | None = None,
     ):
         """Place one aircraft at its home.
 
@@ -78,6 +85,8 @@ class SimulatedMultirotor:
             mission: mission and home; None: random
             extra_params: autopilot parameters that override its own
             wind_field: wind of the whole fleet; None: mean wind and a drift of its own
+            flight_seed: seed of mission, weather and sensor errors of one flight, which is then recorded with the
+                rates of an onboard log; None: they follow from `seed` too
         Raises:
             ValueError: when `uav_id` is outside the MAVLink range.
         """
@@ -85,7 +94,8 @@ class SimulatedMultirotor:
             max_id = MAX_AIRCRAFT - 1
             raise ValueError(f"uav-{uav_id}: found id {uav_id}, expected 0..{max_id} (MAVLink ids); fly fewer aircraft")
         aircraft_seed = int(np.random.SeedSequence((seed, uav_id)).generate_state(1)[0])
-        rng = np.random.default_rng((aircraft_seed, 4))
+        conditions_seed = aircraft_seed if flight_seed is None else flight_seed
+        rng = np.random.default_rng((conditions_seed, 4))
         self.uav_id, self.tick = uav_id, 0
         self.crashed = self.silent = self.link_lost = False
         self.boot_s = float(rng.uniform(60, 600))
@@ -96,14 +106,16 @@ class SimulatedMultirotor:
         self.params |= {_CAPACITY_NAMES[autopilot]: round(capacity, -2)} | dict(extra_params)
         is_px4 = autopilot == "px4"
         cruise = self.params["MPC_XY_CRUISE"] if is_px4 else 0.01 * self.params["WPNAV_SPEED"]
-        self.items, self.origin = mission or draw_mission(aircraft_seed, autopilot, cruise, origin)
+        self.items, self.origin = mission or draw_mission(conditions_seed, autopilot, cruise, origin)
         kind, motors = draw_airframe(TYPES[aircraft], np.random.default_rng((aircraft_seed, 1)))
-        weather = Weather(wind, fleet_wind_direction(seed), turbulence)
+        weather = Weather(wind, fleet_wind_direction(seed if flight_seed is None else flight_seed), turbulence)
         self.vehicle = RotorBody(kind, motors, rng, weather.w20_fps * 0.3048)
         drift = weather.wind(rng, DT * 10)
         self._wind = drift if wind_field is None else LocalWind(wind_field, self.origin, DT * 10)
-        self._sensors = Sensors(rng, DT)
-        self._endpoint = MultirotorEndpoint(uav_id + 1, self.items, self.params, DIALECTS[autopilot])
+        altitude_rng = None if flight_seed is None else np.random.default_rng((flight_seed, 7))
+        self._sensors = Sensors(rng, DT, altitude_rng=altitude_rng)
+        dialects = DIALECTS if flight_seed is None else ONBOARD_DIALECTS
+        self._endpoint = MultirotorEndpoint(uav_id + 1, self.items, self.params, dialects[autopilot])
         self._sequence = TaskSequence(self.items, self.origin, 0 if is_px4 else 1)
         self._guidance = Px4Guidance(self.params) if is_px4 else CopterGuidance(self.params)
         self._position = PositionController(position_gains(self.params, is_px4))

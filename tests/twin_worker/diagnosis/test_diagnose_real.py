@@ -119,10 +119,12 @@ def test_the_quadplanes_wind_agrees_with_its_own_estimator(recordings: Path) -> 
     assert np.hypot(*(w[:2] - last)) < 1.5 and np.hypot(*last) > 1.0, (w, last)
 
 
-@pytest.mark.parametrize("name", ["dronekit_copter_log171_crash.bin", "ardupilot_mechanical_fail_quad.log"])
-def test_rotors_are_refused_by_name(name: str, recordings: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert diagnosis.main([str(recordings / "real" / name), "--against-own-past", "60"]) == 2
-    assert "found a multirotor, expected a fixed wing" in capsys.readouterr().err
+def test_rotors_are_told_from_wings(recordings: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = recordings / "real" / "ardupilot_mechanical_fail_quad.log"
+    assert diagnosis.main([str(path), "--against-own-past", "60"]) == 0
+    assert "loss of control since 90.9 s" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="found a multirotor, expected a fixed wing"):
+        read_flights(path, UNKNOWN)
 
 
 # --- concealing ------------------------------------------------------------------------------------------------------

@@ -15,6 +15,8 @@ from twin_worker.diagnosis.data.card import FaultHypothesis, OnsetProfile
 from twin_worker.diagnosis.inference.report import DiagnosisFinding, Report, ReportOutcome
 from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline
 from twin_worker.diagnosis.model.equations import TERMS
+from twin_worker.diagnosis.multirotor.baseline import FORMAT as ROTOR_FORMAT
+from twin_worker.diagnosis.multirotor.baseline import RotorBaseline, load_rotors
 
 FORMAT = "parauav.simulation.2"
 _OPTIONAL = ("envelope", "block_sigma", "block_chance")  # fields that earlier models lack
@@ -37,8 +39,8 @@ def save(path: Path, base: Baseline, findings: Sequence[DiagnosisFinding] = ()) 
     path.write_text(json.dumps({"format": FORMAT, **simulation, "effects": effects}, indent=1) + "\n")
 
 
-def load(path: Path) -> tuple[Baseline, tuple[FaultHypothesis, ...]]:
-    """Read a simulation and its effects.
+def load(path: Path) -> tuple[Baseline | RotorBaseline, tuple[FaultHypothesis, ...]]:
+    """Read a simulation and its effects; a rotor model has none.
 
     Raises:
         ValueError: if the file is no valid model; the message names the fault.
@@ -50,6 +52,8 @@ def load(path: Path) -> tuple[Baseline, tuple[FaultHypothesis, ...]]:
         raise ValueError(
             f"{path.name}: found no JSON ({error}), expected a model; make it with `fleet calibrate`"
         ) from None
+    if isinstance(document, dict) and document.get("format") == ROTOR_FORMAT:
+        return load_rotors(path, document), ()
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         format_name = document.get("format") if isinstance(document, dict) else type(document).__name__
         raise ValueError(

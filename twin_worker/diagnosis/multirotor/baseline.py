@@ -1,0 +1,222 @@
+"""Calibration of the rotor model on nominal flights of one multirotor; model file."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from scipy.signal import lfilter
+
+from twin_worker.diagnosis.multirotor.flight import RotorFlight
+from twin_worker.diagnosis.multirotor.linearise import (
+    ORDER,
+    FlightFit,
+    FlightSolution,
+    LinearFlight,
+    ResidualNoise,
+    autoregression,
+    solve,
+)
+from twin_worker.diagnosis.multirotor.model import CHANNELS, PARAMETERS, residuals
+
+FORMAT = "parauav.rotors.1"
+_PASSES = 3
+NominalGains = Callable[[RotorFlight, "RotorBaseline"], tuple[dict[str, float], dict[str, float], np.ndarray]]
+_START = {"k": 8.0, "expo": 0.6, "tau": 0.05, "d": 0.05, "c": 0.01, "a_p": 30.0, "a_q": 30.0, "a_r": 3.0}
+_FLOOR = np.array([0.01, 0.01, 1e-3, 0.02, 2e-4, 2e-3, 5e-4, *[2e-3] * 3, *[0.2] * 3, *[0.02] * 5, 0.01, *[2e-3] * 3])
+"""Least standard deviation of the parameters between flights."""
+
+
+@dataclass(frozen=True)
+class RotorBaseline:
+    """Calibrated rotor model.
+
+    Attributes:
+        motors: number of motors
+        parameters: mean, (22,); spread: covariance between flights, (22, 22)
+        filters: noise of the channels, see `ResidualNoise`
+        chance: by effect, largest gain on nominal flights that are left out over that of white noise, at least 1
+        sizes: by effect, root mean square of its values on them
+        excess: largest scale of the whitened residuals of each channel over 20 s on them, (13,)
+        explained: share of the variance of f_x f_y f_z p_dot q_dot r_dot that the model explains
+        flights: names
+    """
+
+    motors: int
+    parameters: np.ndarray
+    spread: np.ndarray
+    filters: np.ndarray
+    chance: dict[str, float]
+    sizes: dict[str, float]
+    excess: np.ndarray
+    explained: dict[str, float]
+    flights: tuple[str, ...]
+
+    @property
+    def temper(self) -> float:
+        """Return the rows per independent sample, as the median of the chance gains shows."""
+        return max(float(np.median(list(self.chance.values()))), 1.0) if self.chance else 1.0
+
+    @property
+    def noise(self) -> ResidualNoise:
+        """Return the noise of the channels."""
+        return ResidualNoise(self.filters)
+
+
+def calibrate_rotors(flights: Sequence[RotorFlight], log: Callable[[str], None], gains: NominalGains) -> RotorBaseline:
+    """Fit the rotor model to nominal flights, each with its own wind and biases.
+
+    Args:
+        flights: nominal flights of one aircraft
+        log: receives progress
+        gains: (flight, baseline) to gains and sizes of the effects and scales of the channels, `search.nominal_gains`
+    Raises:
+        ValueError: if there is no flight.
+    """
+    if not flights:
+        raise ValueError("found no flight of a multirotor, expected nominal flights; name their recordings")
+    parameters = np.array([_START.get(name, 0.0) for name in PARAMETERS])
+    noise: ResidualNoise | None = None
+    starts: list[FlightFit | None] = [None] * len(flights)
+    for k in range(_PASSES):
+        log(f"rotor model: pass {k + 1} of {_PASSES} over {len(flights)} flights")
+        solutions = []
+        for i, flight in enumerate(flights):
+            linear = LinearFlight(flight, noise, None if noise else _FIRST_STD)
+            start = starts[i] or linear.start(parameters)
+            solutions.append((linear, solve(linear, start.parameters, None, start, iterations=8 if k == 0 else 3)))
+        parameters, information = pooled(solutions)
+        noise = ResidualNoise(_filters([(linear, one.base) for linear, one in solutions]))
+        starts = [one.fit for _, one in solutions]
+    assert noise is not None
+    first = RotorBaseline(
+        motors=flights[0].inputs.shape[1],
+        parameters=parameters,
+        spread=between_flights(parameters, information, [one for _, one in solutions]),
+        filters=noise.filters,
+        chance={},
+        sizes={},
+        excess=np.ones(len(CHANNELS)),
+        explained=_explained(solutions),
+        flights=tuple(flight.name for flight in flights),
+    )
+    return _with_chance(first, flights, solutions, gains)
+
+
+def _with_chance(
+    first: RotorBaseline,
+    flights: Sequence[RotorFlight],
+    solutions: Sequence[tuple[LinearFlight, FlightSolution]],
+    gains: NominalGains,
+) -> RotorBaseline:
+    """Return the baseline with what nominal flights show that are left out."""
+    chance: dict[str, float] = {}
+    squares: dict[str, list[float]] = {}
+    excess = []
+    for i, flight in enumerate(flights):
+        others = [pair for j, pair in enumerate(solutions) if j != i] or solutions
+        mean, information = pooled(others)
+        spread = between_flights(mean, information, [one for _, one in others])
+        by_effect, sizes, scales = gains(flight, replace(first, parameters=mean, spread=spread))
+        excess.append(scales)
+        for name, gain in by_effect.items():
+            chance[name] = max(chance.get(name, 1.0), gain)
+            squares.setdefault(name, []).append(sizes[name] ** 2)
+    means = {name: float(np.mean(x)) ** 0.5 for name, x in squares.items()}
+    return replace(first, chance=chance, sizes=means, excess=np.max(excess, axis=0))
+
+
+_FIRST_STD = np.array([0.15, 0.15, 0.25, 0.5, 0.5, 0.2, 0.15, 0.15, 0.15, 0.02, 0.02, 0.02, 1.0])
+"""Rough noise of the channels for the first pass."""
+
+
+def pooled(solutions: Sequence[tuple[LinearFlight, FlightSolution]]) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return the mean of the parameters weighted by information, and the information of each flight."""
+    n = len(PARAMETERS)
+    information, total, weighted = [], 1e-8 * np.eye(n), np.zeros(n)
+    for _, one in solutions:
+        A = one.columns.reshape(-1, one.columns.shape[2])
+        H = A.T @ A + one.precision
+        info = H[:n, :n] - H[:n, n:] @ np.linalg.solve(H[n:, n:], H[n:, :n])
+        information.append(info)
+        total = total + info
+        weighted = weighted + info @ one.fit.parameters
+    return np.linalg.solve(total, weighted), information
+
+
+def between_flights(
+    mean: np.ndarray, information: Sequence[np.ndarray], solutions: Sequence[FlightSolution]
+) -> np.ndarray:
+    """Return the covariance of the parameters of another flight: spread beyond their own uncertainty, and of the mean.
+
+    The spread has the shape of that uncertainty; its size is that of the mean square of the deviations.
+    """
+    n = len(solutions)
+    mean_covariance = np.linalg.inv(np.sum(information, axis=0))
+    own = np.mean([np.linalg.inv(info) for info in information], axis=0)
+    squares = [float(d @ info @ d) / len(d) for d, info in _deviations(mean, information, solutions)]
+    excess = max(float(np.mean(squares)) * n / max(n - 1, 1) - 1.0, 0.0)
+    return np.asarray(np.diag(_FLOOR**2) + excess * own + mean_covariance)
+
+
+def _deviations(
+    mean: np.ndarray, information: Sequence[np.ndarray], solutions: Sequence[FlightSolution]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    return [(one.fit.parameters - mean, info) for one, info in zip(solutions, information, strict=True)]
+
+
+def _filters(residuals: Sequence[tuple[LinearFlight, np.ndarray]]) -> np.ndarray:
+    rows = []
+    for c in range(len(CHANNELS)):
+        series = [base[linear.ok, c] - base[linear.ok, c].mean() for linear, base in residuals]
+        if np.ptp(series[0]) == 0:
+            rows.append(np.eye(ORDER + 1)[0])
+            continue
+        taps = autoregression(np.concatenate(series))
+        white = np.concatenate([lfilter(taps, [1.0], x)[ORDER:] for x in series])
+        rows.append(taps / max(float(np.median(np.abs(white))) / 0.6745, 0.1))
+    return np.array(rows)
+
+
+def _explained(solutions: Sequence[tuple[LinearFlight, FlightSolution]]) -> dict[str, float]:
+    out = {}
+    left, total = np.zeros(6), np.zeros(6)
+    for linear, one in solutions:
+        nothing = residuals(linear.flight, np.zeros(len(PARAMETERS)), np.zeros((len(linear.flight.t), 2)), {})
+        rows = linear.ok
+        left += one.base[rows, :6].var(axis=0) * rows.sum()
+        total += nothing[rows, :6].var(axis=0) * rows.sum()
+    for c in range(6):
+        out[CHANNELS[c]] = float(1 - left[c] / total[c])
+    return out
+
+
+def save_rotors(path: Path, baseline: RotorBaseline) -> None:
+    """Write the model file."""
+    values = msgspec.to_builtins(baseline, enc_hook=lambda x: x.tolist())
+    path.write_text(json.dumps({"format": FORMAT, **values}, indent=1) + "\n")
+
+
+def load_rotors(path: Path, document: dict[str, Any]) -> RotorBaseline:
+    """Read a model from the values of its file.
+
+    Raises:
+        ValueError: if it is no valid model; the message names the fault.
+    """
+    try:
+        baseline = msgspec.convert(document, RotorBaseline, dec_hook=lambda _, x: np.array(x, float))
+        n, c = len(PARAMETERS), len(CHANNELS)
+        for array, shape in (
+            *((baseline.parameters, (n,)), (baseline.spread, (n, n))),
+            *((baseline.filters, (c, ORDER + 1)), (baseline.excess, (c,))),
+        ):
+            if array.shape != shape or not np.isfinite(array).all():
+                raise ValueError(f"shape {array.shape} or non-finite numbers, expected finite numbers of shape {shape}")
+    except (KeyError, TypeError, ValueError, msgspec.ValidationError) as error:
+        raise ValueError(
+            f"{path.name}: found {error!r}, expected a complete model; make it with `fleet calibrate`"
+        ) from None
+    return baseline
