@@ -1,5 +1,6 @@
 """Texts of the selected UAV: status, confidence, verdict, figures."""
 
+from collections.abc import Sequence
 from html import escape
 from math import isfinite
 
@@ -27,10 +28,12 @@ MAX_TEXT = 500  # characters of a received text
 REFUSED_S = 10.0  # how long a rejected message is reported [s]
 
 
-def status_html(vehicle: Vehicle, palette: Palette, now: float, units: Units = METRIC) -> str:
-    """Return the status of the UAV and its twin as HTML. Received texts are escaped here."""
+def status_html(
+    vehicle: Vehicle, palette: Palette, now: float, units: Units = METRIC, workers: Sequence[str] = ()
+) -> str:
+    """Return the status of the UAV and its twin as HTML; `workers`: their texts. Received texts are escaped here."""
     label = status_label(vehicle, palette, now)
-    cards = _cards(vehicle, vehicle.record(now), units) + _sentences(vehicle, palette, now)
+    cards = _cards(vehicle, vehicle.record(now), units) + _sentences(vehicle, palette, now, workers)
     return (
         f'<div class="uav"><div class="head"><h1>{vehicle.name}</h1><b style="color:{label.colour}">'
         f"{label.glyph} {label.text}</b></div>{cards}</div>"
@@ -83,8 +86,8 @@ def fit_and_horizon(vehicle: Vehicle, record: StatusRecord) -> str:
     return " ".join(texts)
 
 
-def limitations(vehicle: Vehicle, now: float) -> list[str]:
-    """Return why there is no prediction, or what limits it; plain text, not escaped."""
+def limitations(vehicle: Vehicle, now: float, workers: Sequence[str] = ()) -> list[str]:
+    """Return why there is no prediction, or what limits it; `workers`: their texts. Plain text, not escaped."""
     record = vehicle.record(now)
     state, texts = record.state, []
     if vehicle.ended:
@@ -92,9 +95,11 @@ def limitations(vehicle: Vehicle, now: float) -> list[str]:
     elif state is TwinState.LINK_LOST:
         note = "the twin predicts the position shown" if vehicle.forecast is not None else "no twin yet"
         texts.append(f"No sample for {age_text(record.sample_age_s)}: {note}; check the radio link.")
-    elif state in (TwinState.WAITING, TwinState.UNCLAIMED) and vehicle.model is None:
+    elif not isfinite(vehicle.result_accepted) and vehicle.model is None and workers:
+        texts.append(f"Its twin is not ready: {'; '.join(workers)}.")
+    elif not isfinite(vehicle.result_accepted) and vehicle.model is None:
         texts.append(
-            "No worker result for this UAV yet: `twin_worker` compiles for about a minute at its first start. "
+            "No twin yet: `twin_worker` compiles for a minute or more at its first start. "
             "If it takes longer, check that it runs on this router."
         )
     elif state is TwinState.UNCLAIMED:
@@ -118,12 +123,12 @@ def limitations(vehicle: Vehicle, now: float) -> list[str]:
     return texts
 
 
-def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
+def _sentences(vehicle: Vehicle, palette: Palette, now: float, workers: Sequence[str]) -> str:
     alert = f'<div class="say" style="border-color:{palette.mismatch}">▲ '
     record, cards = vehicle.record(now), [mismatch_html(vehicle.mismatch, palette)]
     alerts = [a for a in vehicle.alerts.values() if a.kind is not AlertKind.LINK_LOST]  # said by `limitations`
     cards += [f"{alert}{escape(clip(alert_sentence(a, vehicle, now), MAX_TEXT))}</div>" for a in alerts]
-    texts = limitations(vehicle, now)
+    texts = limitations(vehicle, now, workers)
     cards += [f'<div class="say">{escape(clip(text, MAX_TEXT))}</div>' for text in texts]
     verdict = vehicle.model.verdict if vehicle.model is not None else None
     if vehicle.model is not None and verdict is not None:
