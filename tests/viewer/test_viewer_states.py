@@ -174,7 +174,10 @@ def test_the_newest_verification_says_which_fit_the_predictions_use(clock: Clock
     earlier = msgspec.structs.replace(model.active_verdict, fit={"u": 2.0, "w": 4.0})
     bus.publish(msgspec.structs.replace(model, t=T + 2, active_verdict=earlier), STAMP)
     page = status_html(feed.vehicles[0], DARK, clock.now)
-    assert "predictions use an earlier model with fit 3 %" in page and "3 %" in page.split("newest verification")[0]
+    assert (
+        "predictions use an earlier model, whose own verification had fit 3 %" in page
+        and "3 %" in page.split("newest verification")[0]
+    )
 
 
 @pytest.mark.parametrize(

@@ -219,21 +219,20 @@ def _worker_text(store: FleetStore) -> str:
 
 
 def summary_html(fleet: list[Vehicle], store: FleetStore, palette: Palette, now: float) -> str:
-    """Count the fleet by state, with the median horizon and the measured coverage."""
+    """Count the fleet by state, with the median horizon."""
     ordered = sorted(fleet, key=lambda vehicle: severity(vehicle, now)[:2])
     chips = "".join(
         f'<span class="chip"><b style="color:{label.colour}">{label.glyph}</b><b>{n}</b>'
         f'<span class="soft">{label.text}</span></span>'
         for label, n in Counter(status_label(vehicle, palette, now) for vehicle in ordered).items()
     )
-    horizons = sorted(h for vehicle in fleet if (h := vehicle.record(now).horizon_s))
-    median = f'<span class="dot"> · </span>median horizon {horizons[len(horizons) // 2]:.0f} s' if horizons else ""
-    n, coverage, quantile = fleet_coverage(fleet)
-    measured = f"cov. {coverage * 100:.0f}/{quantile * 100:.0f} %"
-    covered = f' · <span title="coverage of the region: measured, nominal">{measured}</span>' if n else ""
+    records = [record for vehicle in fleet if (record := vehicle.record(now)).horizon_s]
+    records.sort(key=lambda record: (record.horizon_s, record.horizon_open))
+    middle = horizon_text(records[len(records) // 2]) if records else ""
+    median = f'<span class="dot"> · </span>median horizon {middle}' if middle else ""
     notes = "".join(f'<div class="soft">{escape(text)}</div>' for text in store.worker_texts())
     plural = "UAV" if len(fleet) == 1 else "UAVs"
-    head = f"<h1>{len(fleet)} {plural}<small>{median}{covered}</small></h1>"
+    head = f"<h1>{len(fleet)} {plural}<small>{median}</small></h1>"
     return f'<div class="uav">{head}{chips}{_recording(fleet, now)}{notes}</div>'
 
 
