@@ -74,6 +74,9 @@ def fit_and_horizon(vehicle: Vehicle, record: StatusRecord) -> str:
     if method not in IDENTIFIED_METHODS:
         return " ".join([*texts, f"Horizon: {text}, which does not use the identified model."])
     texts.append(f"Horizon: {text} and control law in closed loop on the route, measured on past predictions.")
+    if record.horizon_s < SHORT_HORIZON_S:
+        risk = f"{100 * vehicle.prediction.early_exceedance:.0f} %"
+        texts.append(f"The probability of an error of 10 % within 10 s is {risk}: a few metres of a path this short.")
     if record.fit is not None and record.fit < LOW_FIT and record.horizon_s >= SHORT_HORIZON_S:
         texts.append("The control law holds the route although the model alone is inaccurate.")
     elif record.fit is not None and record.fit >= LOW_FIT and record.horizon_s < SHORT_HORIZON_S:
