@@ -282,7 +282,7 @@ def test_local_time_is_shown_beside_utc_where_it_differs(live: SimpleNamespace) 
 def test_the_panel_of_the_client_is_never_shown(live: SimpleNamespace) -> None:
     """Before the viewer has sent its page there is a sentence; with it, no way to the client's settings."""
     server = serve("127.0.0.1", port := unused_port())
-    page = live.page.context.new_page()
+    page = live.page.context.browser.new_page()
     page.goto(f"http://127.0.0.1:{port}/?fixedDpr=0.5")
     page.wait_for_function("document.querySelector('#root button')", timeout=PATIENCE_MS)  # the client has drawn itself
     shown = page.inner_text("body")
