@@ -14,6 +14,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterable
 from importlib.util import find_spec
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -36,7 +37,6 @@ _REWORDED = (  # message of argparse, and what is said instead: `argument NAME` 
     (r"(.*): expected (?:one|at least one|\d+) arguments?", r"\1: found no value, expected one; write it after \1"),
     (r"(.*): ignored explicit argument (.*)", r"\1: found value \2, expected none; leave it out"),
     (r"(.*): not allowed with argument (.*)", r"\1: found \2 as well, expected one of both; leave one out"),
-    (r"ambiguous option: (\S*) could match (.*)", r"\1: found an abbreviation of \2; write one in full"),
     (r"the following arguments are required: (.*)", r"\1: found none, expected one; add it"),
 )
 
@@ -45,9 +45,16 @@ class Parser(argparse.ArgumentParser):
     """Parser whose errors state what was found and expected, with the nearest valid word, after the usage."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **options)
+        super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False, **options)
         self.register("type", int, _whole_number)
         self.register("type", float, _finite_number)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # type: ignore[override]
+        """Parse arguments; an unknown option is reported before absent arguments, whose place its value may take."""
+        for word in () if self._subparsers else takewhile("--".__ne__, sys.argv[1:] if args is None else args):
+            if word.startswith("--") and word.partition("=")[0] not in self._option_string_actions:
+                self.error(self.describe_unknown(word))
+        return super().parse_known_args(args, namespace)
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:  # type: ignore[override]
         """Parse all arguments; an unknown one is an error of the verb, with its usage."""
@@ -81,13 +88,18 @@ class Parser(argparse.ArgumentParser):
         name = word.partition("=")[0]
         if not name.startswith("-"):
             return f"found {word!r} behind all arguments, expected nothing more; leave it out or quote spaces"
+        if full := [option for option in self.option_strings() if option.startswith(name)]:
+            return (
+                f"{name}: found an abbreviation of {', '.join(full)}, expected the name of an option; write it in full"
+            )
         return f"found no option {name!r}, expected one of the usage above{did_you_mean(name, self.option_strings())}"
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Return `; did you mean X?` with the nearest known word; without a near one, a remedy."""
-    near = difflib.get_close_matches(word.lower(), list(known), n=1, cutoff=0.5)
-    return f"; did you mean {near[0]}?" if near else "; see --help"
+    names = {name.lstrip("-"): name for name in known}  # leading dashes would make all options alike
+    near = difflib.get_close_matches(word.lower().lstrip("-"), list(names), n=1, cutoff=0.5)
+    return f"; did you mean {names[near[0]]}?" if near else "; see --help"
 
 
 def _whole_number(text: str) -> int:
@@ -310,7 +322,7 @@ def main(argv: list[str] | None = None) -> int:
     words = sys.argv[1:] if argv is None else argv
     requested = words[0] if words else ""
     parser, verbs = fleet_parser([requested]), command_modules()  # one verb needs no import of the others
-    if requested.startswith("-") and not any(name.startswith(requested) for name in parser.option_strings()):
+    if requested.startswith("-") and requested not in parser.option_strings():
         parser.error(parser.describe_unknown(requested))
     if not requested or not (requested.startswith("-") or requested in verbs):
         absent = f"verb {requested!r}" if requested else "verb"

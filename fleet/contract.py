@@ -460,6 +460,22 @@ class BatteryForecast(msgspec.Struct, frozen=True, kw_only=True):
     sentence: Annotated[str, about("e.g. lands with 12 ± 3 %; cannot reach home after item 9")] = ""
 
 
+METHOD_TEXTS = {
+    "both": "mean of coupled and point-mass model",
+    "hybrid": "point-mass model",
+    "dynamics": "coupled model",
+    "paper": "linear model",
+    "greybox": "guidance law without a model",
+    "copter": "multirotor model",
+    "route_wind": "route at the commanded airspeed",
+    "route_speed": "route at the present ground speed",
+    "constant_turn": "present turn",
+    "constant_velocity": "present velocity",
+    "imm": "turn rate without a route",
+}
+"""Text of each `Prediction.method`."""
+
+
 class Prediction(Message, frozen=True, kw_only=True):
     """Predicted path of one aircraft, its prediction region and confidence horizon."""
 

@@ -81,7 +81,7 @@ def format_line(account: GatewayCounters, statuses: list[Status]) -> str:
     text = f"{len(account.uavs)} aircraft{f', {lost} of them lost' if lost else ''}, {rate:.0f} messages/s"
     counts = {
         "bad frames": account.bad_frames,
-        "refused": sum(account.refused.values()),
+        **{f"messages refused ({reason})": n for reason, n in account.refused.items()},
         "missing by sequence number": sum(status.missed for status in statuses),
         "lost in the socket buffer": sum(link.overrun or 0 for link in account.per_link),
         "unsent without a router": account.unsent,

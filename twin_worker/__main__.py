@@ -7,6 +7,7 @@ import logging
 import os
 import sys
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 SWITCH_INTERVAL_S = 5e-4  # maximum wait of a bus thread for the interpreter [s]
 EXIT_TIMEOUT_S = 10.0  # time from a stop signal to a forced exit [s]
 COMPILING_PERIOD_S = 1.0  # between two reports that the worker compiles [s]
+COMPILING_STEP_S = 10  # step of the time in these reports [s]
 NICE_INCREMENT = 5  # increment of the nice value of the warm-up thread
 GC_THRESHOLD = 50_000  # allocations between garbage collections
 MMAP_THRESHOLD_B = 16 << 20  # malloc blocks above this are mapped separately [bytes]
@@ -115,8 +117,11 @@ def _run(args: argparse.Namespace) -> int:
     with connect(bus_config_from(args, WORKER)) as bus:
         with ThreadPoolExecutor(1) as pool:  # a thread can lower its priority but not raise it again
             prepared, done = pool.submit(_prepare), False
+            begun = time.monotonic()
             while not done:  # repeated, for a viewer that starts later
-                bus.publish(FleetState(t=0.0, sentence="compiling the twin's physics, once"))
+                elapsed_s = int((time.monotonic() - begun) // COMPILING_STEP_S * COMPILING_STEP_S)
+                since = f" ({elapsed_s} s so far)" if elapsed_s else ""
+                bus.publish(FleetState(t=0.0, sentence=f"compiling the twins' physics, once per installation{since}"))
                 done = bool(wait([prepared], COMPILING_PERIOD_S).done)
             prepared.result()
         from twin_worker.alerts.conflict_probability import Separation

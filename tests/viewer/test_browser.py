@@ -328,7 +328,7 @@ def test_an_empty_page_says_what_it_waits_for(page) -> None:
     other = Viewer(unused_port(), address)
     try:
         page.goto(f"http://127.0.0.1:{other.port}/?fixedDpr=0.5")
-        page.get_by_text("No vehicles yet").wait_for(timeout=PATIENCE_MS)
+        page.get_by_text("No aircraft yet").wait_for(timeout=PATIENCE_MS)
         assert "parauav/*/sample" in page.inner_text("body")
     finally:
         other.process.send_signal(signal.SIGTERM)

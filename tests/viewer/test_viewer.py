@@ -21,7 +21,6 @@ from fleet.contract import (
     Verdict,
 )
 from fleet.frames import Origin, body_to_ned, to_geodetic
-from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import HOME, HOSTILE, STAMP, Clock, PretendUav, T, feed_of, fields
 from viewer.panels.charts import axis_range, band
 from viewer.panels.detail import figures_html, law_html, limitations, status_html
@@ -32,8 +31,7 @@ from viewer.scene.scene import DASHES, cut_at_horizon
 from viewer.scene.selection.pins import curtain, marked_look_aheads, rings, tube_faces
 from viewer.server.view import FRAME_MARGIN, outgrown
 from viewer.store.place import UNIT_M, SceneFrame, scene_quat
-from viewer.store.store import FleetStore
-from viewer.text.words import empty_html, summary_html, table
+from viewer.text.words import summary_html, table
 from viewer.theme.palette import _EXPOSURE, _IN, _OUT, DARK, LIGHT, line_colour, rgb
 from viewer.theme.shapes import aircraft, diamond, rotorcraft
 
@@ -309,13 +307,6 @@ def test_a_chart_keeps_its_scale_while_its_values_stay_within() -> None:
             and high > np.nanmax(y)
             and high - low < 3 * max(np.nanmax(y) - np.nanmin(y), 0.03 * abs(np.nanmax(y)), 0.01)
         )
-
-
-def test_an_empty_page_says_what_it_listens_to(clock: Clock) -> None:
-    feed = FleetStore(MemoryBus(), clock)
-    clock.now += 42
-    page = empty_html(feed, clock.now)
-    assert "parauav/*/sample" in page and "for 42 s" in page and "0 messages" in page
 
 
 def test_the_worst_and_shortest_stand_first(clock: Clock) -> None:

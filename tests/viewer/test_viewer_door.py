@@ -4,6 +4,7 @@ import contextlib
 import gc
 import gzip
 import http.client
+import logging
 import re
 import socket
 from collections.abc import Iterator
@@ -23,7 +24,15 @@ from websockets.typing import Origin, Subprotocol
 from tests.support.fake_link import PATIENCE_S, until
 from tests.support.memory_bus import MemoryBus
 from viewer.__main__ import main
-from viewer.browser.http_server import POLICY, REFUSED, VIOLATION, request_filter, serve, without_stdout
+from viewer.browser.http_server import (
+    POLICY,
+    REFUSED,
+    VIOLATION,
+    _shorten_rejection,
+    request_filter,
+    serve,
+    without_stdout,
+)
 from viewer.server.app import App
 
 PASSED = "the library's own answer"
@@ -191,6 +200,26 @@ def test_a_message_that_fails_in_the_library_is_one_line(server, caplog, capfd) 
         until(lambda: gc.collect() is None or "a message failed" in caplog.text)
     handle.remove()
     assert "Traceback" not in caplog.text + "".join(capfd.readouterr())
+
+
+@pytest.mark.parametrize("sent", [b"", b"\x16\x03\x01 no request\r\n\r\n", b"GET"], ids=["port check", "TLS", "cut"])
+def test_a_connection_without_a_request_is_not_reported(server: SimpleNamespace, sent: bytes, caplog, capfd) -> None:
+    """A port check, as `fleet doctor` and port scanners make."""
+    with socket.create_connection(("127.0.0.1", server.port), timeout=PATIENCE_S) as probe:
+        probe.sendall(sent)
+        probe.shutdown(socket.SHUT_WR)
+        with contextlib.suppress(ConnectionResetError):
+            while probe.recv(1_000):  # until the server has answered and closed it
+                pass
+    assert [record for record in caplog.records if record.name.startswith("websockets")] == []
+    assert "".join(capfd.readouterr()) == ""
+
+
+def test_a_request_that_fails_in_the_library_is_one_line(caplog) -> None:
+    record = logging.LogRecord("websockets.server", logging.ERROR, "", 0, "opening handshake failed", (), None)
+    assert _shorten_rejection(record) and record.getMessage() == "opening handshake failed"
+    record.exc_info = (KeyError, KeyError("x"), None)
+    assert _shorten_rejection(record) and record.exc_info is None and "(KeyError: 'x')" in record.getMessage()
 
 
 def test_nobody_can_upload(server: SimpleNamespace) -> None:

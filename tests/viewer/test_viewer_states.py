@@ -8,14 +8,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from fleet.contract import GatewayCounters, LinkCounters, Outcome, Status, TwinState
+from fleet.contract import FleetState, GatewayCounters, LinkCounters, Outcome, Status, TwinState
 from gateway.link_spec import read_spec
 from gateway.links.recorded import ReplayLink
 from gateway.pipeline import Pipeline
 from tests.gateway.test_gateway import flight
 from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import HOSTILE, STAMP, Clock, PretendUav, T, feed_of
-from viewer.panels.detail import figures_html, status_html
+from viewer.panels.detail import figures_html, limitations, status_html
 from viewer.scene.camera import set_initial_view
 from viewer.scene.fleet_arrays import display_status
 from viewer.scene.ground import RINGS_M
@@ -25,6 +25,7 @@ from viewer.store import store as feeds
 from viewer.store.place import UNIT_M
 from viewer.store.states import MAX_TEXT, notices
 from viewer.store.store import FleetStore
+from viewer.store.vehicle import Vehicle
 from viewer.text.words import empty_html, horizon_text, status_label, summary_html
 from viewer.theme.palette import DARK, STATUS_COLOURS
 
@@ -95,12 +96,33 @@ def test_links_without_end_are_bounded(clock: Clock) -> None:
     assert len(feed.links) == feeds.MAX_LINKS and "<b>Link</b>: late" in notices(feed, "", DARK, clock.now)
 
 
-def test_no_fleet_is_said_with_what_is_listened_to_and_what_to_check(clock: Clock) -> None:
+def test_no_fleet_is_said_with_what_is_received_and_what_to_check(clock: Clock) -> None:
     feed = FleetStore(MemoryBus(), clock)
     clock.now += 42
-    said = empty_html(feed, clock.now)
-    assert "No vehicles yet" in said and "parauav/*/sample" in said and "42 s" in said and "0 messages" in said
-    assert "fleet status" in said
+    page = empty_html(feed, clock.now)
+    assert all(text in page for text in ("No aircraft yet", "parauav/*/sample", "42 s", "0 messages", "`fleet up`"))
+    assert "start `twin_worker`" in page and "none found yet; its first start compiles" in page
+
+
+def test_an_empty_page_describes_gateway_and_worker_from_their_messages(clock: Clock) -> None:
+    feed = FleetStore(bus := MemoryBus(), clock)
+    counters = GatewayCounters(t=T, links=("udpin:127.0.0.1:14550",), sentence="no aircraft received yet")
+    bus.publish(counters)
+    bus.publish(FleetState(t=0.0, sentence="compiling <b>"))
+    page = empty_html(feed, clock.now)
+    assert "running (udpin:127.0.0.1:14550); no aircraft received yet" in page and "compiling &lt;b&gt;" in page
+    assert "2 messages, none with the position of an aircraft" in page and "none found" not in page
+    bus.publish(msgspec.structs.replace(counters, uavs=(3, 4), sentence=""))
+    bus.publish(FleetState(t=T))
+    assert "2 aircraft send, none has sent a position yet" in empty_html(feed, clock.now)
+
+
+def test_an_aircraft_whose_worker_compiles_says_so(clock: Clock) -> None:
+    vehicle = Vehicle(0)
+    vehicle.sample_received = clock.now
+    assert "`twin_worker` compiles for a minute" in " ".join(limitations(vehicle, clock.now))
+    texts = limitations(vehicle, clock.now, ["compiling, 20 s so far"])
+    assert texts == ["Its twin is not ready: compiling, 20 s so far."]
 
 
 def test_ten_thousand_letters_of_status_are_cut_and_words_stay_words(clock: Clock) -> None:
@@ -152,7 +174,10 @@ def test_the_newest_verification_says_which_fit_the_predictions_use(clock: Clock
     earlier = msgspec.structs.replace(model.active_verdict, fit={"u": 2.0, "w": 4.0})
     bus.publish(msgspec.structs.replace(model, t=T + 2, active_verdict=earlier), STAMP)
     page = status_html(feed.vehicles[0], DARK, clock.now)
-    assert "predictions use an earlier model with fit 3 %" in page and "3 %" in page.split("newest verification")[0]
+    assert (
+        "predictions use an earlier model, whose own verification had fit 3 %" in page
+        and "3 %" in page.split("newest verification")[0]
+    )
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from math import cos, log, sin
 import numpy as np
 from filterpy.kalman import IMMEstimator, KalmanFilter
 
+from fleet.contract import METHOD_TEXTS
 from twin_worker.confidence.tube_and_horizon import path_length
 from twin_worker.numerics.interpolation import interpolate_rows
 from twin_worker.telemetry.track import STEP as TRACK_STEP
@@ -141,10 +142,10 @@ class MethodSelector:
         """Describe the errors of all methods; empty before enough scores."""
         if len(self.mean_error) < 2 or self.n_scored.get(method, 0.0) < _MIN_DESCRIBED:
             return ""
-        errors = {name.replace("_", " "): f"{error:.1%}" for name, error in self.mean_error.items()}
-        name = method.replace("_", " ")
-        others = ", ".join(f"{other} {error}" for other, error in errors.items() if other != name)
-        return f"prediction method {name}: mean error {errors[name]} of path length; other methods: {others}"
+        errors = sorted((error, name) for name, error in self.mean_error.items() if name != method)
+        others = ", ".join(f"{METHOD_TEXTS[name]} {100 * error:.1f} %" for error, name in errors)
+        own = f"{METHOD_TEXTS[method]}: mean error of past predictions {100 * self.mean_error[method]:.1f} %"
+        return f"predicted with {own} of path length; other methods: {others}"
 
 
 def _log_prior_error(method: str) -> float:

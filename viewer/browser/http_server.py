@@ -20,6 +20,7 @@ import viser
 import websockets.asyncio.server as sockets
 from viser import Icon, _icons, _messages
 from websockets.datastructures import Headers
+from websockets.exceptions import InvalidMessage
 from websockets.http11 import Request, Response
 
 from viewer.text.missed_events import Absence
@@ -68,7 +69,9 @@ def serve(host: str, port: int, name: str = "") -> viser.ViserServer:
     """
     # A page may close while it is drawn: its queued messages are discarded without a warning.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-    logging.getLogger("websockets.server").setLevel(logging.WARNING)  # it logs page requests as rejected connections
+    sockets_log = logging.getLogger("websockets.server")
+    sockets_log.setLevel(logging.WARNING)  # it logs page requests as rejected connections
+    sockets_log.addFilter(_shorten_rejection)
     _read_icons()
     names = {*LOCAL_NAMES, host.strip("[]").lower(), *filter(None, [name.lower()])}
     any_host = host in ("", "0.0.0.0", "::", "[::]")  # every interface: the host name is unknown
@@ -83,6 +86,17 @@ def serve(host: str, port: int, name: str = "") -> viser.ViserServer:
             f"--port: found {port} in use by another program, expected a free port; stop it or choose another"
         )
     return server
+
+
+def _shorten_rejection(record: logging.LogRecord) -> bool:
+    """Drop the log record of a connection without an HTTP request (a port check); shorten others to one line."""
+    error = record.exc_info[1] if record.exc_info else None
+    if isinstance(error, InvalidMessage | EOFError | ConnectionError):
+        return False
+    if error is not None:
+        record.msg, record.args = "page: found a connection without a valid request (%s: %s); it is closed", ()
+        record.args, record.exc_info = (type(error).__name__, error), None
+    return True
 
 
 def _read_icons() -> None:

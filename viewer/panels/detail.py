@@ -1,9 +1,10 @@
 """Texts of the selected UAV: status, confidence, verdict, figures."""
 
+from collections.abc import Sequence
 from html import escape
 from math import isfinite
 
-from fleet.contract import AlertKind, Controller, Outcome, TwinState, Verdict
+from fleet.contract import METHOD_TEXTS, AlertKind, Controller, Outcome, TwinState, Verdict
 from viewer.store.inbox import rate_text, timestamp
 from viewer.store.vehicle import StatusRecord, Vehicle, mean_fit
 from viewer.text.units import METRIC, Units
@@ -27,10 +28,12 @@ MAX_TEXT = 500  # characters of a received text
 REFUSED_S = 10.0  # how long a rejected message is reported [s]
 
 
-def status_html(vehicle: Vehicle, palette: Palette, now: float, units: Units = METRIC) -> str:
-    """Return the status of the UAV and its twin as HTML. Received texts are escaped here."""
+def status_html(
+    vehicle: Vehicle, palette: Palette, now: float, units: Units = METRIC, workers: Sequence[str] = ()
+) -> str:
+    """Return the status of the UAV and its twin as HTML; `workers`: their texts. Received texts are escaped here."""
     label = status_label(vehicle, palette, now)
-    cards = _cards(vehicle, vehicle.record(now), units) + _sentences(vehicle, palette, now)
+    cards = _cards(vehicle, vehicle.record(now), units) + _sentences(vehicle, palette, now, workers)
     return (
         f'<div class="uav"><div class="head"><h1>{vehicle.name}</h1><b style="color:{label.colour}">'
         f"{label.glyph} {label.text}</b></div>{cards}</div>"
@@ -56,12 +59,7 @@ def _cards(vehicle: Vehicle, record: StatusRecord, units: Units) -> str:
     return f'<div class="cards">{html}</div><div class="soft">{escape(fit_and_horizon(vehicle, record))}</div>{note}'
 
 
-IDENTIFIED_METHODS = {  # methods that roll out identified models, and their kind
-    "dynamics": "coupled",
-    "paper": "linear",
-    "hybrid": "point-mass",
-    "both": "mean of coupled and point-mass",
-}
+IDENTIFIED_METHODS = ("both", "hybrid", "dynamics", "paper")  # methods that roll out identified models
 
 
 def fit_and_horizon(vehicle: Vehicle, record: StatusRecord) -> str:
@@ -72,10 +70,13 @@ def fit_and_horizon(vehicle: Vehicle, record: StatusRecord) -> str:
     if not record.horizon_s or vehicle.prediction is None:
         return " ".join(texts)
     method = vehicle.prediction.method
+    text = METHOD_TEXTS.get(method, method[:40])
     if method not in IDENTIFIED_METHODS:
-        return " ".join([*texts, f"Horizon: method {method[:40]}, which does not use the identified model."])
-    kind = IDENTIFIED_METHODS[method]
-    texts.append(f"Horizon: {kind} model and control law in closed loop on the route, measured on past predictions.")
+        return " ".join([*texts, f"Horizon: {text}, which does not use the identified model."])
+    texts.append(f"Horizon: {text} and control law in closed loop on the route, measured on past predictions.")
+    if record.horizon_s < SHORT_HORIZON_S:
+        risk = f"{100 * vehicle.prediction.early_exceedance:.0f} %"
+        texts.append(f"The probability of an error of 10 % within 10 s is {risk}: a few metres of a path this short.")
     if record.fit is not None and record.fit < LOW_FIT and record.horizon_s >= SHORT_HORIZON_S:
         texts.append("The control law holds the route although the model alone is inaccurate.")
     elif record.fit is not None and record.fit >= LOW_FIT and record.horizon_s < SHORT_HORIZON_S:
@@ -83,8 +84,8 @@ def fit_and_horizon(vehicle: Vehicle, record: StatusRecord) -> str:
     return " ".join(texts)
 
 
-def limitations(vehicle: Vehicle, now: float) -> list[str]:
-    """Return why there is no prediction, or what limits it; plain text, not escaped."""
+def limitations(vehicle: Vehicle, now: float, workers: Sequence[str] = ()) -> list[str]:
+    """Return why there is no prediction, or what limits it; `workers`: their texts. Plain text, not escaped."""
     record = vehicle.record(now)
     state, texts = record.state, []
     if vehicle.ended:
@@ -92,9 +93,11 @@ def limitations(vehicle: Vehicle, now: float) -> list[str]:
     elif state is TwinState.LINK_LOST:
         note = "the twin predicts the position shown" if vehicle.forecast is not None else "no twin yet"
         texts.append(f"No sample for {age_text(record.sample_age_s)}: {note}; check the radio link.")
-    elif state in (TwinState.WAITING, TwinState.UNCLAIMED) and vehicle.model is None:
+    elif not isfinite(vehicle.result_accepted) and vehicle.model is None and workers:
+        texts.append(f"Its twin is not ready: {'; '.join(workers)}.")
+    elif not isfinite(vehicle.result_accepted) and vehicle.model is None:
         texts.append(
-            "No worker result for this UAV yet: `twin_worker` compiles for about a minute at its first start. "
+            "No twin yet: `twin_worker` compiles for a minute or more at its first start. "
             "If it takes longer, check that it runs on this router."
         )
     elif state is TwinState.UNCLAIMED:
@@ -118,17 +121,21 @@ def limitations(vehicle: Vehicle, now: float) -> list[str]:
     return texts
 
 
-def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
+def _sentences(vehicle: Vehicle, palette: Palette, now: float, workers: Sequence[str]) -> str:
     alert = f'<div class="say" style="border-color:{palette.mismatch}">▲ '
     record, cards = vehicle.record(now), [mismatch_html(vehicle.mismatch, palette)]
     alerts = [a for a in vehicle.alerts.values() if a.kind is not AlertKind.LINK_LOST]  # said by `limitations`
     cards += [f"{alert}{escape(clip(alert_sentence(a, vehicle, now), MAX_TEXT))}</div>" for a in alerts]
-    texts = limitations(vehicle, now)
+    texts = limitations(vehicle, now, workers)
     cards += [f'<div class="say">{escape(clip(text, MAX_TEXT))}</div>' for text in texts]
     verdict = vehicle.model.verdict if vehicle.model is not None else None
     if vehicle.model is not None and verdict is not None:
         is_active = vehicle.model.active_verdict in (None, verdict) or record.fit is None
-        active = "" if is_active else f"; predictions use an earlier model with fit {fit_text(record)}"
+        active = (
+            ""
+            if is_active
+            else f"; predictions use an earlier model, whose own verification had fit {fit_text(record)}"
+        )
         accepted = {
             Outcome.VERIFIED: fit_colour(mean_fit(verdict.fit), palette),
             Outcome.PLAUSIBLE: palette.plausible,
@@ -137,7 +144,7 @@ def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
         least = f", threshold {verdict.threshold:.0f} %" if verdict.threshold > 0 else ""
         cards.append(
             f'<div class="say" style="border-color:{colour}"><b>{escape(verdict.outcome.value.replace("_", " "))}</b> '
-            f'<span class="soft">newest verification, number {verdict.attempts}{least}{active}</span><br>'
+            f'<span class="soft">newest verification{least}{active}</span><br>'
             f"{escape(clip(verdict.sentence, MAX_TEXT))}</div>"
         )
     elif vehicle.row is not None and not any(vehicle.row.verdict in text for text in ("", *texts)):
@@ -206,16 +213,17 @@ def _facts(vehicle: Vehicle, now: float, units: Units) -> str:
     record = vehicle.record(now)
     at, age_s, rate = record.t, record.sample_age_s, vehicle.time.rate
     time_name = "recorded" if vehicle.recorded else "data time"
-    names = "calibration", "method", "mode", "link", time_name, "sample", "prediction", "within 10 %", "worker"
-    figures = {"coverage": coverage_text(vehicle)} | dict.fromkeys(names, "–")
+    names = "calibration", "method", "mode", "link", time_name, "sample", "prediction", "error below 10 %", "worker"
+    figures = {"coverage": coverage_text(vehicle)} | dict.fromkeys(names, "")
     figures |= {"altitude": f"{units.height_text(vehicle.alt_m)} above mean sea level"}
     figures[time_name] = timestamp(at)
     if vehicle.recorded and rate and not vehicle.ended:
         figures[time_name] += f", played {rate_text(rate)}"
     figures["sample"] = f"{age_text(age_s)} old" if isfinite(age_s) else "none yet"
     if prediction is not None:
-        figures["calibration"] = prediction.calibration or "–"
-        figures["method"] = f"{prediction.method} · {prediction.law or 'no law'}"
+        figures["calibration"] = prediction.calibration
+        method = METHOD_TEXTS.get(prediction.method, prediction.method)
+        figures["method"] = f"{method} · {prediction.law or 'no law'}"
         if record.prediction_age_s is not None:
             coasted = f", coasted {age_text(prediction.coast_s)}" if prediction.coast_s > 0 else ""
             figures["prediction"] = f"{age_text(record.prediction_age_s)} old{coasted}"
@@ -226,5 +234,5 @@ def _facts(vehicle: Vehicle, now: float, units: Units) -> str:
     if row is not None:
         figures["worker"] = f"{row.worker} · epoch {row.epoch}"
         if row.t10_s is not None:
-            figures["within 10 %"] = f"{row.t10_s:.1f} s median, n = {row.t10_n}"
-    return key_value_table((name, escape(clip(text, MAX_TEXT))) for name, text in figures.items())
+            figures["error below 10 %"] = f"for {row.t10_s:.1f} s, median of {row.t10_n} predictions"
+    return key_value_table((name, escape(clip(text, MAX_TEXT))) for name, text in figures.items() if text)

@@ -79,7 +79,6 @@ MAX_OFFERED = 200  # UAVs in the palette; the search field finds the others
 
 
 STALE = "No data from the viewer: this page is out of date. Restart the viewer; the page reconnects automatically."
-NO_UAV = "–"  # menu entry without a selection
 
 
 class Panels:
@@ -104,6 +103,7 @@ class Panels:
         self._gui, self._palette, self._choose = browser.client.gui, palette, choose
         self._browser, self._approvals = browser, approvals
         self._offered: set[int] = set()  # UAVs with a selection command
+        self._workers: list[str] = []  # texts of the workers
         for label, (key, act) in actions.items():
             self._gui.add_command(label, hotkey=key).on_trigger(lambda _, act=act: act())  # type: ignore[arg-type]
         self._pulse = False
@@ -134,7 +134,6 @@ class Panels:
             self._show = gui.add_button_group("Show", ("All", "Alerts", "Selected"))
             self._filter = "All"
             self._table = gui.add_html("")
-            self._menu = gui.add_dropdown("Select", (NO_UAV,))
             self._pick_input = gui.add_text("picked", "", visible=False)
         with tabs.add_tab("Alerts", viser.Icon.ALERT_TRIANGLE):
             self._missed = gui.add_html("")
@@ -156,7 +155,6 @@ class Panels:
             self.region = gui.add_html("")
             gui.add_html(f'<div class="uav keys"><b>Keys</b>{keys}</div>')
         self._acknowledge.on_click(lambda _: setattr(browser, "absence", None))
-        self._menu.on_update(lambda _: self._pick(self._menu.value.removeprefix("UAV-")))
         self._pick_input.on_update(lambda _: self._pick(self._pick_input.value))
         light.on_update(lambda _: browser.set_theme(light=light.value))
         aviation.on_update(lambda _: browser.set_units(aviation=aviation.value))
@@ -229,6 +227,7 @@ class Panels:
         shown = [vehicle for vehicle in fleet if self._passes(vehicle, now, selected)]
         shown = sorted(shown, key=lambda vehicle: severity(vehicle, now))[:MAX_ROWS]
         self._browser.mark_present()
+        self._workers = store.worker_texts()
         missed = missed_events_html(fleet, self._browser.absence, palette, pick)
         contents = (
             (self._unit_style, f"<style>:root{{--aviation:{int(self._browser.aviation)}}}</style>"),
@@ -244,9 +243,6 @@ class Panels:
         with self._browser.client.atomic():  # contents first: the block delays all other messages
             for html, text in contents:
                 html.content = text
-            names = NO_UAV, *(vehicle.name for vehicle in shown)
-            if self._menu.options != names:
-                self._menu.options = names
             self._acknowledge.visible = bool(missed)
             self.show(selected_vehicle, now)
             events = selected_vehicle.events if selected_vehicle is not None else None
@@ -264,9 +260,11 @@ class Panels:
 
     def show(self, vehicle: Vehicle | None, now: float) -> None:
         """Show the status of the selected UAV."""
+        units, workers = self.units, self._workers
         placeholder = '<div class="uav soft">No UAV selected: click a row or an aircraft, or press Ctrl+K.</div>'
         _update(
-            self._about, status_html(vehicle, self._palette, now, self.units) if vehicle is not None else placeholder
+            self._about,
+            placeholder if vehicle is None else status_html(vehicle, self._palette, now, units, workers),
         )
         proposals = "" if vehicle is None else self._proposals_html(vehicle, now)
         _update(self._proposals, f'<div class="uav">{proposals}</div>' if proposals else "")

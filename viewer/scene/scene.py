@@ -15,7 +15,7 @@ from viewer.theme.palette import Palette, mesh_colour, mix, rgb
 from viewer.theme.shapes import aircraft, dart, rotorcraft
 
 SPAN_SHARE, MIN_SPAN_SHARE = 0.042, 0.016  # share of the image height that an aircraft spans at its centre [-]
-LARGE_GLYPH_COUNT = 60  # visible aircraft up to which they have that size; more are drawn smaller
+LARGE_GLYPH_COUNT = 80  # aircraft up to which they have that size in a square image; more are drawn smaller
 DISTANCE_EXPONENT = 0.5  # 1: same apparent size at any distance; 0: perspective [-]
 EXCEPTION_SCALE, SELECTED_SCALE = 1.7, 1.25  # scale of exceptional UAVs in a large fleet, and of the selected UAV
 MUTED_SHARE = 0.62  # large fleet: colour share of nominal UAVs, the rest is ground colour [-]
@@ -51,7 +51,9 @@ class Glyphs:
         focus_distance = float(np.linalg.norm(camera_view.look_at - camera_view.position)) or 1.0
         points, depth = camera_view.project(fleet_arrays.at)
         visible_count = int(((depth > 0) & (np.abs(points) < [camera_view.aspect / 2, 0.5]).all(axis=1)).sum())
-        share = SPAN_SHARE * min(1.0, LARGE_GLYPH_COUNT / max(visible_count, 1)) ** 0.5
+        covered = (camera_view.top_px + camera_view.bottom_px) / camera_view.height_px
+        room = LARGE_GLYPH_COUNT * min(camera_view.aspect, 1.0) * (1.0 - min(covered, 0.9))
+        share = SPAN_SHARE * min(1.0, room / max(visible_count, 1)) ** 0.5
         self.unit = size * focus_distance * max(share, MIN_SPAN_SHARE)
         relative_distance = np.linalg.norm(fleet_arrays.at - camera_view.position, axis=1) / focus_distance
         scale = self.unit * np.clip(relative_distance, 0.05, 20.0) ** DISTANCE_EXPONENT

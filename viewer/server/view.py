@@ -234,6 +234,7 @@ class View:
                 self.scene.draw_alerts(fleet_arrays)
             if tick % 5 == 0 and not self.timeline.player.live:
                 self.timeline.draw(self.selected)
+        with self.client.atomic():  # of its own: a long block arrives in parts, between which labels would overlap
             if tick % 2 == 0:
                 self._draw_labels(fleet_arrays, now)
             self._follow(now)

@@ -58,6 +58,7 @@ class FleetStore:
         self.sentences: dict[int, str] = {}  # status text of each worker
         self._counts: Counter[str] = Counter()
         self.links: dict[str, str] = {}  # texts of gateways about their links
+        self.gateway: GatewayCounters | None = None  # newest statistics of any gateway
         self.rejected_uavs: set[int] = set()  # UAVs beyond MAX_VEHICLES
         self.started = clock()
         self._router_lost_since: float | None = None
@@ -347,6 +348,7 @@ class FleetStore:
 
     def _account(self, account: GatewayCounters, _: Stamp | None, now: float) -> None:
         """Update link texts and which UAVs are replayed from a recording."""
+        self.gateway = account
         for link in account.per_link[:MAX_LINKS]:
             self.links.pop(link.link, None)
             if link.sentence and len(self.links) < MAX_LINKS:

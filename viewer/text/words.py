@@ -186,34 +186,53 @@ def alert_sentence(alert: Alert, vehicle: Vehicle, now: float) -> str:
 
 
 def empty_html(store: FleetStore, now: float) -> str:
-    """Return the page text without UAVs: subscribed key and what to check."""
+    """Return the page text without UAVs: what was received of gateway and workers, and what to check."""
     n, malformed = sum(tuple(store.counts.values())) - store.counts["strange"], store.counts["strange"]
-    malformed_text = f" {malformed} malformed." if malformed else ""
-    notes = "".join(f"<br>{escape(text)}" for text in store.worker_texts())
-    return (
-        f'<div class="uav"><h1>No vehicles yet</h1><div class="soft">Listening on <code>{escape(store.sample_key)}'
-        f"</code> for {now - store.started:.0f} s. {n} messages.{malformed_text}{notes}<br>Check that a gateway "
-        "is running on this router and that aircraft send to it: <code>fleet status</code>, "
-        "<code>fleet up --uavs 8</code>.</div></div>"
-    )
+    malformed_text = f"; {malformed} malformed" if malformed else ""
+    rows = [
+        ("gateway", escape(_gateway_text(store))),
+        ("twin worker", escape("; ".join(store.worker_texts()) or _worker_text(store))),
+        ("listening on", f"<code>{escape(store.sample_key)}</code> for {now - store.started:.0f} s"),
+        ("received", f"{n} messages, none with the position of an aircraft{malformed_text}"),
+    ]
+    table_html = key_value_table(rows)
+    return f'<div class="uav empty"><h1>No aircraft yet</h1><div class="soft">{table_html}</div></div>'
+
+
+def _gateway_text(store: FleetStore) -> str:
+    """Describe the newest gateway statistics, or what to check without any; not escaped."""
+    gateway = store.gateway
+    if gateway is None:
+        return (
+            "none found yet; its first start compiles for about a minute. If it takes longer, start `fleet up`, or "
+            "`gateway` on this router"
+        )
+    links = ", ".join(link[:80] for link in gateway.links[:4]) or "no link"
+    if gateway.uavs:
+        return f"running ({links}); {len(gateway.uavs)} aircraft send, none has sent a position yet"
+    return f"running ({links}); {gateway.sentence or 'no aircraft received yet'}"
+
+
+def _worker_text(store: FleetStore) -> str:
+    """Describe workers without a text of their own; not escaped."""
+    return "ready" if store.sentences else "none found yet; start `twin_worker` on this router, or `fleet up`"
 
 
 def summary_html(fleet: list[Vehicle], store: FleetStore, palette: Palette, now: float) -> str:
-    """Count the fleet by state, with the median horizon and the measured coverage."""
+    """Count the fleet by state, with the median horizon."""
     ordered = sorted(fleet, key=lambda vehicle: severity(vehicle, now)[:2])
     chips = "".join(
         f'<span class="chip"><b style="color:{label.colour}">{label.glyph}</b><b>{n}</b>'
         f'<span class="soft">{label.text}</span></span>'
         for label, n in Counter(status_label(vehicle, palette, now) for vehicle in ordered).items()
     )
-    horizons = sorted(h for vehicle in fleet if (h := vehicle.record(now).horizon_s))
-    median = f'<span class="dot"> · </span>median horizon {horizons[len(horizons) // 2]:.0f} s' if horizons else ""
-    n, coverage, quantile = fleet_coverage(fleet)
-    measured = f"cov. {coverage * 100:.0f}/{quantile * 100:.0f} %"
-    covered = f' · <span title="coverage of the region: measured, nominal">{measured}</span>' if n else ""
+    records = [record for vehicle in fleet if (record := vehicle.record(now)).horizon_s]
+    records.sort(key=lambda record: (record.horizon_s, record.horizon_open))
+    middle = horizon_text(records[len(records) // 2]) if records else ""
+    median = f'<span class="dot"> · </span>median horizon {middle}' if middle else ""
     notes = "".join(f'<div class="soft">{escape(text)}</div>' for text in store.worker_texts())
     plural = "UAV" if len(fleet) == 1 else "UAVs"
-    head = f"<h1>{len(fleet)} {plural}<small>{median}{covered}</small></h1>"
+    head = f"<h1>{len(fleet)} {plural}<small>{median}</small></h1>"
     return f'<div class="uav">{head}{chips}{_recording(fleet, now)}{notes}</div>'
 
 
@@ -289,7 +308,7 @@ def alerts_html(fleet: list[Vehicle], palette: Palette, now: float, pick: str = 
 def legend_html(fleet: list[Vehicle], palette: Palette) -> str:
     """Return the legend of the lines and the measured coverage of the band; it is always visible."""
     n, coverage, quantile = fleet_coverage(fleet)
-    coverage_text = f"coverage {coverage * 100:.0f} %, n = {n}" if n else "not measured yet"
+    coverage_text = f"coverage {coverage * 100:.0f} %, n = {n}" if n else "coverage not measured yet"
     parts = (
         f'<i class="line" style="background:{palette.actual}"></i>flown',
         f'<i class="line dash" style="color:{palette.ink}"></i>predicted',

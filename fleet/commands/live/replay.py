@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from urllib.parse import quote
 
-from fleet.cli import stop_on_signal
+from fleet.cli import check_file, stop_on_signal
 from fleet.config import router_arguments, router_options
 from fleet.process.children import run_until
 from fleet.process.logs import report_progress
@@ -50,6 +50,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Start a gateway that replays the files and return its exit code; or send the files as datagrams."""
     check_arguments(args)
+    for name in args.file:
+        check_file("FILE", name)
     if args.to:
         return _send(args)
     options = [f"--link={replay_link(name, args)}" for name in args.file]

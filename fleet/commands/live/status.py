@@ -108,8 +108,8 @@ def sibling_texts(bus: Bus) -> list[str]:
     return texts + [printable(difference.sentence) for one in types for difference in one.differences]
 
 
-def fleet_rows(bus: Bus) -> list[FleetRow]:
-    """Query the rows of every worker and add aircraft without a worker as unclaimed."""
+def fleet_rows(bus: Bus, *, preparing: bool = False) -> list[FleetRow]:
+    """Query the rows of every worker and add aircraft without a worker as unclaimed; `preparing`: one compiles."""
     best: dict[int, FleetRow] = {}
     states = list(bus.get(FleetState))
     for state, _ in states:
@@ -121,7 +121,11 @@ def fleet_rows(bus: Bus) -> list[FleetRow]:
                 best[row.uav] = row
     sentence = "no worker owns this id: start `twin_worker` with a wider --uavs"
     if not states:
-        sentence = "no worker responds: its first start compiles for about a minute; if none runs, start `twin_worker`"
+        sentence = (
+            "no worker responds: its first start compiles for a minute or more; if none runs, start `twin_worker`"
+        )
+    if preparing:
+        sentence = "its twin starts when the twin worker has compiled"
     for status, _ in bus.get(Status):
         best.setdefault(status.uav, FleetRow(uav=status.uav, state=TwinState.UNCLAIMED, verdict=sentence))
     return [best[uav] for uav in sorted(best)]

@@ -198,7 +198,7 @@ def _watch(bus: Bus, children: Children, args: argparse.Namespace, stop: threadi
     display = _Display(Console(stderr=True))
     with display.live:
         while not stop.wait(1.0):
-            rows = fleet_rows(bus) or rows
+            rows = fleet_rows(bus, preparing=bool(worker_texts[-1]) and not ready.is_set()) or rows
             if story is not None and not story.sentences and ready.is_set():
                 _start_aircraft(children, args)
                 story.begin()
@@ -240,7 +240,7 @@ class _Display:
 
     def draw(self, lines: list[str], rows: list[FleetRow], texts: list[str]) -> None:
         if self.console.is_terminal:
-            self.live.update(Group(Text("\n".join(lines)), fleet_table(rows[:40])))
+            self.live.update(Group(Text("\n".join(lines)), *([fleet_table(rows[:40])] if rows else [])))
             return
         new_lines = [line for line in dict.fromkeys([*texts, *lines[1:]]) if line and line not in self._printed]
         if time.monotonic() >= self._due:
@@ -255,10 +255,10 @@ def _lines(
     rows: list[FleetRow], children: Children, sentence: str, elapsed: float, args: argparse.Namespace
 ) -> list[str]:
     count = {state: sum(row.state is state for row in rows) for state in TwinState}
-    states = ", ".join(f"{n} {state.value}" for state, n in count.items() if n) or "waiting for the first sample"
+    states = ", ".join(f"{n} {state.value}" for state, n in count.items() if n)
     since = f"{elapsed:.0f} s since the first sample" if elapsed else "workers are starting"
-    lines = [f"fleet up · {len(rows)} UAVs · {since} · {states}"]
-    lines += [sentence] if sentence else []
+    lines = [f"fleet up · {len(rows)} UAVs · {since} · {states}" if rows else "fleet up · waiting for the first aircraft"]
+    lines += [f"twin worker: {sentence}"] if sentence else []
     lines += children.last_lines()
     if args.replay and "gateway" in children.finished():
         lines.append("the recording has ended; the twins predict without telemetry until Ctrl-C")

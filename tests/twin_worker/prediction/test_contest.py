@@ -35,7 +35,8 @@ def test_the_one_that_strays_least_is_used_once_enough_is_flown():
     assert contest.best(("hybrid", "dynamics", "both")) == "dynamics"
     assert contest.mean_error["hybrid"] == pytest.approx(0.05, rel=0.1)  # 1 of 20 m/s
     assert contest.describe("dynamics") == (
-        "prediction method dynamics: mean error 1.0% of path length; other methods: hybrid 5.0%, both 3.0%"
+        "predicted with coupled model: mean error of past predictions 1.0 % of path length; "
+        "other methods: mean of coupled and point-mass model 3.0 %, point-mass model 5.0 %"
     )
 
 

@@ -6,10 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
+from conftest import unused_port
 from playwright.sync_api import TimeoutError as TooLate
 
 from tests.viewer.test_browser import FEW_FRAMES, PATIENCE_MS, SCHEME
 from tests.viewer.test_browser_sizes import SIZES, live, until, view_of
+from viewer.browser.http_server import serve, without_stdout
 
 pytestmark = pytest.mark.browser
 __all__ = ["live"]  # the page of a fleet, a fixture
@@ -275,3 +277,19 @@ def test_local_time_is_shown_beside_utc_where_it_differs(live: SimpleNamespace) 
     minutes = [int(text[:2]) * 60 + int(text[3:5]) for text in (utc.split()[1], local)]
     assert (minutes[1] - minutes[0] - 330) % 1440 in (0, 1, 1439)
     assert live.page.locator(".uav .local").inner_text() == ""  # this one is in UTC
+
+
+def test_the_panel_of_the_client_is_never_shown(live: SimpleNamespace) -> None:
+    """Before the viewer has sent its page there is a sentence; with it, no way to the client's settings."""
+    server = serve("127.0.0.1", port := unused_port())
+    page = live.page.context.browser.new_page()
+    page.goto(f"http://127.0.0.1:{port}/?fixedDpr=0.5")
+    page.wait_for_function("document.querySelector('#root button')", timeout=PATIENCE_MS)  # the client has drawn itself
+    shown = page.inner_text("body")
+    page.close()
+    with without_stdout():
+        server.stop()
+    assert "waiting for the viewer" in shown and "Save Canvas" not in shown and "Scene tree" not in shown
+    assert not live.page.locator("#opening").is_visible() and live.page.locator("#root").is_visible()
+    icon = live.page.locator(".tabler-icon-adjustments").first
+    assert icon.count() and not icon.is_visible()

@@ -82,7 +82,7 @@ NARROW = 0.5  # half-axis up to which the tube has its full opacity; beyond it f
 MARK_STEP_S = 0.5  # step of the path in which passes through one place are counted [s]
 BEYOND_S = 20.0  # look-ahead of the grey dashes beyond the horizon [s]
 SHORTEST_S = 0.2  # shortest stretch of tube drawn before the horizon [s]
-SAMPLES, SAMPLE_STEPS = 6, 40  # sample paths, points per path
+SAMPLES = 6  # sample paths
 
 
 class Selection:
@@ -190,8 +190,7 @@ class Selection:
         thin.append((chain(foot), mix(p.tube, p.ground, 0.5)))
         thin.append((np.stack([path[-1], foot[-1]]), mix(p.horizon, p.ground, 0.5)))
         if self.tube:
-            at = np.linspace(start, horizon_s, SAMPLE_STEPS)
-            paths = sample_paths(forecast.position_at(at), forecast.half_axes_at(at), SAMPLES, vehicle.uav)
+            paths = sample_paths(path, axes, SAMPLES, vehicle.uav)
             thin.append((chain(paths), mix(p.tube, p.ground, 0.6)))
         self._draw_marks(forecast, record, start, thin)
         thin.append((_beyond_horizon(forecast, horizon_s), rgb(p.muted)))
