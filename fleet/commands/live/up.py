@@ -257,7 +257,9 @@ def _lines(
     count = {state: sum(row.state is state for row in rows) for state in TwinState}
     states = ", ".join(f"{n} {state.value}" for state, n in count.items() if n)
     since = f"{elapsed:.0f} s since the first sample" if elapsed else "workers are starting"
-    lines = [f"fleet up · {len(rows)} UAVs · {since} · {states}" if rows else "fleet up · waiting for the first aircraft"]
+    lines = [
+        f"fleet up · {len(rows)} UAVs · {since} · {states}" if rows else "fleet up · waiting for the first aircraft"
+    ]
     lines += [f"twin worker: {sentence}"] if sentence else []
     lines += children.last_lines()
     if args.replay and "gateway" in children.finished():
