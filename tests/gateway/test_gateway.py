@@ -285,7 +285,7 @@ def test_fleet_replay_joins_a_running_fleet(router, tmp_path):
     with start("-m", "fleet.cli", "replay", str(tmp_path / "none.tlog"), "--router", router) as child:
         _, errors = child.communicate(timeout=PATIENCE_S)
     assert child.returncode == 2
-    assert "found no such file" in errors
+    assert "found no file" in errors
 
 
 def test_compiling_that_takes_long_is_said(monkeypatch):
