@@ -66,6 +66,12 @@ ANSWERS = {  # command line -> part of the last line
     "fleet inspect": "FILE: found none, expected at least one recording; name one",
     "fleet inspect nosuch.tlog": "FILE: found no file 'nosuch.tlog', expected a recording; check the path",
     "fleet inspect folder": "FILE: found a folder 'folder', expected a recording; name a file in it",
+    "fleet inspect text.txt --mission folder": (
+        "--mission: found a folder 'folder', expected a QGC WPL 110 file; name a file in it"
+    ),
+    "fleet assess text.txt --params folder": (
+        "--params: found a folder 'folder', expected a parameter file; name a file in it"
+    ),
     "fleet assess folder": "FILE: found a folder 'folder', expected a recording; name a file in it",
     "fleet calibrate text.txt": "--out: found none, expected one; add it",
     "fleet export": "FILE: found none, expected one; add it",

@@ -1,7 +1,7 @@
 """Options of every command that reads recordings: mission, parameters and column map from files."""
 
 import argparse
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,23 @@ _NAMES = ("mission", "params", "columns")
 def add_recording_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of recordings."""
     group = parser.add_argument_group("recordings")
-    group.add_argument("--mission", metavar="FILE", help="mission on board, QGC WPL 110, instead of the recorded one")
-    group.add_argument("--params", metavar="FILE", help="autopilot parameters, added to the recorded ones")
+    mission, params = _no_folder("a QGC WPL 110 file"), _no_folder("a parameter file")
+    group.add_argument(
+        "--mission", type=mission, metavar="FILE", help="mission on board, QGC WPL 110, instead of the recorded one"
+    )
+    group.add_argument("--params", type=params, metavar="FILE", help="autopilot parameters, added to the recorded ones")
     group.add_argument(
         "--columns", metavar="MAP", help="column map of .csv, .mat and .tar recordings: a TOML file, alfa or px4"
     )
+
+
+def _no_folder(expected: str) -> Callable[[str], str]:
+    def checked(text: str) -> str:
+        if Path(text).is_dir():
+            raise argparse.ArgumentTypeError(f"found a folder {text!r}, expected {expected}; name a file in it")
+        return text
+
+    return checked
 
 
 @dataclass(frozen=True)
