@@ -63,9 +63,9 @@ def replay(own: int, true: np.ndarray) -> Replay:
     t, states, rest = true[:, 0], true[:, 1:10], true[:, 10:]
     n, euler = len(t), states[:, 6:9]
     p, v, wind, u = np.split(rest, [3, 6, 8], axis=1)
-    kept = {"p": p, "v": v, "euler": euler, "rates": states[:, 3:6], "wind": wind}
+    series = {"p": p, "v": v, "euler": euler, "rates": states[:, 3:6], "wind": wind}
     x = np.hstack([ned_to_body(*euler.T, v), states[:, 3:]])
-    return Replay(own, kept, Flight("paper", 0, DT, t, x, u, np.full(n, np.nan), np.ones(n, bool), SPAN))
+    return Replay(own, series, Flight("paper", 0, DT, t, x, u, np.full(n, np.nan), np.ones(n, bool), SPAN))
 
 
 def without_gusts(airframe: Replay, at: int, n: int) -> np.ndarray:

@@ -115,7 +115,7 @@ class Replay(Aircraft):
         return self.fly(at, n, self.mean_wind(at, n))
 
     def mean_wind(self, at: int, n: int) -> np.ndarray:
-        """Give the true mean wind of rows at .. at + n, north and east, without gusts, (2,) [m/s]."""
+        """Return the true mean wind of rows at .. at + n, north and east, without gusts, (2,) [m/s]."""
         return np.asarray(self._kept["wind"][at : at + n].mean(axis=0))
 
     def fly(

@@ -126,7 +126,7 @@ def test_heavy_work_is_put_off_while_it_would_change_little_and_never_for_long(h
     assert rollouts < 0.6 * every and 3 <= identified_live < live
 
 
-def test_a_changed_plan_and_a_turn_off_the_path_end_the_delay(heard: tuple, twin: Twin) -> None:
+def test_an_event_makes_a_rollout_due_at_once(heard: tuple, twin: Twin) -> None:
     twin.config = msgspec.structs.replace(twin.config, schedule=LIVE_SCHEDULE)
     rest = f.shifted([m for m in heard if isinstance(m, Sample) and m.t > heard[-1].t - 40.0], 40.0, 1e9)
     until = next(k for k, m in enumerate(rest) if m.t > rest[0].t + 20.0)

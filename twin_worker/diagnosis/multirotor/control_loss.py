@@ -165,7 +165,7 @@ def _impact(history: TelemetryHistory, begin: float) -> ControlLoss | None:
         t,
         (),
         f"impact at {t:.1f} s: the specific force reaches {most / G:.0f} g; until then the frame turned as its motor "
-        "outputs demand, so no motor failed before it; what follows cannot be told from damage",
+        "outputs demand, so no motor failed before it; what follows cannot be distinguished from damage",
     )
 
 

@@ -68,7 +68,7 @@ def diagnose_rotors(flight: RotorFlight, baseline: RotorBaseline) -> Report:
     if channel:
         outcome = ReportOutcome.UNKNOWN
     before, after = _rms(none, linear), _rms(best, linear)
-    series, force = _series(linear, baseline, none, best)
+    series, force = _series(linear, none, best)
     ratios = [{n: float(x) for n, x in zip(CHANNELS, _squares(one, linear), strict=True)} for one in (none, best)]
     report = Report(
         flight=flight.name,
@@ -200,9 +200,7 @@ def _rms(one: EffectSet, linear: LinearFlight) -> float:
     return float(np.sqrt(_squares(one, linear)[linear.channels].mean()))
 
 
-def _series(
-    linear: LinearFlight, baseline: RotorBaseline, none: EffectSet, best: EffectSet
-) -> tuple[FigureSeries, tuple[float, float]]:
+def _series(linear: LinearFlight, none: EffectSet, best: EffectSet) -> tuple[FigureSeries, tuple[float, float]]:
     """Return the series of the figures, and the rms error of the predicted force before and after [m/s2].
 
     The prediction before the effects has the parameters of the model, and wind and biases of the fit with effects.
@@ -227,7 +225,6 @@ def _series(
         model=model,
         held_out=np.zeros(len(linear.t), bool),
     )
-    del baseline
     return series, (error[0], error[1])
 
 
@@ -242,7 +239,7 @@ def _ranking(explanations: Sequence[EffectSet]) -> tuple[RankedCandidate, ...]:
 
 
 def loss_report(name: str, loss: ControlLoss | None, limitations: tuple[str, ...] = ()) -> Report:
-    """Return the report of a loss of control; without one, that control was kept and what was not judged."""
+    """Return the report of a loss of control; without one, that none was found and what was not judged."""
     findings: tuple[DiagnosisFinding, ...] = ()
     sentence = "no loss of control: the frame turned as its motor outputs demanded; its physics are not judged"
     where: tuple[str, tuple[tuple[float, float], ...]] = ("", ())

@@ -102,8 +102,14 @@ def can_propagate(twin: Twin, t: float) -> bool:
 
 
 def rollout_overdue(twin: Twin, t: float) -> bool:
-    """Return whether the next rollout is due at `t`, whatever the departure, but waits for CPU time."""
+    """Return whether the longest period between rollouts is over at `t`: the next one waits for CPU time."""
     return t >= twin.prediction.predict_timer.last + twin.config.schedule.longest_predict
+
+
+def _item_changed(t: np.ndarray, item: np.ndarray, since: float) -> bool:
+    """Return whether the newest reported mission item is another than that of time `since` [s since 1970]."""
+    before = max(int(t.searchsorted(since, side="right")) - 1, 0)
+    return len(t) > 0 and bool(item[-1] != item[before])
 
 
 def departure(twin: Twin) -> float:
@@ -115,10 +121,10 @@ def departure(twin: Twin) -> float:
     t, rows = history.rows_since("position", history.newest - 1.0)
     if rollout is None or not len(t) or not can_propagate(twin, float(t[-1])):
         return inf
-    leg_t, leg = history.rows_since("leg", rollout.t)
+    leg_t, leg = history.rows_since("leg")
     elapsed, ahead = float(t[-1]) - rollout.t, rollout.ahead.numpy()
     k = int(ahead.searchsorted(elapsed, side="right"))
-    if not 0 < k < len(ahead) or (len(leg_t) and int(leg[-1, 0]) != int(leg[0, 0])):
+    if not 0 < k < len(ahead) or _item_changed(leg_t, leg[:, 0], rollout.t):
         return inf
     part = slice(max(k - 2, 0), k + 1)
     path, between = rollout.path.numpy()[part].astype(float), ahead[part].astype(float)
