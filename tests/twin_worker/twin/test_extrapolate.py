@@ -103,6 +103,14 @@ def test_a_departure_is_measured_in_half_axes_at_five_seconds(twin: Twin) -> Non
         one = copy.deepcopy(twin)
         on(one, 2.0, np.array(off))
         assert departure(one) == pytest.approx(wanted, abs=0.02)
+    other_item = copy.deepcopy(twin)
+    leg_t, leg = other_item.telemetry.history.rows_since("leg")
+    t = float(leg_t[-1]) + 0.1  # of the rollout: the first report of an item after it is of the next one
+    other_item.prediction.last_rollout = msgspec.structs.replace(twin.prediction.last_rollout, t=t)
+    next_item = f.rows([t + 0.1], [[float(leg[-1, 0]) + 1.0]])
+    other_item.telemetry.history.add(Sample(uav=1, t=t + 0.1, leg=next_item))
+    on(other_item, 2.0, np.zeros(3))
+    assert departure(other_item) == np.inf
     twin.prediction.last_rollout = None
     assert departure(twin) == np.inf
 
