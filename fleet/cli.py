@@ -13,6 +13,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable
+from functools import cache
 from importlib.util import find_spec
 from itertools import takewhile
 from pathlib import Path
@@ -280,12 +281,14 @@ def id_range(text: str) -> range:
     return range(int(low), int(high or low) + 1)
 
 
+@cache
 def command_modules() -> dict[str, str]:
     """List the verbs and the module of each."""
     modules = pkgutil.walk_packages(commands.__path__, f"{commands.__name__}.")
     return {module.name.rpartition(".")[2]: module.name for module in modules if not module.ispkg}
 
 
+@cache
 def _summary(module: str) -> str:
     """Return the first line of a module's docstring without importing it."""
     spec = find_spec(module)

@@ -304,7 +304,8 @@ def test_every_environment_variable_is_documented() -> None:
 
 
 def test_generated_pages_name_every_command_key_metric_and_effect() -> None:
-    assert all(f"### fleet {verb}\n" in generate.cli_page() for verb in cli.command_modules())
+    commands = generate.cli_page()
+    assert all(f"### fleet {verb}\n" in commands for verb in cli.command_modules())
     assert all(f"class {name}(" in (ROOT / "fleet" / "contract.py").read_text() for name in ("Sample", "Prediction"))
     assert (
         "`parauav/{uav}/prediction`" in generate.messages_page()
