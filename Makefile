@@ -19,6 +19,8 @@ QUICK := tests/test_architecture.py tests/fleet/test_contract.py tests/fleet/tes
   tests/viewer/test_browser_sizes.py::test_all_places_of_the_page_show_what_the_bus_carries \
   tests/test_end_to_end.py::test_a_fleet_of_two_flies_answers_and_leaves_a_summary \
   tests/test_end_to_end.py::test_a_flight_of_another_autopilot_is_predicted_on_its_own_mission
+# A suite starts hundreds of processes; without bytecode on disk each compiles its imports anew.
+unexport PYTHONDONTWRITEBYTECODE
 export PARAUAV_RECORDINGS ?= $(abspath ../shared/recordings)
 
 # The stamp names the folder and the interpreter it was made for: a moved checkout sets up again.

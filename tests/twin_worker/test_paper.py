@@ -159,7 +159,7 @@ def test_the_wind_is_taken_out(recorded):
 
 def test_the_command_flies_identifies_and_draws(tmp_path, capfd):
     out, numbers = tmp_path / "figures", tmp_path / "paper.json"
-    flight = ["--uavs", "0-1", "--for", "100", "--first", "pbsid"]
+    flight = ["--uavs", "0", "--for", "100", "--first", "pbsid"]
     assert fleet(["paper", "identify", *flight, "--out", str(out), "--json", str(numbers)]) == 0
     said = capfd.readouterr()
     rows = json.loads(numbers.read_text())["first_step"]["pbsid"]

@@ -231,7 +231,7 @@ def test_a_short_mission_is_scored_as_far_as_it_goes():
 
 def test_the_command_scores_draws_and_writes(recorded, tmp_path, capfd):
     out, numbers = tmp_path / "figures", tmp_path / "assess.json"
-    options = ["--every", "6", "--jobs", "2", "--out", str(out), "--json", str(numbers)]
+    options = ["--every", "10", "--jobs", "2", "--out", str(out), "--json", str(numbers)]
     assert fleet(["assess", str(recorded), *options]) == 0
     said = capfd.readouterr()
     told = json.loads(numbers.read_text())
