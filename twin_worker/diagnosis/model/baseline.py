@@ -33,6 +33,10 @@ class Noise:
     ar: np.ndarray
     sigma: np.ndarray
 
+    def of_channel(self, c: int) -> "Noise":
+        """Return the noise of one channel, (1, 2), (1,)."""
+        return Noise(self.ar[[c]], self.sigma[[c]])
+
     def whiten(self, x: np.ndarray) -> np.ndarray:
         """Whiten residuals, (n, c), or their slopes, (n, c, k); the first two rows are zero."""
         a1, a2, sigma = (column.reshape(-1, *(1,) * (x.ndim - 2)) for column in (*self.ar.T, self.sigma))
