@@ -18,7 +18,7 @@ _SURFACE = {"aileron": "L", "elevator": "M", "rudder": "N"}
 _SHOWS_IN = {"roll": "L", "pitch": "M", "yaw": "N", "thrust": "X", "drag": "X", "lift": "alpha"}
 _EDGE_S = 15.0, 20.0  # no onset closer to the start and the end of the flight [s]
 _ONSET_STRIDE = 5  # rows between two tested onsets, unless the onset is resolved to the row
-_N_GATES = 8  # sets of gates kept: two flights with all kinds of onset
+_N_GATES = 5  # sets of gates kept: those of one flight
 _RAMPS_S = (20.0, 40.0, 60.0, 90.0, 130.0)
 BUMPS_S = (3.0, 5.0, 8.0, 14.0, 25.0, 45.0)
 
@@ -163,7 +163,7 @@ def onset_gates(t: np.ndarray, kind: Onset, stride: int = _ONSET_STRIDE) -> tupl
 
     Both are shared between calls and must not be modified.
     """
-    return _onset_gates(t.tobytes(), kind, stride)
+    return _onset_gates(t.tobytes(), kind, stride if kind is Onset.STEP else 1)
 
 
 @lru_cache(maxsize=_N_GATES)
@@ -235,14 +235,15 @@ def solve_onsets(
     whitened: WhitenedResiduals, A: np.ndarray, b: np.ndarray, C: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve for the gain (m,) and the parameters (m, k) of each onset, the nuisances free within their spread."""
-    b = b - C @ np.linalg.solve(whitened.Ann, whitened.bn)
+    b = b - C @ (whitened.nuisance_covariance @ whitened.bn)
     x = np.linalg.solve(_profiled_matrix(whitened, A, C), b[..., None])[..., 0]
     return (b * x).sum(axis=1), x
 
 
 def _profiled_matrix(whitened: WhitenedResiduals, A: np.ndarray, C: np.ndarray) -> np.ndarray:
     """Return the normal matrices, (m, k, k), with the nuisances free within their spread."""
-    A = A - C @ np.linalg.inv(whitened.Ann) @ np.swapaxes(C, 1, 2)
+    profiled = (C.reshape(-1, C.shape[2]) @ whitened.nuisance_covariance).reshape(C.shape)
+    A = A - profiled @ np.swapaxes(C, 1, 2)
     trace = np.einsum("mii->m", A)
     return A + (1e-9 * trace + 1e-12)[:, None, None] * np.eye(A.shape[1])  # type: ignore[no-any-return]
 

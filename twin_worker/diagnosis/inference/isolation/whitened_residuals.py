@@ -100,7 +100,15 @@ class WhitenedResiduals:
         if self.ok.any():
             scatter = 1.4826 * np.median(np.abs(self.residuals(())[self.ok]), axis=0)
             self.clip = np.maximum(self.clip, _SCATTER_CLIP * scatter)
+        self._inverse: tuple[np.ndarray, np.ndarray] | None = None  # a normal matrix and its inverse
         self._update()
+
+    @property
+    def nuisance_covariance(self) -> np.ndarray:
+        """Return the inverse of the normal matrix of the nuisances, computed once per matrix."""
+        if self._inverse is None or self._inverse[0] is not self.Ann:
+            self._inverse = self.Ann, np.linalg.inv(self.Ann)
+        return self._inverse[1]
 
     def part(self, span: np.ndarray) -> "WhitenedResiduals":
         """Return a copy restricted to the rows of `span`, (n,) bool."""
@@ -226,12 +234,12 @@ class WhitenedResiduals:
         """Return the sum of squares with these hypotheses, the nuisances profiled out."""
         e = self.clipped(hypotheses)
         b = project(self.Jn, e)
-        return float((e * e).sum() - b @ np.linalg.solve(self.Ann, b))
+        return float((e * e).sum() - b @ self.nuisance_covariance @ b)
 
     def channel_cost(self, hypotheses: Sequence[FaultHypothesis]) -> np.ndarray:
         """Return the sum of squares of each channel with these hypotheses, the nuisances profiled out, (c,)."""
         e = self.clipped(hypotheses)
-        profiled = e - self.Jn @ np.linalg.solve(self.Ann, project(self.Jn, e))
+        profiled = e - self.Jn @ (self.nuisance_covariance @ project(self.Jn, e))
         return np.asarray((profiled * profiled).sum(axis=0))
 
     def slopes(self, hypothesis: FaultHypothesis, step: np.ndarray) -> np.ndarray:
