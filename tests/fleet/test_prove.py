@@ -198,7 +198,7 @@ def test_wrong_use_is_refused_before_anything_flies(
 
 def test_an_examination_runs_and_keeps_its_promises(tmp_path: Path) -> None:
     folder, out = tmp_path / "proof", tmp_path / "proof.json"
-    options = ["--flights", "6", "--seed", "5", "--report", folder, "--json", out]
+    options = ["--flights", "6", "--seed", "5", "--jobs", "1", "--report", folder, "--json", out]
     done = subprocess.run([sys.executable, "-m", "fleet.cli", "prove", *options], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     told = json.loads(out.read_text())

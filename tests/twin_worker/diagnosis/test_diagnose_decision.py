@@ -151,10 +151,18 @@ HEARD = 200.0  # peak over the mean power, of 2 x 1000 rows of a pure tone
 T = np.arange(1000) * _STEP_S
 
 
+class Sight(SimpleNamespace):
+    """Whitened residuals, as far as the finders look at them."""
+
+    @property
+    def nuisance_covariance(self) -> np.ndarray:
+        return np.linalg.inv(self.Ann)
+
+
 def quiet(seed: int) -> Any:
     """Give a sight of noise alone, all that the finders look at."""
     n = len(T)
-    return SimpleNamespace(
+    return Sight(
         modelled=SimpleNamespace(t=T),
         base=SimpleNamespace(r2={}),
         noise=unit_noise(),
@@ -164,7 +172,6 @@ def quiet(seed: int) -> Any:
         xn=np.zeros(1),
         Ann=np.eye(1),
         bn=np.zeros(1),
-        whiten_onset_slopes=lambda slopes: np.stack([slopes, slopes]),  # white noise
     )
 
 

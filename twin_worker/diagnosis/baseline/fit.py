@@ -214,23 +214,23 @@ def fit_timing(flights: Sequence[FlightData], card: AircraftCard, vane: bool) ->
     base, winds = fit(flights, card, best, vane)
     modelled_flights = [ModelledFlight(flight, base) for flight in flights]
 
-    def unexplained(timing: ActuatorTiming) -> dict[str, float]:
-        """Return the log innovation variance of pitch and yaw (servo) and of axial force (engine)."""
-        timed = _with_baseline(modelled_flights, replace(base, timing=timing))
-        all_terms = terms_in_wind(timed, winds)
-        axial = axial_regression(all_terms)
-        pitch = pitch_regression(all_terms, {"T": _solve(axial, 0)[0][len(eq.X) :]})
-        yaw = RegressionData(all_terms, "N")
-        return {
-            "servo": _log_innovation_variance(pitch) + _log_innovation_variance(yaw),
-            "engine": _log_innovation_variance(axial),
-        }
+    def terms_with(timing: ActuatorTiming) -> list[EquationTerms]:
+        return terms_in_wind(_with_baseline(modelled_flights, replace(base, timing=timing)), winds)
+
+    def servo_variance(timing: ActuatorTiming) -> float:
+        """Return the log innovation variance of pitch and yaw."""
+        all_terms = terms_with(timing)
+        pitch = pitch_regression(all_terms, {"T": _solve(axial_regression(all_terms), 0)[0][len(eq.X) :]})
+        return _log_innovation_variance(pitch) + _log_innovation_variance(RegressionData(all_terms, "N"))
+
+    def engine_variance(timing: ActuatorTiming) -> float:
+        """Return the log innovation variance of axial force."""
+        return _log_innovation_variance(axial_regression(terms_with(timing)))
 
     # lag and delay are strongly correlated: a search in turn would miss the best pair
     pairs = [replace(best, servo=servo, delay=delay) for servo in _SERVO_LAGS for delay in _DELAYS]
-    best = min(pairs, key=lambda timing: unexplained(timing)["servo"])
-    engines = [replace(best, engine=engine) for engine in _ENGINE_LAGS[vane]]
-    return min(engines, key=lambda timing: unexplained(timing)["engine"])
+    best = min(pairs, key=servo_variance)
+    return min([replace(best, engine=engine) for engine in _ENGINE_LAGS[vane]], key=engine_variance)
 
 
 def pitch_regression(

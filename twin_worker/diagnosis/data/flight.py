@@ -43,7 +43,7 @@ def slope(x: np.ndarray) -> np.ndarray:
 def slow(x: np.ndarray) -> np.ndarray:
     """Filter decimated columns, (n, k), to `SLOW_CUTOFF_HZ`."""
     half = len(_SLOW) // 2
-    padded = np.pad(x, ((half, half), (0, 0)), mode="edge")
+    padded = np.concatenate([np.repeat(x[:1], half, axis=0), x, np.repeat(x[-1:], half, axis=0)])
     return np.stack([np.convolve(column, _SLOW, mode="valid") for column in padded.T], axis=1)
 
 

@@ -33,11 +33,19 @@ class Noise:
     ar: np.ndarray
     sigma: np.ndarray
 
+    def of_channel(self, c: int) -> "Noise":
+        """Return the noise of one channel, (1, 2), (1,)."""
+        return Noise(self.ar[[c]], self.sigma[[c]])
+
     def whiten(self, x: np.ndarray) -> np.ndarray:
         """Whiten residuals, (n, c), or their slopes, (n, c, k); the first two rows are zero."""
         a1, a2, sigma = (column.reshape(-1, *(1,) * (x.ndim - 2)) for column in (*self.ar.T, self.sigma))
-        e = np.zeros_like(x)
-        e[2:] = (x[2:] - a1 * x[1:-1] - a2 * x[:-2]) / sigma
+        e = np.empty_like(x)
+        e[:2], inner = 0.0, e[2:]
+        np.multiply(x[1:-1], a1, out=inner)
+        np.subtract(x[2:], inner, out=inner)
+        inner -= a2 * x[:-2]
+        inner /= sigma
         return e
 
 

@@ -18,6 +18,7 @@ from twin_worker.diagnosis.model import equations as eq
 from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline
 
 _DIFFERENTIATED = ("v_n", "v_e", "v_d", "phi", "theta", "psi", "p", "q", "r")
+_NOT_COMPARED = ("h", "Va", "baro", "gnss", "low", "slow")  # readings without influence on the channels gps and gyro
 _FLOW_STAGES = (Stage.SENSOR, Stage.DELTA, Stage.AIR)
 _ROLL_DAMPING = eq.LATERAL.index("p")
 _N_RECENT = 6  # results stored for repeated evaluations
@@ -48,16 +49,16 @@ class FlowTerms(NamedTuple):
     scale: Signals
 
 
-class _Recent(Generic[Value]):
+class RecentValues(Generic[Value]):
     """Values of the last few sets of hypotheses, found by comparison: effects are not hashable."""
 
-    def __init__(self) -> None:
-        self._entries: deque[tuple[tuple[FaultHypothesis, ...], Value]] = deque(maxlen=_N_RECENT)
+    def __init__(self, n: int = _N_RECENT) -> None:
+        self._entries: deque[tuple[tuple[FaultHypothesis, ...], Value]] = deque(maxlen=n)
 
     def get(self, hypotheses: tuple[FaultHypothesis, ...], compute: Callable[[], Value]) -> Value:
         """Return the value of these hypotheses, computed if it is not among the last few."""
         for entry, value in self._entries:
-            if entry == hypotheses:
+            if entry is hypotheses or entry == hypotheses:
                 return value
         value = compute()
         self._entries.appendleft((hypotheses, value))
@@ -77,8 +78,12 @@ class ModelledFlight:
         self.ok = valid_decimated(flight.ok)
         self.throttle_integral = decimated(np.cumsum(flight.commands[:, 3]) * DT)
         self._zeros = np.zeros(len(self.t))
-        self._recent_flow: _Recent[FlowTerms] = _Recent()
-        self._recent_residuals: _Recent[np.ndarray] = _Recent()
+        self._recent_flow: RecentValues[FlowTerms] = RecentValues()
+        self._recent_residuals: RecentValues[np.ndarray] = RecentValues()
+
+    def with_base(self, base: Baseline) -> "ModelledFlight":
+        """Return the same flight under another baseline."""
+        return ModelledFlight(self.flight, base, template=self)
 
     @cached_property
     def _smooth(self) -> Signals:
@@ -197,7 +202,8 @@ class ModelledFlight:
             self.t, s["h"], s["h"] - self.flight.ground, body, delta_t=d_t, throttle_time=self.throttle_integral
         )
         air = self._increments(flow, hypotheses, (Stage.AIR,))
-        R, derived, disagreement = self._sensor_agreement if s is self._smooth else self._agreement(s)
+        unchanged = all(s[name] is x for name, x in self._smooth.items() if name not in _NOT_COMPARED)
+        R, derived, disagreement = self._sensor_agreement if unchanged else self._agreement(s)
         ground = np.array([s["v_n"], s["v_e"], s["v_d"]])
         wind = np.array([air.get(name, self._zeros) for name in ("w_n", "w_e", "w_d")])
         f = np.array([s["a_x"], s["a_y"], s["a_z"]]) if base.vane else derived

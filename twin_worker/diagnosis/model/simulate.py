@@ -12,7 +12,7 @@ import numpy as np
 
 from fleet.effects import ALL_SURFACES, MEMORY, SURFACES, Flow, Onset, Stage
 from fleet.frames import G, rotation
-from twin_worker.diagnosis.data.card import FaultHypothesis
+from twin_worker.diagnosis.data.card import FaultHypothesis, OnsetProfile
 from twin_worker.diagnosis.data.flight import DT
 from twin_worker.diagnosis.model import equations as eq
 from twin_worker.diagnosis.model.baseline import Baseline
@@ -218,13 +218,19 @@ class _EffectGroup:
         contiguous = np.array_equal(self._runs, np.arange(runs[0], runs[0] + len(runs)))
         self.run_index = slice(runs[0], runs[0] + len(runs)) if contiguous else self._runs  # a slice yields views
         self._par = np.array([hypothesis.par for hypothesis in hypotheses]).T
+        self._full = self._par
         self._time_varying = any(hypothesis.onset.kind is not Onset.ALWAYS for hypothesis in hypotheses)
+        self._onsets: dict[OnsetProfile, list[int]] = {}  # columns of each
+        for column, hypothesis in enumerate(hypotheses):
+            self._onsets.setdefault(hypothesis.onset, []).append(column)
 
     def gate(self, t: np.ndarray) -> None:
         """Set the parameters at times t, (runs,) of all runs."""
         if self._time_varying:
-            pairs = zip(self._hypotheses, self._runs, strict=True)
-            self._par = np.hstack([hypothesis.parameters_at(t[run : run + 1]) for hypothesis, run in pairs])
+            share = np.empty(len(self._runs))
+            for onset, columns in self._onsets.items():
+                share[columns] = onset.gate(t[self._runs[columns]])
+            self._par = self._full * share
 
     def act(self, flow: Flow) -> dict[str, np.ndarray]:
         """Return the increments of the active runs."""

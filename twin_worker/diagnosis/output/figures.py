@@ -66,7 +66,7 @@ def draw(report: Report, folder: Path, stem: str = "") -> list[Path]:
         warnings.simplefilter("ignore", UserWarning)  # a letter without a glyph becomes a box
         for path, draw_figure in zip(paths, (_path, residuals, simulated, _candidates), strict=True):
             picture = _rendered(draw_figure(shown))
-            picture.quantize(_N_COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
+            picture.quantize(_N_COLOURS, dither=Image.Dither.NONE).save(path)
     return paths
 
 

@@ -11,9 +11,7 @@ import numpy as np
 
 from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.data.flight import STEP_S
-from twin_worker.diagnosis.inference.isolation.nuisance import drift_slopes
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
-from twin_worker.diagnosis.model.residual import ModelledFlight
 
 BLOCK_S = 10.0  # longer than the correlation of whitened residuals
 _CLIP = 6.0  # of block means, in standard deviations: one block does not decide
@@ -48,17 +46,8 @@ class BlockMeans:
 
     def __init__(self, whitened: WhitenedResiduals, sigma: np.ndarray) -> None:
         self._whitened, self.conditions, self._sigma = whitened, whitened.conditions, sigma
-        modelled, base = whitened.modelled, whitened.base
-        reference = modelled.residuals(self.conditions)
-        own = [
-            (modelled.residuals((*self.conditions, n.hypothesis(n.step))) - reference) / n.step
-            for n in whitened.nuisances
-        ]
-        columns = np.stack(own, axis=2)
-        varied = [ModelledFlight(modelled.flight, base.varied(k), template=modelled) for k in range(len(base.others))]
-        others = [(one.residuals(self.conditions) - reference)[:, :, None] for one in varied]
-        slopes = np.concatenate([columns, drift_slopes(columns, whitened.drift_modes, modelled.t), *others], axis=2)
-        self.slopes, self.share = block_sums(slopes, whitened.ok, modelled.t)
+        slopes = whitened.linearisation().slopes
+        self.slopes, self.share = block_sums(slopes, whitened.ok, whitened.modelled.t)
         self._weight = np.sqrt(self.share)[:, None] / sigma
         self._J = (self.slopes * self._weight[:, :, None]).reshape(-1, slopes.shape[2])
         self._A = self._J.T @ self._J + np.diag(whitened.precision)

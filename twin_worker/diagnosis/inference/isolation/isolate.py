@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ _SURFACE = {"aileron": "L", "elevator": "M", "rudder": "N"}
 _SHOWS_IN = {"roll": "L", "pitch": "M", "yaw": "N", "thrust": "X", "drag": "X", "lift": "alpha"}
 _EDGE_S = 15.0, 20.0  # no onset closer to the start and the end of the flight [s]
 _ONSET_STRIDE = 5  # rows between two tested onsets, unless the onset is resolved to the row
+_N_GATES = 5  # sets of gates kept: those of one flight
 _RAMPS_S = (20.0, 40.0, 60.0, 90.0, 130.0)
 BUMPS_S = (3.0, 5.0, 8.0, 14.0, 25.0, 45.0)
 
@@ -143,12 +145,13 @@ def _prepare_slopes(whitened: WhitenedResiduals, effect: Effect, target: str) ->
     # a force derived from the velocity does not resolve the first rows
     by_row = whitened.base.vane and Onset.STEP in effect.onsets
     onset_slopes = whitened.whiten_onset_slopes(raw_slopes) / scale if by_row else None
+    products = row_products(whitened, J)
     kinds = []
     for kind in effect.onsets:
         gates, onsets = onset_gates(whitened.modelled.t, kind, 1 if by_row else _ONSET_STRIDE)
         if not len(gates):
             continue
-        sums = normal_equations(whitened, J, gates, kind)
+        sums = sum_products(products, gates, kind)
         if kind is Onset.STEP and onset_slopes is not None:
             sums = with_onset_slopes(whitened, J, onset_slopes, gates, sums)
         kinds.append(_StepsOf(kind, gates, onsets, np.linalg.inv(_profiled_matrix(whitened, sums[0], sums[2]))))
@@ -156,7 +159,16 @@ def _prepare_slopes(whitened: WhitenedResiduals, effect: Effect, target: str) ->
 
 
 def onset_gates(t: np.ndarray, kind: Onset, stride: int = _ONSET_STRIDE) -> tuple[np.ndarray, list[OnsetProfile]]:
-    """Return the gates (m, n) to test and their onset profiles; for steps, rows (m,), `stride` apart, replace gates."""
+    """Return the gates (m, n) to test and their onset profiles; for steps, rows (m,), `stride` apart, replace gates.
+
+    Both are shared between calls and must not be modified.
+    """
+    return _onset_gates(t.tobytes(), kind, stride if kind is Onset.STEP else 1)
+
+
+@lru_cache(maxsize=_N_GATES)
+def _onset_gates(times: bytes, kind: Onset, stride: int) -> tuple[np.ndarray, list[OnsetProfile]]:
+    t = np.frombuffer(times)
     first, last = t[0] + _EDGE_S[0], t[-1] - _EDGE_S[1]
     if kind is Onset.ALWAYS:
         return np.ones((1, len(t))), [ALWAYS]
@@ -176,8 +188,20 @@ def normal_equations(
     whitened: WhitenedResiduals, J: np.ndarray, gates: np.ndarray, kind: Onset
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sum the normal equations of slopes J, (n, c, k), per onset: (m, k, k), (m, k), (m, k, nuisances)."""
+    return sum_products(row_products(whitened, J), gates, kind)
+
+
+def row_products(whitened: WhitenedResiduals, J: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the normal equations of slopes J, (n, c, k), of each row: (n, k, k), (n, k), (n, k, nuisances)."""
     rows = np.swapaxes(J, 1, 2)
-    A, b, C = rows @ J, -(rows @ whitened.e[..., None])[..., 0], rows @ whitened.Jn
+    return rows @ J, -(rows @ whitened.e[..., None])[..., 0], rows @ whitened.Jn
+
+
+def sum_products(
+    products: tuple[np.ndarray, np.ndarray, np.ndarray], gates: np.ndarray, kind: Onset
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sum `row_products` per onset: (m, k, k), (m, k), (m, k, nuisances)."""
+    A, b, C = products
     squares = gates if kind is Onset.STEP else gates**2
     return _onset_sums(A, squares, kind), _onset_sums(b, gates, kind), _onset_sums(C, gates, kind)
 
@@ -211,14 +235,15 @@ def solve_onsets(
     whitened: WhitenedResiduals, A: np.ndarray, b: np.ndarray, C: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve for the gain (m,) and the parameters (m, k) of each onset, the nuisances free within their spread."""
-    b = b - C @ np.linalg.solve(whitened.Ann, whitened.bn)
+    b = b - C @ (whitened.nuisance_covariance @ whitened.bn)
     x = np.linalg.solve(_profiled_matrix(whitened, A, C), b[..., None])[..., 0]
     return (b * x).sum(axis=1), x
 
 
 def _profiled_matrix(whitened: WhitenedResiduals, A: np.ndarray, C: np.ndarray) -> np.ndarray:
     """Return the normal matrices, (m, k, k), with the nuisances free within their spread."""
-    A = A - C @ np.linalg.inv(whitened.Ann) @ np.swapaxes(C, 1, 2)
+    profiled = (C.reshape(-1, C.shape[2]) @ whitened.nuisance_covariance).reshape(C.shape)
+    A = A - profiled @ np.swapaxes(C, 1, 2)
     trace = np.einsum("mii->m", A)
     return A + (1e-9 * trace + 1e-12)[:, None, None] * np.eye(A.shape[1])  # type: ignore[no-any-return]
 

@@ -68,9 +68,9 @@ def normal_at(whitened: WhitenedResiduals, hypothesis: FaultHypothesis) -> tuple
     J = whitened.slopes(hypothesis, slope_steps(hypothesis))
     e = whitened.clipped((hypothesis,))
     C = project(J, whitened.Jn)
-    A = project(J, J) - C @ np.linalg.solve(whitened.Ann, C.T)
-    bn = -project(whitened.Jn, e)
-    b = -project(J, e) - C @ np.linalg.solve(whitened.Ann, bn)
+    profiled = C @ whitened.nuisance_covariance
+    A = project(J, J) - profiled @ C.T
+    b = -project(J, e) + profiled @ project(whitened.Jn, e)
     return A, b
 
 

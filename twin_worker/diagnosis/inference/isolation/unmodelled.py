@@ -25,7 +25,11 @@ from twin_worker.diagnosis.inference.isolation.isolate import (
     with_onset_slopes,
 )
 from twin_worker.diagnosis.inference.isolation.refine import refine
-from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
+from twin_worker.diagnosis.inference.isolation.whitened_residuals import (
+    WhitenedResiduals,
+    project,
+    whiten_onset_slopes,
+)
 from twin_worker.diagnosis.model import equations as eq
 from twin_worker.diagnosis.model.baseline import CHANNEL_OF, CHANNELS
 
@@ -81,12 +85,12 @@ class ChannelEquation:
     def __init__(self, whitened: WhitenedResiduals, channel: str, terms: dict[str, np.ndarray]) -> None:
         c = CHANNELS.index(channel)
         self.channel, self.names = channel, tuple(terms)
-        slopes = np.zeros((len(whitened.modelled.t), len(CHANNELS), len(terms)))
-        slopes[:, c] = np.transpose(list(terms.values()))
-        white = whitened.noise.whiten(slopes)[:, c] * whitened.ok[:, None]
+        slopes = np.transpose(list(terms.values()))
+        noise = whitened.noise.of_channel(c)
+        white = noise.whiten(slopes[:, None, :])[:, 0] * whitened.ok[:, None]
         norm = np.linalg.norm(white, axis=0) + 1e-12
-        self._J, self._raw = (white / norm)[:, None, :], slopes[:, c] / norm
-        self._onset_slopes = whitened.whiten_onset_slopes(slopes)[:, :, [c]] / norm
+        self._J, self._raw = (white / norm)[:, None, :], slopes / norm
+        self._onset_slopes = whiten_onset_slopes(noise, slopes[:, None, :], whitened.ok) / norm
         self._whitened = copy(whitened)  # this channel alone; the nuisance information of the other channels stays
         self._whitened.e, self._whitened.Jn = whitened.e[:, [c]], whitened.Jn[:, [c]]
 
@@ -169,10 +173,10 @@ def _with_free_terms(whitened: WhitenedResiduals, J: np.ndarray) -> WhitenedResi
     """Return a copy with terms, (n, 1, k), added to the nuisances, free throughout the flight."""
     out = copy(whitened)
     out.Jn = np.concatenate([whitened.Jn, J], axis=2)
-    cross = np.einsum("tci,tcj->ij", whitened.Jn, J)
-    own = np.einsum("tci,tcj->ij", J, J) + 1e-6 * np.eye(J.shape[2])
+    cross = project(whitened.Jn, J)
+    own = project(J, J) + 1e-6 * np.eye(J.shape[2])
     out.Ann = np.block([[whitened.Ann, cross], [cross.T, own]])
-    out.bn = np.concatenate([whitened.bn, -np.einsum("tci,tc->i", J, whitened.e)])
+    out.bn = np.concatenate([whitened.bn, -project(J, whitened.e)])
     return out
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,11 +18,12 @@ from twin_worker.diagnosis.inference.isolation.nuisance import (
 )
 from twin_worker.diagnosis.model.baseline import CHANNELS, Noise, wind_is_nominal
 from twin_worker.diagnosis.model.envelope import TRIM, extrapolation_sigma, is_other_day
-from twin_worker.diagnosis.model.residual import ModelledFlight
+from twin_worker.diagnosis.model.residual import ModelledFlight, RecentValues
 
 CLIP = 6.0  # clipping limit of whitened residuals [-]
 _BARO_CLIP = 100.0  # for the barometer: its noise drifts, so that a lasting jump is one large whitened residual
 _SCATTER_CLIP = 3.0  # the limit is at least this multiple of the channel's scatter on this flight
+_N_LINEARISED = 3  # linearisations kept, shared with the parts of the flight
 _MAX_RELEASED = 5  # nuisances that may be beyond their spread
 _FIXED_PRECISION = 1e14  # precision of a nuisance that is fixed at zero
 _MIN_SCATTER = 0.45  # least scatter relative to nominal flights
@@ -34,6 +36,38 @@ _AIR_CHANNELS += [CHANNELS.index(name) for name in ("gps_x", "gps_y", "gps_z")]
 def project(J: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return the products of slopes J, (n, c, k), and series x, (n, c) or (n, c, m), over rows and channels."""
     return J.reshape(-1, J.shape[2]).T @ x.reshape(-1, *x.shape[2:])  # type: ignore[no-any-return]
+
+
+def whiten_onset_slopes(noise: Noise, J: np.ndarray, ok: np.ndarray) -> np.ndarray:
+    """Whiten slopes, (n, c, k), as if the effect started at each row; return its first two rows, (2, n, c, k).
+
+    Slowly drifting noise hides lasting changes: a step is then visible only in its first rows.
+
+    Args:
+        noise: of the channels, (c,)
+        J: slopes of the residuals, (n, c, k)
+        ok: valid rows, (n,); zero elsewhere
+    """
+    ar, sigma = noise.ar, noise.sigma[:, None]
+    out = np.empty((2, *J.shape))
+    out[0] = J / sigma
+    out[1] = out[0]
+    out[1, 1:] -= ar[:, :1] * J[:-1] / sigma
+    return out * ok[None, :, None, None]
+
+
+class Linearisation(NamedTuple):
+    """Residuals under some conditions, and their derivatives with respect to the nuisances.
+
+    Attributes:
+        slopes: derivatives of the residuals, (n, c, nuisances)
+        raw: whitened residuals, zero on rows invalid in the whole flight, (n, c)
+        white_slopes: whitened derivatives, zero on the same rows, (n, c, nuisances)
+    """
+
+    slopes: np.ndarray
+    raw: np.ndarray
+    white_slopes: np.ndarray
 
 
 class WhitenedResiduals:
@@ -60,10 +94,21 @@ class WhitenedResiduals:
         if self.base.vane:
             self.clip[CHANNELS.index("baro")] = _BARO_CLIP
         self.conditions = conditions
+        self._flight_ok = ok
+        self._linearisations: RecentValues[Linearisation] = RecentValues(_N_LINEARISED)
+        self._varied = [modelled.with_base(self.base.varied(k)) for k in range(len(self.base.others))]
         if self.ok.any():
             scatter = 1.4826 * np.median(np.abs(self.residuals(())[self.ok]), axis=0)
             self.clip = np.maximum(self.clip, _SCATTER_CLIP * scatter)
+        self._inverse: tuple[np.ndarray, np.ndarray] | None = None  # a normal matrix and its inverse
         self._update()
+
+    @property
+    def nuisance_covariance(self) -> np.ndarray:
+        """Return the inverse of the normal matrix of the nuisances, computed once per matrix."""
+        if self._inverse is None or self._inverse[0] is not self.Ann:
+            self._inverse = self.Ann, np.linalg.inv(self.Ann)
+        return self._inverse[1]
 
     def part(self, span: np.ndarray) -> "WhitenedResiduals":
         """Return a copy restricted to the rows of `span`, (n,) bool."""
@@ -117,15 +162,33 @@ class WhitenedResiduals:
 
     def _update(self) -> None:
         """Compute residuals and nuisance slopes under the current conditions."""
-        self.raw = self.residuals(())
+        _, raw, white_slopes = self.linearisation()
+        if self.ok is self._flight_ok:
+            self.raw, self.Jn = raw, white_slopes
+        else:
+            self.raw, self.Jn = raw * self.ok[:, None], white_slopes * self.ok[:, None, None]
         self.e = np.clip(self.raw, -self.clip, self.clip)
-        steps = [self.residuals((n.hypothesis(n.step),)) for n in self.nuisances]
-        own = np.stack([(e - self.raw) / n.step for e, n in zip(steps, self.nuisances, strict=True)], axis=2)
-        flight, bases = self.modelled.flight, [self.base.varied(k) for k in range(len(self.base.others))]
-        varied = [self.residuals((), ModelledFlight(flight, base, template=self.modelled)) for base in bases]
-        others = [e[:, :, None] - self.raw[:, :, None] for e in varied]
-        self.Jn = np.concatenate([own, drift_slopes(own, self.drift_modes, self.modelled.t), *others], axis=2)
         self._profile()
+
+    def linearisation(self) -> Linearisation:
+        """Return the linearisation of the whole flight under the current conditions; recent ones are reused."""
+        return self._linearisations.get(self.conditions, self._linearise)
+
+    def _linearise(self) -> Linearisation:
+        modelled, conditions = self.modelled, self.conditions
+        reference = modelled.residuals(conditions)
+        moved = [(modelled.residuals((*conditions, n.hypothesis(n.step))), n.step) for n in self.nuisances]
+        own = np.stack([(x - reference) / step for x, step in moved], axis=2)
+        changes = [varied.residuals(conditions) - reference for varied in self._varied]
+        others = np.stack(changes, axis=2) if changes else np.empty((*reference.shape, 0))
+        raw, ok = self.noise.whiten(reference), self._flight_ok
+        raw[~ok] = 0.0
+        slopes, white_slopes = (
+            np.concatenate([x, drift_slopes(x, self.drift_modes, modelled.t), y], axis=2)
+            for x, y in ((own, others), (self.noise.whiten(own), self.noise.whiten(others)))
+        )
+        white_slopes[~ok] = 0.0
+        return Linearisation(slopes, raw, white_slopes)
 
     def _profile(self) -> None:
         """Estimate the nuisances; fix those beyond their spread at zero, so that hypotheses explain them."""
@@ -171,12 +234,12 @@ class WhitenedResiduals:
         """Return the sum of squares with these hypotheses, the nuisances profiled out."""
         e = self.clipped(hypotheses)
         b = project(self.Jn, e)
-        return float((e * e).sum() - b @ np.linalg.solve(self.Ann, b))
+        return float((e * e).sum() - b @ self.nuisance_covariance @ b)
 
     def channel_cost(self, hypotheses: Sequence[FaultHypothesis]) -> np.ndarray:
         """Return the sum of squares of each channel with these hypotheses, the nuisances profiled out, (c,)."""
         e = self.clipped(hypotheses)
-        profiled = e - self.Jn @ np.linalg.solve(self.Ann, project(self.Jn, e))
+        profiled = e - self.Jn @ (self.nuisance_covariance @ project(self.Jn, e))
         return np.asarray((profiled * profiled).sum(axis=0))
 
     def slopes(self, hypothesis: FaultHypothesis, step: np.ndarray) -> np.ndarray:
@@ -188,14 +251,8 @@ class WhitenedResiduals:
         return self.noise.whiten(J) * self.ok[:, None, None]
 
     def whiten_onset_slopes(self, J: np.ndarray) -> np.ndarray:
-        """Whiten slopes, (n, c, k), as if the effect started at each row; return its first two rows, (2, n, c, k).
-
-        Slowly drifting noise hides lasting changes: a step is then visible only in its first rows.
-        """
-        ar, sigma = self.noise.ar, self.noise.sigma[:, None]
-        first, second = J / sigma, J / sigma
-        second[1:] -= ar[:, :1] * J[:-1] / sigma
-        return np.stack([first, second]) * self.ok[None, :, None, None]
+        """Return `whiten_onset_slopes` of slopes of the residuals, (n, c, k), on the valid rows, (2, n, c, k)."""
+        return whiten_onset_slopes(self.noise, J, self.ok)
 
     def residual_slopes(self, hypothesis: FaultHypothesis, step: np.ndarray) -> np.ndarray:
         """Return the derivative of the raw residuals with respect to the parameters of a hypothesis, (n, c, k)."""
