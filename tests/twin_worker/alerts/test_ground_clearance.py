@@ -6,9 +6,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from fleet.frames import Origin, to_geodetic
-from fleet.terrain.raster import Raster
+from fleet.frames import Origin
 from tests.support.flights import HERE
+from tests.support.heights import raster
 from tests.support.predicted import T, straight
 from twin_worker.alerts.gaussian_forecast import GaussianForecast, to_gaussian
 from twin_worker.alerts.geofence import ground_clearance, ground_hazard
@@ -16,18 +16,6 @@ from twin_worker.ownership.handover import Snapshot, decode_snapshot, encode_sna
 from twin_worker.twin.state.state import Twin
 
 HOME = Origin(HERE.lat_e7, HERE.lon_e7, HERE.alt_mm)
-STEP_M, REACH_M = 10.0, 4_500.0
-
-
-def raster(height, offset_m: float = 0.0, reach_m: float = REACH_M) -> Raster:
-    """Sample heights, a function of north and east [m], on a grid around home."""
-    side = np.arange(-reach_m, reach_m + STEP_M, STEP_M)
-    north, east = np.meshgrid(side[::-1], side, indexing="ij")
-    corners = to_geodetic(HOME, np.array([[side[-1], side[0], 0.0], [side[0], side[-1], 0.0]])) * 1e-7
-    (lat_0, lon_0, _), (lat_1, lon_1, _) = corners
-    n = len(side) - 1
-    affine = np.array([[(lon_1 - lon_0) / n, 0.0, lon_0], [0.0, (lat_1 - lat_0) / n, lat_0]])
-    return Raster("grid", (height(north, east) + offset_m).astype(np.float32), affine)
 
 
 def forecast(height_m: float = 100.0, half: tuple[float, float, float] = (5.0, 5.0, 5.0)) -> GaussianForecast:
@@ -39,7 +27,7 @@ def forecast(height_m: float = 100.0, half: tuple[float, float, float] = (5.0, 5
 
 @pytest.mark.parametrize("offset_m", [0.0, 450.0, -30.0])
 def test_flat_terrain_of_any_height_is_the_height_of_home(offset_m: float) -> None:
-    flight, flat = forecast(), raster(lambda north, east: 0.0 * north, offset_m)
+    flight, flat = forecast(), raster(HOME, lambda north, east: 0.0 * north + offset_m)
     above_home = ground_clearance(flight, HOME, None)
     above_terrain = ground_clearance(flight, HOME, flat)
     assert above_terrain.known.all() and not above_home.known.any()
@@ -48,35 +36,35 @@ def test_flat_terrain_of_any_height_is_the_height_of_home(offset_m: float) -> No
 
 
 def test_a_hill_ahead_is_reported_when_the_aircraft_reaches_it() -> None:
-    hill = raster(lambda north, east: 90.0 * (np.abs(north - 1_500.0) < 200.0), 320.0)
+    hill = raster(HOME, lambda north, east: 320.0 + 90.0 * (np.abs(north - 1_500.0) < 200.0))
     found = ground_hazard(forecast(), HOME, 30.0, terrain=hill)
     assert found.probability > 0.99 and "above the terrain in 6" in found.message and "lowest 10 m" in found.message
     assert found.predicted_t == pytest.approx(T + 1_300.0 / 20.0, abs=2.1)
     assert ground_hazard(forecast(), HOME, 30.0).probability < 0.01  # above home it flies high enough
     assert ground_hazard(forecast(), HOME, 30.0, until=T + 50.0, terrain=hill).probability < 0.01  # not reached yet
-    valley = raster(lambda north, east: -60.0 * (north > 500.0))
+    valley = raster(HOME, lambda north, east: -60.0 * (north > 500.0))
     assert ground_hazard(forecast(20.0), HOME, 30.0, terrain=valley).probability > 0.5  # over home it is too low
 
 
 def test_uncertainty_across_a_slope_is_uncertainty_of_the_height_above_it() -> None:
     flight = forecast(half=(1.0, 40.0, 5.0))
-    slope = ground_clearance(flight, HOME, raster(lambda north, east: 0.5 * east))
+    slope = ground_clearance(flight, HOME, raster(HOME, lambda north, east: 0.5 * east))
     flat = ground_clearance(flight, HOME, None)
     across = flight.sigma[:, 1]
     np.testing.assert_allclose(slope.sigma, np.hypot(flat.sigma, 0.5 * across), rtol=0.1)
 
 
 def test_beyond_the_terrain_the_height_counts_above_home() -> None:
-    flight, small = forecast(), raster(lambda north, east: 95.0 + 0.0 * north, reach_m=1_000.0)
+    flight, small = forecast(), raster(HOME, lambda north, east: 95.0 + 0.0 * north, reach_m=1_000.0)
     found = ground_clearance(flight, HOME, small)
     assert found.known[:20].all() and not found.known[30:].any()
     np.testing.assert_allclose(found.height[30:], 100.0, atol=0.2)
-    low = ground_hazard(forecast(20.0), HOME, 30.0, terrain=raster(lambda north, east: np.nan * north))
+    low = ground_hazard(forecast(20.0), HOME, 30.0, terrain=raster(HOME, lambda north, east: np.nan * north))
     assert "above home (terrain unknown)" in low.message
 
 
 def test_copies_of_a_twin_share_the_terrain_and_a_handover_leaves_it_out() -> None:
-    flat = raster(lambda north, east: 0.0 * north)
+    flat = raster(HOME, lambda north, east: 0.0 * north)
     twin = msgspec.structs.replace(Twin.of(3), terrain=flat)
     assert copy.deepcopy(twin).terrain is flat
     data = encode_snapshot(Snapshot(twin))
