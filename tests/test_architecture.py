@@ -19,6 +19,7 @@ ORDER = (  # a folder, or a module in the root of a package, imports only from i
     ("fleet.mission_jumps", "fleet.mission_legs"),
     ("fleet.metrics", "fleet.mission", "fleet.window", "fleet.access"),
     ("fleet.config", "fleet.bus", "fleet.cli"),
+    ("fleet.terrain",),
     ("fleet.airframes", "fleet.autopilots.control_law"),
     ("fleet.autopilots.arduplane",),
     ("fleet.autopilots.px4_fixedwing", "fleet.autopilots.textbook"),

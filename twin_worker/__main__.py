@@ -41,6 +41,7 @@ EXAMPLES = """
   twin_worker --uavs 0-9 --airframe my_aircraft.toml       copy fleet/airframes/small_fixed_wing.toml and fill it in
   twin_worker --uavs 0-49 --processes 4                    four processes share the range
   twin_worker --uavs 50-99 --router tcp/192.168.1.10:7447
+  twin_worker --uavs 0-9 --terrain N47E008.hgt             ground alerts above this terrain instead of above home
   twin_worker --uavs 0-9 --baseline skywalker.json         model from `fleet calibrate`; default: each UAV's own past
 """
 
@@ -110,8 +111,10 @@ def _run(args: argparse.Namespace) -> int:
     from fleet.bus.session import connect
     from fleet.contract import FleetState
     from fleet.metrics import serve
+    from fleet.terrain.raster import read_raster
 
     airframe, baselines = load(args.airframe or GENERIC), _load_baselines(args.baseline)
+    terrain = read_raster(args.terrain, colours=False) if args.terrain else None
     stop = stop_on_signal()
     threading.Thread(target=_force_exit, args=(stop,), daemon=True).start()
     with connect(bus_config_from(args, WORKER)) as bus:
@@ -140,6 +143,7 @@ def _run(args: argparse.Namespace) -> int:
             separation=Separation(*args.separation),
             schedule=args.pace,
             use_siblings=args.use_siblings,
+            terrain=terrain,
             diagnosis=None if args.no_diagnosis else Coordinator(executor, baselines, adapt=not args.no_adapt),
         )
         _tune_runtime()
@@ -222,6 +226,11 @@ def main(argv: list[str] | None = None) -> int:
         help="shortest periods of rollouts, identifications, ensembles, renewals "
         "(predict=1,identify=1,ensemble=10,renew=1), changes below which rollouts and identifications wait up "
         "to 10 s (departure=0.05,information=0.1; 0: never), size and look-ahead of an ensemble (members=24,span=180)",
+    )
+    parser.add_argument(
+        "--terrain",
+        metavar="FILE",
+        help="terrain heights for ground alerts and proposals: GeoTIFF, SRTM .hgt, or FILE@south,west,north,east",
     )
     parser.add_argument(
         "--use-siblings", action="store_true", help="first models with what aircraft of their type have learnt"

@@ -76,8 +76,8 @@ def run(args: argparse.Namespace) -> int:
     check_port("--port", args.port)
     _check_approvals(args)
     from fleet.bus.session import connect  # here, as --help and --version need none of these
+    from fleet.terrain.raster import read_raster
     from viewer.browser.http_server import serve, without_stdout
-    from viewer.scene.map.raster import read_raster
     from viewer.scene.map.tiles import open_tiles
     from viewer.scene.terrain import TerrainLayer
     from viewer.server.app import App

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image, TiffImagePlugin
 
+from fleet.terrain.raster import KEYS, NO_DATA, SCALE, TIEPOINT, read_raster, to_utm
 from tests.support.pretend_feed import HOME
-from viewer.scene.map.raster import KEYS, NO_DATA, SCALE, TIEPOINT, read_raster, to_utm
 from viewer.scene.terrain import MAX_CONTOURS, HeightGrid, TerrainLayer, contours
 from viewer.store.place import UNIT_M, SceneFrame
 from viewer.theme.palette import DARK

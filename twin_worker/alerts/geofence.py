@@ -1,5 +1,7 @@
 """Probability that a predicted flight breaches the geofence in the autopilot parameters, or the minimum height.
 
+The minimum height counts above the terrain where its heights are given, else above home.
+
 Supported are a circle around home and height limits above home. Polygon fences (ArduPilot polygons, PX4 fence items)
 are not parameters and are not received; the alert text names them as not monitored.
 Source: ArduPilot "Geofencing" (FENCE_*), PX4 "Geofence" (GF_*).
@@ -13,7 +15,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from fleet.contract import AlertKind
-from fleet.frames import Origin, to_ned
+from fleet.frames import Origin, to_geodetic, to_ned
+from fleet.terrain.raster import Raster
 from twin_worker.alerts.gaussian_forecast import GaussianForecast
 from twin_worker.alerts.hysteresis import HazardEstimate
 
@@ -90,7 +93,7 @@ def geofence_hazard(
     )
 
 
-MIN_HEIGHT_WINGS_M = 30.0  # minimum height above home of fixed wings outside landings [m]
+MIN_HEIGHT_WINGS_M = 30.0  # minimum height above ground of fixed wings outside landings [m]
 MIN_HEIGHT_ROTORS_M = 5.0  # the same of multirotors [m]
 _MIN_PROBABILITY = 0.02  # below this probability no alert text is composed [-]
 _GROUND_CLEAR_TEXT = "no descent below the minimum height predicted"
@@ -101,23 +104,62 @@ def height_above_home(flight: GaussianForecast, home: Origin) -> np.ndarray:
     return (flight.prediction.origin[2] - home.alt_mm) * 1e-3 - flight.path[:, 2]
 
 
-def ground_hazard(flight: GaussianForecast, home: Origin, margin: float, until: float = np.inf) -> HazardEstimate:
-    """Compute the probability of descending below a height above home [m], up to an instant [s since 1970].
+class GroundClearance(NamedTuple):
+    """Height above the terrain; above home where the terrain is unknown."""
 
-    The vertical error is one draw for the whole flight, so the worst instant determines the probability:
+    height: np.ndarray  # mean, (n,) [m]
+    sigma: np.ndarray  # standard deviation, (n,) [m]
+    known: np.ndarray  # whether the terrain is known, (n,)
 
-        p = max over t of Phi((margin - height(t)) / sigma(t))
+
+def ground_clearance(
+    flight: GaussianForecast, home: Origin, terrain: Raster | None, until: float = np.inf
+) -> GroundClearance:
+    """Compute the height above the terrain up to an instant [s since 1970].
+
+    The terrain counts relative to its height at home, so that an error of the altitude at home cancels:
+
+        h(t) = height above home(t) - (terrain(p(t)) - terrain(p_home))
+
+    Mean and standard deviation are those of 128 draws of the path, so steep terrain beside it counts.
+    Source: ArduPilot "Terrain Following", terrain offset at arming.
     """
     k = max(int(np.searchsorted(flight.t, until, side="right")), 1)
     height, sigma = height_above_home(flight, home)[:k], flight.sigma[:k, 2]
+    if terrain is None:
+        return GroundClearance(height, sigma, np.zeros(k, bool))
+    draws = flight.draws(until)
+    lat_e7, lon_e7, alt_mm = np.moveaxis(to_geodetic(flight.prediction.ned_origin(), draws), -1, 0)
+    rise = terrain.sample(lat_e7 * 1e-7, lon_e7 * 1e-7) - terrain.sample(
+        np.array(home.lat_e7 * 1e-7), np.array(home.lon_e7 * 1e-7)
+    )
+    known = np.isfinite(rise).all(axis=0)
+    clearance = (alt_mm - home.alt_mm) * 1e-3 - rise
+    return GroundClearance(
+        np.where(known, clearance.mean(axis=0), height), np.where(known, clearance.std(axis=0), sigma), known
+    )
+
+
+def ground_hazard(
+    flight: GaussianForecast, home: Origin, margin: float, until: float = np.inf, terrain: Raster | None = None
+) -> HazardEstimate:
+    """Compute the probability of descending below a height above ground [m], up to an instant [s since 1970].
+
+    The ground is the terrain, or the height of home where the terrain is unknown. The vertical error is one draw for
+    the whole flight, so the worst instant determines the probability:
+
+        p = max over t of Phi((margin - height(t)) / sigma(t))
+    """
+    height, sigma, known = ground_clearance(flight, home, terrain, until)
     z = (margin - height) / sigma
     probability = float(ndtr(z.max()))
     if probability < _MIN_PROBABILITY:
         return HazardEstimate(AlertKind.GROUND, probability, "", _GROUND_CLEAR_TEXT)
     first = int(np.flatnonzero(z >= min(z.max(), 0.0))[0])  # where the mean is below the margin, else the lowest point
     t = float(flight.t[first])
+    ground = "the terrain" if known[first] else "home (terrain unknown)"
     message = (
-        f"{probability:.0%} chance that it sinks below {margin:.0f} m above home (terrain unknown) in "
+        f"{probability:.0%} chance that it sinks below {margin:.0f} m above {ground} in "
         f"{max(t - flight.prediction.t, 0.0):.0f} s; lowest {height.min():.0f} m"
     )
     return HazardEstimate(AlertKind.GROUND, probability, message, _GROUND_CLEAR_TEXT, -1, t, flight.position(first))

@@ -52,7 +52,7 @@ def encode_snapshot(snapshot: Snapshot) -> bytes:
     """
     encode = msgspec.msgpack.Encoder(enc_hook=_to_parts).encode
     inbox = [(message.topic, msgspec.Raw(encode(message))) for message in snapshot.inbox]
-    twin = msgspec.structs.replace(snapshot.twin, budget=None)  # the new owner has its own
+    twin = msgspec.structs.replace(snapshot.twin, budget=None, terrain=None)  # the new owner has its own
     return encode((twin, inbox, snapshot.traffic_alerts, snapshot.mismatch))
 
 

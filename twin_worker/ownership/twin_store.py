@@ -164,7 +164,7 @@ class TwinStore:
         self._companion.import_state(uav, snapshot)
         fresh = self._create(uav)
         config = msgspec.structs.replace(snapshot.twin.config, schedule=fresh.config.schedule)
-        snapshot.twin.config, snapshot.twin.budget = config, fresh.budget
+        snapshot.twin.config, snapshot.twin.budget, snapshot.twin.terrain = config, fresh.budget, fresh.terrain
         if (prediction := self._predictions.pop(uav, None)) is not None:
             owned.fallback_t = max(owned.fallback_t, prediction.t)  # for a delayed snapshot
         for cache in (self._models, self._last_messages):

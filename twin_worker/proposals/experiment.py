@@ -20,7 +20,7 @@ from fleet.contract import AlertKind, Change, Item, Mission, Prediction
 from fleet.frames import to_ned
 from fleet.mission import SPEED, Route
 from twin_worker.alerts.gaussian_forecast import GaussianForecast, to_gaussian
-from twin_worker.alerts.geofence import height_above_home, read_geofence
+from twin_worker.alerts.geofence import ground_clearance, height_above_home, read_geofence
 from twin_worker.alerts.hysteresis import RULES
 from twin_worker.prediction.autopilot_parameters import SPEED_PARAMETERS, RouteOverride
 from twin_worker.proposals.candidates import DECISION_S, LAND_MODE, MODES, Candidate, Deficit, Plan, to_change
@@ -201,9 +201,17 @@ def _report_change(twin: Twin) -> None:
 
 
 class _Extremes(NamedTuple):
-    """Lowest and highest mean height above home and largest distance from it, each with its standard deviation [m]."""
+    """Extremes of the mean path, each with its standard deviation [m].
+
+    Attributes:
+        low: lowest height above the terrain, or above home where the terrain is unknown
+        floor: lowest height above home
+        high: highest height above home
+        far: largest distance from home
+    """
 
     low: tuple[float, float]
+    floor: tuple[float, float]
     high: tuple[float, float]
     far: tuple[float, float]
 
@@ -217,8 +225,11 @@ def _extremes(twin: Twin, forecast: GaussianForecast) -> _Extremes:
     distance = np.hypot(*(forecast.path[:k] - home)[:, :2].T)
     height, sigma = height_above_home(forecast, twin.home)[:k], forecast.sigma
     low, high, far = int(height.argmin()), int(height.argmax()), int(distance.argmax())
+    clearance = ground_clearance(forecast, twin.home, twin.terrain, until)
+    near = int(clearance.height.argmin())
     sigma_far = float(sigma[far, :2].max())
     return _Extremes(
+        (float(clearance.height[near]), float(clearance.sigma[near])),
         (float(height[low]), float(sigma[low, 2])),
         (float(height[high]), float(sigma[high, 2])),
         (float(distance[far]), sigma_far),
@@ -226,11 +237,11 @@ def _extremes(twin: Twin, forecast: GaussianForecast) -> _Extremes:
 
 
 def _margins(twin: Twin, forecast: GaussianForecast) -> dict[AlertKind, float]:
-    """Return the lowest height above home of the mean path, and its smallest distance to the geofence [m]."""
+    """Return the lowest height above ground of the mean path, and its smallest distance to the geofence [m]."""
     if twin.home is None:
         return {}
     extremes, fence = _extremes(twin, forecast), read_geofence(twin.received_params)
-    inside = min(fence.radius - extremes.far[0], fence.ceiling - extremes.high[0], extremes.low[0] - fence.floor)
+    inside = min(fence.radius - extremes.far[0], fence.ceiling - extremes.high[0], extremes.floor[0] - fence.floor)
     return {AlertKind.GROUND: extremes.low[0], AlertKind.GEOFENCE: inside}
 
 
@@ -242,10 +253,11 @@ def deficit(plan: Plan, experiment: PlanExperiment, kind: AlertKind) -> Deficit:
     if kind not in (AlertKind.GROUND, AlertKind.GEOFENCE) or plan.twin.home is None:
         return Deficit()
     extremes, z = _extremes(plan.twin, experiment.forecast), -float(ndtri(_MARGIN_SHARE * RULES[kind].clear_below))
-    (low, sigma_low), (high, sigma_high), (far, sigma_far) = extremes
+    (low, sigma_low), (floor, sigma_floor), (high, sigma_high), (far, sigma_far) = extremes
     if kind is AlertKind.GROUND:
         return Deficit(max(plan.min_height_m + z * sigma_low - low, 0.0))
     fence = read_geofence(plan.twin.received_params)
-    too_high, too_low = min(fence.ceiling - z * sigma_high - high, 0.0), max(fence.floor + z * sigma_low - low, 0.0)
+    too_high = min(fence.ceiling - z * sigma_high - high, 0.0)
+    too_low = max(fence.floor + z * sigma_floor - floor, 0.0)
     overshoot = far - (fence.radius - z * sigma_far)
     return Deficit(too_low or too_high, fence.radius - overshoot - z * sigma_far if overshoot > 0 else np.inf)

@@ -22,6 +22,7 @@ from fleet.contract import (
     Sample,
     Status,
 )
+from fleet.terrain.raster import Raster
 from twin_worker.alerts.conflict_probability import Separation
 from twin_worker.alerts.hysteresis import AlertState
 from twin_worker.alerts.traffic import TrafficMonitor
@@ -77,9 +78,10 @@ class Worker:
         diagnosis: Coordinator | None = None,
         schedule: Schedule | None = None,
         use_siblings: bool = False,
+        terrain: Raster | None = None,
     ) -> None:
         self.bus, self.uavs, self.diagnosis = bus, uavs, diagnosis
-        self.omega, self.method, self.airframe = omega, method, airframe or load(GENERIC)
+        self.omega, self.method, self.airframe, self._terrain = omega, method, airframe or load(GENERIC), terrain
         self.schedule, self._use_siblings = schedule or Schedule(), use_siblings
         # short for frequent propagation
         self._late_after_s = min(max(_LATE_PERIODS * self.schedule.renew, _LATE_LIMITS_S[0]), _LATE_LIMITS_S[1])
@@ -136,7 +138,7 @@ class Worker:
 
     def _create_twin(self, uav: int) -> Twin:
         config = TwinConfig(uav, self.omega, self.method, self.airframe, self.schedule)
-        return Twin(config, budget=self.quota)
+        return Twin(config, budget=self.quota, terrain=self._terrain)
 
     def _copy_of(self, uav: int) -> Twin | None:
         owned = self._owned.get(uav)

@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 
 from fleet.frames import to_geodetic
-from viewer.scene.map.raster import Raster
+from fleet.terrain.raster import Raster
 from viewer.scene.map.tiles import Mosaic, TileMap
 from viewer.scene.map.world import ground_lines
 from viewer.scene.strokes import Strokes, chain

@@ -71,7 +71,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--for", dest="seconds", type=float, default=0.0, help="stop this long after the first sample")
     parser.add_argument("--no-viewer", action="store_true", help="without the web page")
     parser.add_argument("--port", type=int, default=8080, help="port of the web page (8080)")
-    parser.add_argument("--terrain", metavar="FILE", help="terrain heights for the page, as in viewer --help")
+    parser.add_argument("--terrain", metavar="FILE", help="terrain heights for alerts and page, as in viewer --help")
     parser.add_argument("--imagery", metavar="FILE", help="ground imagery for the page, as in viewer --help")
     parser.add_argument("--map", metavar="FILE", help="map tiles for the page, as in viewer --help")
     parser.add_argument("--seed", type=int, default=1, help="seed of the simulated aircraft (1)")
@@ -126,7 +126,7 @@ def _check(args: argparse.Namespace) -> None:
         uav, _, model = text.partition("=")
         check_file("--baseline", model if uav.isdecimal() else text, "a model from `fleet calibrate`")
     for option in ("terrain", "imagery"):
-        if (file := getattr(args, option)) and not args.no_viewer:
+        if (file := getattr(args, option)) and not (option == "imagery" and args.no_viewer):
             check_file(f"--{option}", file if Path(file).exists() else file.rpartition("@")[0] or file, "a raster file")
     if args.map and not args.no_viewer:
         check_file("--map", args.map, "an MBTiles or PMTiles file")
@@ -153,7 +153,8 @@ def _start(children: Children, args: argparse.Namespace) -> None:
     if not args.results:
         ids = "0-999999" if args.replay else "0-249"
         baselines = [f"--baseline={text}" for text in args.baseline]
-        children.start("twin worker", "twin_worker", "--uavs", ids, *baselines, *router)
+        terrain = [f"--terrain={args.terrain}"] if args.terrain else []
+        children.start("twin worker", "twin_worker", "--uavs", ids, *baselines, *terrain, *router)
     gateway_options = [f"--forward={text}" for text in args.forward] + router
     gateway_options += [f"--keys={args.keys}"] if args.keys else []
     links = [f"--link={text}" for text in args.link]

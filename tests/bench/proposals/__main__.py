@@ -3,11 +3,12 @@
     python -m tests.bench.proposals --pairs 4 --triples 2 --ground 2 --geofence 2 --clear 2 --seed 900 --json FILE
 
 Aircraft are simulated by JSBSim. In `pairs` and `triples` the second and third aircraft meet the first; in `ground` it
-sinks below 30 m above home, in `geofence` it leaves its circle, in `leg` a waypoint is 220 m above the one before,
-in `clear` two pass each other at a distance. Options are computed as by a worker (CPU time) while an alert is active.
-The first option of each proposal against an event that happens without it is approved 2 to 16 s after it was offered
-(drawn), as it is then, three in a flight at most, and flown 2 s later. `happened`: the event or a loss of separation,
-up to 200 s; `cleared`: the alert, by the twins; `created`: alerts of what does not happen without the changes;
+sinks below 30 m above home, in `terrain` a hill rises to 10 m below its route, in `geofence` it leaves its circle, in
+`leg` a waypoint is 220 m above the one before, in `clear` two pass each other at a distance. Options are computed as by
+a worker (CPU time) while an alert is active. The first option of each proposal against an event that happens without it
+is approved 2 to 16 s after it was offered (drawn), as it is then, three in a flight at most, and flown 2 s later.
+`happened`: the event or a loss of separation, up to 200 s; `cleared`: the alert, by the twins; `created`: alerts of
+what does not happen without the changes;
 `unneeded`: options against such.
 """
 
@@ -32,6 +33,7 @@ ARGUMENTS = {
     "geofence": "--geofence",
     "clear": "--clear",
     "leg": "--legs",
+    "terrain": "--terrain",
 }
 
 

@@ -15,10 +15,10 @@ from pmtiles.tile import Compression, TileType, zxy_to_tileid
 from pmtiles.writer import Writer
 
 from fleet.frames import Origin
+from fleet.terrain.raster import MERCATOR, Raster, read_raster, to_mercator, to_utm
 from tests.support import pretend_feed
 from tests.support.pretend_feed import HOME, Clock, T, feed_of
 from viewer.scene.map import tiles
-from viewer.scene.map.raster import MERCATOR, Raster, read_raster, to_mercator, to_utm
 from viewer.scene.map.tiles import TILE_PX, open_tiles
 from viewer.scene.map.world import FILE, ground_lines, overview_html, world
 from viewer.scene.terrain import TerrainLayer, spread

@@ -22,6 +22,7 @@ from fleet.contract import (
 )
 from fleet.frames import Origin
 from fleet.mission import FIRST_ITEM, extends, route_items
+from fleet.terrain.raster import Raster
 from fleet.vehicles import UNKNOWN, VehicleClass, vehicle_class
 from fleet.window import Window
 from twin_worker.estimation.wind_field import shared_wind
@@ -103,6 +104,7 @@ class Twin(msgspec.Struct):
 
     Attributes:
         budget: compute budget of the driver; None: unlimited
+        terrain: heights of the terrain, of the driver; None: unknown
     """
 
     config: TwinConfig
@@ -115,6 +117,7 @@ class Twin(msgspec.Struct):
     confidence: ConfidenceState = msgspec.field(default_factory=ConfidenceState)
     alerts: AlertingState = msgspec.field(default_factory=AlertingState)
     budget: ComputeBudget | None = None
+    terrain: Raster | None = None
 
     def __post_init__(self) -> None:
         """Use the servo map of the airframe file, if it has one, before any parameter arrives."""

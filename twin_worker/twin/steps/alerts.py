@@ -94,7 +94,7 @@ def limit_hazards(twin: Twin, gaussian: GaussianForecast) -> list[HazardEstimate
         twin, on_rotors
     )  # still taking off, possibly on rotors
     if not near_ground:
-        findings = [ground_hazard(gaussian, home_origin, margin, until)]
+        findings = [ground_hazard(gaussian, home_origin, margin, until, twin.terrain)]
     limit = read_geofence(_params(twin))
     if near_ground:
         limit = limit._replace(floor=-np.inf)

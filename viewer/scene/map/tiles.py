@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from fleet.cli import check_file
-from viewer.scene.map.raster import MERCATOR, Raster, to_mercator
+from fleet.terrain.raster import MERCATOR, Raster, to_mercator
 
 EQUATOR_M = 40_075_017.0  # circumference of the earth [m]
 LEVELS = ((15_000.0, 24.0), (4_000.0, 6.0), (1_200.0, 2.0))  # reach around the origin [m], pixel size at most [m]

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from PIL import Image
 
 from fleet.cli import check_file
 
@@ -56,6 +55,10 @@ class Raster(NamedTuple):
     affine: np.ndarray  # (2, 3): column, row, 1 -> x, y of the pixel centre
     zone: tuple[int, bool] | str | None = None  # UTM zone and northern hemisphere; MERCATOR; None: x, y in degrees
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Raster":
+        """Return itself: a raster is not changed, and may be large."""
+        return self
+
     def sample(self, lat_deg: np.ndarray, lon_deg: np.ndarray) -> np.ndarray:
         """Interpolate values at positions of any shape, NaN outside; colours have a last axis of 3."""
         from scipy.ndimage import map_coordinates  # deferred import: only needed with terrain
@@ -92,6 +95,8 @@ def read_raster(text: str, *, colours: bool) -> Raster:
         ValueError: when the file is invalid or not georeferenced; the message contains the remedy.
         OSError: when it cannot be opened.
     """
+    from PIL import Image  # deferred import: only needed with a file
+
     path, bounds = _split(text)
     check_file("--imagery" if colours else "--terrain", path, "a raster file")
     if not colours and path.suffix.lower() == ".hgt":

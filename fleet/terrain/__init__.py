@@ -1,0 +1,1 @@
+"""Heights of the terrain and imagery, from files."""
