@@ -47,6 +47,7 @@ class PlanExperiment:
         forecast: its prediction on the common grid
         hazards: probabilities of ground, geofence and an infeasible mission
         margin_m: smallest distance to the minimum height and to the geofence within the look-ahead, by hazard [m]
+        over_terrain: whether the heights are above terrain that is given, not above home
     """
 
     candidate: Candidate | None
@@ -54,6 +55,7 @@ class PlanExperiment:
     forecast: GaussianForecast
     hazards: dict[AlertKind, float]
     margin_m: dict[AlertKind, float]
+    over_terrain: bool = False
 
     @property
     def prediction(self) -> Prediction:
@@ -127,7 +129,8 @@ def _fly(twin: Twin, candidate: Candidate | None, change: Change | None) -> Plan
     _report_change(twin)
     hazards = [*limit_hazards(twin, forecast), mission_feasibility(twin, twin.telemetry.history.newest)]
     probabilities = {hazard.kind: hazard.probability for hazard in hazards if hazard.kind in LIMITS}
-    return PlanExperiment(candidate, change, forecast, probabilities, _margins(twin, forecast))
+    margins = _margins(twin, forecast)
+    return PlanExperiment(candidate, change, forecast, probabilities, margins, twin.terrain is not None)
 
 
 def _apply(twin: Twin, change: Change, start: _Start | None) -> None:

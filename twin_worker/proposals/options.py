@@ -91,7 +91,7 @@ def _clearance(problem: Problem, solution: Solution) -> tuple[float, str]:
         return _separation(problem, solution)
     if problem.kind is AlertKind.GROUND:
         height = own.margin_m.get(AlertKind.GROUND, 0.0)
-        return height, f"stays {height:.0f} m above home"
+        return height, f"stays {height:.0f} m above {'ground' if own.over_terrain else 'home'}"
     if problem.kind is AlertKind.GEOFENCE:
         margin = own.margin_m.get(AlertKind.GEOFENCE, 0.0)
         return min(margin, _MAX_CLEARANCE_M), f"stays {margin:.0f} m inside the geofence"
