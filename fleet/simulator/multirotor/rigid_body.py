@@ -17,6 +17,7 @@ from rotorpy.vehicles.multirotor import Multirotor
 from fleet.frames import G
 from fleet.simulator.multirotor.airframes import MultirotorType, rotorpy_parameters
 from fleet.simulator.vehicle.jsbsim import Truth
+from fleet.simulator.vehicle.sensors import pressure_at, pressure_height
 from fleet.simulator.vehicle.weather import FT
 
 DT = 0.01  # physics step [s]
@@ -140,6 +141,16 @@ class RotorBody:
         beta = asin(min(max(air[1] / max(Va, 1e-3), -1.0), 1.0))
         attitude = np.array([phi, theta, psi])
         angles = (atan2(air[2], hypot(air[0], 1e-3)), beta)
+        pressure = pressure_at(pressure_height(_P) + float(s[2]))  # the home has pressure _P
         return Truth(
-            s[:3] * _FLIP, s[3:6] * _FLIP, attitude, s[10:13] * _FLIP, self._force * _FLIP, Va, *angles, _RHO, _P, _T
+            s[:3] * _FLIP,
+            s[3:6] * _FLIP,
+            attitude,
+            s[10:13] * _FLIP,
+            self._force * _FLIP,
+            Va,
+            *angles,
+            _RHO,
+            pressure,
+            _T,
         )

@@ -142,7 +142,8 @@ def _sentence(report: Report) -> str:
     if report.outcome is ReportOutcome.NAMED:
         return f"{findings}; {_describe_validation(report)}"
     if report.outcome is ReportOutcome.SUSPECTED:
-        return f"suspected, not confirmed on held-out data: {findings}"
+        where = " on held-out data" if report.series.held_out.any() else ""
+        return f"suspected, not confirmed{where}: {findings}"
     channel, segments = report.where
     times = ", ".join(f"{a:.0f}-{b:.0f} s" for a, b in segments[:3]) or "throughout"
     term = " + ".join(f"{x:.3g} {name}" for name, x in report.terms.items())
@@ -192,7 +193,8 @@ def _describe_validation(report: Report) -> str:
     before, after, of_what, unit = report.fit_before, report.fit_after, "residual", ""
     if not 1.0 - after / before >= MIN_RMS_DROP:
         before, after, of_what, unit = report.force_before, report.force_after, "error of specific force", " m/s2"
-    text = f"on held-out blocks the {of_what} falls from {before:.2f} to {after:.2f}{unit} ({1.0 - after / before:.0%})"
+    where = "on held-out blocks " if report.series.held_out.any() else ""  # otherwise all rows are fitted
+    text = f"{where}the {of_what} falls from {before:.2f} to {after:.2f}{unit} ({1.0 - after / before:.0%})"
     before, after = report.free_run_error_before, report.free_run_error_after
     if after < 0.9 * before:
         text += f", and the attitude error of free runs of 5 s falls from {before:.1f} to {after:.1f} deg"

@@ -8,7 +8,6 @@ outcome is unknown, with that channel and time.
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -91,8 +90,7 @@ def diagnose_rotors(flight: RotorFlight, baseline: RotorBaseline) -> Report:
         seconds=time.process_time() - begun,
         posterior=posterior,
     )
-    text = with_sentence(report).sentence.replace("on held-out blocks ", "").replace(" on held-out data", "")
-    return replace(report, sentence=text)  # nothing is held out: the evidence carries its own penalty
+    return with_sentence(report)
 
 
 def _posterior(explanations: Sequence[EffectSet]) -> dict[str, float]:

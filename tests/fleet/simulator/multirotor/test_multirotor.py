@@ -17,6 +17,7 @@ from fleet.simulator.multirotor.rigid_body import RotorBody
 from fleet.simulator.multirotor.tasks import TaskSequence
 from fleet.simulator.multirotor.uav import SimulatedMultirotor
 from fleet.simulator.vehicle.missions import HOME, mission_item
+from fleet.simulator.vehicle.sensors import pressure_height
 
 TAKEOFF, WAYPOINT, TURNS, DELAY, RETURN, JUMP = 22, 16, 18, 93, 20, 177
 
@@ -163,3 +164,13 @@ def test_one_seed_flies_one_flight() -> None:
     assert first.step(6.0) == second.step(6.0)
     with pytest.raises(ValueError, match=r"uav-250: found id 250"):
         SimulatedMultirotor(250, 1)
+
+
+def test_the_static_pressure_falls_with_height() -> None:
+    uav = SimulatedMultirotor(0, 31_000, wind=1.0, flight_seed=31_002)
+    first = uav.vehicle.truth()
+    uav.step(40.0)
+    then = uav.vehicle.truth()
+    climbed = float(first.p[2] - then.p[2])
+    assert climbed > 3.0
+    assert pressure_height(then.P) - pressure_height(first.P) == pytest.approx(climbed, rel=1e-6)

@@ -63,6 +63,7 @@ def test_the_weak_motor_is_named_with_place_time_and_size(report: Report) -> Non
     assert finding.reported["loss"] == pytest.approx(LOSS, rel=0.1)
     assert finding.segments[0][0] == pytest.approx(ONSET_S - BEGIN_S, abs=1.0)
     assert finding.probability > 0.95
+    assert "the residual falls from" in report.sentence and "held-out" not in report.sentence  # all rows are fitted
 
 
 def test_the_healthy_part_is_not_named(flown: FlightAndUav, baseline: RotorBaseline) -> None:
