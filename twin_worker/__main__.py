@@ -16,6 +16,7 @@ from fleet.access.roles import WORKER
 from fleet.cli import id_range, make_parser, run_command, stop_on_signal
 from fleet.config import bus_config_from, router_arguments
 from fleet.process.children import Children
+from fleet.process.file_options import airframe_file, model_of
 from fleet.process.logs import log_arguments, report_progress, report_status
 from fleet.process.malloc_trim import enable_malloc_trim
 from twin_worker.twin.state.budget import LIVE_SCHEDULE, parse_schedule
@@ -111,7 +112,7 @@ def _run(args: argparse.Namespace) -> int:
     from fleet.contract import FleetState
     from fleet.metrics import serve
 
-    airframe, baselines = load(args.airframe or GENERIC), _load_baselines(args.baseline)
+    airframe, baselines = load(str(args.airframe or GENERIC)), _load_baselines(args.baseline)
     stop = stop_on_signal()
     threading.Thread(target=_force_exit, args=(stop,), daemon=True).start()
     with connect(bus_config_from(args, WORKER)) as bus:
@@ -197,7 +198,10 @@ def main(argv: list[str] | None = None) -> int:
         help="prediction model: derivatives (dynamics), point mass (hybrid), the better (auto), or linear axes (paper)",
     )
     parser.add_argument(
-        "--airframe", metavar="NAME|FILE", help="airframe data, a TOML file (that of a small fixed wing)"
+        "--airframe",
+        type=airframe_file,
+        metavar="NAME|FILE",
+        help="airframe data, a TOML file (that of a small fixed wing)",
     )
     parser.add_argument("--omega", type=float, default=0.0, help="minimum mean fit to verify, %% (0, as in the paper)")
     parser.add_argument(
@@ -210,6 +214,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--baseline",
         action="append",
+        type=model_of,
         default=[],
         metavar="[ID=]MODEL",
         help="comparison model from `fleet calibrate` for one aircraft or all (default: its own first 105 s)",

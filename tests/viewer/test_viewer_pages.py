@@ -19,7 +19,7 @@ from tests.bench.viewing.watcher import Watcher
 from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import PretendFleet
 from viewer.browser.http_server import Browser, serve, without_stdout
-from viewer.server.app import App
+from viewer.server.app import TICKS_PER_S, App
 from viewer.server.view import View
 from viewer.text.missed_events import encode_click, parse_click
 from viewer.text.words import table
@@ -144,6 +144,54 @@ def test_nothing_is_held_back_while_lists_are_made(site, monkeypatch) -> None:
     monkeypatch.setattr("viewer.panels.panels.table", made)
     site.run()
     assert held and not any(held)
+
+
+def test_row_tile_label_and_ring_of_one_record_are_sent_in_one_block(site, monkeypatch) -> None:
+    """A horizon that changes with every prediction; also after a change of the time shown, which is drawn at once."""
+    view, block, sent, publish = site.views[0], 0, [], site.bus.publish
+    buffer = view.client._websock_connection.get_message_buffer()
+    push, start = buffer.push, buffer.atomic_start
+
+    def begin() -> None:
+        nonlocal block
+        block += buffer.atomic_counter == 0
+        start()
+
+    def note(message: Any) -> None:
+        sent.append((block if buffer.atomic_counter else -1, message))
+        push(message)
+
+    def changed(message: Any, *more: Any) -> None:
+        if isinstance(message, Prediction):
+            message = msgspec.structs.replace(message, horizon_s=6.0 + (message.t * 7.0) % 20.0)
+        publish(message, *more)
+
+    monkeypatch.setattr(buffer, "atomic_start", begin)
+    monkeypatch.setattr(buffer, "push", note)
+    monkeypatch.setattr(site.bus, "publish", changed)
+    name, table_id = "horizon ", view.panels._table._impl.uuid
+    compared, begun = 0, int(time.time()) + 1.5
+    for k in range(6):
+        sent.clear()
+        site.fleet.advance(begun + k)
+        site.app.tick(TICKS_PER_S)  # the fleet is read
+        if k % 2:
+            view._redraw()
+            site.app.draw_selections()
+        for tick in range(TICKS_PER_S):
+            site.app.tick(tick)
+        rows = {number: one.updates["content"] for number, one in sent if getattr(one, "uuid", "") == table_id}
+        texts = [(number, getattr(one, "updates", {}).get("text", "")) for number, one in sent]
+        labels = {number: text for number, text in texts if text.startswith(name)}
+        rings = {number for number, one in sent if getattr(one, "name", "") == "/selected/horizon"}
+        assert rows.keys() >= labels.keys() and -1 not in rows
+        for number, label in labels.items():
+            row = re.search(r'<tr class="pick on".*?<span class="num">(.*?)</span>', rows[number])
+            assert row is not None and label.startswith(f"{name}{row[1]}:") and number in rings
+            compared += 1
+        sizes = [sum(number == other for other, _ in sent) for number in rows]
+        assert max(sizes) < buffer.max_window_size  # a longer block is sent in parts
+    assert compared > 4
 
 
 def test_a_click_is_written_as_it_is_read() -> None:
