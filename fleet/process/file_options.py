@@ -58,8 +58,8 @@ def output_file(text: str) -> Path:
     if path.is_dir():
         raise ArgumentTypeError(f"found a folder {text!r}, expected a file; name a file in it")
     if not parent.is_dir():
-        found = "a file in place of the" if parent.exists() else "no"
-        raise ArgumentTypeError(f"found {found} folder {str(path.parent)!r}, expected one; create it first")
+        absence = "a file in place of the" if parent.exists() else "no"
+        raise ArgumentTypeError(f"found {absence} folder {str(path.parent)!r}, expected one; create it first")
     _check_writable(path if path.exists() else parent)
     return path
 

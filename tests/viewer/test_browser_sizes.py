@@ -16,7 +16,7 @@ from conftest import unused_port
 from playwright.sync_api import TimeoutError as TooLate
 
 from fleet.contract import Prediction, TwinState
-from tests.bench.viewing.page import PLACES, differing, drawn, labels_differing
+from tests.bench.viewing.page import NOTE_LABELS, PLACES, differing, drawn, labels_differing
 from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import PretendFleet
 from tests.viewer.test_browser import ARGS, FEW_FRAMES, IN_SCENE, PATIENCE_MS, SCHEME
@@ -111,8 +111,8 @@ AT_ZERO_SCROLL = "document.documentElement.scrollWidth <= innerWidth"
 class Wild(PretendFleet):
     """A fleet whose horizons and fits change with each message, and one of which falls silent."""
 
-    def __init__(self, bus: MemoryBus) -> None:
-        super().__init__(bus, UAVS)
+    def __init__(self, bus: MemoryBus, uavs: int) -> None:
+        super().__init__(bus, uavs)
         publish, start = bus.publish, time.time()
         self.predictions: list[Prediction] = []
 
@@ -129,14 +129,14 @@ class Wild(PretendFleet):
         super().advance(t, lost_since=self._silent_from)
 
 
-@pytest.fixture(scope="module")
-def live(chromium: str) -> Iterator[SimpleNamespace]:
+@contextlib.contextmanager
+def page_of(chromium: str, uavs: int) -> Iterator[SimpleNamespace]:
     """A viewer in this process with a fleet that flies, and a browser with its page."""
     from playwright.sync_api import sync_playwright
 
     port, bus, stop = unused_port(), MemoryBus(), threading.Event()
     server = serve("127.0.0.1", port)
-    app, fleet = App(bus, server), Wild(bus)
+    app, fleet = App(bus, server), Wild(bus, uavs)
 
     def fly() -> None:
         while not stop.wait(0.1):
@@ -150,6 +150,7 @@ def live(chromium: str) -> Iterator[SimpleNamespace]:
         browser = playwright.chromium.launch(executable_path=chromium, args=ARGS)
         page = browser.new_page(viewport={"width": 1280, "height": 720})
         page.add_init_script(FEW_FRAMES)
+        page.add_init_script(NOTE_LABELS)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.goto(f"http://127.0.0.1:{port}/?fixedDpr=0.5")
         page.wait_for_function(IN_SCENE, timeout=PATIENCE_MS)
@@ -160,6 +161,13 @@ def live(chromium: str) -> Iterator[SimpleNamespace]:
         thread.join()
     with without_stdout():
         server.stop()
+
+
+@pytest.fixture(scope="module")
+def live(chromium: str) -> Iterator[SimpleNamespace]:
+    """The page of a small fleet."""
+    with page_of(chromium, UAVS) as site:
+        yield site
 
 
 def until(page, true) -> None:

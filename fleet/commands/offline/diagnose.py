@@ -1,9 +1,10 @@
 """Locate deviations between a flight and its simulation, name the missing physics, and verify it on held-out data."""
 
 import argparse
+from pathlib import Path
 
 from fleet.cli import run_module
-from fleet.process.file_options import MODEL, airframe_card, input_file, output_file, output_folder
+from fleet.process.file_options import MODEL, airframe_card, check_file, input_file, output_file, output_folder
 from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
 
 _MAX_PAST_S = 1e6
@@ -19,9 +20,7 @@ EXAMPLES = """
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options; `python -m twin_worker.diagnosis` takes the same."""
-    parser.add_argument(
-        "file", nargs="+", type=input_file(), metavar="FLIGHT", help="recordings of any kind, also compressed"
-    )
+    parser.add_argument("file", nargs="+", type=Path, metavar="FLIGHT", help="recordings of any kind, also compressed")
     parser.add_argument("--model", type=input_file(MODEL), metavar="MODEL", help="output of `fleet calibrate`")
     parser.add_argument(
         "--against",
@@ -62,6 +61,8 @@ def check_arguments(args: argparse.Namespace) -> None:
     """
     if not 1 <= args.jobs <= 64:
         raise ValueError(f"--jobs: found {args.jobs}, expected 1..64; change it")
+    if not any(path.is_file() for path in args.file):  # one of several is reported, and the others are diagnosed
+        check_file("FLIGHT", args.file[0])
     if sum(map(bool, (args.model, args.against, args.against_own_past))) != 1:
         raise ValueError(
             "expected exactly one of --model, --against, --against-own-past; name one reference for the flights"
