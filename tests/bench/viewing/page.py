@@ -182,7 +182,8 @@ def labels_differing(samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def _agrees(label: str, fit: str, horizon: str, age: str) -> bool:
     if label.startswith("horizon "):
         return label.startswith(f"horizon {horizon}:")
-    return f"link lost {age}" in label if age else f"  fit {fit}" in label and f"horizon {horizon}" in label
+    claim = "no horizon" if horizon == "–" else f"  horizon {horizon}"
+    return f"link lost {age}" in label if age else f"  fit {fit}" in label and claim in label
 
 
 def drawn(samples: list[dict[str, Any]], *, with_ring: bool = True) -> list[dict[str, Any]]:

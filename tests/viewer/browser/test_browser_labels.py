@@ -7,7 +7,7 @@ import pytest
 
 from tests.bench.viewing.page import LABEL_OVERLAPS
 from tests.viewer.test_browser import PATIENCE_MS, SCHEME
-from tests.viewer.test_browser_sizes import FONT, page_of, until, view_of
+from tests.viewer.test_browser_sizes import FONT, Wild, page_of, until, view_of
 from viewer.scene.labels import EM_PX
 
 pytestmark = pytest.mark.browser
@@ -17,7 +17,7 @@ CROWD = 40
 @pytest.fixture(scope="module")
 def crowd(chromium: str) -> Iterator[SimpleNamespace]:
     """The page of a crowd, its most severe aircraft selected and all of it framed, at 1280 x 720."""
-    with page_of(chromium, CROWD) as site:
+    with page_of(chromium, lambda bus: Wild(bus, CROWD)) as site:
         site.page.get_by_text(f"{CROWD} UAVs").first.wait_for(timeout=PATIENCE_MS)
         site.page.locator("tr.pick").first.dispatch_event("pointerdown")
         yield site
