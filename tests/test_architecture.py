@@ -323,7 +323,6 @@ SHARED = (  # what concealer and finder may both stand on: words, frames, format
     *("fleet.mission", "fleet.mission_jumps", "fleet.mission_legs", "fleet.simulator", "fleet.bus", "fleet.bus.codec"),
 )
 READERS = ("fleet.telemetry", "fleet.airframes", "fleet.vehicles", "fleet.window", "fleet.metrics", "fleet.access")
-PROCESSES = "fleet.process"  # starts and ends processes, logs, checks paths
 AUTOPILOT = "fleet.autopilots"  # flies the pretend aircraft; the finder has no use for it, but draws beside who has
 
 
@@ -347,7 +346,9 @@ def test_finder_and_concealer_share_nothing_that_flies_or_decides(begin: str, al
     finder = reached(*(f"twin_worker.diagnosis.{name}" for name in ("__main__", "learn")))
     assert any(inside(n, "fleet.simulator.conceal") or inside(n, "fleet.blind_test.inject.thrust") for n in concealer)
     assert {"fleet.effects.icing", "twin_worker.diagnosis.model.simulate"} <= finder | reached("fleet.effects.icing")
-    assert all(n in SHARED or any(inside(n, x) for x in (AUTOPILOT, PROCESSES, *allowed)) for n in concealer & finder)
+    assert all(
+        n in SHARED or any(inside(n, x) for x in (AUTOPILOT, "fleet.process", *allowed)) for n in concealer & finder
+    )
 
 
 ALLOWED = (
