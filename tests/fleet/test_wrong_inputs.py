@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from conftest import exit_code
 
 from fleet import cli
 from fleet.commands.offline.completion import SCRIPTS, verb_parsers
@@ -176,10 +177,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 @pytest.mark.parametrize("line", ANSWERS)
 def test_a_wrong_input_is_answered_in_one_line(line: str, folder: None, capsys: pytest.CaptureFixture[str]) -> None:
     program, *words = line.split()
-    try:
-        code = MAINS[program](words)
-    except SystemExit as left:
-        code = left.code
+    code = exit_code(lambda: MAINS[program](words))
     said = capsys.readouterr().err
     last = logs.strip_time(said.splitlines()[-1])
     verb = f"fleet {words[0]}" if program == "fleet" and words and words[0] in cli.command_modules() else program
