@@ -205,28 +205,6 @@ def run_module(verb: str, lost: str, module: str, *options: str) -> int:
     return INTERRUPTED
 
 
-def check_parent(option: str, path: Path | str | None) -> None:
-    """Check that the folder of an output exists.
-
-    Raises:
-        ValueError: when it does not; the text names the option.
-    """
-    if path and not Path(path).absolute().parent.is_dir():
-        raise ValueError(f"{option}: found no folder {str(Path(path).parent)!r}, expected one; create it first")
-
-
-def check_file(option: str, path: Path | str, expected: str = "a recording") -> None:
-    """Check that an input is a file.
-
-    Raises:
-        ValueError: when it does not exist or is a folder; the text names the option.
-    """
-    if Path(path).is_dir():
-        raise ValueError(f"{option}: found a folder {str(path)!r}, expected {expected}; name a file in it")
-    if not Path(path).exists():
-        raise ValueError(f"{option}: found no file {str(path)!r}, expected {expected}; check the path")
-
-
 def check_port(option: str, port: int) -> None:
     """Check the number of a TCP port.
 

@@ -504,9 +504,13 @@ class Prediction(Message, frozen=True, kw_only=True):
     ]
     quantile: Annotated[float, about("nominal coverage of the prediction region, 0..1")] = 0.9
     axis_quantile: Annotated[float, about("nominal coverage of each half-axis alone; 0: as of independent axes")] = 0.0
-    horizon_s: Annotated[float, about("confidence horizon: `quantile` of similar predictions stay within 10 % [s]")] = (
-        0.0
-    )
+    horizon_s: Annotated[
+        float,
+        about(
+            "confidence horizon from `t`: `quantile` of similar predictions stay within 10 %; below 0.5 s, or once the "
+            "prediction is older, nothing is claimed [s]"
+        ),
+    ] = 0.0
     horizon_open: Annotated[bool, about("true: still below 10 % at the end of `ahead`")] = False
     early_exceedance: Annotated[float, about("probability that the error exceeds 10 % within 10 s, 0..1")] = 0.0
     coverage: Annotated[
@@ -538,6 +542,20 @@ class Prediction(Message, frozen=True, kw_only=True):
     def ned_origin(self) -> Origin:
         """Return the origin as a named tuple."""
         return Origin(*self.origin)
+
+
+MIN_HORIZON_S = 0.5  # a shorter confidence horizon counts as none [s]
+
+
+def claimed_horizon_s(horizon_s: float, age_s: float | None) -> float:
+    """Return the confidence horizon of a prediction of this age: 0 where it has passed or is none, else unchanged [s].
+
+    Args:
+        horizon_s: `Prediction.horizon_s` or `FleetRow.horizon_s`, from the time of the prediction [s]
+        age_s: of the prediction [s]; None: unknown
+    """
+    passed = age_s is not None and age_s >= horizon_s
+    return 0.0 if passed or not horizon_s >= MIN_HORIZON_S else horizon_s
 
 
 class WhatIfStart(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -794,7 +812,7 @@ class FleetRow(msgspec.Struct, frozen=True, kw_only=True):
     state: TwinState
     verdict: Annotated[str, about("sentence of the last verdict")]
     fit: Annotated[dict[str, float], about("per state [%]")] = {}
-    horizon_s: Annotated[float, about("confidence horizon of the newest prediction [s]")] = 0.0
+    horizon_s: Annotated[float, about("confidence horizon of the newest prediction, from its time [s]")] = 0.0
     worker: Annotated[str, about("writer of the accepted results, 16 hex digits")] = ""
     sample_age_s: Annotated[float | None, about("since the newest sample arrived [s]")] = None
     prediction_age_s: Annotated[float | None, about("since the newest prediction [s]")] = None

@@ -6,12 +6,12 @@ import gc
 import logging
 import sys
 import threading
-from pathlib import Path
 
 from fleet.access.entry import BusConfig
 from fleet.access.roles import GATEWAY
-from fleet.cli import check_file, id_range, make_parser, run_command, stop_on_signal
+from fleet.cli import id_range, make_parser, run_command, stop_on_signal
 from fleet.config import MAX_UAVS, bus_config_from, has_operators, router_arguments
+from fleet.process.file_options import audit_file, input_file, output_folder
 from fleet.process.logs import log_arguments, report_status
 from fleet.process.malloc_trim import enable_malloc_trim
 from fleet.process.private_files import state_folder
@@ -111,8 +111,6 @@ def run(args: argparse.Namespace) -> int:
     specs += [read_forward(text) for text in args.forward]
     if args.most_uavs < 1:
         raise ValueError(f"--most-uavs: found {args.most_uavs}, expected at least 1; write e.g. 250")
-    if args.keys is not None:
-        check_file("--keys", args.keys, "a file of keys")
     gates = make_admissions(specs, len(args.forward), args.keys)
     bus_config = bus_config_from(args, GATEWAY)
     check_commands(args, bus_config)
@@ -193,7 +191,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--most-uavs", type=int, default=MAX_UAVS, metavar="N", help=f"maximum number of aircraft ({MAX_UAVS})"
     )
-    parser.add_argument("--keys", type=Path, metavar="FILE", help="keys of signed links, readable only by the owner")
+    parser.add_argument(
+        "--keys",
+        type=input_file("a file of keys"),
+        metavar="FILE",
+        help="keys of signed links, readable only by the owner",
+    )
     router_arguments(parser)
     parser.add_argument("--listen-only", action="store_true", help="send nothing to the aircraft")
     parser.add_argument(
@@ -204,7 +207,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--dry-run", action="store_true", help="print the messages of approved proposals, send none")
     parser.add_argument(
-        "--audit", type=Path, metavar="FILE", help="audit of all commands (~/.local/state/parauav/commands.jsonl)"
+        "--audit", type=audit_file, metavar="FILE", help="audit of all commands (~/.local/state/parauav/commands.jsonl)"
     )
     parser.add_argument(
         "--budget",
@@ -212,7 +215,9 @@ def main(argv: list[str] | None = None) -> int:
         metavar="SIZE",
         help=f"bytes/s aircraft may send on a link ({DEFAULT_BUDGET}; serial: 70 %% of baud)",
     )
-    parser.add_argument("--record", type=Path, metavar="DIR", help="write a .tlog of each link into this folder")
+    parser.add_argument(
+        "--record", type=output_folder, metavar="DIR", help="write a .tlog of each link into this folder"
+    )
     parser.add_argument(
         "--record-budget",
         default="10G",

@@ -60,7 +60,7 @@ def _table(console: Console, snapshot: Callable[[], StatusSnapshot], done: threa
 
 
 def _print_lines(report: Callable[[str], None], snapshot: Callable[[], StatusSnapshot], done: threading.Event) -> None:
-    due, reported = time.monotonic() + PLAIN_S, ""
+    due, reported, uavs = time.monotonic() + PLAIN_S, "", 0
     while not done.wait(REFRESH_S):
         account, statuses = snapshot()
         if account is None:
@@ -69,8 +69,8 @@ def _print_lines(report: Callable[[str], None], snapshot: Callable[[], StatusSna
         if sentences != reported:
             reported = sentences
             report(sentences or "all links are normal again")
-        if time.monotonic() >= due:
-            due = time.monotonic() + PLAIN_S
+        if time.monotonic() >= due or len(account.uavs) != uavs:
+            due, uavs = time.monotonic() + PLAIN_S, len(account.uavs)
             report(format_line(account, statuses))
 
 

@@ -12,7 +12,7 @@ import shutil
 import signal
 import socket
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -81,6 +81,14 @@ def unused_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
             s.bind(("127.0.0.1", port))
             return port
     raise AssertionError
+
+
+def exit_code(run: Callable[[], int]) -> int | str | None:
+    """Return the exit code of a command, also where its parser ends it."""
+    try:
+        return run()
+    except SystemExit as left:
+        return left.code
 
 
 @pytest.fixture

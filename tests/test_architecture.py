@@ -318,9 +318,9 @@ def test_no_folder_is_crowded() -> None:
 
 
 SHARED = (  # what concealer and finder may both stand on: words, frames, formats; nothing that flies or decides
-    *(f"fleet.{name}" for name in ("contract", "cli", "process", "commands", "frames", "compiled_frames", "config")),
-    *("fleet.mission", "fleet.mission_jumps", "fleet.mission_legs", "fleet.simulator", "fleet.bus", "fleet.bus.codec"),
-    *("fleet", *(f"fleet.process.{name}" for name in ("sanitise", "logs", "children", "interrupt", "private_files"))),
+    *(f"fleet.{n}" for n in ("contract", "cli", "process", "commands", "frames", "compiled_frames", "config", "bus")),
+    *("fleet", "fleet.mission", "fleet.mission_jumps", "fleet.mission_legs", "fleet.simulator", "fleet.bus.codec"),
+    *(f"fleet.process.{n}" for n in ("sanitise", "logs", "children", "interrupt", "private_files", "file_options")),
 )
 READERS = ("fleet.telemetry", "fleet.airframes", "fleet.vehicles", "fleet.window", "fleet.metrics", "fleet.access")
 AUTOPILOT = "fleet.autopilots"  # flies the pretend aircraft; the finder has no use for it, but draws beside who has

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ROOT, unused_port
+from conftest import ROOT, exit_code, unused_port
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from fleet import cli
@@ -180,7 +180,7 @@ def test_what_makes_no_sense_is_refused_in_one_sentence(
 ) -> None:
     ports, _ = own_ports()
     if options in REFUSED:
-        code, errors = cli.main(["up", *ports, *options]), capfd.readouterr().err
+        code, errors = exit_code(lambda: cli.main(["up", *ports, *options])), capfd.readouterr().err
     else:
         with process("fleet.cli", "up", *ports, *options) as up:
             code, _, errors = ended(up)

@@ -16,6 +16,7 @@ from fleet.access.roles import WORKER
 from fleet.cli import id_range, make_parser, run_command, stop_on_signal
 from fleet.config import bus_config_from, router_arguments
 from fleet.process.children import Children
+from fleet.process.file_options import airframe_file, model_of
 from fleet.process.logs import log_arguments, report_progress, report_status
 from fleet.process.malloc_trim import enable_malloc_trim
 from twin_worker.twin.state.budget import LIVE_SCHEDULE, parse_schedule
@@ -113,7 +114,7 @@ def _run(args: argparse.Namespace) -> int:
     from fleet.metrics import serve
     from fleet.terrain.raster import read_raster
 
-    airframe, baselines = load(args.airframe or GENERIC), _load_baselines(args.baseline)
+    airframe, baselines = load(str(args.airframe or GENERIC)), _load_baselines(args.baseline)
     terrain = read_raster(args.terrain, colours=False) if args.terrain else None
     stop = stop_on_signal()
     threading.Thread(target=_force_exit, args=(stop,), daemon=True).start()
@@ -201,7 +202,10 @@ def main(argv: list[str] | None = None) -> int:
         help="prediction model: derivatives (dynamics), point mass (hybrid), the better (auto), or linear axes (paper)",
     )
     parser.add_argument(
-        "--airframe", metavar="NAME|FILE", help="airframe data, a TOML file (that of a small fixed wing)"
+        "--airframe",
+        type=airframe_file,
+        metavar="NAME|FILE",
+        help="airframe data, a TOML file (that of a small fixed wing)",
     )
     parser.add_argument("--omega", type=float, default=0.0, help="minimum mean fit to verify, %% (0, as in the paper)")
     parser.add_argument(
@@ -214,6 +218,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--baseline",
         action="append",
+        type=model_of,
         default=[],
         metavar="[ID=]MODEL",
         help="comparison model from `fleet calibrate` for one aircraft or all (default: its own first 105 s)",

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fleet.cli import check_file
+from fleet.process.file_options import check_file
 
 _A, _F = 6_378_137.0, 1 / 298.257223563  # WGS 84: semi-major axis [m], flattening
 _N = _F / (2 - _F)

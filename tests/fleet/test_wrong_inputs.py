@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from conftest import exit_code
 
 from fleet import cli
 from fleet.commands.offline.completion import SCRIPTS, verb_parsers
@@ -61,6 +62,47 @@ ANSWERS = {  # command line -> part of the last line
     "fleet up --baseline nosuch.json": "--baseline: found no file 'nosuch.json', expected a model from",
     "fleet up --baseline 3=nosuch.json": "--baseline: found no file 'nosuch.json', expected a model from",
     "fleet up --replay text.txt --speed fast": "--speed: found 'fast', expected a number above 0 or max; write e.g. 4",
+    "fleet up --baseline 3=folder": "--baseline: found a folder 'folder', expected a model from",
+    "fleet up --summary folder": "--summary: found a folder 'folder', expected a file; name a file in it",
+    "fleet up --summary nosuch/x.json": "--summary: found no folder 'nosuch', expected one; create it first",
+    "fleet up --summary text.txt/x.json": (
+        "--summary: found a file in place of the folder 'text.txt', expected one; create it first"
+    ),
+    "fleet up --columns nosuch": "--columns: found no file 'nosuch', expected a TOML file or one of alfa, px4",
+    "fleet up --columns folder": "--columns: found a folder 'folder', expected a TOML file or one of alfa, px4",
+    "fleet up --mission nosuch": "--mission: found no file 'nosuch', expected a QGC WPL 110 file; check the path",
+    "fleet replay text.txt --params nosuch": "--params: found no file 'nosuch', expected a parameter file",
+    "fleet replay nosuch": "FILE: found no file 'nosuch', expected a recording; check the path",
+    "fleet fly --tlog folder": "--tlog: found a folder 'folder', expected a file; name a file in it",
+    "fleet fly --tlog nosuch/x.tlog": "--tlog: found no folder 'nosuch', expected one; create it first",
+    "fleet record nosuch/x.parauav": "FILE: found no folder 'nosuch', expected one; create it first",
+    "fleet record folder": "FILE: found a folder 'folder', expected a file; name a file in it",
+    "fleet whatif 7 --items nosuch": "--items: found no file 'nosuch', expected a QGC WPL 110 file; check the path",
+    "fleet diagnose nosuch --model text.txt": "FLIGHT: found no file 'nosuch', expected a recording; check the path",
+    "fleet diagnose text.txt --against folder": "--against: found a folder 'folder', expected a recording",
+    "fleet diagnose text.txt --airframe nosuch": "--airframe: found no file 'nosuch', expected an airframe TOML, a",
+    "fleet diagnose text.txt --json folder": "--json: found a folder 'folder', expected a file; name a file in it",
+    "fleet diagnose text.txt --report text.txt": "--report: found the file 'text.txt', expected a folder; name another",
+    "fleet calibrate nosuch --out x.json": "NOMINAL: found no file 'nosuch', expected a recording; check the path",
+    "fleet calibrate text.txt --out folder": "--out: found a folder 'folder', expected a file; name a file in it",
+    "fleet calibrate text.txt --out x --airframe folder": "--airframe: found a folder 'folder', expected an airframe",
+    "fleet calibrate text.txt --out x --json nosuch/y": "--json: found no folder 'nosuch', expected one; create it",
+    "fleet assess text.txt --json folder": "--json: found a folder 'folder', expected a file; name a file in it",
+    "fleet assess text.txt --out text.txt": "--out: found the file 'text.txt', expected a folder; name another",
+    "fleet prove --json folder": "--json: found a folder 'folder', expected a file; name a file in it",
+    "fleet prove --report text.txt": "--report: found the file 'text.txt', expected a folder; name another",
+    "fleet prove --inject nosuch": "--inject: found no file 'nosuch', expected a recording; check the path",
+    "fleet inspect text.txt --json folder": "--json: found a folder 'folder', expected a file; name a file in it",
+    "fleet inspect text.txt --plot nosuch/x.png": "--plot: found no folder 'nosuch', expected one; create it first",
+    "fleet paper identify nosuch": "FILE: found no file 'nosuch', expected a recording; check the path",
+    "fleet paper predict --json folder": "--json: found a folder 'folder', expected a file; name a file in it",
+    "fleet paper identify --out text.txt": "--out: found the file 'text.txt', expected a folder; name another",
+    "twin_worker --baseline folder": "--baseline: found a folder 'folder', expected a model from `fleet calibrate`",
+    "twin_worker --baseline 3=nosuch": "--baseline: found no file 'nosuch', expected a model from `fleet calibrate`",
+    "twin_worker --airframe nosuch": "--airframe: found no file 'nosuch', expected a TOML file or one of aerosonde",
+    "twin_worker --config folder": "--config: found a folder 'folder', expected a TOML file; name a file in it",
+    "viewer --config nosuch": "--config: found no file 'nosuch', expected one such as deploy/fleet.toml; check",
+    "viewer --map folder": "--map: found a folder 'folder', expected an MBTiles or PMTiles file; name a file in it",
     "fleet diagnose text.txt --model nosuch.json": "--model: found no file 'nosuch.json', expected a model from",
     "fleet router --listen nowhere": "--listen: found 'nowhere', expected e.g. tcp/127.0.0.1:7447",
     "fleet inspect": "FILE: found none, expected at least one recording; name one",
@@ -93,7 +135,10 @@ ANSWERS = {  # command line -> part of the last line
     "gateway --link upd:127.0.0.1:14550": "each with an address behind a :; did you mean udpin?",
     "gateway --link udpin:127.0.0.1": "expected udpin:HOST:PORT; write e.g. udpin:127.0.0.1:14550",
     "gateway --link serial:/dev/ttyUSB0:x7:0": "expected serial:PATH:BAUD; write e.g. serial:/dev/ttyUSB0:57600",
-    "gateway --record text.txt": "--record: 'text.txt' cannot be created (File exists); name another folder",
+    "gateway --record text.txt": "--record: found the file 'text.txt', expected a folder; name another",
+    "gateway --record text.txt/x": "--record: found the file 'text.txt', expected a folder; name another",
+    "gateway --keys nosuch": "--keys: found no file 'nosuch', expected a file of keys; check the path",
+    "gateway --audit folder": "--audit: found a folder 'folder', expected a file; name a file in it",
     "gateway --record-budget lots --record r": "--record-budget: found 'lots', expected a size such as 500M or 10G",
     "gateway --keys folder": "--keys: found a folder 'folder', expected a file of keys; name a file in it",
     "gateway --most-uavs 0": "--most-uavs: found 0, expected at least 1; write e.g. 250",
@@ -132,10 +177,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 @pytest.mark.parametrize("line", ANSWERS)
 def test_a_wrong_input_is_answered_in_one_line(line: str, folder: None, capsys: pytest.CaptureFixture[str]) -> None:
     program, *words = line.split()
-    try:
-        code = MAINS[program](words)
-    except SystemExit as left:
-        code = left.code
+    code = exit_code(lambda: MAINS[program](words))
     said = capsys.readouterr().err
     last = logs.strip_time(said.splitlines()[-1])
     verb = f"fleet {words[0]}" if program == "fleet" and words and words[0] in cli.command_modules() else program

@@ -60,6 +60,24 @@ def test_plain_lines_come_at_news_and_now_and_then(monkeypatch):
         assert enough.wait(PATIENCE_S)
 
 
+def test_a_plain_line_comes_at_once_when_aircraft_come_or_go(monkeypatch):
+    monkeypatch.setattr(status_table, "REFRESH_S", 0.001)
+    shown = [(), (7,), (7, 8), (7,)]  # ids received, one after the other
+    said, enough = [], threading.Event()
+
+    def say(line):
+        said.append(line)
+        shown.pop(0) if len(shown) > 1 else enough.set()
+
+    def account():
+        return msgspec.structs.replace(ACCOUNT, uavs=shown[0], per_link=()), [STATUS]
+
+    shown.pop(0)  # none so far: no line
+    with status_display(account, say):
+        assert enough.wait(PATIENCE_S)
+    assert [line.split()[0] for line in said] == ["1", "2", "1"]
+
+
 def test_prometheus_reads_every_number_of_the_account(free_port):
     with serve(f"127.0.0.1:{free_port}", counters(lambda: (ACCOUNT, [STATUS]))) as address:
         with urllib.request.urlopen(address, timeout=PATIENCE_S) as reply:

@@ -281,7 +281,10 @@ def test_it_ends_by_itself_and_never_overwrites_unasked(router, tmp_path):
         with command(path, *options, router=router) as child:
             _, errors = child.communicate(timeout=PATIENCE_S)
         assert (child.returncode, errors.count("\n")) == (code, 1) and words in errors
-    for name, words in (("a.tlog", "expected a name that ends in .parauav"), ("none/a.parauav", "cannot be written")):
+    for name, words in (
+        ("a.tlog", "expected a name that ends in .parauav"),
+        ("none/a.parauav", "expected one; create it first"),
+    ):
         with command(tmp_path / name, router=router) as child:
             _, errors = child.communicate(timeout=PATIENCE_S)
         assert child.returncode == 2 and words in errors

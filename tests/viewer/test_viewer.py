@@ -294,7 +294,7 @@ def test_wild_numbers_in_good_messages_do_not_stop_the_page(clock: Clock, value:
     assert "UAV-000" in status_html(vehicle, DARK, clock.now) and "fit per state" in figures_html(vehicle, clock.now)
     assert "2 UAVs" in summary_html(feed.all(), feed, DARK, clock.now)
     assert "UAV-000" in table(feed.all(), DARK, clock.now, total=2, pick="{}", selected=0)
-    assert all(np.isfinite(part).all() for part in band(vehicle, np.zeros((0, 30)))[2:3])
+    assert all(np.isfinite(part).all() for part in band(vehicle, np.zeros((0, 30)), clock.now)[2:3])
 
 
 def test_a_chart_keeps_its_scale_while_its_values_stay_within() -> None:

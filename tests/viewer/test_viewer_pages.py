@@ -19,7 +19,7 @@ from tests.bench.viewing.watcher import Watcher
 from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import PretendFleet
 from viewer.browser.http_server import Browser, serve, without_stdout
-from viewer.server.app import App
+from viewer.server.app import TICKS_PER_S, App
 from viewer.server.view import View
 from viewer.text.missed_events import encode_click, parse_click
 from viewer.text.words import table
@@ -144,6 +144,80 @@ def test_nothing_is_held_back_while_lists_are_made(site, monkeypatch) -> None:
     monkeypatch.setattr("viewer.panels.panels.table", made)
     site.run()
     assert held and not any(held)
+
+
+class Cursors(dict[int, int]):
+    """Number of the last message sent, by client, and of all before it."""
+
+    def __init__(self, present: dict[int, int]) -> None:
+        super().__init__(present)
+        self.ends: list[int] = []
+
+    def __setitem__(self, client: int, last: int) -> None:
+        self.ends.append(last)
+        super().__setitem__(client, last)
+
+
+def test_a_long_block_is_sent_whole(site) -> None:
+    """In two frames of the socket, labels of this block could be on the screen with labels of the block before."""
+    client, count = site.views[0].client, 300
+    buffer = client._websock_connection.get_message_buffer()
+    labels = [client.scene.add_label(f"/many/{k}", "") for k in range(count)]
+    buffer.generator_cursors = cursors = Cursors(buffer.generator_cursors)
+    for text in ("first", "second"):
+        begin = buffer.message_counter
+        with client.atomic():
+            for label in labels:
+                label.text = text
+        end = buffer.message_counter - 1
+        while cursors[client.client_id] < end:
+            threading.Event().wait(0.01)
+        assert end + 1 - begin == count and not any(begin <= last < end for last in cursors.ends)
+
+
+def test_row_tile_label_and_ring_of_one_record_are_sent_in_one_block(site, monkeypatch) -> None:
+    """A horizon that changes with every prediction; also after a change of the time shown, which is drawn at once."""
+    view, block, sent, publish = site.views[0], 0, [], site.bus.publish
+    buffer = view.client._websock_connection.get_message_buffer()
+    push, start = buffer.push, buffer.atomic_start
+
+    def begin() -> None:
+        nonlocal block
+        block += buffer.atomic_counter == 0
+        start()
+
+    def note(message: Any) -> None:
+        sent.append((block if buffer.atomic_counter else -1, message))
+        push(message)
+
+    def changed(message: Any, *more: Any) -> None:
+        if isinstance(message, Prediction):
+            message = msgspec.structs.replace(message, horizon_s=6.0 + (message.t * 7.0) % 20.0)
+        publish(message, *more)
+
+    monkeypatch.setattr(buffer, "atomic_start", begin)
+    monkeypatch.setattr(buffer, "push", note)
+    monkeypatch.setattr(site.bus, "publish", changed)
+    table_id, compared, ticks = view.panels._table._impl.uuid, 0, 0
+    while compared < 6:
+        site.fleet.advance(time.time())
+        site.app.tick(ticks % TICKS_PER_S)
+        ticks += 1
+        if ticks % (2 * TICKS_PER_S) == 0:
+            view._redraw()
+            site.app.draw_selections()
+        if ticks % TICKS_PER_S:
+            continue
+        rows = {number: one.updates["content"] for number, one in sent if getattr(one, "uuid", "") == table_id}
+        texts = [(number, getattr(one, "updates", {}).get("text", "")) for number, one in sent]
+        labels = {number: text for number, text in texts if text.startswith("horizon ")}
+        rings = {number for number, one in sent if getattr(one, "name", "") == "/selected/horizon"}
+        assert rows.keys() >= labels.keys() and -1 not in rows
+        for number, label in labels.items():
+            row = re.search(r'<tr class="pick on".*?<span class="num">(.*?)</span>', rows[number])
+            assert row is not None and label.startswith(f"horizon {row[1]}:") and number in rings
+            compared += 1
+        sent.clear()
 
 
 def test_a_click_is_written_as_it_is_read() -> None:

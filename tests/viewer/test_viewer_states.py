@@ -7,14 +7,26 @@ from types import SimpleNamespace
 import msgspec
 import numpy as np
 import pytest
+from rich.console import Console
 
-from fleet.contract import FleetState, GatewayCounters, LinkCounters, Outcome, Status, TwinState
+from fleet.commands.live.status import fleet_table
+from fleet.contract import (
+    FleetRow,
+    FleetState,
+    GatewayCounters,
+    LinkCounters,
+    Outcome,
+    Status,
+    TwinState,
+    claimed_horizon_s,
+)
 from gateway.link_spec import read_spec
 from gateway.links.recorded import ReplayLink
 from gateway.pipeline import Pipeline
 from tests.gateway.test_gateway import flight
 from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import HOSTILE, STAMP, Clock, PretendUav, T, feed_of
+from viewer.panels.charts import band
 from viewer.panels.detail import figures_html, limitations, status_html
 from viewer.scene.camera import set_initial_view
 from viewer.scene.fleet_arrays import display_status
@@ -233,7 +245,29 @@ def test_a_horizon_that_has_passed_is_none_everywhere(clock: Clock) -> None:
     feed, _, bus = feed_of(clock, 1)
     bus.publish(msgspec.structs.replace(PretendUav(0).prediction(T + 1, 0.0), horizon_s=4.0), STAMP)
     assert feed.get(0).record(clock.now).horizon_s == 4.0
+    assert np.isfinite(band(feed.get(0), np.zeros((0, 30)), clock.now)[3]).any()
     clock.now += 9.0
     record = feed.get(0).record(0.0)  # a snapshot has its own instant
     assert record.horizon_s == 0.0 and horizon_text(record) == "–" and record.prediction_age_s > 5.0
     assert "link lost 9 s" in selection_text(feed.get(0), clock.now) and "prediction" in selection_text(feed.get(0), 0)
+    assert np.isnan(band(feed.get(0), np.zeros((0, 30)), clock.now)[3]).all()  # no line at a horizon
+
+
+@pytest.mark.parametrize(
+    ("horizon_s", "age_s", "claimed_s"),
+    [(4.0, None, 4.0), (4.0, 3.9, 4.0), (4.0, 4.1, 0.0), (0.4, 0.1, 0.0), (0.0, 0.0, 0.0), (np.nan, 1.0, 0.0)],
+)
+def test_fleet_status_and_page_show_the_same_horizon_of_a_prediction_of_an_age(
+    clock: Clock, horizon_s: float, age_s: float | None, claimed_s: float
+) -> None:
+    assert claimed_horizon_s(horizon_s, age_s) == claimed_s and claimed_horizon_s(4.0, 4.0) == 0.0
+    row = FleetRow(uav=0, state=TwinState.VERIFIED, verdict="", horizon_s=horizon_s, prediction_age_s=age_s)
+    console = Console(width=200, record=True)
+    console.print(fleet_table([row]))
+    figures = console.export_text().splitlines()[1].split()
+    assert figures[3] == (f"{claimed_s:.0f}" if claimed_s else "-")
+    feed, _, bus = feed_of(clock, 1)
+    bus.publish(msgspec.structs.replace(PretendUav(0).prediction(T + 1, 0.0), horizon_s=horizon_s), STAMP)
+    vehicle = feed.get(0)
+    vehicle.instant = clock.now + vehicle.forecast.t + (age_s or 0.0) - vehicle.time.t
+    assert vehicle.record(0.0).horizon_s == pytest.approx(claimed_s)

@@ -57,7 +57,7 @@ def _page(reports: list[Report], reference: Reference, folder: Path) -> None:
     from twin_worker.diagnosis.output.figures import stems
     from twin_worker.diagnosis.output.page import write
 
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     rotors = [report for report in reports if not set(CHANNELS) <= report.ratio_before.keys()]
     if rotors:
         log_progress(f"found {len(rotors)} reports of multirotors, which have no figures; use --json")

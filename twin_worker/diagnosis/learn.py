@@ -64,8 +64,6 @@ def calibrate_recordings(
 
 
 def _run(args: argparse.Namespace) -> int:
-    if not args.out.absolute().parent.is_dir():
-        raise ValueError(f"--out: found no folder {str(args.out.parent)!r}, expected one; make it first")
     options = RecordingOptions.of(args)
     if holds_rotorcraft(args.file[0], options):
         rotors = calibrate_multirotor(args.file, log_progress, np.inf if args.until is None else args.until, options)

@@ -50,6 +50,7 @@ REFUSED = (  # messages that this page never sends
     _messages.ShareUrlRequest,
     _messages.ShareUrlDisconnect,
 )
+BLOCK_MESSAGES = 10_000  # most messages of one block, `atomic()`, and of blocks waiting behind each other
 VIOLATION = 1008  # close code for a policy violation (RFC 6455, 7.4.1)
 RequestHandler = Callable[[Any, Request], Response | None]
 SocketHandler = Callable[[Any], Awaitable[None]]
@@ -286,6 +287,8 @@ class Browser:
     def __init__(self, client: Any, palette: Palette, wake: Callable[[], None]) -> None:
         self.client, self._default_palette, self._wake = client, palette, wake
         self._storage = client.local_storage
+        # viser sends at most 128 messages at once: a longer block would be shown in parts
+        client._websock_connection.get_message_buffer().max_window_size = BLOCK_MESSAGES
         self.absence: Absence | None = None  # until its events are marked as read
         self.uav: int | None = None  # stored selection, until a UAV is selected
         self.light: bool | None = None  # light theme; None: not chosen

@@ -86,7 +86,7 @@ class Charts:
             return
         trail = store.trail(vehicle)
         issued, distances = prediction_errors(store.past(vehicle), trail)
-        _show(self._band, band(vehicle, distances), from_zero=True)
+        _show(self._band, band(vehicle, distances, now), from_zero=True)
         _show(self._error, over_time(issued, distances, vehicle), from_zero=True)
         _show(self._fit, _history(store.fits(vehicle), 1))
         altitude = _altitude(vehicle, trail, now)
@@ -145,15 +145,17 @@ def axis_range(y: np.ndarray) -> tuple[float, float]:
     return float(np.floor(low / step) * step), float((np.floor(high / step) + 1) * step)
 
 
-def band(vehicle: Vehicle | None, distances: np.ndarray) -> tuple[np.ndarray, ...] | None:
+def band(vehicle: Vehicle | None, distances: np.ndarray, now: float) -> tuple[np.ndarray, ...] | None:
     """Return measured error and largest half-axis of the band against look-ahead, and a vertical horizon line.
 
-    `distances` is (k, 30) from `prediction_errors`. Returns x [s], measured, band, horizon [m].
+    `distances` is (k, 30) from `prediction_errors`; `now` monotonic [s]. Returns x [s], measured, band, horizon [m].
+    Without a horizon its line is NaN.
     """
     if vehicle is None or (forecast := vehicle.forecast) is None:
         return None
-    last = min(float(forecast.ahead[-1]), max(1.4 * forecast.horizon_s, 10.0))
-    horizon = [forecast.horizon_s, forecast.horizon_s + 1e-3]
+    horizon_s = vehicle.record(now).horizon_s
+    last = min(float(forecast.ahead[-1]), max(1.4 * horizon_s, 10.0))
+    horizon = [horizon_s, horizon_s + 1e-3]
     x = np.unique(np.concatenate([LOOK_AHEADS_S[last >= LOOK_AHEADS_S], np.linspace(0, last, 40), horizon]))
     half_axis = forecast.half_axes_at(x).max(axis=1) * UNIT_M
     measured = rms_by_look_ahead(distances)
@@ -164,7 +166,8 @@ def band(vehicle: Vehicle | None, distances: np.ndarray) -> tuple[np.ndarray, ..
         inside = (x >= ends[0]) & (x <= ends[1])
         line[inside] = np.interp(x[inside], LOOK_AHEADS_S[valid], measured[valid])
     horizon_line = np.full(len(x), np.nan)
-    horizon_line[np.searchsorted(x, horizon)] = [0.0, half_axis.max()]
+    if horizon_s:
+        horizon_line[np.searchsorted(x, horizon)] = [0.0, half_axis.max()]
     return x, line, half_axis, horizon_line
 
 
@@ -198,7 +201,8 @@ def _altitude(vehicle: Vehicle | None, trail: np.ndarray, now: float) -> tuple[n
     if vehicle.forecast is None:
         return x, up, np.full(len(x), np.nan)
     forecast = vehicle.forecast
-    ahead = np.linspace(0.1, max(forecast.horizon_s, 0.2), 40)
-    predicted = forecast.position_at(ahead + max(float(trail[-1, 0]) - forecast.t, 0.0))[:, 2] * UNIT_M + base
+    start = max(float(trail[-1, 0]) - forecast.t, 0.0)
+    ahead = np.linspace(0.1, max(vehicle.record(now).horizon_s - start, 0.2), 40)
+    predicted = forecast.position_at(ahead + start)[:, 2] * UNIT_M + base
     blank = np.full(len(ahead), np.nan), np.full(len(x), np.nan)
     return np.concatenate([x, ahead]), np.concatenate([up, blank[0]]), np.concatenate([blank[1], predicted])

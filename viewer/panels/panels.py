@@ -220,8 +220,13 @@ class Panels:
         """Show the state of the measure tool; empty while it is off."""
         _update(self._measure, html)
 
-    def draw(self, fleet: list[Vehicle], store: FleetStore, now: float, selected: int | None) -> None:
-        """Update all panels; call it about once per second and when the selection changes."""
+    def draw(
+        self, fleet: list[Vehicle], store: FleetStore, now: float, selected: int | None, *, scene: Callable[[], None]
+    ) -> None:
+        """Update all panels; call it about once per second and when the selection changes.
+
+        `scene` draws labels and ring of the same records: the page receives both in one block of messages.
+        """
         self._pulse, palette, pick = not self._pulse, self._palette, self._handler(self._pick_input)
         selected_vehicle = next((vehicle for vehicle in fleet if vehicle.uav == selected), None)
         shown = [vehicle for vehicle in fleet if self._passes(vehicle, now, selected)]
@@ -247,7 +252,7 @@ class Panels:
             self.show(selected_vehicle, now)
             events = selected_vehicle.events if selected_vehicle is not None else None
             _update(self._events, "" if events is None else event_list_html(events, palette, self.seek))
-        self.charts.draw(selected_vehicle, store, now, self.units)
+            scene()
         self._offer(fleet)
 
     def _offer(self, fleet: list[Vehicle]) -> None:

@@ -3,6 +3,7 @@
 import contextlib
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import viser
@@ -240,11 +241,25 @@ class View:
             self._follow(now)
 
     def draw_selection(self, fleet_arrays: FleetArrays, now: float, ground: float) -> None:
-        """Draw the selected UAV immediately: path, route, tube, labels."""
+        """Draw the selected UAV immediately: path, route, tube, labels; at another time the panels too."""
+        fleet_arrays = self.timeline.fleet_arrays(fleet_arrays, self.selected, now)
+        if not self._shown:
+            self._draw_records(fleet_arrays, now)
         with self.client.atomic():
             self._draw_selected(now, ground)
-            self._draw_labels(self.timeline.fleet_arrays(fleet_arrays, self.selected, now), now)
+            self._draw_labels(fleet_arrays, now)
         self.client.flush()
+
+    def _draw_records(self, fleet_arrays: FleetArrays, now: float) -> None:
+        """Draw state, fit, horizon and ages in panels, labels and ring, from one record of each UAV."""
+        self._shown = {vehicle.uav: vehicle for vehicle in fleet_arrays.fleet}
+        self.panels.draw(
+            fleet_arrays.fleet,
+            self._store,
+            fleet_arrays.now,
+            self.selected,
+            scene=partial(self._draw_labels, fleet_arrays, now) if fleet_arrays.uavs else lambda: None,
+        )
 
     def _draw_labels(self, fleet_arrays: FleetArrays, now: float) -> None:
         """Draw the selected UAV, scale the aircraft to the camera distance and draw the labels."""
@@ -267,10 +282,12 @@ class View:
     def draw_slow(self, fleet_arrays: FleetArrays, now: float, ground: float) -> None:
         """Draw slow content once per second and on a new selection: trails, predictions, routes, panels."""
         fleet_arrays = self.timeline.fleet_arrays(fleet_arrays, self.selected, now)
-        self.dirty, self._shown = False, {vehicle.uav: vehicle for vehicle in fleet_arrays.fleet}
+        self.dirty = False
         self._restore_selection(fleet_arrays)
+        self._draw_records(fleet_arrays, now)  # first, as a long block is sent in parts
         self.timeline.draw(self.selected)
-        self.panels.draw(fleet_arrays.fleet, self._store, fleet_arrays.now, self.selected)
+        shown = self._shown.get(self.selected) if self.selected is not None else None
+        self.panels.charts.draw(shown, self._store, fleet_arrays.now, self.panels.units)
         self.panels.show_measure(self.measure.html(self.panels.units))
         if (scene_frame := self._store.scene_frame) is not None and fleet_arrays.uavs:
             with self.client.atomic():

@@ -25,6 +25,7 @@ from fleet.contract import (
     Rows,
     Status,
     TwinState,
+    claimed_horizon_s,
 )
 from viewer.store.event_detection import DetectorState, detect_events
 from viewer.store.forecast import PastPrediction, ScenePrediction
@@ -38,7 +39,6 @@ SILENT_S = 3.0  # without a sample for this long the link counts as lost [s]
 UNCLAIMED_S = 30.0  # without a worker message for this long the UAV counts as unclaimed [s]
 LATE_S = 5.0  # a prediction older than this is reported as late, wall time [s]
 POSE_FIELDS = ("t", "at", "alt_m", "attitude", "Va", "time", "sample_received", "shown_t")  # change between records
-MIN_HORIZON_S = 0.5  # a shorter horizon counts as none [s]
 ENDED_S = 3.0  # a replay without messages for this long has ended [s]
 JUMP_S = 5.0  # a larger step back in time is another flight: reset [s]
 OTHER_FLIGHT_S = 86_400.0  # a status farther from the sample time belongs to another flight [s]
@@ -142,9 +142,7 @@ class Vehicle:
     def _compute_record(self, now: float) -> StatusRecord:
         data_t, forecast = self.data_time(now), self.forecast
         age_s = None if forecast is None or not isfinite(data_t) else max(data_t - forecast.t, 0.0)
-        horizon_s = forecast.horizon_s if forecast is not None else 0.0
-        if age_s is not None and (age_s >= horizon_s or horizon_s < MIN_HORIZON_S):
-            horizon_s = 0.0
+        horizon_s = claimed_horizon_s(forecast.horizon_s, age_s) if forecast is not None else 0.0
         return StatusRecord(
             data_t,
             self.state(now),

@@ -16,7 +16,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from fleet.bus.session import connect
-from fleet.cli import check_file, check_parent, id_range, stop_on_signal
+from fleet.cli import id_range, stop_on_signal
 from fleet.config import bus_config_from, router_arguments
 from fleet.contract import Message
 from fleet.export.features import MapFeature, summarise
@@ -24,6 +24,7 @@ from fleet.export.map_files import geojson_text, kml_text
 from fleet.export.mcap_file import McapExport
 from fleet.export.message_source import LiveSource, only, recorded_messages
 from fleet.export.rerun_file import RerunExport, check_rerun
+from fleet.process.file_options import input_file, output_file
 from fleet.process.logs import report_progress
 from fleet.telemetry.recording.fleet_news import BusMessageReader
 from fleet.telemetry.recording.opening import COMPRESSED, RecordingFile
@@ -41,8 +42,10 @@ _RECORDING = ".parauav"
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("file", type=Path, metavar="FILE", help=f"file to write, {', '.join(FORMATS)}")
-    parser.add_argument("--from", dest="source", type=Path, metavar="RECORDING", help="read a .parauav recording")
+    parser.add_argument("file", type=output_file, metavar="FILE", help=f"file to write, {', '.join(FORMATS)}")
+    parser.add_argument(
+        "--from", dest="source", type=input_file(), metavar="RECORDING", help="read a .parauav recording"
+    )
     parser.add_argument(
         "--for",
         dest="seconds",
@@ -95,9 +98,6 @@ def check_arguments(args: argparse.Namespace) -> None:
         )
     if args.file.suffix.lower() == ".rrd":
         check_rerun()
-    check_parent("FILE", args.file)
-    if args.file.is_dir():
-        raise ValueError(f"FILE: found a folder {str(args.file)!r}, expected a file; name a file in it")
     if args.file.exists() and not args.overwrite:
         raise ValueError(
             f"FILE: found an existing file {str(args.file)!r}, expected a new name; choose one, or add --overwrite"
@@ -108,7 +108,6 @@ def check_arguments(args: argparse.Namespace) -> None:
         return
     if args.seconds is not None:
         raise ValueError("--for: found --from too, expected only one; a recording is exported as a whole, drop --for")
-    check_file("--from", args.source)
     if (
         Path(args.source.name.removesuffix(next(filter(args.source.name.endswith, COMPRESSED), ""))).suffix
         != _RECORDING

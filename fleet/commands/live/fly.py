@@ -1,10 +1,10 @@
 """Fly simulated aircraft: wings on JSBSim, rotors on RotorPy, which send MAVLink 2 over UDP or into a recording."""
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fleet.cli import host_and_port, id_range, stop_on_signal
+from fleet.process.file_options import output_file
 from fleet.process.logs import report_status
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--for", dest="seconds", type=float, metavar="S", help="duration (unlimited; 300 with --tlog)")
     fault_arguments(parser)
     parser.add_argument("--story", choices=STORIES, help="conflict: aircraft 0 and 1 meet, the others are far away")
-    parser.add_argument("--tlog", type=Path, metavar="FILE", help="write this .tlog as fast as possible instead")
+    parser.add_argument("--tlog", type=output_file, metavar="FILE", help="write this .tlog as fast as possible instead")
 
 
 def fault_arguments(parser: argparse.ArgumentParser) -> None:

@@ -18,6 +18,7 @@ from fleet.bus.session import Bus, connect
 from fleet.cli import stop_on_signal
 from fleet.config import bus_config_from, router_arguments
 from fleet.contract import TOPICS, Sample
+from fleet.process.file_options import output_file
 from fleet.process.logs import report_progress
 from fleet.telemetry.recording.fleet_log import BusRecord
 
@@ -34,7 +35,7 @@ _LOG_PERIOD_S = 10.0  # between progress lines where the output is not a termina
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("file", type=Path, metavar="FILE", help=f"recording to write, {SUFFIX}")
+    parser.add_argument("file", type=output_file, metavar="FILE", help=f"recording to write, {SUFFIX}")
     parser.add_argument("--for", dest="seconds", type=float, default=0.0, metavar="S", help="duration (until Ctrl-C)")
     parser.add_argument("--overwrite", action="store_true", help="replace FILE where it exists")
     router_arguments(parser)
@@ -60,15 +61,19 @@ def _check(args: argparse.Namespace) -> None:
         raise ValueError(f"--for: found {args.seconds} s, expected 0 (until Ctrl-C) or more; change it")
     if args.file.suffix != SUFFIX:
         raise ValueError(f"FILE: found {args.file.name!r}, expected a name that ends in {SUFFIX}; rename it")
+    if args.file.exists() and not args.overwrite:
+        raise ValueError(_exists(args.file))
+
+
+def _exists(path: Path) -> str:
+    return f"FILE: found an existing file {str(path)!r}, expected a new name; choose one, or add --overwrite"
 
 
 def _open_file(path: Path, overwrite: bool) -> IO[bytes]:
     try:
         return path.open("wb" if overwrite else "xb", buffering=0)
     except FileExistsError:
-        raise ValueError(
-            f"FILE: found an existing file {str(path)!r}, expected a new name; choose one, or add --overwrite"
-        ) from None
+        raise ValueError(_exists(path)) from None
     except OSError as error:
         raise OSError(f"FILE: {str(path)!r} cannot be written ({error.strerror}); choose another place") from None
 

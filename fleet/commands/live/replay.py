@@ -7,9 +7,10 @@ from functools import partial
 from pathlib import Path
 from urllib.parse import quote
 
-from fleet.cli import check_file, stop_on_signal
+from fleet.cli import stop_on_signal
 from fleet.config import router_arguments, router_options
 from fleet.process.children import run_until
+from fleet.process.file_options import check_file
 from fleet.process.logs import report_progress
 from fleet.report.progress import show_progress
 from fleet.telemetry.recording.ids import MAX_PER_LINK, IdAllocator

@@ -19,7 +19,17 @@ from fleet.bus.codec import is_plausible_epoch
 from fleet.bus.session import Bus, connect
 from fleet.cli import stop_on_signal
 from fleet.config import bus_config_from, router_arguments
-from fleet.contract import Claim, FleetRow, FleetState, GatewayCounters, Siblings, Status, TwinState, WindField
+from fleet.contract import (
+    Claim,
+    FleetRow,
+    FleetState,
+    GatewayCounters,
+    Siblings,
+    Status,
+    TwinState,
+    WindField,
+    claimed_horizon_s,
+)
 from fleet.process.sanitise import printable
 from fleet.report.report_text import id_ranges
 
@@ -169,7 +179,7 @@ def fleet_table(rows: list[FleetRow]) -> Table:
     out.add_column("alerts and verdict", overflow="fold")
     for row in rows:
         fit = _number(sum(row.fit.values()) / len(row.fit) if row.fit else None, 0)
-        horizon = _number(row.horizon_s or None, 0)
+        horizon = _number(claimed_horizon_s(row.horizon_s, row.prediction_age_s) or None, 0)
         age = _number(row.prediction_age_s, 1)
         late = row.prediction_age_s is not None and row.prediction_age_s > LATE_S
         ages = _number(row.sample_age_s, 1), f"[red]{age}[/red]" if late else age

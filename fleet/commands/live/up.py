@@ -14,7 +14,7 @@ from rich.text import Text
 
 from fleet.access.knock import probe_router
 from fleet.bus.session import Bus, connect, open_router
-from fleet.cli import check_file, check_link, check_parent, check_port, host_and_port, stop_on_signal
+from fleet.cli import check_link, check_port, host_and_port, stop_on_signal
 from fleet.commands.live.fly import AIRCRAFT_HELP, AUTOPILOTS, CHOICES, STORIES, fault_arguments, faults_of
 from fleet.commands.live.replay import check_arguments as check_playing
 from fleet.commands.live.replay import replay_link
@@ -22,6 +22,7 @@ from fleet.commands.live.status import as_objects, fleet_rows, fleet_table
 from fleet.config import bus_config_from, router_arguments, router_options
 from fleet.contract import FleetRow, FleetState, TwinState
 from fleet.process.children import Children
+from fleet.process.file_options import check_file, input_file, model_of, output_file
 from fleet.process.logs import add_time, report_progress
 from fleet.process.sanitise import printable
 from fleet.report.story import ConflictStory
@@ -60,7 +61,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--link", action="append", default=[], help="real aircraft instead, e.g. udpin:0.0.0.0:14550")
     parser.add_argument("--forward", action="append", default=[], help="another ground station, as in gateway --help")
-    parser.add_argument("--keys", metavar="FILE", help="keys of signed links, as in gateway --help")
+    parser.add_argument(
+        "--keys", type=input_file("a file of keys"), metavar="FILE", help="keys of signed links, as in gateway --help"
+    )
     parser.add_argument(
         "--replay", action="extend", nargs="+", default=[], metavar="FILE", help="recordings of any kind instead"
     )
@@ -79,11 +82,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--baseline",
         action="append",
+        type=model_of,
         default=[],
         metavar="[ID=]MODEL",
         help="reference model for mismatches, of one aircraft or of all (each aircraft's own first flight)",
     )
-    parser.add_argument("--summary", type=Path, metavar="FILE", help="write the last state of every UAV as JSON")
+    parser.add_argument("--summary", type=output_file, metavar="FILE", help="write the last state of every UAV as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -122,18 +126,12 @@ def _check(args: argparse.Namespace) -> None:
         check_link("--forward", text)
     for name in args.replay:
         check_file("--replay", name)
-    for text in args.baseline:
-        uav, _, model = text.partition("=")
-        check_file("--baseline", model if uav.isdecimal() else text, "a model from `fleet calibrate`")
     for option in ("terrain", "imagery"):
         if (file := getattr(args, option)) and not (option == "imagery" and args.no_viewer):
             check_file(f"--{option}", file if Path(file).exists() else file.rpartition("@")[0] or file, "a raster file")
     if args.map and not args.no_viewer:
         check_file("--map", args.map, "an MBTiles or PMTiles file")
-    if args.keys:
-        check_file("--keys", args.keys, "a file of keys")
     check_port("--port", args.port)
-    check_parent("--summary", args.summary)
     if not (args.link or args.replay):
         _check_free(args.mavlink)
 

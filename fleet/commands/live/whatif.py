@@ -4,7 +4,6 @@ import argparse
 import json
 import sys
 from math import radians
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -13,6 +12,7 @@ from fleet.bus.session import Bus, connect
 from fleet.config import bus_config_from, router_arguments
 from fleet.contract import Prediction, WhatIf, WhatIfStart
 from fleet.frames import to_geodetic, to_ned
+from fleet.process.file_options import input_file
 from fleet.process.sanitise import printable
 from fleet.telemetry.mavlink.microservices.waypoints import read_waypoints
 
@@ -28,7 +28,9 @@ _SHOWN_S = (0, 5, 10, 20, 30, 45, 60, 92, 120, 180)
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("uav", type=int, help="UAV id")
-    parser.add_argument("--items", type=Path, metavar="FILE", help="another mission, a QGC WPL 110 file")
+    parser.add_argument(
+        "--items", type=input_file("a QGC WPL 110 file"), metavar="FILE", help="another mission, a QGC WPL 110 file"
+    )
     parser.add_argument("--seq", type=int, metavar="N", help="item to fly to first")
     parser.add_argument("--speed", type=float, metavar="M/S", help="another airspeed; of a multirotor, ground speed")
     parser.add_argument(

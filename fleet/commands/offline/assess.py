@@ -1,9 +1,9 @@
 """Replay recordings through the twins as if live, and score every prediction against the recorded flight."""
 
 import argparse
-from pathlib import Path
 
-from fleet.cli import check_file, check_parent, run_module
+from fleet.cli import run_module
+from fleet.process.file_options import input_file, output_file, output_folder
 from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
 
 EXAMPLES = """
@@ -17,7 +17,9 @@ BASELINE_METHODS = ("cv", "ct", "imm", "route", "route_wind", "paper", "dynamics
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options; `python -m twin_worker.evaluation` takes the same."""
-    parser.add_argument("file", nargs="+", type=Path, metavar="FILE", help="recordings of any kind, also compressed")
+    parser.add_argument(
+        "file", nargs="+", type=input_file(), metavar="FILE", help="recordings of any kind, also compressed"
+    )
     parser.add_argument("--every", type=float, default=5.0, metavar="S", help="interval between starts (5)")
     parser.add_argument(
         "--method", default=OWN_METHODS[0], choices=OWN_METHODS, help="method of the twin (auto: the best available)"
@@ -31,8 +33,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--without-params", action="store_true", help="withhold the autopilot's parameters from the twins"
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="draw figures and write predictions.npz into DIR")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE")
+    parser.add_argument(
+        "--out", type=output_folder, metavar="DIR", help="draw figures and write predictions.npz into DIR"
+    )
+    parser.add_argument("--json", type=output_file, metavar="FILE", help="write the figures to FILE")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes that share the aircraft (1)")
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
     add_recording_arguments(parser)
@@ -53,13 +57,8 @@ def check_arguments(args: argparse.Namespace) -> None:
         )
     if not 1 <= args.jobs <= 64:
         raise ValueError(f"--jobs: found {args.jobs}, expected 1..64; change it")
-    for path in args.file:
-        check_file("FILE", path)
-    check_parent("--json", args.json)
     if args.json and any(args.json.exists() and path.samefile(args.json) for path in args.file):
         raise ValueError(f"--json: found the recording {str(args.json)!r} itself, expected another file; rename it")
-    if args.out and args.out.exists() and not args.out.is_dir():
-        raise ValueError(f"--out: found the file {str(args.out)!r}, expected a folder; name another")
 
 
 def baseline_methods(methods: str) -> tuple[str, ...]:

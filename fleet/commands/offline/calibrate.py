@@ -1,9 +1,9 @@
 """Calibrate an aircraft's simulation on nominal flights, for `fleet diagnose`."""
 
 import argparse
-from pathlib import Path
 
 from fleet.cli import run_module
+from fleet.process.file_options import airframe_card, input_file, output_file
 from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
 
 EXAMPLES = """
@@ -17,14 +17,20 @@ EXAMPLES = """
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options; `python -m twin_worker.diagnosis.learn` takes the same."""
     parser.add_argument(
-        "file", nargs="+", type=Path, metavar="NOMINAL", help="recordings without a fault, with much manoeuvring"
+        "file",
+        nargs="+",
+        type=input_file(),
+        metavar="NOMINAL",
+        help="recordings without a fault, with much manoeuvring",
     )
-    parser.add_argument("--airframe", type=Path, metavar="CARD", help="airframe TOML, its name, or a JSON card (none)")
+    parser.add_argument(
+        "--airframe", type=airframe_card, metavar="CARD", help="airframe TOML, its name, or a JSON card (none)"
+    )
     parser.add_argument(
         "--until", type=float, metavar="SECONDS", help="use only the data before SECONDS on each flight's clock"
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="MODEL", help="write the simulation to MODEL")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the fit achieved to FILE")
+    parser.add_argument("--out", type=output_file, required=True, metavar="MODEL", help="write the simulation to MODEL")
+    parser.add_argument("--json", type=output_file, metavar="FILE", help="write the fit achieved to FILE")
     add_recording_arguments(parser)
 
 

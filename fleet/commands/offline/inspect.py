@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from rich.console import Console
 
-from fleet.cli import check_file, check_parent
 from fleet.commands.offline.schema import fields_of, parts_of, summary
 from fleet.process.children import run_to_end
+from fleet.process.file_options import input_file, output_file
 from fleet.process.interrupt import interrupt_deferred
 from fleet.process.logs import report_progress
 from fleet.report.progress import show_progress
@@ -40,13 +40,21 @@ PLOTS = (".png", ".svg", ".pdf")
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("file", nargs="*", type=Path, metavar="FILE", help="recordings, also compressed")
-    parser.add_argument("--json", nargs="?", const="-", metavar="FILE", help="JSON to FILE, or instead of the table")
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="a page for every aircraft: .png, .svg or .pdf")
+    parser.add_argument("file", nargs="*", type=input_file(), metavar="FILE", help="recordings, also compressed")
+    parser.add_argument(
+        "--json", nargs="?", type=_json_file, const="-", metavar="FILE", help="JSON to FILE, or instead of the table"
+    )
+    parser.add_argument(
+        "--plot", type=output_file, metavar="FILE", help="a page for every aircraft: .png, .svg or .pdf"
+    )
     parser.add_argument("--twin", action="store_true", help="replay the recording through a twin and report the result")
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
     add_recording_arguments(parser)
     parser.add_argument("--keys", action="store_true", help="explain every key of the JSON and stop")
+
+
+def _json_file(text: str) -> str:
+    return text if text == "-" else str(output_file(text))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -130,12 +138,9 @@ def _check(args: argparse.Namespace) -> None:
     """Validate the options before anything is read."""
     if not args.file:
         raise ValueError("FILE: found none, expected at least one recording; name one")
-    for path in args.file:
-        check_file("FILE", path)
     if args.plot and args.plot.suffix not in PLOTS:
         raise ValueError(f"--plot: found {args.plot.name!r}, expected a name in {' '.join(PLOTS)}; change the suffix")
     for option, name in (("--plot", args.plot), ("--json", args.json)):
-        check_parent(option, name)
         if name and any(path.exists() and Path(name).exists() and path.samefile(name) for path in args.file):
             raise ValueError(f"{option}: found the recording {str(name)!r} itself, expected another file; rename it")
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from fleet.cli import id_range, stop_on_signal
 from fleet.process.children import run_until
+from fleet.process.file_options import input_file, output_file, output_folder
 from fleet.process.interrupt import INTERRUPTED
 from fleet.process.logs import report_progress
 from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
@@ -42,7 +43,9 @@ _LOSS = 0.01  # share of frames lost in transit [-]
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("experiment", choices=tuple(_AIR), help="identify: figures 7 and 8; predict: figure 9")
-    parser.add_argument("file", nargs="*", type=Path, metavar="FILE", help="recordings (none: fly simulated aircraft)")
+    parser.add_argument(
+        "file", nargs="*", type=input_file(), metavar="FILE", help="recordings (none: fly simulated aircraft)"
+    )
     parser.add_argument("--uavs", type=id_range, metavar="A-B", help="aircraft to fly (0-15)")
     parser.add_argument("--seed", type=int, default=5, help="random seed of aircraft, missions, weather and noise (5)")
     parser.add_argument("--for", dest="seconds", type=float, default=300.0, metavar="S", help="flight time (300)")
@@ -54,8 +57,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--first", choices=("projection", "pbsid", "both"), default="both", help="first step: the paper's, PBSID (both)"
     )
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes that share the predictions (1)")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="draw the figures into DIR")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the numbers to FILE")
+    parser.add_argument("--out", type=output_folder, metavar="DIR", help="draw the figures into DIR")
+    parser.add_argument("--json", type=output_file, metavar="FILE", help="write the numbers to FILE")
     add_recording_arguments(parser)
 
 

@@ -5,7 +5,8 @@ import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from fleet.cli import check_parent, stop_on_signal
+from fleet.cli import stop_on_signal
+from fleet.process.file_options import MODEL, airframe_card, input_file, output_file, output_folder
 from fleet.process.logs import report_progress
 from fleet.telemetry.recording.options import RecordingOptions, add_recording_arguments
 
@@ -27,8 +28,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--aircraft", choices=("wing", "quad"), default="wing", help="class of the simulated aircraft (wing)"
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write scores, marks and hashes")
-    parser.add_argument("--report", type=Path, metavar="DIR", help="store recordings, reports and pages in DIR")
+    parser.add_argument("--json", type=output_file, metavar="FILE", help="write scores, marks and hashes")
+    parser.add_argument(
+        "--report", type=output_folder, metavar="DIR", help="store recordings, reports and pages in DIR"
+    )
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
     parser.add_argument(
         "--smallest",
@@ -38,16 +41,22 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         help="simulated effects of SHARE to 1 times their usual magnitude, for limits of detection (1)",
     )
     group = parser.add_argument_group("recordings", "conceal faults in recordings instead of simulated flights")
-    group.add_argument("--inject", type=Path, nargs="+", metavar="FLIGHT", help="healthy flights of one fixed wing")
-    group.add_argument("--model", type=Path, metavar="MODEL", help="reference: output of `fleet calibrate`")
+    group.add_argument(
+        "--inject", type=input_file(), nargs="+", metavar="FLIGHT", help="healthy flights of one fixed wing"
+    )
+    group.add_argument(
+        "--model", type=input_file(MODEL), metavar="MODEL", help="reference: output of `fleet calibrate`"
+    )
     group.add_argument(
         "--against",
-        type=Path,
+        type=input_file(),
         nargs="+",
         metavar="NOMINAL",
         help="or other healthy flights, each flight without itself; otherwise the past of each flight",
     )
-    group.add_argument("--airframe", type=Path, metavar="CARD", help="without --model: the aircraft, as for calibrate")
+    group.add_argument(
+        "--airframe", type=airframe_card, metavar="CARD", help="without --model: the aircraft, as for calibrate"
+    )
     add_recording_arguments(parser)
 
 
@@ -60,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     _check(args)
     with TemporaryDirectory(prefix="parauav-proof-") as temporary:
         folder = args.report or Path(temporary)
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         return _run_test(args, folder)
 
 
@@ -107,8 +116,6 @@ def _check(args: argparse.Namespace) -> None:
         raise ValueError(f"--smallest: found {args.smallest:g}, expected 0.01..1; change it")
     if args.aircraft == "quad" and args.smallest < 1.0:
         raise ValueError("--smallest: found it with --aircraft quad, expected wings; leave one out")
-    check_parent("--json", args.json)
-    check_parent("--report", args.report)
     if args.report and args.report.exists() and any(args.report.iterdir()):
         raise ValueError(f"--report: found files in {str(args.report)!r}, expected an empty folder; name another")
     _check_recordings(args)
@@ -136,6 +143,3 @@ def _check_recordings(args: argparse.Namespace) -> None:
             raise ValueError(
                 f"--against: found {others} flights besides one of --inject, expected 2 to calibrate; name more"
             )
-    missing = [path for path in (*args.inject, *(args.against or ()), args.model) if path and not path.exists()]
-    if missing:
-        raise ValueError(f"found no file {str(missing[0])!r}, expected a recording or a model; correct the path")

@@ -1,12 +1,13 @@
 """Options of every command that reads recordings: mission, parameters and column map from files."""
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from fleet.contract import Item, Mission, Params, Sample
+from fleet.process.file_options import input_file
 from fleet.telemetry.mavlink.microservices.parameter_file import read_parameters
 from fleet.telemetry.mavlink.microservices.waypoints import read_waypoints
 
@@ -16,23 +17,18 @@ _NAMES = ("mission", "params", "columns")
 def add_recording_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of recordings."""
     group = parser.add_argument_group("recordings")
-    mission, params = _no_folder("a QGC WPL 110 file"), _no_folder("a parameter file")
+    mission, params = input_file("a QGC WPL 110 file"), input_file("a parameter file")
+    columns = input_file("a TOML file", "fleet.telemetry.onboard_logs.columns")
     group.add_argument(
         "--mission", type=mission, metavar="FILE", help="mission on board, QGC WPL 110, instead of the recorded one"
     )
     group.add_argument("--params", type=params, metavar="FILE", help="autopilot parameters, added to the recorded ones")
     group.add_argument(
-        "--columns", metavar="MAP", help="column map of .csv, .mat and .tar recordings: a TOML file, alfa or px4"
+        "--columns",
+        type=columns,
+        metavar="MAP",
+        help="column map of .csv, .mat and .tar recordings: a TOML file, alfa or px4",
     )
-
-
-def _no_folder(expected: str) -> Callable[[str], str]:
-    def checked(text: str) -> str:
-        if Path(text).is_dir():
-            raise argparse.ArgumentTypeError(f"found a folder {text!r}, expected {expected}; name a file in it")
-        return text
-
-    return checked
 
 
 @dataclass(frozen=True)
@@ -52,7 +48,7 @@ class RecordingOptions:
     @classmethod
     def of(cls, args: argparse.Namespace) -> "RecordingOptions":
         """Return the options of a command line, absent ones empty."""
-        return cls(*(getattr(args, name, None) or "" for name in _NAMES))
+        return cls(*(str(getattr(args, name, None) or "") for name in _NAMES))
 
     def arguments(self) -> list[str]:
         """Return the options as arguments of another command."""

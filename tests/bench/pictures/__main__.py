@@ -37,7 +37,7 @@ from .messages import (
 )
 from .page import command, page, settled, shoot, turn_to, viewer
 
-OUT = ROOT / "viewer"
+OUT = ROOT / "docs" / "images"
 REAL = "real/alfa_20180718_155331_1_engine_failure.tlog"
 EIGHT = ("--uavs", "0-7", "--for", "232")
 FAULTY = ("--uavs", "0-3", "--for", "260", "--fault", "airspeed_bias,bias_mps=-6,at=120", "--fault-uav", "0")

@@ -113,6 +113,51 @@ PLACES = """seconds => new Promise(done => {
   };
   look();
 })"""
+NOTE_LABELS = """(() => {  // text, anchor, position and visibility of each label, as the page takes them at a frame
+  const install = () => {
+    const page = window.__viserMutable;
+    if (!page || !page.messageQueue) { setTimeout(install, 1); return; }
+    const tags = page.tags = {}, queue = page.messageQueue, splice = queue.splice;
+    queue.splice = function (...range) {
+      const messages = splice.apply(queue, range);
+      for (const {name, props, updates, position, visible} of messages)
+        if (/labels\\/\\d+$/.test(name || ''))
+          Object.assign(tags[name] = tags[name] || {}, props, updates, position && {position},
+            visible !== undefined && {visible});
+      return messages;
+    };
+  };
+  install();
+})()"""
+LABEL_OVERLAPS = """([seconds, font, em]) => new Promise(done => {  // pairs of labels that overlap on the screen
+  const page = window.__viserMutable, env = page.nodeRefFromName['/env'], Vector = page.camera.position.constructor;
+  const pen = document.createElement('canvas').getContext('2d'); pen.font = font;
+  const until = performance.now() + 1e3 * seconds, found = {looks: 0, most: 0, pairs: []};
+  let before = '';
+  const box = ({text, anchor, position}) => {
+    const at = env.localToWorld(new Vector(...position)).project(page.camera);
+    const canvas = page.canvas.getBoundingClientRect(), [vertical, horizontal] = anchor.split('-');
+    const width = pen.measureText(text).width + em, height = 1.8 * em;
+    const left = (at.x + 1) / 2 * canvas.width - {left: 0, center: 0.5, right: 1}[horizontal] * width;
+    const top = (1 - at.y) / 2 * canvas.height - {top: 0, center: 0.5, bottom: 1}[vertical] * height;
+    return {text, left, top, right: left + width, bottom: top + height};
+  };
+  const look = () => {
+    const camera = page.camera.matrixWorld.elements.join();
+    const boxes = Object.values(page.tags).filter(one => one.visible && one.position && one.text).map(box);
+    if (camera === before) {  // labels follow a moved camera one update later
+      found.looks += 1;
+      found.most = Math.max(found.most, boxes.length);
+      boxes.forEach((a, i) => boxes.slice(i + 1).forEach(b => {
+        if (a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1)
+          found.pairs.push(a.text + ' | ' + b.text);
+      }));
+    }
+    before = camera;
+    performance.now() < until ? requestAnimationFrame(look) : done(found);
+  };
+  look();
+})"""
 ROWS = "[...document.querySelectorAll('tr.pick')].map(e => Number(e.dataset.uav))"
 
 
@@ -137,7 +182,8 @@ def labels_differing(samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def _agrees(label: str, fit: str, horizon: str, age: str) -> bool:
     if label.startswith("horizon "):
         return label.startswith(f"horizon {horizon}:")
-    return f"link lost {age}" in label if age else f"  fit {fit}" in label and f"horizon {horizon}" in label
+    claim = "no horizon" if horizon == "–" else f"  horizon {horizon}"
+    return f"link lost {age}" in label if age else f"  fit {fit}" in label and claim in label
 
 
 def drawn(samples: list[dict[str, Any]], *, with_ring: bool = True) -> list[dict[str, Any]]:

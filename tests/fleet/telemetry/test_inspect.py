@@ -7,6 +7,7 @@ import sys
 import msgspec
 import numpy as np
 import pytest
+from conftest import exit_code
 
 from fleet.cli import main
 from fleet.commands.offline import inspect
@@ -239,7 +240,7 @@ def test_a_file_of_another_kind_is_refused_in_a_sentence(tmp_path, capsys):
     "args", [[], ["missing.tlog"], ["{tlog}", "--plot", "a.bmp"], ["{tlog}", "--json", "no/where"]]
 )
 def test_wrong_use_is_refused_before_anything_is_read(tlog, args, capsys):
-    assert main(["inspect", *(each.format(tlog=tlog) for each in args)]) == 2
+    assert exit_code(lambda: main(["inspect", *(each.format(tlog=tlog) for each in args)])) == 2
     assert "expected" in capsys.readouterr().err
 
 

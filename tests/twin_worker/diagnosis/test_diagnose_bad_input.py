@@ -169,14 +169,18 @@ def test_folders_that_are_not_there_are_named_before_any_work(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     gone = str(tmp_path / "gone" / "x.json")
-    assert learn.main(["a.tlog", "--out", gone]) == 2 and "--out: found no folder" in capsys.readouterr().err
     (model := tmp_path / "m.json").write_text("{}")
-    assert diagnosis.main(["a.tlog", "--model", str(model), "--json", gone]) == 2
-    assert "--json: found no folder" in capsys.readouterr().err
+    for main, option, words in (
+        (learn.main, "--out", [str(model), "--out", gone]),
+        (diagnosis.main, "--json", ["a.tlog", "--model", str(model), "--json", gone]),
+    ):
+        with pytest.raises(SystemExit) as left:
+            main(words)
+        assert left.value.code == 2 and f"{option}: found no folder" in capsys.readouterr().err
 
 
 def test_it_must_be_said_what_to_compare_with() -> None:
     parser = argparse.ArgumentParser()
     verb.arguments(parser)
     with pytest.raises(ValueError, match="exactly one of --model, --against"):
-        verb.run(parser.parse_args(["a.tlog"]))
+        verb.run(parser.parse_args([__file__]))

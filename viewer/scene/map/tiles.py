@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from PIL import Image
 
-from fleet.cli import check_file
+from fleet.process.file_options import check_file
 from fleet.terrain.raster import MERCATOR, Raster, to_mercator
 
 EQUATOR_M = 40_075_017.0  # circumference of the earth [m]
