@@ -19,7 +19,7 @@ from twin_worker.alerts.feasibility import read_limits
 from twin_worker.alerts.geofence import MIN_HEIGHT_ROTORS_M, MIN_HEIGHT_WINGS_M
 from twin_worker.prediction.autopilot_parameters import fixed_wing_controller
 from twin_worker.prediction.replay_window import AutopilotConfig
-from twin_worker.proposals.mission_edits import insert, move_within, remove
+from twin_worker.proposals.mission_edits import insert, move_within, remove, without_jumps
 from twin_worker.twin.state.routes import ROUTE_MODES
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.kinematic_prediction import is_hovering
@@ -361,25 +361,25 @@ def _skip(plan: Plan, seq: int) -> Change | None:
     return Change(uav=plan.uav, items=remove(plan.items, seq), seq=plan.seq)
 
 
-def _last_waypoints(plan: Plan) -> list[Item]:
-    """Return the waypoints behind the current item that may be left out; none of a mission with jumps."""
-    if any(item.command == JUMP for item in plan.items):
-        return []
-    return [item for item in plan.ahead if item.seq > plan.seq and m.KINDS[item.command] in _PASSED]
+def _last_waypoints(items: tuple[Item, ...], seq: int) -> list[Item]:
+    """Return the waypoints behind item `seq` that may be left out."""
+    return [one for one in items if one.seq > seq and is_positional(one) and m.KINDS[one.command] in _PASSED]
 
 
 def _shortenings(plan: Plan) -> list[int]:
-    """Return the numbers of last waypoints of which each is tried to be left out: 1, 2, 4, …, all."""
-    n = len(_last_waypoints(plan))
-    return sorted({*(2**k for k in range(n.bit_length())), n} - {0})
+    """Return the numbers of last waypoints of which each is tried to be left out: 1, 2, 4, …, all; 0: repetitions."""
+    items = without_jumps(plan.items)
+    n = len(_last_waypoints(items, plan.seq))
+    return sorted({*(2**k for k in range(n.bit_length())), n, 0} - ({0} if len(items) == len(plan.items) else set()))
 
 
 def _without_last(plan: Plan, number: float) -> tuple[Item, ...] | None:
-    """Return the mission without its last waypoints; what follows them, such as a landing, remains."""
-    left_out, items = _last_waypoints(plan)[-int(number) :], plan.items
-    for item in reversed(left_out):
+    """Return the mission without repetitions and its last waypoints; what follows them, such as a return, remains."""
+    items = without_jumps(plan.items)
+    left_out = _last_waypoints(items, plan.seq)
+    for item in reversed(left_out[len(left_out) - int(number) :]):
         items = remove(items, item.seq)
-    return items if left_out else None
+    return items if items != plan.items else None
 
 
 def _within(plan: Plan, radius: float) -> tuple[Item, ...] | None:

@@ -31,6 +31,13 @@ def remove(items: Sequence[Item], seq: int) -> tuple[Item, ...]:
     return tuple(moved(item) for item in items if item.seq != seq)
 
 
+def without_jumps(items: Sequence[Item]) -> tuple[Item, ...]:
+    """Leave out all jumps, so that nothing is repeated."""
+    for jump in reversed([item for item in items if item.command == JUMP]):
+        items = remove(items, jump.seq)
+    return tuple(items)
+
+
 def move_within(item: Item, home: Origin, radius: float) -> Item:
     """Return an item moved towards home where it is farther than `radius` from it [m]."""
     offset = to_ned(home, np.array([item.lat_e7], float), np.array([item.lon_e7], float), np.zeros(1))[0]

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from fleet.contract import AlertKind, Array, Option, ProposedPath
+from fleet.mission_jumps import JUMP
 from twin_worker.prediction.multirotor.endurance import Z90
 from twin_worker.proposals.assessment import Approach, closest_approach
 from twin_worker.proposals.candidates import Candidate, Kind, Plan, present_speed
@@ -72,7 +73,9 @@ def describe(candidate: Candidate, plan: Plan) -> str:
     if candidate.kind is Kind.SKIP:
         return f"{name} leaves out item {value:.0f}"
     if candidate.kind is Kind.SHORTEN:
-        return f"{name} leaves out its last {f'{value:.0f} waypoints' if value > 1 else 'waypoint'}"
+        last = f"its last {f'{value:.0f} waypoints' if value > 1 else 'waypoint'}" if value else ""
+        repeats = "repetitions" if any(item.command == JUMP for item in plan.items) else ""
+        return f"{name} leaves out {' and '.join(filter(None, (repeats, last)))}"
     if candidate.kind is Kind.SHRINK:
         return f"{name} stays within {value:.0f} m of home"
     return f"{name} {candidate.kind.value}s" + (" to launch" if candidate.kind is Kind.RETURN else "")
