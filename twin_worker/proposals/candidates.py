@@ -1,6 +1,6 @@
 """Candidate changes of the plan of one aircraft, and the items, item number or mode that each of them uploads."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from math import ceil, hypot
@@ -19,6 +19,7 @@ from twin_worker.alerts.feasibility import read_limits
 from twin_worker.alerts.geofence import MIN_HEIGHT_ROTORS_M, MIN_HEIGHT_WINGS_M
 from twin_worker.prediction.autopilot_parameters import fixed_wing_controller
 from twin_worker.prediction.replay_window import AutopilotConfig
+from twin_worker.proposals.mission_edits import insert, move_within, remove, without_jumps
 from twin_worker.twin.state.routes import ROUTE_MODES
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.kinematic_prediction import is_hovering
@@ -43,6 +44,7 @@ _SKIPPED = 2  # items nearest to the event of which each is left out
 _AHEAD_ITEMS = 8  # navigation items ahead that are looked at
 _LOITER_TIME, _WAYPOINT, _LAND, _VTOL_LAND = 19, 16, 21, 85  # MAV_CMD
 _NO_OFFSET = (m.LAND, m.TAKEOFF)  # legs whose altitude is not changed
+_PASSED = (m.WAYPOINT, m.LOITER_TURNS, m.LOITER_TIME)  # legs after which the mission goes on, and may do without
 
 
 class Kind(StrEnum):
@@ -52,6 +54,7 @@ class Kind(StrEnum):
     ALTITUDE = "altitude"
     DELAY = "delay"
     SKIP = "skip"
+    SHORTEN = "shorten"
     SHRINK = "shrink"
     HOLD = "hold"
     RETURN = "return"
@@ -65,8 +68,8 @@ INTERRUPTING = (Kind.HOLD, Kind.RETURN, Kind.LAND)
 class Candidate(NamedTuple):
     """One change: kind, and its value.
 
-    The value is the airspeed [m/s], the altitude offset [m], the waiting time [s], the item that is left out, or the
-    distance from home within which all items ahead are moved [m].
+    The value is the airspeed [m/s], the altitude offset [m], the waiting time [s], the item that is left out, the
+    number of last waypoints that are left out, or the distance from home within which all items ahead are moved [m].
     """
 
     uav: int
@@ -196,12 +199,16 @@ def candidates(
         tried += [Candidate(plan.uav, Kind.ALTITUDE, offset) for offset in _offsets(plan, kind, separation_m, deficit)]
         if kind is AlertKind.CONFLICT:
             tried += [Candidate(plan.uav, Kind.DELAY, seconds) for seconds in _DELAYS_S]
+        if kind is AlertKind.BATTERY:
+            tried += [Candidate(plan.uav, Kind.SHORTEN, float(n)) for n in _shortenings(plan)]
         tried += [Candidate(plan.uav, Kind.SKIP, float(seq)) for seq in _skipped(plan, kind, event)]
         if np.isfinite(deficit.radius):
             radii = (deficit.radius, deficit.radius - 30.0)
             tried += [Candidate(plan.uav, Kind.SHRINK, radius) for radius in radii if radius > 0.0]
-    modes = ((Kind.HOLD, HOLD_MODE), (Kind.RETURN, RETURN_MODE), (Kind.LAND, LAND_MODE))
-    return tried + [Candidate(plan.uav, interruption) for interruption, mode in modes if plan.twin.mode != mode]
+    modes = {Kind.HOLD: HOLD_MODE, Kind.RETURN: RETURN_MODE, Kind.LAND: LAND_MODE}
+    if kind is AlertKind.BATTERY:
+        del modes[Kind.HOLD]  # a hover uses energy and reaches nothing
+    return tried + [Candidate(plan.uav, interruption) for interruption, mode in modes.items() if plan.twin.mode != mode]
 
 
 def to_change(plan: Plan, candidate: Candidate) -> Change | None:
@@ -220,6 +227,7 @@ def to_change(plan: Plan, candidate: Candidate) -> Change | None:
         Kind.ALTITUDE: _with_offset,
         Kind.DELAY: _with_wait,
         Kind.SHRINK: _within,
+        Kind.SHORTEN: _without_last,
     }[candidate.kind](plan, candidate.value)
     return None if items is None else Change(uav=plan.uav, items=items, seq=plan.seq)
 
@@ -333,26 +341,6 @@ def _with_wait(plan: Plan, seconds: float) -> tuple[Item, ...] | None:
     return insert(plan.items, _item_on_path(plan, ahead_s, command=command, param1=seconds))
 
 
-def insert(items: Sequence[Item], new: Item) -> tuple[Item, ...]:
-    """Insert an item before the one of the same number; those after it, and jumps to them, move up by one."""
-
-    def moved(item: Item) -> Item:
-        param1 = item.param1 + 1 if item.command == JUMP and item.param1 >= new.seq else item.param1
-        return msgspec.structs.replace(item, seq=item.seq + (item.seq >= new.seq), param1=param1)
-
-    return tuple(sorted((*map(moved, items), new), key=lambda item: item.seq))
-
-
-def remove(items: Sequence[Item], seq: int) -> tuple[Item, ...]:
-    """Leave out one item; those after it, and jumps to them, move down by one."""
-
-    def moved(item: Item) -> Item:
-        param1 = item.param1 - 1 if item.command == JUMP and item.param1 > seq else item.param1
-        return msgspec.structs.replace(item, seq=item.seq - (item.seq > seq), param1=param1)
-
-    return tuple(moved(item) for item in items if item.seq != seq)
-
-
 def _skipped(plan: Plan, kind: AlertKind, event: Origin | None) -> list[int]:
     """Return the items of which each is left out: the current one, or those nearest to the event."""
     ahead = plan.ahead[:_AHEAD_ITEMS]
@@ -373,23 +361,35 @@ def _skip(plan: Plan, seq: int) -> Change | None:
     return Change(uav=plan.uav, items=remove(plan.items, seq), seq=plan.seq)
 
 
+def _last_waypoints(items: tuple[Item, ...], seq: int) -> list[Item]:
+    """Return the waypoints behind item `seq` that may be left out."""
+    return [one for one in items if one.seq > seq and is_positional(one) and m.KINDS[one.command] in _PASSED]
+
+
+def _shortenings(plan: Plan) -> list[int]:
+    """Return the numbers of last waypoints of which each is tried to be left out: 1, 2, 4, …, all; 0: repetitions."""
+    items = without_jumps(plan.items)
+    n = len(_last_waypoints(items, plan.seq))
+    return sorted({*(2**k for k in range(n.bit_length())), n, 0} - ({0} if len(items) == len(plan.items) else set()))
+
+
+def _without_last(plan: Plan, number: float) -> tuple[Item, ...] | None:
+    """Return the mission without repetitions and its last waypoints; what follows them, such as a return, remains."""
+    items = without_jumps(plan.items)
+    left_out = _last_waypoints(items, plan.seq)
+    for item in reversed(left_out[len(left_out) - int(number) :]):
+        items = remove(items, item.seq)
+    return items if items != plan.items else None
+
+
 def _within(plan: Plan, radius: float) -> tuple[Item, ...] | None:
     """Return the mission with all remaining items within `radius` of home [m]."""
     home = plan.twin.home
     if home is None:
         return None
-    moved: Mapping[int, Item] = {item.seq: _move_within(item, home, radius) for item in plan.remaining}
+    moved: Mapping[int, Item] = {item.seq: move_within(item, home, radius) for item in plan.remaining}
     items = tuple(moved.get(item.seq, item) for item in plan.items)
     return items if items != plan.items else None
-
-
-def _move_within(item: Item, home: Origin, radius: float) -> Item:
-    offset = to_ned(home, np.array([item.lat_e7], float), np.array([item.lon_e7], float), np.zeros(1))[0]
-    distance = hypot(*offset[:2])
-    if distance <= radius:
-        return item
-    lat, lon, _ = to_geodetic(home, np.array([*(offset[:2] * radius / distance), 0.0]))
-    return msgspec.structs.replace(item, lat_e7=int(lat), lon_e7=int(lon))
 
 
 def _landing(plan: Plan) -> Change | None:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from fleet.autopilots.modes import ModeEntry
-from fleet.contract import AlertKind, Change, Item, Mission, Prediction
+from fleet.contract import AlertKind, BatteryForecast, Change, Item, Mission, Prediction
 from fleet.frames import to_ned
 from fleet.mission import SPEED, Route
 from twin_worker.alerts.gaussian_forecast import GaussianForecast, to_gaussian
@@ -27,11 +27,12 @@ from twin_worker.proposals.candidates import DECISION_S, LAND_MODE, MODES, Candi
 from twin_worker.twin.state.events import invalidate_prediction
 from twin_worker.twin.state.routes import route_of_mode
 from twin_worker.twin.state.state import Twin
-from twin_worker.twin.steps.alerts import limit_hazards, mission_feasibility, reach_s
-from twin_worker.twin.steps.predict_step import predict
+from twin_worker.twin.steps.alerts import battery_hazard, limit_hazards, mission_feasibility, reach_s
+from twin_worker.twin.steps.kinematic_prediction import predict_battery, recent_track
+from twin_worker.twin.steps.predict_step import LOOK_BACK_ROTORS_S, predict
 from twin_worker.whatif import active_seq
 
-LIMITS = (AlertKind.GROUND, AlertKind.GEOFENCE, AlertKind.NOT_ACHIEVABLE)
+LIMITS = (AlertKind.GROUND, AlertKind.GEOFENCE, AlertKind.NOT_ACHIEVABLE, AlertKind.BATTERY)
 """Hazards of one aircraft alone that an experiment assesses."""
 _MARGIN_SHARE = 0.1  # probability aimed at, of that at which an alert is cleared [-]
 _NO_ROUTE = "imm"  # method of a prediction from the turn rate alone: the change has no effect on it
@@ -45,9 +46,10 @@ class PlanExperiment:
         candidate: the change; None: the present plan
         change: what is sent to the aircraft; None: nothing
         forecast: its prediction on the common grid
-        hazards: probabilities of ground, geofence and an infeasible mission
+        hazards: probabilities of ground, geofence, an infeasible mission and an empty battery
         margin_m: smallest distance to the minimum height and to the geofence within the look-ahead, by hazard [m]
         over_terrain: whether the heights are above terrain that is given, not above home
+        battery: of a multirotor at the end of the changed plan and at home; None: not known
     """
 
     candidate: Candidate | None
@@ -56,6 +58,7 @@ class PlanExperiment:
     hazards: dict[AlertKind, float]
     margin_m: dict[AlertKind, float]
     over_terrain: bool = False
+    battery: BatteryForecast | None = None
 
     @property
     def prediction(self) -> Prediction:
@@ -126,11 +129,24 @@ def _fly(twin: Twin, candidate: Candidate | None, change: Change | None) -> Plan
     forecast = None if prediction is None else to_gaussian(prediction)
     if forecast is None or forecast.prediction.method == _NO_ROUTE:
         return None
+    battery = _battery(twin, lands_here=change is not None and _lands_by_mode(change))
     _report_change(twin)
     hazards = [*limit_hazards(twin, forecast), mission_feasibility(twin, twin.telemetry.history.newest)]
+    hazards.append(battery_hazard(battery))
     probabilities = {hazard.kind: hazard.probability for hazard in hazards if hazard.kind in LIMITS}
     margins = _margins(twin, forecast)
-    return PlanExperiment(candidate, change, forecast, probabilities, margins, twin.terrain is not None)
+    return PlanExperiment(candidate, change, forecast, probabilities, margins, twin.terrain is not None, battery)
+
+
+def _battery(twin: Twin, *, lands_here: bool) -> BatteryForecast | None:
+    """Predict the battery of a multirotor under its plan; a landing at the present position needs no return."""
+    if twin.environment.battery_forecast is None:
+        return None
+    recent = recent_track(twin, LOOK_BACK_ROTORS_S, with_attitude=False)
+    forecast = None if recent is None else predict_battery(twin, recent)
+    if forecast is None or not lands_here or forecast.end is None:
+        return forecast
+    return msgspec.structs.replace(forecast, home=forecast.end, home_sigma=forecast.end_sigma or 0.0)
 
 
 def _apply(twin: Twin, change: Change, start: _Start | None) -> None:
@@ -173,8 +189,10 @@ def _landing_here(twin: Twin) -> tuple[tuple[Item, ...], int]:
     lat, lon, _ = (int(x) for x in twin.telemetry.history.rows("position")[1][-1])
     first, home = twin.first_item, twin.home
     land = Item(seq=first, command=21, lat_e7=lat, lon_e7=lon)
-    at_home = () if home is None else (Item(seq=0, command=16, frame=0, lat_e7=home[0], lon_e7=home[1]),)
-    return (*(at_home if first else ()), land), first
+    if home is None or not first:
+        return (land,), first
+    lat, lon, alt_mm = home
+    return (Item(seq=0, command=16, frame=0, lat_e7=lat, lon_e7=lon, alt_m=alt_mm * 1e-3), land), first
 
 
 def _enter_mode(twin: Twin, mode: str) -> None:

@@ -5,6 +5,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from fleet.contract import AlertKind, Array, Option, ProposedPath
+from fleet.mission_jumps import JUMP
+from twin_worker.prediction.multirotor.endurance import Z90
 from twin_worker.proposals.assessment import Approach, closest_approach
 from twin_worker.proposals.candidates import Candidate, Kind, Plan, present_speed
 from twin_worker.proposals.experiment import PlanExperiment
@@ -70,6 +72,10 @@ def describe(candidate: Candidate, plan: Plan) -> str:
         return f"{name} {'waits' if plan.twin.vehicle_class.is_rotorcraft else 'circles'} for {value:.0f} s"
     if candidate.kind is Kind.SKIP:
         return f"{name} leaves out item {value:.0f}"
+    if candidate.kind is Kind.SHORTEN:
+        last = f"its last {f'{value:.0f} waypoints' if value > 1 else 'waypoint'}" if value else ""
+        repeats = "repetitions" if any(item.command == JUMP for item in plan.items) else ""
+        return f"{name} leaves out {' and '.join(filter(None, (repeats, last)))}"
     if candidate.kind is Kind.SHRINK:
         return f"{name} stays within {value:.0f} m of home"
     return f"{name} {candidate.kind.value}s" + (" to launch" if candidate.kind is Kind.RETURN else "")
@@ -92,10 +98,23 @@ def _clearance(problem: Problem, solution: Solution) -> tuple[float, str]:
     if problem.kind is AlertKind.GROUND:
         height = own.margin_m.get(AlertKind.GROUND, 0.0)
         return height, f"stays {height:.0f} m above {'ground' if own.over_terrain else 'home'}"
+    if problem.kind is AlertKind.BATTERY:
+        return _MAX_CLEARANCE_M, _battery_text(own)
     if problem.kind is AlertKind.GEOFENCE:
         margin = own.margin_m.get(AlertKind.GEOFENCE, 0.0)
         return min(margin, _MAX_CLEARANCE_M), f"stays {margin:.0f} m inside the geofence"
     return _MAX_CLEARANCE_M, "every leg ahead is achievable"
+
+
+def _battery_text(experiment: PlanExperiment) -> str:
+    """Describe the battery at the end of a changed plan, or at home where no mission is flown to its end."""
+    battery = experiment.battery
+    if battery is None:
+        return "battery unknown"
+    share, sigma, where = battery.home, battery.home_sigma, "is at home with"
+    if battery.end is not None:
+        share, sigma, where = battery.end, battery.end_sigma or 0.0, "ends with"
+    return f"{where} {100 * max(share, 0.0):.0f} ± {100 * Z90 * sigma:.0f} % of its battery"
 
 
 def _separation(problem: Problem, solution: Solution) -> tuple[float, str]:

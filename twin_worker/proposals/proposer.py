@@ -16,13 +16,13 @@ from twin_worker.alerts.gaussian_forecast import GaussianForecast
 from twin_worker.alerts.hysteresis import RULES
 from twin_worker.proposals.assessment import Comparison
 from twin_worker.proposals.candidates import Candidate, Plan, candidates
-from twin_worker.proposals.experiment import PlanExperiment, deficit, present, run, run_change
+from twin_worker.proposals.experiment import LIMITS, PlanExperiment, deficit, present, run, run_change
 from twin_worker.proposals.options import to_option, to_path
 from twin_worker.proposals.resolution import Airspace, Problem, Solution, pareto, solve
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.kinematic_prediction import is_hovering
 
-PROPOSED = (AlertKind.CONFLICT, AlertKind.GROUND, AlertKind.GEOFENCE, AlertKind.NOT_ACHIEVABLE)
+PROPOSED = (AlertKind.CONFLICT, *LIMITS)
 """Alerts that are answered with a proposal."""
 RENEW_S = 5.0
 """Time after which a proposal is renewed while its alert lasts [s]."""
@@ -38,6 +38,7 @@ _EVENTS = {
     AlertKind.GROUND: "a descent below the minimum height",
     AlertKind.GEOFENCE: "a geofence breach",
     AlertKind.NOT_ACHIEVABLE: "a leg that is not achievable",
+    AlertKind.BATTERY: "an empty battery",
 }
 
 

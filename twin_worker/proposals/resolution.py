@@ -234,6 +234,10 @@ def _interrupts(solution: Solution) -> bool:
     return any(_is_interruption(experiment) for experiment in solution.experiments)
 
 
+def _lands(solution: Solution) -> bool:
+    return any(kind is Kind.LAND for _, kind in solution.kinds)
+
+
 def _is_interruption(experiment: PlanExperiment) -> bool:
     return experiment.candidate is not None and experiment.candidate.kind in INTERRUPTING
 
@@ -287,9 +291,13 @@ def pareto(solutions: list[Solution]) -> list[tuple[Solution, str]]:
 
     Compared are delay, energy, deviation and remaining probability of changes of the same aircraft. Of each kind of
     change only the one with the smallest deviation is considered, and changes that interrupt the mission only where no
-    other avoids the event.
+    other avoids the event; a landing only where no hold or return does.
     """
-    solutions = [one for one in solutions if not _interrupts(one)] or solutions
+    solutions = (
+        [one for one in solutions if not _interrupts(one)]
+        or [one for one in solutions if not _lands(one)]
+        or (solutions)
+    )
     by_kind: dict[tuple[tuple[int, Kind], ...], Solution] = {}
     for solution in solutions:
         known = by_kind.get(solution.kinds)

@@ -8,16 +8,19 @@ import pytest
 
 from fleet.contract import Alert, AlertKind, Array, Change, Prediction, Proposal
 from tests.support.memory_bus import MemoryBus
+from tests.twin_worker.prediction.test_endurance import battery
 from twin_worker.alerts.conflict_probability import Separation
 from twin_worker.alerts.traffic import TrafficPicture
 from twin_worker.ownership.twin_store import OwnedTwin
 from twin_worker.proposals import candidates as changes
-from twin_worker.proposals.candidates import Candidate, Deficit, Kind, Plan, insert, remove, to_change
+from twin_worker.proposals.candidates import Candidate, Deficit, Kind, Plan, to_change
 from twin_worker.proposals.experiment import present, run
-from twin_worker.proposals.proposer import RENEW_S, Proposer
+from twin_worker.proposals.mission_edits import insert, remove
+from twin_worker.proposals.proposer import RENEW_S, AvoidedEvent, Proposer
 from twin_worker.service.worker import Worker
 from twin_worker.twin.state.state import Twin
-from twin_worker.twin.steps.predict_step import predict
+from twin_worker.twin.steps.kinematic_prediction import predict_battery, recent_track
+from twin_worker.twin.steps.predict_step import LOOK_BACK_ROTORS_S, predict
 
 MEET_S = 60.0
 OTHER = 3
@@ -56,8 +59,8 @@ class Fleet:
         return self.twin.telemetry.history.newest
 
     def copy_of(self, uav: int) -> Twin | None:
-        self.asked += uav == 1
-        return copy.deepcopy(self.twin) if uav == 1 else None
+        self.asked += uav == self.twin.config.uav
+        return copy.deepcopy(self.twin) if uav == self.twin.config.uav else None
 
     def forecasts(self, now: float):
         picture = TrafficPicture()
@@ -206,6 +209,45 @@ def test_a_multirotor_flies_its_candidates(hovered):
         (one for one in run(plan, tried) if one.candidate.kind is Kind.ALTITUDE), key=lambda e: e.candidate.value
     )
     assert higher.prediction.path.numpy()[-1, 2] < before[-1, 2] - 10.0
+
+
+def low_on_battery(twin: Twin, share: float) -> Twin:
+    """Let the battery of a multirotor have this share at the first row of the battery's flight."""
+    twin.environment.battery = battery(share)
+    recent = recent_track(twin, LOOK_BACK_ROTORS_S, with_attitude=False)
+    assert recent is not None
+    twin.environment.store_battery_forecast(predict_battery(twin, recent), twin.telemetry.history.newest)
+    return twin
+
+
+def test_a_battery_that_is_empty_before_the_end_is_answered_with_a_shorter_mission(hovered):
+    fleet = Fleet(low_on_battery(hovered, 0.38))
+    alert = Alert(uav=7, t=fleet.now, kind=AlertKind.BATTERY, active=True, probability=1.0)
+    computed = fleet.proposer.compute(AvoidedEvent.of(alert), fleet.now)
+    assert computed is not None and computed.proposal.options and "empty battery" in computed.proposal.sentence
+    first = computed.proposal.options[0]
+    assert first.probability < 0.2 and "leaves out its last waypoint" in first.sentence
+    assert "ends with" in first.sentence and "of its battery" in first.sentence
+    before = {item.seq: item for item in hovered.onboard.mission.items}
+    changed = first.changes[0]
+    assert len(changed.items) == len(before) - 1 and changed.items[-1].command == 20  # it still returns to launch
+    full = Fleet(low_on_battery(copy.deepcopy(hovered), 0.9))
+    unneeded = full.proposer.compute(AvoidedEvent.of(alert), full.now)
+    assert unneeded is not None and not unneeded.proposal.options
+
+
+def test_a_landing_or_a_return_is_proposed_where_no_shorter_mission_is_enough(hovered):
+    fleet = Fleet(low_on_battery(hovered, 0.25))
+    plan = Plan.of(hovered, present(hovered).prediction)
+    tried = run(plan, changes.candidates(plan, AlertKind.BATTERY, 20.0, None, Deficit()))
+    by_kind = {one.candidate.kind: one.hazards[AlertKind.BATTERY] for one in tried}
+    assert by_kind[Kind.LAND] < 0.01 < 0.9 < by_kind[Kind.SHORTEN] and Kind.HOLD not in by_kind
+    landing = next(one for one in tried if one.candidate.kind is Kind.LAND).prediction
+    home_below = (hovered.home.alt_mm - landing.origin[2]) * -1e-3
+    assert landing.path.numpy()[-1, 2] == pytest.approx(home_below, abs=1.0)  # on the ground, not below it
+    alert = Alert(uav=7, t=fleet.now, kind=AlertKind.BATTERY, active=True, probability=1.0)
+    options = fleet.proposer.compute(AvoidedEvent.of(alert), fleet.now).proposal.options
+    assert options and all(option.changes[0].mode in ("land", "return") for option in options)
 
 
 def test_speeds_stay_within_the_limits_of_the_autopilot(twin):

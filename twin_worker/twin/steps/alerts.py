@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.special import ndtr
 
-from fleet.contract import Alert, AlertKind, Prediction
+from fleet.contract import Alert, AlertKind, BatteryForecast, Prediction
 from fleet.frames import Origin, to_ned
 from twin_worker.alerts.feasibility import MissionState, feasibility_hazard, read_limits
 from twin_worker.alerts.gaussian_forecast import GaussianForecast, to_gaussian
@@ -51,7 +51,7 @@ def prediction_alerts(twin: Twin, now: float, prediction: Prediction | None) -> 
     gaussian = to_gaussian(prediction) if prediction is not None else None
     _update_home_fallback(twin)
     twin.alerts.update_turn_rate(now, only=gaussian is not None and gaussian.prediction.method == "imm")
-    hazards = [] if prediction is None else [battery_hazard(prediction)]
+    hazards = [] if prediction is None else [battery_hazard(prediction.battery)]
     findings = [_not_predicted(kind) for kind in (AlertKind.GROUND, AlertKind.GEOFENCE)]
     if gaussian is not None:
         turn_rate_only = (
@@ -142,9 +142,9 @@ def _short_horizon(prediction: Prediction | None) -> HazardEstimate:
     return HazardEstimate(AlertKind.SHORT_HORIZON, probability, sentence, "predictions hold 10 s again")
 
 
-def battery_hazard(prediction: Prediction) -> HazardEstimate:
+def battery_hazard(forecast: BatteryForecast | None) -> HazardEstimate:
     """Evaluate whether the battery is empty before the end of the mission or before home."""
-    clear, forecast = "the battery is sufficient again", prediction.battery
+    clear = "the battery is sufficient again"
     if forecast is None:
         return HazardEstimate(AlertKind.BATTERY, 0.0, "", clear)
     probability = float(ndtr(-forecast.home / forecast.home_sigma)) if forecast.home_sigma > 0 else 0.0

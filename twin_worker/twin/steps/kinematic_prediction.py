@@ -6,7 +6,7 @@ from math import isfinite
 import numpy as np
 
 from fleet.autopilots import greybox
-from fleet.contract import Mission
+from fleet.contract import BatteryForecast, Mission
 from fleet.mission import route_items
 from twin_worker.prediction import kinematic
 from twin_worker.prediction.autopilot_parameters import ControllerTwin, RouteOverride, multirotor_controller
@@ -187,19 +187,25 @@ def fit_kinematic_models(twin: Twin) -> None:
 
 def update_battery_forecast(twin: Twin, recent: Track, now: float) -> None:
     """Predict the remaining battery of a multirotor in flight at the end of its mission and at home, if it is due."""
-    if not twin.environment.battery_timer.due(now, _BATTERY_PERIOD_S):
-        return
+    if twin.environment.battery_timer.due(now, _BATTERY_PERIOD_S):
+        twin.environment.store_battery_forecast(predict_battery(twin, recent), now)
+
+
+def predict_battery(twin: Twin, recent: Track) -> BatteryForecast | None:
+    """Predict the remaining battery of a multirotor with its present plan, or the overridden one; None: not known."""
     unbroken, status = recent.with_attitude(twin.telemetry.history).unbroken_tail(), twin.onboard.status
     if status is None or not status.armed or twin.environment.flight_phase.landed or len(unbroken) < _MIN_ROWS:
-        twin.environment.store_battery_forecast(None, now)
-        return
-    config = _multirotor_config(twin, unbroken)
+        return None
+    override = twin.prediction.override
+    config = _multirotor_config(twin, unbroken, override)
     seq = rollout.items_in_force(unbroken.t, twin.telemetry.history.rows_since("leg"), twin.onboard.mission)
-    returns = status.mode in rollout.RETURN_MODES or active_command(twin) == _RETURN_COMMAND
+    returns = status.mode in rollout.RETURN_MODES or (override is None and active_command(twin) == _RETURN_COMMAND)
     if twin.no_route_reason() or returns:  # the end of a return is home
         seq = np.full(len(unbroken), np.nan)
+    elif override is not None:
+        seq[-1] = override.seq
     models = config, twin.models.multirotor, twin.environment.battery
-    twin.environment.store_battery_forecast(forecast_battery(unbroken, seq, models, twin.received_params), now)
+    return forecast_battery(unbroken, seq, models, twin.received_params)
 
 
 def predict_without_model(twin: Twin, recent: Track, ahead: np.ndarray) -> PathForecast:

@@ -28,7 +28,7 @@ from twin_worker.twin.steps.kinematic_prediction import (
 from twin_worker.twin.steps.rollouts import BOTH, HYBRID, ensemble_spread, predict_route, select_method
 
 LOOK_BACK_S = 62.0  # telemetry used for a prediction [s]
-_LOOK_BACK_ROTORS_S = 130.0  # the same of a rotorcraft: its circles last longer
+LOOK_BACK_ROTORS_S = 130.0  # the same of a rotorcraft: its circles last longer
 _REPORT_PERIOD_S = 10.0  # between reports of unchanged law and parameters [s]
 _STALE_S = 3.0  # maximum age of positions relative to other telemetry [s]
 _MAX_ABSENT = 2  # maximum number of absent autopilot parameters in the group of known parameters [-]
@@ -43,7 +43,7 @@ def predict(twin: Twin, now: float) -> list[Message]:
     Without positions the prediction coasts: it continues from the last valid state until its confidence horizon ends.
     """
     assert twin.telemetry.origin is not None
-    look_back_s = _LOOK_BACK_ROTORS_S if twin.vehicle_class.is_rotorcraft else LOOK_BACK_S
+    look_back_s = LOOK_BACK_ROTORS_S if twin.vehicle_class.is_rotorcraft else LOOK_BACK_S
     recent = recent_track(twin, look_back_s, with_attitude=False)
     if recent is None:
         return []
