@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+from conftest import exit_code
 
 from fleet.airframes import GENERIC, load
 from fleet.cli import main as fleet
@@ -205,7 +206,7 @@ def test_what_cannot_be_identified_is_said_and_not_done(recorded):
     ],
 )
 def test_wrong_use_is_one_sentence(words, sentence, capfd):
-    assert fleet(["paper", "identify", *words]) == 2
+    assert exit_code(lambda: fleet(["paper", "identify", *words])) == 2
     said = capfd.readouterr().err
     assert sentence in said and "Traceback" not in said
 

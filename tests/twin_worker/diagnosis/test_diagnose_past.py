@@ -102,9 +102,11 @@ def test_a_model_of_the_own_past_is_written_and_loaded(sitl: Path, tmp_path: Pat
 
 
 def test_it_is_one_thing_that_flights_are_compared_with(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert diagnosis.main(["a.tlog", "--model", "m.json", "--against-own-past", "90"]) == 2
+    flight, model = tmp_path / "a.tlog", tmp_path / "m.json"
+    flight.touch(), model.touch()
+    assert diagnosis.main([str(flight), "--model", str(model), "--against-own-past", "90"]) == 2
     assert "exactly one of --model, --against, --against-own-past" in capsys.readouterr().err
-    assert diagnosis.main(["a.tlog", "--against-own-past", "-3"]) == 2
+    assert diagnosis.main([str(flight), "--against-own-past", "-3"]) == 2
     assert "--against-own-past: found -3" in capsys.readouterr().err
 
 

@@ -145,6 +145,8 @@ def test_an_axis_whose_command_is_concealed_is_not_judged() -> None:
     assert np.flatnonzero(dull.noise.sigma != base.noise.sigma).tolist() == [CHANNELS.index("force_x")]
 
 
-def test_a_channel_there_is_none_of_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert diagnosis.main(["a.tlog", "--against-own-past", "60", "--conceal", "truth"]) == 2
+def test_a_channel_there_is_none_of_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flight = tmp_path / "a.tlog"
+    flight.touch()
+    assert diagnosis.main([str(flight), "--against-own-past", "60", "--conceal", "truth"]) == 2
     assert "--conceal: found 'truth', expected names of airspeed, imu" in capsys.readouterr().err

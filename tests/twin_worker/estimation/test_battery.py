@@ -1,11 +1,9 @@
 """Battery of a multirotor: power by speed and climb, charge, and the share that remains after a flight."""
 
-import msgspec
 import numpy as np
 import pytest
 
-from fleet.contract import BatteryForecast, Prediction
-from tests.support.examples import EXAMPLES
+from fleet.contract import BatteryForecast
 from twin_worker.estimation.battery import BatteryModel
 from twin_worker.twin.steps.alerts import battery_hazard
 
@@ -79,19 +77,9 @@ def test_a_new_battery_starts_anew() -> None:
     assert model.charge({})[0] == pytest.approx(1 / CAPACITY_AS, rel=0.1)
 
 
-def test_an_empty_battery_before_home_or_the_end_is_a_hazard(example: Prediction) -> None:
+def test_an_empty_battery_before_home_or_the_end_is_a_hazard() -> None:
     def hazard(**fields: float) -> float:
-        battery = BatteryForecast(remaining=0.3, home_sigma=0.01, end_sigma=0.02, **fields)
-        return battery_hazard(_with(example, battery)).probability
+        return battery_hazard(BatteryForecast(remaining=0.3, home_sigma=0.01, end_sigma=0.02, **fields)).probability
 
     assert hazard(home=0.2, end=0.1) < 0.01 and hazard(home=0.2, end=-0.05) > 0.9 and hazard(home=-0.03, end=0.1) > 0.9
-    assert battery_hazard(_with(example, None)).probability == 0.0
-
-
-def _with(prediction: Prediction, battery: BatteryForecast | None) -> Prediction:
-    return msgspec.structs.replace(prediction, battery=battery)
-
-
-@pytest.fixture
-def example() -> Prediction:
-    return EXAMPLES[Prediction]
+    assert battery_hazard(None).probability == 0.0
