@@ -63,10 +63,10 @@ def test_plain_lines_come_at_news_and_now_and_then(monkeypatch):
 def test_a_plain_line_comes_at_once_when_aircraft_come_or_go(monkeypatch):
     monkeypatch.setattr(status_table, "REFRESH_S", 0.001)
     shown = [(), (7,), (7, 8), (7,)]  # ids received, one after the other
-    said, enough = [], threading.Event()
+    lines, enough = [], threading.Event()
 
     def say(line):
-        said.append(line)
+        lines.append(line)
         shown.pop(0) if len(shown) > 1 else enough.set()
 
     def account():
@@ -75,7 +75,7 @@ def test_a_plain_line_comes_at_once_when_aircraft_come_or_go(monkeypatch):
     shown.pop(0)  # none so far: no line
     with status_display(account, say):
         assert enough.wait(PATIENCE_S)
-    assert [line.split()[0] for line in said] == ["1", "2", "1"]
+    assert [line.split()[0] for line in lines] == ["1", "2", "1"]
 
 
 def test_prometheus_reads_every_number_of_the_account(free_port):

@@ -44,7 +44,7 @@ _SKIPPED = 2  # items nearest to the event of which each is left out
 _AHEAD_ITEMS = 8  # navigation items ahead that are looked at
 _LOITER_TIME, _WAYPOINT, _LAND, _VTOL_LAND = 19, 16, 21, 85  # MAV_CMD
 _NO_OFFSET = (m.LAND, m.TAKEOFF)  # legs whose altitude is not changed
-_PASSED = (m.WAYPOINT, m.LOITER_TURNS, m.LOITER_TIME)  # legs after which the mission goes on, and may do without
+_PASSED = (m.WAYPOINT, m.LOITER_TURNS, m.LOITER_TIME)  # legs after which the mission continues; it may omit them
 
 
 class Kind(StrEnum):

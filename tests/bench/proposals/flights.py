@@ -142,8 +142,12 @@ class Result:
 
 def arranged(name: str, seed: int) -> Case:
     """Arrange one case."""
-    limits = {"ground": AlertKind.GROUND, "geofence": AlertKind.GEOFENCE, "leg": AlertKind.NOT_ACHIEVABLE}
-    limits["terrain"] = AlertKind.GROUND
+    limits = {
+        "ground": AlertKind.GROUND,
+        "terrain": AlertKind.GROUND,
+        "geofence": AlertKind.GEOFENCE,
+        "leg": AlertKind.NOT_ACHIEVABLE,
+    }
     rng = np.random.default_rng((seed, KINDS.index(name)))
     told = partial(Told, seed=seed, may_leave=name == "geofence")
     first = arrange(told(uav=0, meets=None, sinks=name == "ground"), rng, None)

@@ -18,7 +18,7 @@ _SURFACE = {"aileron": "L", "elevator": "M", "rudder": "N"}
 _SHOWS_IN = {"roll": "L", "pitch": "M", "yaw": "N", "thrust": "X", "drag": "X", "lift": "alpha"}
 _EDGE_S = 15.0, 20.0  # no onset closer to the start and the end of the flight [s]
 _ONSET_STRIDE = 5  # rows between two tested onsets, unless the onset is resolved to the row
-_N_GATES = 5  # sets of gates kept: those of one flight
+_N_GATES = 5  # sets of gates stored: those of one flight
 _RAMPS_S = (20.0, 40.0, 60.0, 90.0, 130.0)
 BUMPS_S = (3.0, 5.0, 8.0, 14.0, 25.0, 45.0)
 

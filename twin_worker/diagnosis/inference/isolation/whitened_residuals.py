@@ -23,7 +23,7 @@ from twin_worker.diagnosis.model.residual import ModelledFlight, RecentValues
 CLIP = 6.0  # clipping limit of whitened residuals [-]
 _BARO_CLIP = 100.0  # for the barometer: its noise drifts, so that a lasting jump is one large whitened residual
 _SCATTER_CLIP = 3.0  # the limit is at least this multiple of the channel's scatter on this flight
-_N_LINEARISED = 3  # linearisations kept, shared with the parts of the flight
+_N_LINEARISED = 3  # linearisations stored, shared with the parts of the flight
 _MAX_RELEASED = 5  # nuisances that may be beyond their spread
 _FIXED_PRECISION = 1e14  # precision of a nuisance that is fixed at zero
 _MIN_SCATTER = 0.45  # least scatter relative to nominal flights
