@@ -56,12 +56,12 @@ bench-setup:
 run: setup
 	@exec $(BIN)/fleet up $(UP)
 
-# Three processes on two cores: about half of a test's time is a wait for a browser, or for a fleet in real time.
+# Four processes on two cores: tests of browsers and of fleets in real time wait much of their time.
 test: setup browser
-	@$(BIN)/python -m pytest -n 3 --dist loadfile $(TESTS)
+	@$(BIN)/python -m pytest -n 4 --dist loadfile $(TESTS)
 
 test-quick: setup browser
-	@$(BIN)/python -m pytest -n 3 --dist loadfile $(QUICK)
+	@$(BIN)/python -m pytest -n 4 --dist loadfile $(QUICK)
 
 lint: setup
 	@$(BIN)/ruff check .

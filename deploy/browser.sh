@@ -15,7 +15,7 @@ if command -v apt-get >/dev/null; then
     echo "browser: found none; trying apt-get install chromium"
     if [ "$(id -u)" = 0 ]; then as=; else as="sudo -n"; fi
     $as apt-get -qq update >/dev/null 2>&1 || true
-    DEBIAN_FRONTEND=noninteractive $as apt-get -qq install -y chromium >/dev/null 2>&1 || true
+    DEBIAN_FRONTEND=noninteractive $as apt-get -qq install -y chromium libegl-mesa0 libgl1-mesa-dri >/dev/null 2>&1 || true
 fi
 has_browser && exit 0
 echo "browser: found none and cannot install one; the browser tests are skipped (with CI=1: fail)." >&2
