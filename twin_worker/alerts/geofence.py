@@ -140,6 +140,12 @@ def ground_clearance(
     )
 
 
+def lowest_after(flight: GaussianForecast, home: Origin, terrain: Raster | None, since: float) -> float:
+    """Return the lowest mean height above the ground after an instant [s since 1970]; infinite at the end [m]."""
+    k = max(int(np.searchsorted(flight.t, since, side="right")), 1)
+    return float(ground_clearance(flight, home, terrain).height[k:].min(initial=np.inf))
+
+
 def ground_hazard(
     flight: GaussianForecast, home: Origin, margin: float, until: float = np.inf, terrain: Raster | None = None
 ) -> HazardEstimate:

@@ -27,7 +27,13 @@ from twin_worker.proposals.candidates import DECISION_S, LAND_MODE, MODES, Candi
 from twin_worker.twin.state.events import invalidate_prediction
 from twin_worker.twin.state.routes import route_of_mode
 from twin_worker.twin.state.state import Twin
-from twin_worker.twin.steps.alerts import battery_hazard, limit_hazards, mission_feasibility, reach_s
+from twin_worker.twin.steps.alerts import (
+    battery_hazard,
+    limit_hazards,
+    lowest_beyond_reach,
+    mission_feasibility,
+    reach_s,
+)
 from twin_worker.twin.steps.kinematic_prediction import predict_battery, recent_track
 from twin_worker.twin.steps.predict_step import LOOK_BACK_ROTORS_S, predict
 from twin_worker.whatif import active_seq
@@ -131,7 +137,10 @@ def _fly(twin: Twin, candidate: Candidate | None, change: Change | None) -> Plan
         return None
     battery = _battery(twin, lands_here=change is not None and _lands_by_mode(change))
     _report_change(twin)
-    hazards = [*limit_hazards(twin, forecast), mission_feasibility(twin, twin.telemetry.history.newest)]
+    hazards = [
+        *limit_hazards(twin, forecast, to_the_end=True),
+        mission_feasibility(twin, twin.telemetry.history.newest),
+    ]
     hazards.append(battery_hazard(battery))
     probabilities = {hazard.kind: hazard.probability for hazard in hazards if hazard.kind in LIMITS}
     margins = _margins(twin, forecast)
@@ -229,12 +238,14 @@ class _Extremes(NamedTuple):
         floor: lowest height above home
         high: highest height above home
         far: largest distance from home
+        later: lowest mean height above the terrain beyond that look-ahead [m]
     """
 
     low: tuple[float, float]
     floor: tuple[float, float]
     high: tuple[float, float]
     far: tuple[float, float]
+    later: float
 
 
 def _extremes(twin: Twin, forecast: GaussianForecast) -> _Extremes:
@@ -254,6 +265,7 @@ def _extremes(twin: Twin, forecast: GaussianForecast) -> _Extremes:
         (float(height[low]), float(sigma[low, 2])),
         (float(height[high]), float(sigma[high, 2])),
         (float(distance[far]), sigma_far),
+        lowest_beyond_reach(twin, forecast),
     )
 
 
@@ -263,7 +275,7 @@ def _margins(twin: Twin, forecast: GaussianForecast) -> dict[AlertKind, float]:
         return {}
     extremes, fence = _extremes(twin, forecast), read_geofence(twin.received_params)
     inside = min(fence.radius - extremes.far[0], fence.ceiling - extremes.high[0], extremes.floor[0] - fence.floor)
-    return {AlertKind.GROUND: extremes.low[0], AlertKind.GEOFENCE: inside}
+    return {AlertKind.GROUND: min(extremes.low[0], extremes.later), AlertKind.GEOFENCE: inside}
 
 
 def deficit(plan: Plan, experiment: PlanExperiment, kind: AlertKind) -> Deficit:
@@ -274,9 +286,9 @@ def deficit(plan: Plan, experiment: PlanExperiment, kind: AlertKind) -> Deficit:
     if kind not in (AlertKind.GROUND, AlertKind.GEOFENCE) or plan.twin.home is None:
         return Deficit()
     extremes, z = _extremes(plan.twin, experiment.forecast), -float(ndtri(_MARGIN_SHARE * RULES[kind].clear_below))
-    (low, sigma_low), (floor, sigma_floor), (high, sigma_high), (far, sigma_far) = extremes
+    (low, sigma_low), (floor, sigma_floor), (high, sigma_high), (far, sigma_far), later = extremes
     if kind is AlertKind.GROUND:
-        return Deficit(max(plan.min_height_m + z * sigma_low - low, 0.0))
+        return Deficit(plan.min_height_m + max(z * sigma_low - low, -later, -plan.min_height_m))
     fence = read_geofence(plan.twin.received_params)
     too_high = min(fence.ceiling - z * sigma_high - high, 0.0)
     too_low = max(fence.floor + z * sigma_floor - floor, 0.0)

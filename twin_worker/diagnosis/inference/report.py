@@ -191,7 +191,7 @@ def _describe_validation(report: Report) -> str:
     if not report.fit_before > 0:
         return "detected in the variance of the air data"
     before, after, of_what, unit = report.fit_before, report.fit_after, "residual", ""
-    if not 1.0 - after / before >= MIN_RMS_DROP:
+    if not 1.0 - after / before >= MIN_RMS_DROP and np.isfinite(report.force_after):
         before, after, of_what, unit = report.force_before, report.force_after, "error of specific force", " m/s2"
     where = "on held-out blocks " if report.series.held_out.any() else ""  # otherwise all rows are fitted
     text = f"{where}the {of_what} falls from {before:.2f} to {after:.2f}{unit} ({1.0 - after / before:.0%})"

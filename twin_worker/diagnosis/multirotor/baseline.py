@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 from scipy.signal import lfilter
+from scipy.stats import t as student_t
 
 from twin_worker.diagnosis.multirotor.flight import RotorFlight
 from twin_worker.diagnosis.multirotor.linearise import (
@@ -22,8 +23,10 @@ from twin_worker.diagnosis.multirotor.linearise import (
 )
 from twin_worker.diagnosis.multirotor.model import CHANNELS, PARAMETERS, residuals
 
-FORMAT = "parauav.rotors.1"
+FORMAT = "parauav.rotors.2"
 _PASSES = 3
+_FALSE_ALARM = 0.01  # probability that a channel of a nominal flight seems too noisy in any block
+_NO_LIMIT = 1e3
 NominalGains = Callable[[RotorFlight, "RotorBaseline"], tuple[dict[str, float], dict[str, float], np.ndarray]]
 _START = {"k": 8.0, "expo": 0.6, "tau": 0.05, "d": 0.05, "c": 0.01, "a_p": 30.0, "a_q": 30.0, "a_r": 3.0}
 _FLOOR = np.array([0.01, 0.01, 1e-3, 0.02, 2e-4, 2e-3, 5e-4, *[2e-3] * 3, *[0.2] * 3, *[0.02] * 5, 0.01, *[2e-3] * 3])
@@ -38,9 +41,10 @@ class RotorBaseline:
         motors: number of motors
         parameters: mean, (22,); spread: covariance between flights, (22, 22)
         filters: noise of the channels, see `ResidualNoise`
-        chance: by effect, largest gain on nominal flights that are left out over that of white noise, at least 1
-        sizes: by effect, root mean square of its values on them
-        excess: largest scale of the whitened residuals of each channel over 20 s on them, (13,)
+        chance: by group of effects, largest gain on nominal flights that are left out over that of noise, at least 1
+        sizes: by group, standard deviation of its values on them beyond the error of their estimates
+        excess: scale of the whitened residuals over 20 s that one nominal flight in a hundred exceeds in any channel,
+            (13,), from those of the nominal flights that are left out
         explained: share of the variance of f_x f_y f_z p_dot q_dot r_dot that the model explains
         flights: names
     """
@@ -72,7 +76,7 @@ def calibrate_rotors(flights: Sequence[RotorFlight], log: Callable[[str], None],
     Args:
         flights: nominal flights of one aircraft
         log: receives progress
-        gains: (flight, baseline) to gains and sizes of the effects and scales of the channels, `search.nominal_gains`
+        gains: (flight, baseline) to gains and sizes of the effects and scales by block, `search.nominal_gains`
     Raises:
         ValueError: if there is no flight.
     """
@@ -113,20 +117,49 @@ def _with_chance(
     gains: NominalGains,
 ) -> RotorBaseline:
     """Return the baseline with what nominal flights show that are left out."""
-    chance: dict[str, float] = {}
-    squares: dict[str, list[float]] = {}
-    excess = []
+    found, blocks = [], []
     for i, flight in enumerate(flights):
         others = [pair for j, pair in enumerate(solutions) if j != i] or solutions
         mean, information = pooled(others)
         spread = between_flights(mean, information, [one for _, one in others])
         by_effect, sizes, scales = gains(flight, replace(first, parameters=mean, spread=spread))
-        excess.append(scales)
-        for name, gain in by_effect.items():
-            chance[name] = max(chance.get(name, 1.0), gain)
-            squares.setdefault(name, []).append(sizes[name] ** 2)
-    means = {name: float(np.mean(x)) ** 0.5 for name, x in squares.items()}
-    return replace(first, chance=chance, sizes=means, excess=np.max(excess, axis=0))
+        found.append((by_effect, sizes))
+        blocks.append(scales)
+    names = sorted({name for by_effect, _ in found for name in by_effect})
+    chance = {name: max(1.0, *(by_effect.get(name, 1.0) for by_effect, _ in found)) for name in names}
+    baseline = replace(first, chance=chance, excess=block_limits(blocks))
+    means = {}
+    for name in chance:
+        squares = [
+            sizes.get(name, 0.0) ** 2 * max(1.0 - baseline.temper / max(by_effect.get(name, 0.0), 1e-9), 0.0)
+            for by_effect, sizes in found
+        ]
+        means[name] = float(np.mean(squares)) ** 0.5
+    return replace(baseline, sizes=means)
+
+
+def block_limits(blocks: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the scale of each channel that a block of another nominal flight exceeds by chance, (13,).
+
+    Logarithms of scales are normal with one variance within each channel, and one between flights for all channels,
+    as weather differs. The limit is that of the predictive distribution. A channel that is absent has none.
+
+    Args:
+        blocks: scales of the blocks of each nominal flight, (b, 13), nan where a block has no rows
+    """
+    logs = [np.log(np.maximum(x[np.isfinite(x).all(axis=1)], 1e-3)) for x in blocks]
+    logs = [x for x in logs if len(x) > 1]
+    channels = np.array([np.concatenate([x[:, c] for x in logs] or [np.zeros(1)]) for c in range(len(CHANNELS))])
+    present = channels.std(axis=1) > 0
+    if not present.any():
+        return np.full(len(CHANNELS), _NO_LIMIT)
+    n, flights = channels.shape[1], len(logs)
+    within = np.sum([((x - x.mean(axis=0)) ** 2).sum(axis=0) for x in logs], axis=0) / (n - flights)
+    between = np.var([x.mean(axis=0)[present] for x in logs], axis=0).mean() * flights / max(flights - 1, 1)
+    freedom = min(n - flights, max(flights - 1, 1) * int(present.sum()))
+    quantile = float(student_t.ppf(1 - _FALSE_ALARM * flights / (n * present.sum()), freedom))
+    limits = np.exp(channels.mean(axis=1) + quantile * np.sqrt(within + between * (1 + 1 / flights)))
+    return np.where(present, np.minimum(limits, _NO_LIMIT), _NO_LIMIT)
 
 
 _FIRST_STD = np.array([0.15, 0.15, 0.25, 0.5, 0.5, 0.2, 0.15, 0.15, 0.15, 0.02, 0.02, 0.02, 1.0])

@@ -31,7 +31,6 @@ from twin_worker.diagnosis.multirotor.model import CHANNELS, STEP, modelled_forc
 from twin_worker.diagnosis.multirotor.search import EffectSet, block_scales, search
 
 NAMED, SUSPECTED = 0.95, 0.1  # probability of a class
-_UNUSUAL = 1.5  # scale of a channel over the largest one of nominal flights that makes the outcome unknown
 _MAX_CLASS = 4
 _EXPLAINED = 0.6  # share of the excess variance of all channels that effects explain which leaves no unknown
 _FORCE_HZ = np.full(3, 2.0)
@@ -147,8 +146,8 @@ def _finding(
     linear: LinearFlight, baseline: RotorBaseline, active: ActiveEffect, sigma: np.ndarray, members: dict[str, float]
 ) -> DiagnosisFinding:
     one, end = active.one, float(linear.t[linear.valid][-1])
-    chance = np.sqrt(baseline.chance.get(one.effect.name, 1.0))
-    nominal = baseline.sizes.get(one.effect.name, 0.0)
+    chance = np.sqrt(baseline.chance.get(one.group, 1.0))
+    nominal = baseline.sizes.get(one.group, 0.0)
     spread = np.sqrt((chance * sigma) ** 2 + nominal**2)
     tau = float(baseline.parameters[2])
     profile = ALWAYS if active.onset is None else OnsetProfile(Onset.STEP, active.onset)
@@ -175,10 +174,10 @@ def _finding(
 def _unusual(
     linear: LinearFlight, baseline: RotorBaseline, none: EffectSet, best: EffectSet
 ) -> tuple[str, tuple[tuple[float, float], ...]]:
-    """Return the channel that is noisier than on nominal flights, and when; empty if there is none."""
+    """Return the channel that is noisier than nominal flights are, and when; empty if there is none."""
     blocks, times = block_scales(best.solution.white, linear)
     usual = np.maximum(baseline.excess, 1.0)
-    ratio = blocks / (_UNUSUAL * usual)
+    ratio = blocks / usual
     before, after = (
         float(np.nansum(np.maximum((scales / usual) ** 2 - 1.0, 0.0)))
         for scales in (block_scales(none.solution.white, linear)[0], blocks)

@@ -39,6 +39,11 @@ class RotorEffect:
         """Return name and place."""
         return f"{self.effect.name}:{self.target}" if self.target else self.effect.name
 
+    @property
+    def group(self) -> str:
+        """Return the name of effects that are alike on nominal flights: those of all motors, but of each axis apart."""
+        return self.effect.name if self.target.startswith("motor") else self.label
+
     def reported(self, values: np.ndarray, tau: float) -> dict[str, float]:
         """Return the values of the coordinates in reporting units; a lag includes that of the healthy motors [s]."""
         factor = degrees(1.0) if "bias_d" in self.effect.parameters[0].name else 1.0

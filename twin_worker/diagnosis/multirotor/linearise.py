@@ -25,6 +25,7 @@ _LOW = np.array([0.5, 0.0, 0.005, *[-np.inf] * 19])  # least k, expo, tau: witho
 _HIGH = np.array([200.0, 1.5, 0.5, *[np.inf] * 19])
 _DERIVATIVES = 6  # iterations with new derivatives by the nuisances
 _ENOUGH = 0.5  # drop of the cost
+_SHARES = 0.5 ** np.arange(6)  # of a step
 _LIMIT = 5.0  # standard deviations at which a whitened residual is limited (Huber)
 _STEPS = np.array(
     [0.05, 0.02, 0.005, 0.02, 0.001, 0.005, 0.002, *[0.01] * 3, *[0.5] * 3, *[0.05] * 5, 0.05, *[0.01] * 3]
@@ -227,14 +228,11 @@ def solve(
     precision = linear.prior_precision(spread)
     p = len(precision)
     base = linear.residuals(fit, active)
+    white, cost = _cost(linear, base, linear.vector(fit, mean), precision)
     columns = known.columns if known is not None else np.zeros(0)
-    previous = np.inf
+    drop = np.inf
     for k in range(iterations + 1):
-        white = linear.whitened(base)
-        nuisance = linear.vector(fit, mean)
-        cost = huber(white) + float(nuisance @ precision @ nuisance)
-        is_last = k == iterations or (k > 1 and previous - cost < _ENOUGH)
-        previous = cost
+        is_last = k == iterations or (k > 1 and drop < _ENOUGH)
         if known is None and k < _DERIVATIVES:
             columns = linear.whitened(linear.nuisance_columns(fit, active, base))
         effects = effect_derivatives(linear, fit, active, base)
@@ -251,11 +249,26 @@ def solve(
         if is_last:
             covariance = cho_solve(factor, np.eye(len(H)))[p:, p:]
             break
-        step = -cho_solve(factor, A.T @ (weight * r) + prior @ np.concatenate([nuisance, values]))
-        fit = linear.moved(fit, step[:p])
-        active = _moved_effects(active, step[p:])
-        base = linear.residuals(fit, active)
+        unknowns = np.concatenate([linear.vector(fit, mean), values])
+        step = -cho_solve(factor, A.T @ (weight * r) + prior @ unknowns)
+        for share in _SHARES:  # of the step, until the cost falls
+            moved, moved_effects = linear.moved(fit, share * step[:p]), _moved_effects(active, share * step[p:])
+            moved_base = linear.residuals(moved, moved_effects)
+            moved_white, moved_cost = _cost(linear, moved_base, linear.vector(moved, mean), precision)
+            if k == 0 or moved_cost < cost:  # the first step may leave a start with values of the linear search
+                break
+        drop = cost - moved_cost
+        if k == 0 or drop > 0:
+            fit, active, base, white, cost = moved, moved_effects, moved_base, moved_white, moved_cost
     return FlightSolution(fit, active, covariance, cost, white, columns, precision, base)
+
+
+def _cost(
+    linear: LinearFlight, base: np.ndarray, nuisance: np.ndarray, precision: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Return the whitened residuals and the penalised sum of squares."""
+    white = linear.whitened(base)
+    return white, huber(white) + float(nuisance @ precision @ nuisance)
 
 
 def huber(white: np.ndarray) -> float:

@@ -227,8 +227,8 @@ def _evidence(
 
     G' = G - max(2 c ln n, k^2 s^2 / |x|^2 G)   with the root mean square s of such values on nominal flights, k = 2
     """
-    name = active.one.effect.name
-    chance, nominal = baseline.chance.get(name, 1.0), baseline.sizes.get(name, 0.0)
+    group = active.one.group
+    chance, nominal = baseline.chance.get(group, 1.0), baseline.sizes.get(group, 0.0)
     square = max(float(active.values @ active.values), 1e-12)
     usual = max(2 * chance * float(np.log(n_onsets)), gain * (_NOMINAL_SIGMAS * nominal) ** 2 / square)
     precision = np.eye(len(information)) / active.one.scale**2
@@ -274,7 +274,7 @@ def _with_onset(linear: LinearFlight, baseline: RotorBaseline, solution: FlightS
 def nominal_gains(
     flight: RotorFlight, baseline: RotorBaseline
 ) -> tuple[dict[str, float], dict[str, float], np.ndarray]:
-    """Return the gain of each effect over that of chance, its size, and the scale of each channel, (13,).
+    """Return the gain of each group over that of chance, its size, and the scale of each channel by block, (b, 13).
 
     The best of n onsets gains about 2 ln n by chance.
     """
@@ -287,7 +287,7 @@ def nominal_gains(
     gains: dict[str, float] = {}
     sizes: dict[str, float] = {}
     for scan in scan_effects(linear, none, baseline):
-        name = scan.one.effect.name
-        gains[name] = max(gains.get(name, 0.0), scan.gain / len(scan.one.coordinates) / expected)
-        sizes[name] = max(sizes.get(name, 0.0), float(np.linalg.norm(scan.values)))
-    return gains, sizes, np.nan_to_num(np.nanmax(block_scales(none.white, linear)[0], axis=0), nan=1.0)
+        group = scan.one.group
+        gains[group] = max(gains.get(group, 0.0), scan.gain / len(scan.one.coordinates) / expected)
+        sizes[group] = max(sizes.get(group, 0.0), float(np.linalg.norm(scan.values)))
+    return gains, sizes, block_scales(none.white, linear)[0]

@@ -1,5 +1,7 @@
 """Alerts of a single aircraft: link, ground, geofence, short horizon, infeasible mission."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.special import ndtr
 
@@ -13,6 +15,7 @@ from twin_worker.alerts.geofence import (
     geofence_hazard,
     ground_hazard,
     height_above_home,
+    lowest_after,
     read_geofence,
 )
 from twin_worker.alerts.hysteresis import HazardEstimate
@@ -81,8 +84,13 @@ def _update_home_fallback(twin: Twin) -> None:
     twin.alerts.disarmed_at(Origin(*map(int, position[-1])) if len(position) else None)
 
 
-def limit_hazards(twin: Twin, gaussian: GaussianForecast) -> list[HazardEstimate]:
-    """Evaluate ground clearance and geofence; neither without a home position."""
+def limit_hazards(twin: Twin, gaussian: GaussianForecast, *, to_the_end: bool = False) -> list[HazardEstimate]:
+    """Evaluate ground clearance and geofence; neither without a home position.
+
+    Args:
+        twin: the aircraft; gaussian: its prediction
+        to_the_end: beyond the look-ahead of the alerts, a mean path below the minimum height counts, with one half
+    """
     home_origin, on_rotors = twin.home, is_hovering(twin)
     if home_origin is None:
         return [_not_predicted(AlertKind.GROUND), _not_predicted(AlertKind.GEOFENCE)]
@@ -94,7 +102,10 @@ def limit_hazards(twin: Twin, gaussian: GaussianForecast) -> list[HazardEstimate
         twin, on_rotors
     )  # still taking off, possibly on rotors
     if not near_ground:
-        findings = [ground_hazard(gaussian, home_origin, margin, until, twin.terrain)]
+        ground = ground_hazard(gaussian, home_origin, margin, until, twin.terrain)
+        if to_the_end and lowest_beyond_reach(twin, gaussian) < margin:
+            ground = replace(ground, probability=max(ground.probability, 0.5))
+        findings = [ground]
     limit = read_geofence(_params(twin))
     if near_ground:
         limit = limit._replace(floor=-np.inf)
@@ -104,6 +115,16 @@ def limit_hazards(twin: Twin, gaussian: GaussianForecast) -> list[HazardEstimate
         if limit.any_limit()
         else _not_predicted(AlertKind.GEOFENCE),
     ]
+
+
+def lowest_beyond_reach(twin: Twin, gaussian: GaussianForecast) -> float:
+    """Return the lowest mean height above ground beyond the look-ahead of the alerts [m].
+
+    It is infinite without a home position, and where the rest of the flight contains a landing.
+    """
+    if twin.home is None or _is_landing(twin, is_hovering(twin), within=None):
+        return np.inf
+    return lowest_after(gaussian, twin.home, twin.terrain, gaussian.prediction.t + reach_s(twin, gaussian.prediction))
 
 
 def reach_s(twin: Twin, prediction: Prediction) -> float:
@@ -119,8 +140,8 @@ def reach_s(twin: Twin, prediction: Prediction) -> float:
     return _DEFAULT_REACH_S if is_uncertain or prediction.calibration.startswith(UNCALIBRATED) else _REACH_S
 
 
-def _is_landing(twin: Twin, on_rotors: bool) -> bool:
-    """Return whether the aircraft is landing, or is about to by its mode or mission."""
+def _is_landing(twin: Twin, on_rotors: bool, within: int | None = _LANDING_LOOKAHEAD) -> bool:
+    """Return whether the aircraft is landing, or is about to: by its mode or the next items, None: all."""
     mode = twin.onboard.status.mode if twin.onboard.status is not None else ""
     if "LAND" in mode or (on_rotors and mode in RETURN_MODES):
         return True
@@ -129,7 +150,7 @@ def _is_landing(twin: Twin, on_rotors: bool) -> bool:
     items = sorted(twin.onboard.mission.items, key=lambda item: item.seq)
     commands = [item.command for item in items if item.seq >= twin.onboard.mission.seq]
     nav_commands = [command for command in commands if command < _LAST_NAV_COMMAND or command in _LANDING_COMMANDS][
-        :_LANDING_LOOKAHEAD
+        :within
     ]
     return any(command in _LANDING_COMMANDS or (on_rotors and command == _RETURN_COMMAND) for command in nav_commands)
 

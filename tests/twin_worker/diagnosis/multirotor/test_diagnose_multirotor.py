@@ -1,6 +1,7 @@
 """Diagnosis of multirotors: effects concealed in RotorPy's parameters, loss of control, refusals, model file."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,15 @@ from fleet.simulator.conceal.multirotor.exam import draw_rotor_jobs
 from fleet.simulator.conceal.multirotor.faults import HIDDEN, FaultyMultirotor
 from fleet.simulator.faults.physics import Fault
 from fleet.simulator.multirotor.tuning import motor_inputs
-from twin_worker.diagnosis.inference.report import Report, ReportOutcome
-from twin_worker.diagnosis.multirotor.baseline import FORMAT, RotorBaseline, calibrate_rotors, load_rotors, save_rotors
+from twin_worker.diagnosis.inference.report import Report, ReportOutcome, with_sentence
+from twin_worker.diagnosis.multirotor.baseline import (
+    FORMAT,
+    RotorBaseline,
+    block_limits,
+    calibrate_rotors,
+    load_rotors,
+    save_rotors,
+)
 from twin_worker.diagnosis.multirotor.control_loss import find_control_loss, unjudged
 from twin_worker.diagnosis.multirotor.diagnose import diagnose_rotors
 from twin_worker.diagnosis.multirotor.flight import DT, FRAMES, RotorFlight, rotor_frame
@@ -81,6 +89,21 @@ def test_thrust_and_lag_are_those_of_the_physics(flown: FlightAndUav, baseline: 
     assert p["tau"] == pytest.approx(kind.tau_m, abs=0.025)  # with the delay of the sampled outputs
 
 
+def test_few_blocks_of_nominal_flights_widen_the_limit_of_unusual_noise() -> None:
+    rng = np.random.default_rng(1)
+    many, few = (block_limits([np.exp(0.1 * rng.standard_normal((n, 13))) for _ in range(3)]) for n in (30, 2))
+    assert (many > 1.3).all() and (many < 2.0).all() and (few > many).all()
+    another = np.exp(0.1 * rng.standard_normal((500, 30, 13)))
+    assert 0.0 < (another > many).any(axis=(1, 2)).mean() < 0.05  # of nominal flights
+    one = block_limits([np.ones((1, 13))])
+    assert (one > 100.0).all()  # nothing is known of the spread
+
+
+def test_an_effect_without_force_is_stated_by_the_residual(report: Report) -> None:
+    unseen = with_sentence(replace(report, fit_before=1.2, fit_after=1.15, force_before=0.1, force_after=float("nan")))
+    assert "the residual falls from 1.20 to 1.15 (4%)" in unseen.sentence and "nan" not in unseen.sentence
+
+
 def test_a_model_file_is_read_again(baseline: RotorBaseline, tmp_path: Path) -> None:
     path = tmp_path / "model.json"
     save_rotors(path, baseline)
@@ -93,8 +116,6 @@ def test_a_model_file_is_read_again(baseline: RotorBaseline, tmp_path: Path) -> 
 
 
 def test_another_number_of_motors_is_refused(flown: FlightAndUav, baseline: RotorBaseline) -> None:
-    from dataclasses import replace
-
     with pytest.raises(ValueError, match="found 4 motors, expected 6"):
         diagnose_rotors(flown[0], replace(baseline, motors=6))
 
