@@ -117,22 +117,22 @@ def _with_chance(
     gains: NominalGains,
 ) -> RotorBaseline:
     """Return the baseline with what nominal flights show that are left out."""
-    found, blocks = [], []
+    searched, blocks = [], []
     for i, flight in enumerate(flights):
         others = [pair for j, pair in enumerate(solutions) if j != i] or solutions
         mean, information = pooled(others)
         spread = between_flights(mean, information, [one for _, one in others])
         by_effect, sizes, scales = gains(flight, replace(first, parameters=mean, spread=spread))
-        found.append((by_effect, sizes))
+        searched.append((by_effect, sizes))
         blocks.append(scales)
-    names = sorted({name for by_effect, _ in found for name in by_effect})
-    chance = {name: max(1.0, *(by_effect.get(name, 1.0) for by_effect, _ in found)) for name in names}
+    names = sorted({name for by_effect, _ in searched for name in by_effect})
+    chance = {name: max(1.0, *(by_effect.get(name, 1.0) for by_effect, _ in searched)) for name in names}
     baseline = replace(first, chance=chance, excess=block_limits(blocks))
     means = {}
     for name in chance:
         squares = [
             sizes.get(name, 0.0) ** 2 * max(1.0 - baseline.temper / max(by_effect.get(name, 0.0), 1e-9), 0.0)
-            for by_effect, sizes in found
+            for by_effect, sizes in searched
         ]
         means[name] = float(np.mean(squares)) ** 0.5
     return replace(baseline, sizes=means)
@@ -146,6 +146,7 @@ def block_limits(blocks: Sequence[np.ndarray]) -> np.ndarray:
 
     Args:
         blocks: scales of the blocks of each nominal flight, (b, 13), nan where a block has no rows
+    Source: Satterthwaite 1946 (degrees of freedom of a sum of variances)
     """
     logs = [np.log(np.maximum(x[np.isfinite(x).all(axis=1)], 1e-3)) for x in blocks]
     logs = [x for x in logs if len(x) > 1]
@@ -156,9 +157,11 @@ def block_limits(blocks: Sequence[np.ndarray]) -> np.ndarray:
     n, flights = channels.shape[1], len(logs)
     within = np.sum([((x - x.mean(axis=0)) ** 2).sum(axis=0) for x in logs], axis=0) / (n - flights)
     between = np.var([x.mean(axis=0)[present] for x in logs], axis=0).mean() * flights / max(flights - 1, 1)
-    freedom = min(n - flights, max(flights - 1, 1) * int(present.sum()))
-    quantile = float(student_t.ppf(1 - _FALSE_ALARM * flights / (n * present.sum()), freedom))
-    limits = np.exp(channels.mean(axis=1) + quantile * np.sqrt(within + between * (1 + 1 / flights)))
+    added = between * (1 + 1 / flights)
+    others = max(flights - 1, 1) * int(present.sum())
+    freedom = (within + added) ** 2 / np.maximum(within**2 / (n - flights) + added**2 / others, 1e-12)
+    quantile = student_t.ppf(1 - _FALSE_ALARM * flights / (n * present.sum()), np.maximum(freedom, 1.0))
+    limits = np.exp(channels.mean(axis=1) + quantile * np.sqrt(within + added))
     return np.where(present, np.minimum(limits, _NO_LIMIT), _NO_LIMIT)
 
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fleet.effects import Onset
 from twin_worker.diagnosis.multirotor.baseline import RotorBaseline
 from twin_worker.diagnosis.multirotor.effects import RotorEffect
 from twin_worker.diagnosis.multirotor.flight import RotorFlight
@@ -225,10 +226,12 @@ def _evidence(
 ) -> float:
     """Return the log evidence of one effect beyond what nominal flights show of it.
 
-    G' = G - max(2 c ln n, k^2 s^2 / |x|^2 G)   with the root mean square s of such values on nominal flights, k = 2
+    G' = G - max(2 c ln n, k^2 s^2 / |x|^2 G)   with the standard deviation s of such values on nominal flights, k = 2
     """
-    group = active.one.group
-    chance, nominal = baseline.chance.get(group, 1.0), baseline.sizes.get(group, 0.0)
+    one = active.one
+    chance, nominal = baseline.chance.get(one.group, 1.0), baseline.sizes.get(one.group, 0.0)
+    if Onset.ALWAYS in one.effect.onsets:  # of others a constant value is nominal, but no step
+        nominal = float(np.hypot(nominal, one.nominal))
     square = max(float(active.values @ active.values), 1e-12)
     usual = max(2 * chance * float(np.log(n_onsets)), gain * (_NOMINAL_SIGMAS * nominal) ** 2 / square)
     precision = np.eye(len(information)) / active.one.scale**2

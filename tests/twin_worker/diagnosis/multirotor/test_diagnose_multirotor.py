@@ -92,7 +92,7 @@ def test_thrust_and_lag_are_those_of_the_physics(flown: FlightAndUav, baseline: 
 def test_few_blocks_of_nominal_flights_widen_the_limit_of_unusual_noise() -> None:
     rng = np.random.default_rng(1)
     many, few = (block_limits([np.exp(0.1 * rng.standard_normal((n, 13))) for _ in range(3)]) for n in (30, 2))
-    assert (many > 1.3).all() and (many < 2.0).all() and (few > many).all()
+    assert (many > 1.3).all() and (many < 2.0).all() and few.mean() > 1.2 * many.mean()
     another = np.exp(0.1 * rng.standard_normal((500, 30, 13)))
     assert 0.0 < (another > many).any(axis=(1, 2)).mean() < 0.05  # of nominal flights
     one = block_limits([np.ones((1, 13))])
