@@ -42,7 +42,8 @@ class RotorBaseline:
         parameters: mean, (22,); spread: covariance between flights, (22, 22)
         filters: noise of the channels, see `ResidualNoise`
         chance: by group of effects, largest gain on nominal flights that are left out over that of noise, at least 1
-        sizes: by group, standard deviation of its values on them beyond the error of their estimates
+        sizes: by group, standard deviation of its values on them beyond the error of their estimates, with that of the
+            parameters which it changes
         excess: scale of the whitened residuals over 20 s that one nominal flight in a hundred exceeds in any channel,
             (13,), from those of the nominal flights that are left out
         explained: share of the variance of f_x f_y f_z p_dot q_dot r_dot that the model explains
@@ -128,14 +129,30 @@ def _with_chance(
     names = sorted({name for by_effect, _ in searched for name in by_effect})
     chance = {name: max(1.0, *(by_effect.get(name, 1.0) for by_effect, _ in searched)) for name in names}
     baseline = replace(first, chance=chance, excess=block_limits(blocks))
-    means = {}
+    means, least = {}, _least_sizes(first)
     for name in chance:
         squares = [
             sizes.get(name, 0.0) ** 2 * max(1.0 - baseline.temper / max(by_effect.get(name, 0.0), 1e-9), 0.0)
             for by_effect, sizes in searched
         ]
         means[name] = float(np.mean(squares)) ** 0.5
+        means[name] = float(np.hypot(means[name], least.get(name.split(":")[0], 0.0)))
     return replace(baseline, sizes=means)
+
+
+def _least_sizes(baseline: RotorBaseline) -> dict[str, float]:
+    """Return the standard deviation between flights of the parameters that an effect changes, in its coordinates."""
+    p = dict(zip(PARAMETERS, baseline.parameters.tolist(), strict=True))
+    std = dict(zip(PARAMETERS, np.sqrt(np.diag(baseline.spread)).tolist(), strict=True))
+    k, c = std["k"] / p["k"], std["c"] / max(abs(p["c"]), 1e-6)
+    return {
+        "motor_thrust_loss": float(np.linalg.norm([std["m_p"], std["m_q"], std["m_r"]])),
+        "cg_shift": float(np.hypot(std["x_c"], std["y_c"])),
+        "thrust_loss": k,
+        "mass_change": k,
+        "motor_lag": std["tau"],
+        "drag_increase": c,
+    }
 
 
 def block_limits(blocks: Sequence[np.ndarray]) -> np.ndarray:
