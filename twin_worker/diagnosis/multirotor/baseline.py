@@ -27,6 +27,8 @@ FORMAT = "parauav.rotors.2"
 _PASSES = 3
 _FALSE_ALARM = 0.01  # probability that a channel of a nominal flight seems too noisy in any block
 _NO_LIMIT = 1e3
+_ALIKE = (slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 13))
+"""Channels of specific force, angular acceleration, velocity, attitude, pressure height."""
 NominalGains = Callable[[RotorFlight, "RotorBaseline"], tuple[dict[str, float], dict[str, float], np.ndarray]]
 _START = {"k": 8.0, "expo": 0.6, "tau": 0.05, "d": 0.05, "c": 0.01, "a_p": 30.0, "a_q": 30.0, "a_r": 3.0}
 _FLOOR = np.array([0.01, 0.01, 1e-3, 0.02, 2e-4, 2e-3, 5e-4, *[2e-3] * 3, *[0.2] * 3, *[0.02] * 5, 0.01, *[2e-3] * 3])
@@ -158,8 +160,9 @@ def _least_sizes(baseline: RotorBaseline) -> dict[str, float]:
 def block_limits(blocks: Sequence[np.ndarray]) -> np.ndarray:
     """Return the scale of each channel that a block of another nominal flight exceeds by chance, (13,).
 
-    Logarithms of scales are normal with one variance within each channel, and one between flights for all channels,
-    as weather differs. The limit is that of the predictive distribution. A channel that is absent has none.
+    Logarithms of scales are normal with one variance within each channel, and one between flights for the channels of
+    one kind, as gusts act on forces and less on the others. The limit is that of the predictive distribution. A channel
+    that is absent has none.
 
     Args:
         blocks: scales of the blocks of each nominal flight, (b, 13), nan where a block has no rows
@@ -173,9 +176,12 @@ def block_limits(blocks: Sequence[np.ndarray]) -> np.ndarray:
         return np.full(len(CHANNELS), _NO_LIMIT)
     n, flights = channels.shape[1], len(logs)
     within = np.sum([((x - x.mean(axis=0)) ** 2).sum(axis=0) for x in logs], axis=0) / (n - flights)
-    between = np.var([x.mean(axis=0)[present] for x in logs], axis=0).mean() * flights / max(flights - 1, 1)
-    added = between * (1 + 1 / flights)
-    others = max(flights - 1, 1) * int(present.sum())
+    of_channels = np.var([x.mean(axis=0) for x in logs], axis=0) * flights / max(flights - 1, 1)
+    added, others = np.empty(len(CHANNELS)), np.empty(len(CHANNELS))
+    for group in _ALIKE:
+        used = present[group]
+        added[group] = (of_channels[group][used].mean() if used.any() else 0.0) * (1 + 1 / flights)
+        others[group] = max(flights - 1, 1) * max(int(used.sum()), 1)
     freedom = (within + added) ** 2 / np.maximum(within**2 / (n - flights) + added**2 / others, 1e-12)
     quantile = student_t.ppf(1 - _FALSE_ALARM * flights / (n * present.sum()), np.maximum(freedom, 1.0))
     limits = np.exp(channels.mean(axis=1) + quantile * np.sqrt(within + added))
