@@ -227,11 +227,12 @@ class Item(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Mission(Message, frozen=True, kw_only=True):
-    """The route on board; item 0 of an ArduPilot mission is home."""
+    """The route and the fence items on board; item 0 of an ArduPilot mission is home."""
 
     topic: ClassVar[str] = "mission"
 
     items: tuple[Item, ...] = ()
+    fence: Annotated[tuple[Item, ...], about("fence items (MAV_CMD_NAV_FENCE_*); empty where none were received")] = ()
     seq: Annotated[int, about("current item when this was sent; -1 unknown")] = -1
     complete: Annotated[bool, about("every item was received")] = False
     sentence: Annotated[str, about("error in the mission, or empty")] = ""

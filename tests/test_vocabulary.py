@@ -153,7 +153,7 @@ def test_every_part_of_the_state_is_written_by_one_module() -> None:
     fields = {
         node.target.id for node in twin.body if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
     }
-    assert fields == {*PARTS, "config", "budget", "terrain"}
+    assert fields == {*PARTS, "config", "budget", "terrain", "areas"}
 
 
 def test_every_exception_is_needed() -> None:

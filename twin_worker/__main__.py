@@ -16,7 +16,7 @@ from fleet.access.roles import WORKER
 from fleet.cli import id_range, make_parser, run_command, stop_on_signal
 from fleet.config import bus_config_from, router_arguments
 from fleet.process.children import Children
-from fleet.process.file_options import airframe_file, model_of
+from fleet.process.file_options import airframe_file, input_file, model_of
 from fleet.process.logs import log_arguments, report_progress, report_status
 from fleet.process.malloc_trim import enable_malloc_trim
 from twin_worker.twin.state.budget import LIVE_SCHEDULE, parse_schedule
@@ -43,6 +43,7 @@ EXAMPLES = """
   twin_worker --uavs 0-49 --processes 4                    four processes share the range
   twin_worker --uavs 50-99 --router tcp/192.168.1.10:7447
   twin_worker --uavs 0-9 --terrain N47E008.hgt             ground alerts above this terrain instead of above home
+  twin_worker --uavs 0-9 --areas no-fly.geojson            geofence alerts for these areas, too
   twin_worker --uavs 0-9 --baseline skywalker.json         model from `fleet calibrate`; default: each UAV's own past
 """
 
@@ -112,10 +113,12 @@ def _run(args: argparse.Namespace) -> int:
     from fleet.bus.session import connect
     from fleet.contract import FleetState
     from fleet.metrics import serve
+    from fleet.terrain.areas import read_areas
     from fleet.terrain.raster import read_raster
 
     airframe, baselines = load(str(args.airframe or GENERIC)), _load_baselines(args.baseline)
     terrain = read_raster(args.terrain, colours=False) if args.terrain else None
+    areas = read_areas(args.areas) if args.areas else ()
     stop = stop_on_signal()
     threading.Thread(target=_force_exit, args=(stop,), daemon=True).start()
     with connect(bus_config_from(args, WORKER)) as bus:
@@ -145,6 +148,7 @@ def _run(args: argparse.Namespace) -> int:
             schedule=args.pace,
             use_siblings=args.use_siblings,
             terrain=terrain,
+            areas=areas,
             diagnosis=None if args.no_diagnosis else Coordinator(executor, baselines, adapt=not args.no_adapt),
         )
         _tune_runtime()
@@ -236,6 +240,13 @@ def main(argv: list[str] | None = None) -> int:
         "--terrain",
         metavar="FILE",
         help="terrain heights for ground alerts and proposals: GeoTIFF, SRTM .hgt, or FILE@south,west,north,east",
+    )
+    parser.add_argument(
+        "--areas",
+        type=input_file("a GeoJSON file"),
+        metavar="FILE",
+        help="GeoJSON polygons for geofence alerts of all aircraft: no-fly areas, or with the property fence=inclusion "
+        "areas to stay in; floor_m and ceiling_m above sea level",
     )
     parser.add_argument(
         "--use-siblings", action="store_true", help="first models with what aircraft of their type have learnt"

@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from fleet.access.roles import OPERATOR, VIEWER
 from fleet.cli import check_port, make_parser, run_command, stop_on_signal
 from fleet.config import LOOPBACK, bus_config_from, has_operators, router_arguments
+from fleet.process.file_options import input_file
 from fleet.process.logs import log_arguments, report_status
 from fleet.process.malloc_trim import enable_malloc_trim
 from fleet.report.changes import user_name
@@ -55,6 +56,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--imagery", metavar="FILE", help="ground imagery: GeoTIFF, PNG or JPEG, or FILE@south,west,north,east"
     )
+    parser.add_argument(
+        "--areas",
+        type=input_file("a GeoJSON file"),
+        metavar="FILE",
+        help="geofence areas drawn on the map: GeoJSON polygons, as in twin_worker --help",
+    )
     parser.add_argument("--map", metavar="FILE", help="map tiles: MBTiles or PMTiles with PNG, JPEG or WebP images")
     parser.add_argument(
         "--allow",
@@ -76,6 +83,7 @@ def run(args: argparse.Namespace) -> int:
     check_port("--port", args.port)
     _check_approvals(args)
     from fleet.bus.session import connect  # here, as --help and --version need none of these
+    from fleet.terrain.areas import read_areas
     from fleet.terrain.raster import read_raster
     from viewer.browser.http_server import serve, without_stdout
     from viewer.scene.map.tiles import open_tiles
@@ -85,6 +93,7 @@ def run(args: argparse.Namespace) -> int:
     terrain = read_raster(args.terrain, colours=False) if args.terrain else None
     imagery = read_raster(args.imagery, colours=True) if args.imagery else None
     tiles = open_tiles(args.map) if args.map else None
+    areas = read_areas(args.areas) if args.areas else ()
     stop = stop_on_signal()
     gc.set_threshold(*GC_THRESHOLDS)
     enable_malloc_trim(LARGE_BLOCK_BYTES)
@@ -97,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
             approver = operator.publish, args.who or user_name()
         server = serve(args.host, args.port, args.name)
         try:
-            app = App(bus, server, light=args.light, terrain_layer=terrain_layer, approver=approver)
+            app = App(bus, server, light=args.light, terrain_layer=terrain_layer, areas=areas, approver=approver)
             report_status("viewer", f"http://{args.host}:{args.port}")
             app.run(stop)
         finally:

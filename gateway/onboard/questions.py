@@ -8,6 +8,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
+from fleet.telemetry.mavlink.microservices.fence import FENCE_TYPE
 from fleet.telemetry.mavlink.parsing.decode import IDS, layout
 from gateway import DEFAULT_BUDGET
 from gateway.link_spec import LinkSpec
@@ -102,6 +103,8 @@ class RequestScheduler:
         self._params_at = self._items_at = float("-inf")
         self._items_left: int | None = None
         self._item_tries = 0  # since the last item received
+        self._fence_list, self._fence_tries, self._fence_left = RetryTimer(), 0, 0
+        self._fence_at = self._fence_watch_t = now
 
     def requests(
         self, now: float, share: float = 1.0, diagnosis_share: float = 0.0, *, mission: bool = True
@@ -117,7 +120,7 @@ class RequestScheduler:
             self._store_t = now
             self._cache_check.store()
         requests = (
-            (self._mission(now) if mission else [])
+            (self._mission(now) or self._fence(now) if mission else [])
             + self._home(now)
             + self._params(now)
             + self._rates(now, share, diagnosis_share)
@@ -170,6 +173,33 @@ class RequestScheduler:
         self._watch_t, self._watched_item = now, (self._watched_item + 1) % count
         seq = min(route.unconfirmed, default=self._watched_item)
         return [dialect.MAVLink_mission_request_int_message(*self._to, seq)]
+
+    def _fence(self, now: float) -> list[Any]:
+        """Return requests for the fence items, once the mission is complete; the list is checked periodically."""
+        fence, mission = self.aircraft.fence, self.aircraft.mission
+        if not fence.supported or not mission.complete or mission.needs_download:
+            return []
+        if now - self._fence_watch_t > REDOWNLOAD_S:
+            self._fence_watch_t, fence.needs_download = now, True
+            self._fence_list.reset()
+        if missing := fence.missing():
+            is_stalled = len(missing) == self._fence_left
+            if is_stalled and now - self._fence_at < RETRY_S:
+                return []
+            self._fence_tries = self._fence_tries + 1 if is_stalled else 0
+            self._fence_left, self._fence_at = len(missing), now
+            if self._fence_tries > ITEM_TRIES:
+                self._fence_tries = 0
+                fence.abort_download()
+                return []
+            batch = missing[: self._request_dialect.items_at_once]
+            return [dialect.MAVLink_mission_request_int_message(*self._to, seq, FENCE_TYPE) for seq in batch]
+        if self._fence_left:
+            self._fence_left = 0
+            return [dialect.MAVLink_mission_ack_message(*self._to, dialect.MAV_MISSION_ACCEPTED, FENCE_TYPE)]
+        if fence.needs_download and self._fence_list.due(now):
+            return [dialect.MAVLink_mission_request_list_message(*self._to, FENCE_TYPE)]
+        return []
 
     def _home(self, now: float) -> list[Any]:
         """Return a request for HOME_POSITION where the mission came before it, or, with PX4, never contains home."""

@@ -1,7 +1,8 @@
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from fleet.contract import Mission, Params
+from fleet.contract import Item, Mission, Params
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
 from gateway.onboard import RequestSender
 from tests.support.talker import ITEMS, T0, Aircraft, Ears, Talker, of
@@ -36,10 +37,58 @@ def test_mission_and_parameters_are_fetched_whatever_the_radio_loses(loss):
     assert params.values == {f"P{i:03d}": float(i) for i in range(300)}
     if not loss:
         names = aircraft.names()
-        assert (
-            names.count("PARAM_REQUEST_LIST") == names.count("MISSION_REQUEST_LIST") == names.count("MISSION_ACK") == 1
-        )
+        assert names.count("PARAM_REQUEST_LIST") == names.count("MISSION_ACK") == 1
+        assert [one.mission_type for _, one in aircraft.asked if one.get_type() == "MISSION_REQUEST_LIST"] == [0, 1]
         assert names.count("MISSION_REQUEST_INT") <= len(ITEMS) + 5
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_fence_items_follow_the_mission_and_are_renewed(loss):
+    aircraft = Aircraft(loss)
+    first, second = (fence_items(n) for n in (4, 6))
+    aircraft.voice.missions.fence = first
+
+    def replace(t):
+        aircraft.voice.missions.fence = first if t < 60.0 else second
+
+    news, _ = fly(aircraft, 180.0, every_tick=replace)
+    fences = [one.fence for one in of(Mission, news) if one.complete]
+    assert first in fences and fences[-1] == second and of(Mission, news)[-1].items == ITEMS
+    assert set(fences) == {(), first, second}  # never a part
+    if not loss:
+        asked = [one for _, one in aircraft.asked if one.get_type() == "MISSION_REQUEST_INT" and one.mission_type == 1]
+        assert len(asked) <= 2 * 4 + 2 * 6 + 10  # again every minute
+
+
+def fence_items(n: int) -> tuple[Item, ...]:
+    """Give a polygon of n vertices."""
+    angles = np.linspace(0.0, 2 * np.pi, n, endpoint=False)
+    return tuple(
+        Item(
+            seq=k,
+            command=5001,
+            frame=0,
+            param1=float(n),
+            lat_e7=470_000_000 + round(9e4 * np.cos(a)),
+            lon_e7=80_000_000,
+        )
+        for k, a in enumerate(angles)
+    )
+
+
+def test_an_autopilot_without_fence_items_is_asked_once():
+    aircraft = Aircraft(0.0)
+    refuse = aircraft.voice.missions.receive
+
+    def receive(message, now):
+        if message.mission_type == 1:
+            return [mav.MAVLink_mission_ack_message(255, 190, mav.MAV_MISSION_UNSUPPORTED, 1)]
+        return refuse(message, now)
+
+    aircraft.voice.missions.receive = receive
+    fly(aircraft, 200.0)
+    asked = [one for _, one in aircraft.asked if getattr(one, "mission_type", 0) == 1]
+    assert len(asked) == 1
 
 
 def test_a_mission_that_became_shorter_meanwhile_is_asked_for_again():

@@ -155,7 +155,7 @@ MESSAGES = (
         home=(470_000_000, 80_000_000, 400_100),
         sentence="link lost 3 s ago",
     ),
-    Mission(uav=UAV, t=T, items=(ITEM,), seq=1, complete=True, sentence="fine"),
+    Mission(uav=UAV, t=T, items=(ITEM,), fence=(ITEM,), seq=1, complete=True, sentence="fine"),
     Params(uav=UAV, t=T, values={"NAVL1_PERIOD": 17.0}, complete=True, sentence="fine"),
     History(
         uav=UAV,

@@ -20,7 +20,7 @@ from fleet.contract import AlertKind, BatteryForecast, Change, Item, Mission, Pr
 from fleet.frames import to_ned
 from fleet.mission import SPEED, Route
 from twin_worker.alerts.gaussian_forecast import GaussianForecast, to_gaussian
-from twin_worker.alerts.geofence import ground_clearance, height_above_home, read_geofence
+from twin_worker.alerts.geofence import area_margin, ground_clearance, height_above_home
 from twin_worker.alerts.hysteresis import RULES
 from twin_worker.prediction.autopilot_parameters import SPEED_PARAMETERS, RouteOverride
 from twin_worker.proposals.candidates import DECISION_S, LAND_MODE, MODES, Candidate, Deficit, Plan, to_change
@@ -29,6 +29,7 @@ from twin_worker.twin.state.routes import route_of_mode
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.alerts import (
     battery_hazard,
+    geofence,
     limit_hazards,
     lowest_beyond_reach,
     mission_feasibility,
@@ -273,8 +274,13 @@ def _margins(twin: Twin, forecast: GaussianForecast) -> dict[AlertKind, float]:
     """Return the lowest height above ground of the mean path, and its smallest distance to the geofence [m]."""
     if twin.home is None:
         return {}
-    extremes, fence = _extremes(twin, forecast), read_geofence(twin.received_params)
-    inside = min(fence.radius - extremes.far[0], fence.ceiling - extremes.high[0], extremes.floor[0] - fence.floor)
+    extremes, fence = _extremes(twin, forecast), geofence(twin)
+    inside = min(
+        fence.radius - extremes.far[0],
+        fence.ceiling - extremes.high[0],
+        extremes.floor[0] - fence.floor,
+        area_margin(forecast, fence, forecast.prediction.t + reach_s(twin, forecast.prediction)),
+    )
     return {AlertKind.GROUND: min(extremes.low[0], extremes.later), AlertKind.GEOFENCE: inside}
 
 
@@ -289,7 +295,7 @@ def deficit(plan: Plan, experiment: PlanExperiment, kind: AlertKind) -> Deficit:
     (low, sigma_low), (floor, sigma_floor), (high, sigma_high), (far, sigma_far), later = extremes
     if kind is AlertKind.GROUND:
         return Deficit(plan.min_height_m + max(z * sigma_low - low, -later, -plan.min_height_m))
-    fence = read_geofence(plan.twin.received_params)
+    fence = geofence(plan.twin)
     too_high = min(fence.ceiling - z * sigma_high - high, 0.0)
     too_low = max(fence.floor + z * sigma_floor - floor, 0.0)
     overshoot = far - (fence.radius - z * sigma_far)

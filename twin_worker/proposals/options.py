@@ -102,7 +102,7 @@ def _clearance(problem: Problem, solution: Solution) -> tuple[float, str]:
         return _MAX_CLEARANCE_M, _battery_text(own)
     if problem.kind is AlertKind.GEOFENCE:
         margin = own.margin_m.get(AlertKind.GEOFENCE, 0.0)
-        return min(margin, _MAX_CLEARANCE_M), f"stays {margin:.0f} m inside the geofence"
+        return min(margin, _MAX_CLEARANCE_M), f"keeps {margin:.0f} m from the geofence"
     return _MAX_CLEARANCE_M, "every leg ahead is achievable"
 
 

@@ -22,6 +22,7 @@ from fleet.contract import (
     Sample,
     Status,
 )
+from fleet.terrain.areas import Area
 from fleet.terrain.raster import Raster
 from twin_worker.alerts.conflict_probability import Separation
 from twin_worker.alerts.hysteresis import AlertState
@@ -79,9 +80,11 @@ class Worker:
         schedule: Schedule | None = None,
         use_siblings: bool = False,
         terrain: Raster | None = None,
+        areas: tuple[Area, ...] = (),
     ) -> None:
         self.bus, self.uavs, self.diagnosis = bus, uavs, diagnosis
-        self.omega, self.method, self.airframe, self._terrain = omega, method, airframe or load(GENERIC), terrain
+        self.omega, self.method, self.airframe = omega, method, airframe or load(GENERIC)
+        self._terrain, self._areas = terrain, areas
         self.schedule, self._use_siblings = schedule or Schedule(), use_siblings
         # short for frequent propagation
         self._late_after_s = min(max(_LATE_PERIODS * self.schedule.renew, _LATE_LIMITS_S[0]), _LATE_LIMITS_S[1])
@@ -138,7 +141,7 @@ class Worker:
 
     def _create_twin(self, uav: int) -> Twin:
         config = TwinConfig(uav, self.omega, self.method, self.airframe, self.schedule)
-        return Twin(config, budget=self.quota, terrain=self._terrain)
+        return Twin(config, budget=self.quota, terrain=self._terrain, areas=self._areas)
 
     def _copy_of(self, uav: int) -> Twin | None:
         owned = self._owned.get(uav)

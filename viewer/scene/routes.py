@@ -1,11 +1,16 @@
-"""Mission as lines: navigation items in order, loiters as circles; other or invalid items are skipped."""
+"""Mission as lines: navigation items in order, loiters as circles; other or invalid items are skipped.
 
+Outlines of geofence areas lie on the ground.
+"""
+
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from fleet.contract import Item, Mission
-from viewer.scene.strokes import circle
+from fleet.terrain.areas import Area
+from viewer.scene.strokes import chain, circle
 from viewer.store import event_detection as mav
 from viewer.store.place import UNIT_M, SceneFrame
 
@@ -15,6 +20,8 @@ LOITERS = {*RADIUS_FIELD, mav.LOITER_TIME}
 ABSOLUTE = {0, 5}  # MAV_FRAME: GLOBAL, GLOBAL_INT; every other altitude counts from home
 RADIUS_M = 60.0  # default loiter radius: WP_LOITER_RAD of ArduPlane [m]
 MAX_M = 50_000.0  # larger altitudes and radii are not drawn [m]
+Heights = Callable[[np.ndarray], np.ndarray]
+EDGE_PARTS = 12  # of each edge of an area: it follows the terrain
 
 
 class RouteLines(NamedTuple):
@@ -102,6 +109,24 @@ def route_ahead(route: RouteLines, seq: int, at: np.ndarray) -> np.ndarray:
         again = int(np.argmin(np.linalg.norm(route.points - back[-1], axis=1)))
         points += [*route.points[again : begin + 1]]
     return np.array(points)
+
+
+def area_lines(area: Area, scene_frame: SceneFrame, heights: Heights, ground: float) -> np.ndarray:
+    """Return the outline of an area on the ground, segments (n, 2, 3) [10 m].
+
+    Args:
+        area, scene_frame: the area, and the frame of the scene
+        heights: of the terrain under scene points (n, 3), NaN where unknown [10 m]
+        ground: height of the ground there [10 m]
+    """
+    north, east = area.outline(scene_frame.origin).T / UNIT_M
+    corners = np.column_stack([east, north, np.full(len(east), ground)])
+    shares = np.linspace(0.0, 1.0, EDGE_PARTS, endpoint=False)[:, None]
+    edges = corners[:, None] + shares * (np.roll(corners, -1, axis=0) - corners)[:, None]
+    points = np.concatenate([edges.reshape(-1, 3), corners[:1]])
+    known = heights(points)
+    points[:, 2] = np.where(np.isfinite(known), known, ground)
+    return chain(points)
 
 
 def _return_seq(item: Item) -> int | None:

@@ -5,11 +5,13 @@ from typing import Any
 
 import numpy as np
 
+from fleet.terrain.areas import Area
 from viewer.scene.fleet_arrays import CHUNKS, LOST, MISMATCH, STEPS, FleetArrays
 from viewer.scene.ground import GroundGrid
 from viewer.scene.labels import CameraView
-from viewer.scene.routes import NOTHING, RouteLines
+from viewer.scene.routes import NOTHING, Heights, RouteLines, area_lines
 from viewer.scene.strokes import Strokes, chain, circle, dash_lines, faded, smooth_curve
+from viewer.store.place import SceneFrame
 from viewer.store.vehicle import Vehicle
 from viewer.theme.palette import Palette, mesh_colour, mix, rgb
 from viewer.theme.shapes import aircraft, dart, rotorcraft
@@ -130,8 +132,10 @@ class Scene:
         self.predicted = Strokes(scene, "/fleet/predicted", 1.8)
         self.stems = Strokes(scene, "/fleet/stems", 1.2)
         self.routes = Strokes(scene, "/fleet/routes", 1.4)
+        self.areas = Strokes(scene, "/fleet/areas", 2.0)
         self.alert = Strokes(scene, "/alert", 2.2)
         self._drawn: tuple = (None, -1)  # revision and selection, and closed chunks, when the trails were last drawn
+        self._drawn_areas: tuple = ()
         self._statuses = np.zeros(0, int)  # statuses they were coloured by
         self._head_statuses = np.zeros(0, int)
 
@@ -207,6 +211,15 @@ class Scene:
         """Draw the routes of the other UAVs in a muted colour."""
         lines = [part for r in routes for part in (r.legs, r.circles, dash_lines(r.returns, 4.0))]
         self.routes.draw(np.concatenate([*lines, NOTHING.legs]), mix(self._palette.route, self._palette.ground, 0.45))
+
+    def draw_areas(self, areas: frozenset[Area], scene_frame: SceneFrame, heights: Heights) -> None:
+        """Draw the outlines of geofence areas on the ground, no-fly areas in the colour of alerts."""
+        key = (areas, scene_frame, self.ground.height)
+        if key == self._drawn_areas:
+            return
+        self._drawn_areas, palette = key, self._palette
+        lines = [(area_lines(area, scene_frame, heights, self.ground.height + 0.05), area.exclusion) for area in areas]
+        self.areas.draw_parts([(x, rgb(palette.mismatch if out else palette.route)) for x, out in lines])
 
 
 def _curves(fleet_arrays: FleetArrays, points: np.ndarray, selected: int | None) -> np.ndarray:

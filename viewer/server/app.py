@@ -12,6 +12,7 @@ import viser
 
 from fleet.bus.session import Bus
 from fleet.contract import Approval, History
+from fleet.terrain.areas import Area
 from viewer.browser.http_server import Browser
 from viewer.panels.approval import ApprovalDialog
 from viewer.scene.camera import IN_VIEW_M, set_initial_view, within_reach
@@ -97,6 +98,7 @@ class App:
         *,
         light: bool = False,
         terrain_layer: TerrainLayer | None = None,
+        areas: tuple[Area, ...] = (),
         approver: Approver | None = None,
     ) -> None:
         self._palette, self._approver = LIGHT if light else DARK, approver
@@ -104,6 +106,7 @@ class App:
         self._backfill = Backfill(bus, self.store)
         self.recordings, self._terrain_layer = RecordingStore(), terrain_layer or TerrainLayer(None, None)
         self.views: dict[int, View] = {}  # by client
+        self._areas = areas
         self._failed_clients: set[int] = set()  # clients whose page could not be opened
         self._wake = threading.Event()
         self._ground_height, self._framing_points = 0.0, np.zeros((0, 3))
@@ -203,7 +206,7 @@ class App:
             self.views.pop(client_id, None)
             _log.exception("page %d could not be opened; other pages continue; reload it", client_id)
             return
-        view.heights = self._terrain_layer.heights
+        view.heights, view.areas = self._terrain_layer.heights, self._areas
         view.offset = client_id * 4 % TICKS_PER_S
         if previous is not None:
             view.restore(previous)

@@ -4,10 +4,12 @@ import contextlib
 import time
 from collections.abc import Callable
 from functools import partial
+from itertools import chain
 
 import numpy as np
 import viser
 
+from fleet.terrain.areas import Area, read_fence_items
 from viewer.browser.http_server import Browser
 from viewer.export import Export
 from viewer.panels.approval import ApprovalDialog
@@ -60,6 +62,7 @@ class View:
         self.scene = Scene(client.scene, palette, self._on_aircraft)
         self.measure, self._route = Measure(client.scene, palette), NOTHING
         self.heights: Callable[[np.ndarray], np.ndarray] = unknown_heights  # terrain under scene points
+        self.areas: tuple[Area, ...] = ()  # geofence areas of the operator
         self._positions: dict[int, np.ndarray] = {}  # drawn positions while measuring, by UAV
         self.selection, self._labels = Selection(client.scene, palette), Labels(client.scene)
         commands = {
@@ -309,6 +312,8 @@ class View:
             strokes.show(options.trails.value)
         others = [v for v in fleet_arrays.fleet if v.uav != self.selected] if options.routes.value else []
         scene.draw_routes([mission_lines(v.mission, scene_frame, ground) for v in others])
+        on_board = (read_fence_items(v.mission.fence).areas for v in fleet_arrays.fleet if v.mission is not None)
+        scene.draw_areas(frozenset(chain(self.areas, *on_board)), scene_frame, self.heights)
         self.selection.tube = options.tube.value
         self._draw_selected(now, ground)
 

@@ -75,6 +75,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-viewer", action="store_true", help="without the web page")
     parser.add_argument("--port", type=int, default=8080, help="port of the web page (8080)")
     parser.add_argument("--terrain", metavar="FILE", help="terrain heights for alerts and page, as in viewer --help")
+    parser.add_argument(
+        "--areas", type=input_file("a GeoJSON file"), metavar="FILE", help="geofence areas, as in twin_worker --help"
+    )
     parser.add_argument("--imagery", metavar="FILE", help="ground imagery for the page, as in viewer --help")
     parser.add_argument("--map", metavar="FILE", help="map tiles for the page, as in viewer --help")
     parser.add_argument("--seed", type=int, default=1, help="seed of the simulated aircraft (1)")
@@ -151,8 +154,8 @@ def _start(children: Children, args: argparse.Namespace) -> None:
     if not args.results:
         ids = "0-999999" if args.replay else "0-249"
         baselines = [f"--baseline={text}" for text in args.baseline]
-        terrain = [f"--terrain={args.terrain}"] if args.terrain else []
-        children.start("twin worker", "twin_worker", "--uavs", ids, *baselines, *terrain, *router)
+        ground = [f"--{name}={file}" for name in ("terrain", "areas") if (file := getattr(args, name))]
+        children.start("twin worker", "twin_worker", "--uavs", ids, *baselines, *ground, *router)
     gateway_options = [f"--forward={text}" for text in args.forward] + router
     gateway_options += [f"--keys={args.keys}"] if args.keys else []
     links = [f"--link={text}" for text in args.link]
@@ -165,7 +168,8 @@ def _start(children: Children, args: argparse.Namespace) -> None:
         if not args.story:  # its aircraft start when the worker is ready
             _start_aircraft(children, args)
     if not args.no_viewer:
-        map_options = [f"--{name}={file}" for name in ("terrain", "imagery", "map") if (file := getattr(args, name))]
+        names = ("terrain", "areas", "imagery", "map")
+        map_options = [f"--{name}={file}" for name in names if (file := getattr(args, name))]
         map_options += ["--allow=approvals"] if args.story else []
         children.start("viewer", "viewer", "--port", str(args.port), *map_options, *router)
 

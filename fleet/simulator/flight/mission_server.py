@@ -42,6 +42,7 @@ class MissionServer:
 
     def __init__(self, items: tuple[Item, ...], is_px4: bool) -> None:
         self.items, self._is_px4 = items, is_px4
+        self.fence: tuple[Item, ...] = ()
         self._upload: _Upload | None = None
         self._retry_s, self._timeout_s = (0.25, 5.0) if is_px4 else (1.0, 8.0)
         self._received: UploadedMission | None = None
@@ -66,9 +67,12 @@ class MissionServer:
     def receive(self, message: Any, now: float) -> list[Any]:
         """Process one message of the mission protocol at `now` [s] and return the replies."""
         name, sender = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
-        if message.mission_type != 0:  # neither geofence nor rally points
+        if message.mission_type != 0:  # fence items can be read, rally points there are none
+            stored = self.fence if message.mission_type == mav.MAV_MISSION_TYPE_FENCE else ()
             if name == "MISSION_REQUEST_LIST":
-                return [mav.MAVLink_mission_count_message(*sender, 0, message.mission_type)]
+                return [mav.MAVLink_mission_count_message(*sender, len(stored), message.mission_type)]
+            if name == "MISSION_REQUEST_INT" and message.seq < len(stored):
+                return [_item_message(stored[message.seq], message, sender)]
             return [_ack(sender, mav.MAV_MISSION_UNSUPPORTED, message.mission_type)]
         if name == "MISSION_COUNT":
             return self._start(message.count, sender, now)
@@ -86,11 +90,7 @@ class MissionServer:
     def _item(self, message: Any, sender: tuple[int, int]) -> list[Any]:
         if message.seq >= len(self.items):
             return [_ack(sender, mav.MAV_MISSION_INVALID_SEQUENCE)]
-        item = self.items[message.seq]
-        head = (*sender, item.seq, item.frame, item.command, 0, 1, item.param1, item.param2, item.param3, item.param4)
-        if message.get_type() == "MISSION_REQUEST_INT":
-            return [mav.MAVLink_mission_item_int_message(*head, item.lat_e7, item.lon_e7, item.alt_m)]
-        return [mav.MAVLink_mission_item_message(*head, item.lat_e7 * 1e-7, item.lon_e7 * 1e-7, item.alt_m)]
+        return [_item_message(self.items[message.seq], message, sender)]
 
     def _start(self, count: int, sender: tuple[int, int], now: float) -> list[Any]:
         upload = self._upload
@@ -135,6 +135,15 @@ class MissionServer:
 
 def _ack(to: tuple[int, int], result: int, mission_type: int = 0) -> Any:
     return mav.MAVLink_mission_ack_message(*to, result, mission_type)
+
+
+def _item_message(item: Item, request: Any, to: tuple[int, int]) -> Any:
+    """Return an item as requested, with coordinates as integers or floats."""
+    head = (*to, item.seq, item.frame, item.command, 0, 1, item.param1, item.param2, item.param3, item.param4)
+    if request.get_type() == "MISSION_REQUEST_INT":
+        position = (item.lat_e7, item.lon_e7, item.alt_m)
+        return mav.MAVLink_mission_item_int_message(*head, *position, request.mission_type)
+    return mav.MAVLink_mission_item_message(*head, item.lat_e7 * 1e-7, item.lon_e7 * 1e-7, item.alt_m)
 
 
 def _read(message: Any) -> Item:

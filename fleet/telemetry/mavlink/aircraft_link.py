@@ -14,6 +14,7 @@ from fleet.contract import Link, Mission, Params, Status
 from fleet.telemetry.mavlink import heartbeat
 from fleet.telemetry.mavlink.arrays.counts import LAST_ARRIVAL, LAST_COUNTED, MISSED, RECEIVED
 from fleet.telemetry.mavlink.arrays.fleet_arrays import AircraftArrays
+from fleet.telemetry.mavlink.microservices.fence import FENCE_TYPE, FenceCollector
 from fleet.telemetry.mavlink.microservices.params import ParamCollector
 from fleet.telemetry.mavlink.microservices.route import MISSION_MESSAGES, MissionCollector
 from fleet.telemetry.mavlink.onboard_log import OnboardEvent
@@ -64,7 +65,7 @@ class AircraftLink:
         self.firmware = ""
         self.board_id = ""  # hardware id and firmware version of the autopilot, or empty
         self.texts: deque[tuple[float, int, str]] = deque(maxlen=MAX_TEXTS)  # fleet time, severity, text
-        self.params, self.mission = ParamCollector(uav), MissionCollector(uav)
+        self.params, self.mission, self.fence = ParamCollector(uav), MissionCollector(uav), FenceCollector()
         self.home: tuple[int, int, int] | None = None  # latitude, longitude, altitude [1e-7 deg, 1e-7 deg, mm]
         self.rates: dict[str, float] = {}
         self.timing = LinkTiming(lambda: arrays.clocks[self.number])
@@ -104,7 +105,7 @@ class AircraftLink:
         if self._queue_done == len(self._queue):  # free the processed messages
             self._queue.clear()
             self._queue_done = 0
-        updates = (self.mission.take_update(now), self.params.take_update(now), self._status(now))
+        updates = (self.mission.take_update(now, self.fence.items), self.params.take_update(now), self._status(now))
         self.arrays.next_due_t[self.number] = self._next_due(now)
         return [message for message in updates if message is not None]
 
@@ -137,7 +138,7 @@ class AircraftLink:
         elif name == "PARAM_VALUE":
             self.params.process(message, self.autopilot, now)
         elif name in MISSION_MESSAGES:
-            self.mission.process(message, is_upload=False, now=now)
+            self._process_mission(message, is_upload=False, now=now)
         elif name == "HOME_POSITION":
             self._process_home(message)
         elif name == "STATUSTEXT":
@@ -166,7 +167,13 @@ class AircraftLink:
 
     def process_uplink(self, message: Any, now: float) -> None:
         """Process one mission protocol message from a ground station to this aircraft."""
-        self.mission.process(message, is_upload=True, now=now)
+        self._process_mission(message, is_upload=True, now=now)
+
+    def _process_mission(self, message: Any, *, is_upload: bool, now: float) -> None:
+        if getattr(message, "mission_type", 0) == FENCE_TYPE:
+            self.fence.process(message, is_upload=is_upload)
+        else:
+            self.mission.process(message, is_upload=is_upload, now=now)
 
     def process_target(self, message: Any, now: float) -> None:
         """Process one POSITION_TARGET_GLOBAL_INT of an aircraft without mission list."""
@@ -213,7 +220,7 @@ class AircraftLink:
     def apply_clock_jump(self, count: int, now: float) -> None:
         """Set the number of jumps of the aircraft's clock."""
         self._clock_jumps = count
-        self.mission.needs_download = True  # the mission may differ after a restart
+        self.mission.needs_download = self.fence.needs_download = True  # they may differ after a restart
         self.set_operator_text(f"the aircraft's clock jumped ({count} times so far), time was re-anchored", now)
 
     def apply_reanchor(self, step_s: float, now: float) -> None:

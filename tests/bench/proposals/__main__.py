@@ -34,6 +34,7 @@ ARGUMENTS = {
     "clear": "--clear",
     "leg": "--legs",
     "terrain": "--terrain",
+    "area": "--areas",
 }
 
 

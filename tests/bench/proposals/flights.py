@@ -33,9 +33,8 @@ from fleet.simulator.flight.drive import EPOCH_US, RadioLink
 from fleet.simulator.flight.uav import SimulatedUav
 from fleet.simulator.vehicle.missions import HOME
 from fleet.telemetry.mavlink.intake import MavlinkReceiver
-from fleet.terrain.raster import Raster
 from tests.bench.alerts.world import Flight, Told, apart, arrange, fly, make
-from tests.support.heights import raster
+from tests.bench.proposals.surroundings import NOTHING_AROUND, Surroundings, hill, no_fly_area
 from twin_worker.alerts.traffic import TrafficMonitor
 from twin_worker.proposals.candidates import MODES
 from twin_worker.proposals.proposer import PROPOSED, Proposer
@@ -49,9 +48,8 @@ READ_BACK_S = 1.0  # from the change on board to the new mission at the twin [s]
 END_S = 200.0  # end of a flight [s]
 DECIDED_S = 150.0  # proposals are approved until then: an event has happened, or will not [s]
 WIDE_M, HIGH_M, SAFE_M = 50.0, 20.0, 30.0  # separation, and least height above home
-KINDS = ("pair", "triple", "ground", "geofence", "clear", "leg", "terrain")
+KINDS = ("pair", "triple", "ground", "geofence", "clear", "leg", "terrain", "area")
 STEEP_S, STEEP_M, MISSED_M = 120.0, 220.0, 30.0  # when and how far a leg climbs; height by which it misses its end
-HILL_S, HILL_TOP_M, HILL_WIDTH_M = 120.0, 10.0, 250.0  # when the aircraft reaches it, how far below; a bell's width
 MAX_APPROVED = 3  # proposals that are approved in one flight
 AGAIN_S = 30.0  # after an approval, another one against the same event, where its alert is active still or again [s]
 LOSS = 0.02  # of telemetry [-]
@@ -68,17 +66,7 @@ class Case:
     name: str
     flights: list[Flight]
     kind: AlertKind | None
-    terrain: Raster | None = None
-
-    def clearance(self, path: np.ndarray) -> np.ndarray:
-        """Return the height of the first aircraft above ground along a path, NED from HOME (n, 3) [m]."""
-        home = self.flights[0].home
-        height: np.ndarray = home[2] - path[:, 2]
-        if self.terrain is None:
-            return height
-        at = to_geodetic(HOME, np.vstack([path, home])) * 1e-7
-        ground = self.terrain.sample(at[:, 0], at[:, 1])
-        return height - np.nan_to_num(ground[:-1] - ground[-1])
+    around: Surroundings = NOTHING_AROUND
 
     def make(self) -> list[SimulatedUav]:
         fenced = self.name == "geofence"
@@ -92,9 +80,9 @@ class Case:
             wide, high = apart(one.path, self.flights[other].path)
             return bool(((wide < WIDE_M) & (high < HIGH_M)).any())
         if kind is AlertKind.GROUND:
-            return bool((self.clearance(one.path) < SAFE_M).any())
+            return bool((self.around.clearance(one.path, one.home) < SAFE_M).any())
         if kind is AlertKind.GEOFENCE:
-            return self.name == "geofence" and one.leaves()
+            return (self.name == "geofence" and one.leaves()) or self.around.enters(one.path)
         return self.name == "leg"
 
 
@@ -146,6 +134,7 @@ def arranged(name: str, seed: int) -> Case:
         "ground": AlertKind.GROUND,
         "terrain": AlertKind.GROUND,
         "geofence": AlertKind.GEOFENCE,
+        "area": AlertKind.GEOFENCE,
         "leg": AlertKind.NOT_ACHIEVABLE,
     }
     rng = np.random.default_rng((seed, KINDS.index(name)))
@@ -155,19 +144,12 @@ def arranged(name: str, seed: int) -> Case:
     for uav in range(1, {"pair": 2, "triple": 3, "clear": 2}.get(name, 1)):
         flights.append(arrange(told(uav=uav, meets=name != "clear", sinks=False), rng, first.path))
         kind = None if name == "clear" else AlertKind.CONFLICT
-    return Case(name, flights, kind, hill(first) if name == "terrain" else None)
-
-
-def hill(flight: Flight) -> Raster:
-    """Return flat terrain with a bell-shaped hill below one place of a flight."""
-    k = int(HILL_S / _ROW_S)
-    top, centre = flight.height()[k] - HILL_TOP_M, flight.path[k]
-
-    def height(north: np.ndarray, east: np.ndarray) -> np.ndarray:
-        away = np.hypot(north - centre[0], east - centre[1]) / HILL_WIDTH_M
-        return HOME.alt_mm * 1e-3 + top * np.exp(-0.5 * away**2)
-
-    return raster(HOME, height, step_m=30.0, reach_m=12_000.0)
+    around = NOTHING_AROUND
+    if name == "terrain":
+        around = hill(first.path, first.height(), _ROW_S)
+    elif name == "area":
+        around = no_fly_area(first.path, _ROW_S)
+    return Case(name, flights, kind, around)
 
 
 def steepened(flight: Flight) -> Flight:
@@ -207,7 +189,7 @@ def apply(uav: SimulatedUav, change: Change) -> None:
 class Twins:
     """Offline twins with their alerts and proposals."""
 
-    terrain: Raster | None = None
+    around: Surroundings = NOTHING_AROUND
     twins: dict[int, Twin] = field(default_factory=dict)
     traffic: TrafficMonitor = field(default_factory=TrafficMonitor)
 
@@ -225,7 +207,7 @@ class Twins:
         """Let the twin of an aircraft hear a message; return the alerts that follow."""
         if message.uav not in self.twins:
             self.twins[message.uav] = Twin.of(message.uav, schedule=SCHEDULE)
-            self.twins[message.uav].terrain = self.terrain
+            self.twins[message.uav].terrain, self.twins[message.uav].areas = self.around
         twin = self.twins[message.uav]
         results = self.traffic.process_results(message.uav, twin.telemetry.last_step_t, advance(twin, (message,)))
         alerts = [one for one in results if isinstance(one, Alert) and one.kind in PROPOSED]
@@ -241,7 +223,7 @@ class Scene:
     """One case in the air: aircraft, their radio links, their twins, and a person who approves."""
 
     def __init__(self, case: Case, seed: int) -> None:
-        self.case, self.twins, self.result = case, Twins(case.terrain), Result(case.name, seed)
+        self.case, self.twins, self.result = case, Twins(case.around), Result(case.name, seed)
         self._uavs = {uav.uav_id: uav for uav in case.make()}
         self._links = {uav: RadioLink(np.random.default_rng((seed, 6, uav)), LOSS) for uav in self._uavs}
         self._receiver = MavlinkReceiver(-1)
@@ -387,10 +369,12 @@ class Scene:
                 return True
         home, path = flights[0].home, paths[0][since:]
         if self.case.kind is AlertKind.GROUND:
-            return bool((self.case.clearance(path) < SAFE_M).any())
+            return bool((self.case.around.clearance(path, home) < SAFE_M).any())
         if self.case.kind is AlertKind.NOT_ACHIEVABLE:
             ends = [k for k in range(since + 4, len(self._missed)) if self._missed[k][0] != self._missed[k - 1][0]]
             return any(abs(self._missed[k - 1][1]) > MISSED_M for k in ends)
+        if self.case.name == "area":
+            return self.case.around.enters(path)
         is_outside = np.hypot(*(path - home)[:, :2].T) > flights[0].radius
         return self.case.kind is AlertKind.GEOFENCE and bool(is_outside.any())
 

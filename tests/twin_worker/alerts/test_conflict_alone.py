@@ -127,7 +127,9 @@ def test_a_fence_is_read_from_parameters(params: dict, expected: GeofenceLimits)
 
 def test_a_polygon_is_said_not_to_be_judged() -> None:
     params = {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 6.0, "FENCE_TOTAL": 5.0, "FENCE_RADIUS": 1000.0}
-    assert "5 points was not received" in geofence_hazard(laid(straight()), read_geofence(params), LOW).message
+    assert (
+        "its 5 fence items were not received" in geofence_hazard(laid(straight()), read_geofence(params), LOW).message
+    )
 
 
 def test_leaving_a_circle_is_told_when_and_where() -> None:

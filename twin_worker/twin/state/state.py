@@ -22,6 +22,7 @@ from fleet.contract import (
 )
 from fleet.frames import Origin
 from fleet.mission import FIRST_ITEM, extends, route_items
+from fleet.terrain.areas import Area
 from fleet.terrain.raster import Raster
 from fleet.vehicles import UNKNOWN, VehicleClass, vehicle_class
 from fleet.window import Window
@@ -105,6 +106,7 @@ class Twin(msgspec.Struct):
     Attributes:
         budget: compute budget of the driver; None: unlimited
         terrain: heights of the terrain, of the driver; None: unknown
+        areas: to stay in or out of, of the driver
     """
 
     config: TwinConfig
@@ -118,6 +120,7 @@ class Twin(msgspec.Struct):
     alerts: AlertingState = msgspec.field(default_factory=AlertingState)
     budget: ComputeBudget | None = None
     terrain: Raster | None = None
+    areas: tuple[Area, ...] = ()
 
     def __post_init__(self) -> None:
         """Use the servo map of the airframe file, if it has one, before any parameter arrives."""

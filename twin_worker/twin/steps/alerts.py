@@ -12,6 +12,7 @@ from twin_worker.alerts.gaussian_forecast import GaussianForecast, to_gaussian
 from twin_worker.alerts.geofence import (
     MIN_HEIGHT_ROTORS_M,
     MIN_HEIGHT_WINGS_M,
+    GeofenceLimits,
     geofence_hazard,
     ground_hazard,
     height_above_home,
@@ -106,15 +107,21 @@ def limit_hazards(twin: Twin, gaussian: GaussianForecast, *, to_the_end: bool = 
         if to_the_end and lowest_beyond_reach(twin, gaussian) < margin:
             ground = replace(ground, probability=max(ground.probability, 0.5))
         findings = [ground]
-    limit = read_geofence(_params(twin))
+    limit = geofence(twin)
     if near_ground:
-        limit = limit._replace(floor=-np.inf)
+        limit = limit.without_floors()
     return [
         *findings,
         geofence_hazard(gaussian, limit, home_origin, until)
         if limit.any_limit()
         else _not_predicted(AlertKind.GEOFENCE),
     ]
+
+
+def geofence(twin: Twin) -> GeofenceLimits:
+    """Return the geofence of an aircraft: of its parameters, its fence items and the areas of the operator."""
+    mission = twin.onboard.mission
+    return read_geofence(_params(twin), mission.fence if mission is not None else (), twin.areas)
 
 
 def lowest_beyond_reach(twin: Twin, gaussian: GaussianForecast) -> float:

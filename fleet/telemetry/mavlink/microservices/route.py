@@ -58,6 +58,7 @@ class MissionCollector:
         self._home: Item | None = None  # replaces item 0 of missions that contain home (ArduPilot)
         self._home_m: float | None = None
         self._text = ""
+        self._fence: tuple[Item, ...] = ()  # as last published
         self._identity: tuple[int, int] | None = None  # reported item count and mission id
         self._transfers: dict[bool, _MissionTransfer | None] = {False: None, True: None}
         self._changed = False
@@ -162,19 +163,26 @@ class MissionCollector:
         """Discard a stalled download; the mission must be requested again."""
         self._transfers[False], self.needs_download = None, True
 
-    def take_update(self, now: float) -> Mission | None:
-        """Return the mission if it has changed."""
+    def take_update(self, now: float, fence: tuple[Item, ...] = ()) -> Mission | None:
+        """Return the mission with the fence items on board if either has changed."""
         upload, download = self._transfers[True], self._transfers[False]
         if upload is not None and upload.is_complete() and now - upload.last_arrival > ACCEPT_S:
             self._finish_upload(accepted=True)
         if download is not None and now - download.last_arrival > PARTIAL_AFTER_S and not self.complete:
             self._publish_partial(download)
-        if not self._changed:
+        fence = fence if self.items or self.complete else self._fence  # no fence without a mission list
+        if not self._changed and fence == self._fence:
             return None
-        self._changed = False
+        self._changed, self._fence = False, fence
         sentence = f"uav-{self.uav}: {self._text}" if self._text else ""
         return Mission(
-            uav=self.uav, t=now, items=self.published_items, seq=self.seq, complete=self.complete, sentence=sentence
+            uav=self.uav,
+            t=now,
+            items=self.published_items,
+            fence=fence,
+            seq=self.seq,
+            complete=self.complete,
+            sentence=sentence,
         )
 
     @property
