@@ -56,7 +56,7 @@ ANSWERS = {  # command line -> part of the last line
     "fleet up --for inf": "--for: found 'inf', expected a number; correct it",
     "fleet up --port 99999": "--port: found 99999, expected 1 to 65535; choose another port",
     "fleet up --mavlink 127.0.0.1": "--mavlink: found '127.0.0.1', expected HOST:PORT such as 127.0.0.1:14550",
-    "fleet up --areas nosuch.geojson": "--areas: found no file 'nosuch.geojson', expected a GeoJSON file; check the path",
+    "fleet up --areas nosuch.json": "--areas: found no file 'nosuch.json', expected a GeoJSON file; check the path",
     "twin_worker --uavs 0-1 --areas text.txt": "text.txt: found JSON is malformed",
     "fleet up --terrain nosuch.tif": "--terrain: found no file 'nosuch.tif', expected a raster file; check the path",
     "fleet up --imagery folder": "--imagery: found a folder 'folder', expected a raster file; name a file in it",
