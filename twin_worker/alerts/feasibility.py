@@ -1,7 +1,7 @@
 """Feasibility of the mission legs ahead: headwind, climb and descent rate, circle radius.
 
     ground speed   sqrt(Va^2 - w_cross^2) + w_along, at most Va - |w_cross|
-    slope          rise / length x ground speed, against the autopilot's climb and sink limits
+    slope          (rise - tolerated miss) / length x ground speed, against the autopilot's climb and sink limits
     circle         tan(phi) = Va^2 / (g R) in still air, against the bank limit
 
 Limits that were not received are not checked. The probability includes the sigma and drift of the wind, and 5 % of each
@@ -27,7 +27,7 @@ _LEGS = 12  # legs ahead that are checked
 _MIN_GROUND_SPEED = 1.0  # minimum ground speed that counts as headway [m/s]
 _WIND_DRIFT = 0.55  # standard deviation of the change of wind within minutes [m/s]
 _LIMIT_SIGMA = 0.05  # relative standard deviation of a limit [-]
-_MIN_HEIGHT_STEP = 15.0  # smaller height differences are not checked: they take little time [m]
+_TOLERATED_MISS = 15.0  # height by which the end of a leg may be missed [m]
 _CLEAR_TEXT = "the mission is achievable"
 _CIRCLES = (m.LOITER_TURNS, m.LOITER_UNLIMITED, m.LOITER_TIME, m.LOITER_TO_ALT)
 
@@ -114,10 +114,9 @@ def _assess_leg(
         headway = min(speed, Va - abs(cross))
         reason = f"wind of {hypot(*wind[:2]):.0f} m/s leaves no headway at {Va:.0f} m/s of airspeed; raise the airspeed"
         checks.append((_probability(_MIN_GROUND_SPEED - headway, sigma), reason))
-        if abs(vector[2]) > _MIN_HEIGHT_STEP:
-            checks += _assess_slope(
-                leg, -float(vector[2]) / length * max(speed, 0.0), limits, sigma / max(speed, _MIN_GROUND_SPEED)
-            )
+        if (rise := abs(float(vector[2])) - _TOLERATED_MISS) > 0.0:
+            rate = -float(np.sign(vector[2])) * rise / length * max(speed, 0.0)
+            checks += _assess_slope(leg, rate, limits, sigma / max(speed, _MIN_GROUND_SPEED))
     radius = abs(leg[m.RADIUS]) or limits.radius
     if int(leg[m.KIND]) in _CIRCLES and isfinite(limits.bank + radius) and radius > 0 and limits.bank > 0:
         required, allowed = Va * Va / (G * radius), tan(min(limits.bank, 1.5))

@@ -15,13 +15,15 @@ from fleet.contract import AlertKind, Change, Item, Prediction
 from fleet.frames import Origin, to_geodetic, to_ned
 from fleet.mission import SPEED
 from fleet.mission_jumps import JUMP, LAND_START
+from fleet.terrain.areas import Area
 from twin_worker.alerts.feasibility import read_limits
 from twin_worker.alerts.geofence import MIN_HEIGHT_ROTORS_M, MIN_HEIGHT_WINGS_M
-from twin_worker.prediction.autopilot_parameters import fixed_wing_controller
-from twin_worker.prediction.replay_window import AutopilotConfig
-from twin_worker.proposals.mission_edits import insert, move_within, remove, without_jumps
+from twin_worker.proposals.detour import way_around
+from twin_worker.proposals.mission_edits import insert, is_circle, is_positional, move_within, remove, without_jumps
+from twin_worker.proposals.speeds import tried_speeds
 from twin_worker.twin.state.routes import ROUTE_MODES
 from twin_worker.twin.state.state import Twin
+from twin_worker.twin.steps.alerts import geofence
 from twin_worker.twin.steps.kinematic_prediction import is_hovering
 from twin_worker.whatif import active_seq
 
@@ -31,15 +33,13 @@ MODES = {"hold": HOLD_MODE, "return": RETURN_MODE, "land": LAND_MODE}
 """Mode of each `Change.mode`."""
 OFFSETS = (-3.0, -2.0, -1.5, 1.5, 2.0, 3.0)
 """Altitude offsets that are tried against a conflict, in vertical separations [-]."""
-_SPEEDS = 5  # airspeeds tried, evenly spaced between the lowest and the highest
-_ROTOR_SPEEDS = (0.4, 0.6, 0.8)  # speeds of a multirotor that are tried, of its present limit [-]
-_MIN_SPEED_STEP = 1.0  # a smaller change of speed is none [m/s]
 _DELAYS_S = (20.0, 40.0)  # circling or waiting times that are tried [s]
 DECISION_S = 20.0
 """Time from a proposal to the start of its change: a person reads, decides and confirms, the gateway uploads [s]."""
 _MARGIN_S = 5.0  # an inserted item lies at least so far behind the start of the change [s]
 _PASSING_M = 100.0  # an item is passed where the path comes nearer and goes away again [m]
 _DEFAULT_CLIMB = 2.0  # climb and sink rate without received limits [m/s]
+_TURN_M = 60.0  # distance that is added around a no-fly area: corners are cut or overshot [m]
 _SKIPPED = 2  # items nearest to the event of which each is left out
 _AHEAD_ITEMS = 8  # navigation items ahead that are looked at
 _LOITER_TIME, _WAYPOINT, _LAND, _VTOL_LAND = 19, 16, 21, 85  # MAV_CMD
@@ -56,6 +56,7 @@ class Kind(StrEnum):
     SKIP = "skip"
     SHORTEN = "shorten"
     SHRINK = "shrink"
+    DETOUR = "detour"
     HOLD = "hold"
     RETURN = "return"
     LAND = "land"
@@ -69,7 +70,8 @@ class Candidate(NamedTuple):
     """One change: kind, and its value.
 
     The value is the airspeed [m/s], the altitude offset [m], the waiting time [s], the item that is left out, the
-    number of last waypoints that are left out, or the distance from home within which all items ahead are moved [m].
+    number of last waypoints that are left out, the distance from home within which all items ahead are moved [m], or
+    the distance that is kept from a no-fly area, positive to pass it on the right [m].
     """
 
     uav: int
@@ -82,6 +84,7 @@ class Deficit(NamedTuple):
 
     height: float = 0.0  # climb that is missing; negative: descent
     radius: float = np.inf  # largest distance from home at which items may lie
+    around: float = np.nan  # distance to keep from a no-fly area
 
 
 @dataclass(frozen=True)
@@ -171,16 +174,6 @@ class Plan:
         return MIN_HEIGHT_ROTORS_M if is_hovering(self.twin) else MIN_HEIGHT_WINGS_M
 
 
-def is_circle(item: Item) -> bool:
-    """Return whether an item is a circle."""
-    return m.KINDS.get(item.command) in m.CIRCLES
-
-
-def is_positional(item: Item) -> bool:
-    """Return whether an item is flown to: a waypoint or a circle with a position."""
-    return item.command in m.KINDS and m.KINDS[item.command] != m.CHANGE_ALTITUDE and not m.is_zero_position(item)
-
-
 def candidates(
     plan: Plan, kind: AlertKind, separation_m: float, event: Origin | None, deficit: Deficit
 ) -> list[Candidate]:
@@ -194,7 +187,7 @@ def candidates(
         deficit: what is missing to the limits of the aircraft
     """
     is_limit = kind in (AlertKind.GROUND, AlertKind.GEOFENCE)  # another speed would only postpone them
-    tried = [Candidate(plan.uav, Kind.SPEED, speed) for speed in ([] if is_limit else _speeds(plan))]
+    tried = [Candidate(plan.uav, Kind.SPEED, speed) for speed in ([] if is_limit else tried_speeds(plan.twin))]
     if plan.seq >= 0:
         tried += [Candidate(plan.uav, Kind.ALTITUDE, offset) for offset in _offsets(plan, kind, separation_m, deficit)]
         if kind is AlertKind.CONFLICT:
@@ -205,6 +198,9 @@ def candidates(
         if np.isfinite(deficit.radius):
             radii = (deficit.radius, deficit.radius - 30.0)
             tried += [Candidate(plan.uav, Kind.SHRINK, radius) for radius in radii if radius > 0.0]
+        if np.isfinite(deficit.around):
+            distances = (deficit.around, deficit.around + _TURN_M)
+            tried += [Candidate(plan.uav, Kind.DETOUR, side * distance) for distance in distances for side in (1, -1)]
     modes = {Kind.HOLD: HOLD_MODE, Kind.RETURN: RETURN_MODE, Kind.LAND: LAND_MODE}
     if kind is AlertKind.BATTERY:
         del modes[Kind.HOLD]  # a hover uses energy and reaches nothing
@@ -227,23 +223,13 @@ def to_change(plan: Plan, candidate: Candidate) -> Change | None:
         Kind.ALTITUDE: _with_offset,
         Kind.DELAY: _with_wait,
         Kind.SHRINK: _within,
+        Kind.DETOUR: _around,
         Kind.SHORTEN: _without_last,
     }[candidate.kind](plan, candidate.value)
     return None if items is None else Change(uav=plan.uav, items=items, seq=plan.seq)
 
 
 # --- speed -----------------------------------------------------------------------------------------------------------
-
-
-def _speeds(plan: Plan) -> list[float]:
-    """Return the speeds to try within the limits of the autopilot [m/s]."""
-    if is_hovering(plan.twin):
-        return [fraction * present_speed(plan.twin) for fraction in _ROTOR_SPEEDS]
-    low, high = speed_limits(plan.twin)
-    if not 0 < low < high:
-        return []
-    present = present_speed(plan.twin)
-    return [float(V) for V in np.linspace(low, high, _SPEEDS + 2)[1:-1] if abs(V - present) >= _MIN_SPEED_STEP]
 
 
 def _speed_change(plan: Plan, speed: float) -> Change:
@@ -255,28 +241,6 @@ def _speed_change(plan: Plan, speed: float) -> Change:
     if plan.seq < 0 or items == plan.items:
         return Change(uav=plan.uav, speed=speed)
     return Change(uav=plan.uav, speed=speed, items=items, seq=plan.seq)
-
-
-def speed_limits(twin: Twin) -> tuple[float, float]:
-    """Return the lowest and highest airspeed that a fixed-wing autopilot accepts; nan: unknown [m/s]."""
-    law = _config(twin).law
-    names = {"arduplane": ("AIRSPEED_MIN", "AIRSPEED_MAX")}.get(law, ("FW_AIRSPD_MIN", "FW_AIRSPD_MAX"))
-    values = fixed_wing_controller(twin.received_params, law=law).values if law else {}
-    return float(values.get(names[0], np.nan)), float(values.get(names[1], np.nan))
-
-
-def present_speed(twin: Twin) -> float:
-    """Return the present speed: through the air, of a multirotor its limit over ground [m/s]."""
-    if is_hovering(twin):
-        return float(copter.limits(twin.received_params, twin.vehicle_class.rotor_prefix)[0].speed)
-    _, velocity = twin.telemetry.history.rows_since("velocity", twin.telemetry.history.newest - 3.0)
-    return float(np.linalg.norm(velocity.mean(axis=0) - twin.environment.wind.wind)) if len(velocity) else np.nan
-
-
-def _config(twin: Twin) -> AutopilotConfig:
-    window = twin.window(10.0)
-    assert window is not None
-    return twin.situation(window).onboard
 
 
 # --- altitude --------------------------------------------------------------------------------------------------------
@@ -390,6 +354,37 @@ def _within(plan: Plan, radius: float) -> tuple[Item, ...] | None:
     moved: Mapping[int, Item] = {item.seq: move_within(item, home, radius) for item in plan.remaining}
     items = tuple(moved.get(item.seq, item) for item in plan.items)
     return items if items != plan.items else None
+
+
+def entered_area(plan: Plan) -> Area | None:
+    """Return the no-fly area that the present plan enters most deeply, or comes nearest to; None without one."""
+    origin, path = plan.prediction.ned_origin(), plan.prediction.path.numpy().astype(float)
+    return max(geofence(plan.twin).exclusions, key=lambda area: float(area.depth(path, origin).max()), default=None)
+
+
+def _around(plan: Plan, distance: float) -> tuple[Item, ...] | None:
+    """Return the mission around a no-fly area, at a distance; positive: on the right [m]."""
+    area, seconds = entered_area(plan), DECISION_S + _MARGIN_S
+    first = plan.seq_after(Change(uav=plan.uav), seconds)
+    ahead, origin = [item for item in plan.ahead if item.seq >= first], plan.prediction.ned_origin()
+    if area is None or not ahead:
+        return None
+    route = np.array([plan.at(seconds)[:2], *(plan.position(item) for item in ahead)])
+    detour = way_around(route, area.outline(origin), abs(distance), right=distance > 0.0)
+    if detour is None:
+        return None
+    following, items = ahead[detour.last - 1], plan.items
+    level = following if m.KINDS[following.command] not in _NO_OFFSET else ahead[max(detour.last - 2, 0)]
+    for item in reversed(ahead[detour.first : detour.last - 1]):
+        items = remove(items, item.seq)
+    seq = following.seq - (detour.last - 1 - detour.first)
+    for corner in reversed(detour.corners):
+        lat, lon, _ = to_geodetic(origin, np.array([*corner, 0.0]))
+        items = insert(
+            items,
+            Item(seq=seq, command=_WAYPOINT, frame=level.frame, lat_e7=int(lat), lon_e7=int(lon), alt_m=level.alt_m),
+        )
+    return items
 
 
 def _landing(plan: Plan) -> Change | None:

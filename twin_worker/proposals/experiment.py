@@ -23,7 +23,16 @@ from twin_worker.alerts.gaussian_forecast import GaussianForecast, to_gaussian
 from twin_worker.alerts.geofence import area_margin, ground_clearance, height_above_home
 from twin_worker.alerts.hysteresis import RULES
 from twin_worker.prediction.autopilot_parameters import SPEED_PARAMETERS, RouteOverride
-from twin_worker.proposals.candidates import DECISION_S, LAND_MODE, MODES, Candidate, Deficit, Plan, to_change
+from twin_worker.proposals.candidates import (
+    DECISION_S,
+    LAND_MODE,
+    MODES,
+    Candidate,
+    Deficit,
+    Plan,
+    entered_area,
+    to_change,
+)
 from twin_worker.twin.state.events import invalidate_prediction
 from twin_worker.twin.state.routes import route_of_mode
 from twin_worker.twin.state.state import Twin
@@ -299,4 +308,16 @@ def deficit(plan: Plan, experiment: PlanExperiment, kind: AlertKind) -> Deficit:
     too_high = min(fence.ceiling - z * sigma_high - high, 0.0)
     too_low = max(fence.floor + z * sigma_floor - floor, 0.0)
     overshoot = far - (fence.radius - z * sigma_far)
-    return Deficit(too_low or too_high, fence.radius - overshoot - z * sigma_far if overshoot > 0 else np.inf)
+    radius = fence.radius - overshoot - z * sigma_far if overshoot > 0 else np.inf
+    return Deficit(too_low or too_high, radius, _distance_around(plan, experiment.forecast, z))
+
+
+def _distance_around(plan: Plan, forecast: GaussianForecast, z: float) -> float:
+    """Return the distance to keep from the no-fly area that is entered, `z` standard deviations there; else nan [m]."""
+    area = entered_area(plan)
+    if area is None:
+        return np.nan
+    depth = area.depth(forecast.path, forecast.prediction.ned_origin())
+    k = int(depth.argmax())
+    keep = z * float(forecast.sigma[k, :2].max())
+    return keep if depth[k] > -keep else np.nan

@@ -1,4 +1,4 @@
-"""Insert, remove and move mission items; numbers and jumps of the others follow."""
+"""Kinds of mission items; insert, remove and move them: numbers and jumps of the others follow."""
 
 from collections.abc import Sequence
 from math import hypot
@@ -6,9 +6,20 @@ from math import hypot
 import msgspec
 import numpy as np
 
+from fleet import mission_legs as m
 from fleet.contract import Item
 from fleet.frames import Origin, to_geodetic, to_ned
 from fleet.mission_jumps import JUMP
+
+
+def is_circle(item: Item) -> bool:
+    """Return whether an item is a circle."""
+    return m.KINDS.get(item.command) in m.CIRCLES
+
+
+def is_positional(item: Item) -> bool:
+    """Return whether an item is flown to: a waypoint or a circle with a position."""
+    return item.command in m.KINDS and m.KINDS[item.command] != m.CHANGE_ALTITUDE and not m.is_zero_position(item)
 
 
 def insert(items: Sequence[Item], new: Item) -> tuple[Item, ...]:

@@ -8,9 +8,10 @@ from fleet.contract import AlertKind, Array, Option, ProposedPath
 from fleet.mission_jumps import JUMP
 from twin_worker.prediction.multirotor.endurance import Z90
 from twin_worker.proposals.assessment import Approach, closest_approach
-from twin_worker.proposals.candidates import Candidate, Kind, Plan, present_speed
+from twin_worker.proposals.candidates import Candidate, Kind, Plan
 from twin_worker.proposals.experiment import PlanExperiment
 from twin_worker.proposals.resolution import Problem, Solution
+from twin_worker.proposals.speeds import present_speed
 
 _MAX_CLEARANCE_M = 1e5  # reported where nothing is near [m]
 _MIN_DELAY_S = 0.5  # smaller delays are not mentioned [s]
@@ -78,6 +79,8 @@ def describe(candidate: Candidate, plan: Plan) -> str:
         return f"{name} leaves out {' and '.join(filter(None, (repeats, last)))}"
     if candidate.kind is Kind.SHRINK:
         return f"{name} stays within {value:.0f} m of home"
+    if candidate.kind is Kind.DETOUR:
+        return f"{name} passes the no-fly area on the {'right' if value > 0 else 'left'}"
     return f"{name} {candidate.kind.value}s" + (" to launch" if candidate.kind is Kind.RETURN else "")
 
 

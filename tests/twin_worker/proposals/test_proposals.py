@@ -13,6 +13,7 @@ from twin_worker.alerts.conflict_probability import Separation
 from twin_worker.alerts.traffic import TrafficPicture
 from twin_worker.ownership.twin_store import OwnedTwin
 from twin_worker.proposals import candidates as changes
+from twin_worker.proposals import speeds
 from twin_worker.proposals.candidates import Candidate, Deficit, Kind, Plan, to_change
 from twin_worker.proposals.experiment import present, run
 from twin_worker.proposals.mission_edits import insert, remove
@@ -252,7 +253,7 @@ def test_a_landing_or_a_return_is_proposed_where_no_shorter_mission_is_enough(ho
 
 def test_speeds_stay_within_the_limits_of_the_autopilot(twin):
     plan = Plan.of(twin, present(twin).prediction)
-    low, high = changes.speed_limits(twin)
+    low, high = speeds.speed_limits(twin)
     found = [
         c.value for c in changes.candidates(plan, AlertKind.CONFLICT, 20.0, None, Deficit()) if c.kind is Kind.SPEED
     ]

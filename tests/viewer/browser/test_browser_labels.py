@@ -32,6 +32,7 @@ def test_labels_of_a_crowd_do_not_overlap_on_the_screen(crowd: SimpleNamespace, 
     until(page, lambda: view_of(crowd).palette.dark != light)
     view_of(crowd).show_all()
     until(page, lambda: len(view_of(crowd)._labels.boxes) > 4)
-    found = page.evaluate(LABEL_OVERLAPS, [12.0, f"{EM_PX}px {FONT}", EM_PX])
-    print(found)
+    look = [f"{EM_PX}px {FONT}", EM_PX]
+    until(page, lambda: page.evaluate(LABEL_OVERLAPS, [0.3, *look])["most"] > 4)  # a busy page shows them later
+    found = page.evaluate(LABEL_OVERLAPS, [12.0, *look])
     assert found["pairs"] == [] and found["looks"] > 10 and found["most"] > 4 and crowd.errors == []
