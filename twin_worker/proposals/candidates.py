@@ -199,7 +199,7 @@ def candidates(
             radii = (deficit.radius, deficit.radius - 30.0)
             tried += [Candidate(plan.uav, Kind.SHRINK, radius) for radius in radii if radius > 0.0]
         if np.isfinite(deficit.around):
-            distances = (deficit.around, deficit.around + _TURN_M)
+            distances = (0.5 * deficit.around, deficit.around, deficit.around + _TURN_M)
             tried += [Candidate(plan.uav, Kind.DETOUR, side * distance) for distance in distances for side in (1, -1)]
     modes = {Kind.HOLD: HOLD_MODE, Kind.RETURN: RETURN_MODE, Kind.LAND: LAND_MODE}
     if kind is AlertKind.BATTERY:
