@@ -212,7 +212,8 @@ def _fill_leg_history(twin: Twin, override: RouteOverride) -> None:
     now = twin.telemetry.history.newest
     twin.onboard.plan_changed(now - _REPLAY_S)
     items = override.items
-    mission = Mission(uav=twin.config.uav, t=now, items=items, seq=override.seq, complete=True)
+    known = twin.onboard.mission or Mission(uav=twin.config.uav, t=now)
+    mission = msgspec.structs.replace(known, t=now, items=items, seq=override.seq, complete=True)
     twin.onboard.set_mission(mission, twin.first_item)
     t = np.arange(now - 2 * _REPLAY_S, now + 0.5, 1.0)
     twin.telemetry.history.replace_rows("leg", t, np.full((len(t), 1), float(override.seq)))

@@ -23,7 +23,7 @@ from twin_worker.proposals.mission_edits import insert, is_circle, is_positional
 from twin_worker.proposals.speeds import tried_speeds
 from twin_worker.twin.state.routes import ROUTE_MODES
 from twin_worker.twin.state.state import Twin
-from twin_worker.twin.steps.alerts import geofence
+from twin_worker.twin.steps.alerts import geofence, reach_s
 from twin_worker.twin.steps.kinematic_prediction import is_hovering
 from twin_worker.whatif import active_seq
 
@@ -357,8 +357,9 @@ def _within(plan: Plan, radius: float) -> tuple[Item, ...] | None:
 
 
 def entered_area(plan: Plan) -> Area | None:
-    """Return the no-fly area that the present plan enters most deeply, or comes nearest to; None without one."""
-    origin, path = plan.prediction.ned_origin(), plan.prediction.path.numpy().astype(float)
+    """Return the no-fly area that the present plan enters most deeply within the look-ahead of the alerts, if any."""
+    near = plan.prediction.ahead.numpy() <= reach_s(plan.twin, plan.prediction)
+    origin, path = plan.prediction.ned_origin(), plan.prediction.path.numpy()[near].astype(float)
     return max(geofence(plan.twin).exclusions, key=lambda area: float(area.depth(path, origin).max()), default=None)
 
 

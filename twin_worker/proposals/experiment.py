@@ -232,7 +232,8 @@ def _report_change(twin: Twin) -> None:
     if override is None:
         return
     now = twin.telemetry.history.newest
-    mission = Mission(uav=twin.config.uav, t=now, items=override.items, seq=override.seq, complete=True)
+    known = twin.onboard.mission or Mission(uav=twin.config.uav, t=now)
+    mission = msgspec.structs.replace(known, t=now, items=override.items, seq=override.seq, complete=True)
     twin.onboard.set_mission(mission, twin.first_item)
     if twin.onboard.params is not None:
         values = twin.onboard.params.values
@@ -317,7 +318,8 @@ def _distance_around(plan: Plan, forecast: GaussianForecast, z: float) -> float:
     area = entered_area(plan)
     if area is None:
         return np.nan
-    depth = area.depth(forecast.path, forecast.prediction.ned_origin())
-    k = int(depth.argmax())
+    n = max(int(np.searchsorted(forecast.t, forecast.prediction.t + reach_s(plan.twin, forecast.prediction))), 1)
+    depth = area.depth(forecast.path[:n], forecast.prediction.ned_origin())
+    k = int((depth > 0.0).argmax()) if depth.max() > 0.0 else int(depth.argmax())  # where it is entered, or nearest
     keep = z * float(forecast.sigma[k, :2].max())
     return keep if depth[k] > -keep else np.nan

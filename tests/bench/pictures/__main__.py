@@ -10,8 +10,10 @@ flight has a faulty airspeed sensor, one is a replayed real flight, and the crow
 """
 
 import argparse
+import json
 import os
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -19,17 +21,22 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from fleet.bus.session import connect
 from fleet.contract import Alert, AlertKind, Cause, DiagnosisOutcome, Mismatch
+from fleet.terrain.areas import read_areas
 from tests.bench.viewing.page import ARGS
 from tests.bench.viewing.process import free_port, start, tell
 
 from .messages import (
     ROOT,
+    SETTLED_S,
     Publisher,
     TimedMessages,
     moment,
     named_s,
+    position_at,
     proposed,
     recorded_flight,
     twin_messages,
@@ -42,6 +49,8 @@ REAL = "real/alfa_20180718_155331_1_engine_failure.tlog"
 EIGHT = ("--uavs", "0-7", "--for", "232")
 FAULTY = ("--uavs", "0-3", "--for", "260", "--fault", "airspeed_bias,bias_mps=-6,at=120", "--fault-uav", "0")
 MEETING, PROPOSED_S = ("--uavs", "0-1", "--for", "125", "--story", "conflict"), 80.0
+MIXED, AROUND_UAV, AROUND_S = ("--uavs", "0-7", "--for", "232", "--aircraft", "mixed"), 3, 190.0
+AREA_M = 120.0  # half side of the no-fly area around the place where that aircraft is then
 FAULTY_UAV = 1  # its id
 CROWD, ROTOR_SHARE = 60, 0.3  # aircraft of the pictures in three sizes; multirotors among them [-]
 SIZES, PHONE_PX = ((390, 844), (1280, 720), (1920, 1080)), 600  # of the window [CSS px]; narrower is a phone
@@ -82,6 +91,25 @@ def proposal(browser: Any, out: Path) -> None:
     """Show a predicted conflict and a proposal that can be approved."""
     messages = twin_messages(recorded_flight("conflict", *MEETING), proposes=True)
     take(browser, messages, proposed(messages, PROPOSED_S), out / "proposal.png", "--allow", "approvals")
+
+
+def mixed(browser: Any, out: Path) -> None:
+    """Show wings and multirotors, and a no-fly area on the way of one of them."""
+    flight = recorded_flight("mixed", *MIXED)
+    lat, lon = (x * 1e-7 for x in position_at(flight, AROUND_UAV, AROUND_S))
+    north, east = np.degrees(AREA_M / 6_367_000), np.degrees(AREA_M / 6_367_000) / np.cos(np.radians(lat))
+    ring = [[lon + e * east, lat + n * north] for n, e in ((-1, -1), (-1, 1), (1, 1), (1, -1))]
+    feature = {
+        "type": "Feature",
+        "properties": {"name": "village"},
+        "geometry": {"type": "Polygon", "coordinates": [ring]},
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "areas.geojson"
+        file.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+        messages = twin_messages(flight, proposes=True, areas=read_areas(file))
+        when = proposed(messages, SETTLED_S, AROUND_UAV)
+        take(browser, messages, when, out / "mixed.png", "--allow", "approvals", "--areas", str(file))
 
 
 def trouble(router: str, stop: threading.Event, uavs: int) -> None:
@@ -189,7 +217,14 @@ def sizes_crowd(browser: Any, out: Path) -> None:
 
 
 SIZE_SCENES = {"selected": sizes_selected, "many": sizes_crowd}
-SCENES = {"selected": selected, "many": many, "mismatch": mismatch, "proposal": proposal, "replay": replay}
+SCENES = {
+    "selected": selected,
+    "many": many,
+    "mismatch": mismatch,
+    "proposal": proposal,
+    "mixed": mixed,
+    "replay": replay,
+}
 
 
 def main() -> int:

@@ -18,12 +18,13 @@ from fleet.bus.session import connect, open_router
 from fleet.contract import DiagnosisOutcome, GatewayCounters, Mismatch, Prediction, Proposal, Sample, Status
 from fleet.process import private_files
 from fleet.telemetry.recording.recordings import Recording
+from fleet.terrain.areas import Area
 from tests.bench.mismatch.flown import Inline
 from tests.bench.mismatch.world import baseline
 from tests.bench.viewing.process import free_port
 from twin_worker.alerts.traffic import TrafficMonitor
 from twin_worker.mismatch.coordinator import ALL_UAVS, Coordinator
-from twin_worker.proposals.proposer import Proposer
+from twin_worker.proposals.proposer import PROPOSED, Proposer
 from twin_worker.twin.step import Twin, advance
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -45,13 +46,16 @@ def recorded_flight(name: str, *options: str) -> Path:
     return path
 
 
-def twin_messages(path: Path, diagnosed: int | None = None, *, proposes: bool = False) -> TimedMessages:
+def twin_messages(
+    path: Path, diagnosed: int | None = None, *, proposes: bool = False, areas: tuple[Area, ...] = ()
+) -> TimedMessages:
     """Return the messages of a recording and those of its twins, in the order of time.
 
     Args:
         path: the recording
         diagnosed: UAV whose mismatch is diagnosed; None: of none
         proposes: include the proposals against its alerts
+        areas: of the operator
     """
     messages: TimedMessages = []
     twins: dict[int, Twin] = {}
@@ -63,6 +67,7 @@ def twin_messages(path: Path, diagnosed: int | None = None, *, proposes: bool = 
         for message in news:
             messages.append((now, message, None))
             twin = twins.setdefault(message.uav, Twin.of(message.uav))
+            twin.areas = areas
             messages += [
                 (now, result, STAMP)
                 for result in traffic.process_results(
@@ -70,12 +75,26 @@ def twin_messages(path: Path, diagnosed: int | None = None, *, proposes: bool = 
                 )
             ]
             last_t = twin.telemetry.last_step_t
-            due = [one for one in traffic.active(message.uav) if proposes and proposer.due(one, last_t)]
+            active = (*traffic.active(message.uav), *twin.alerts.alarms.active) if proposes else ()
+            due = [one for one in active if one.kind in PROPOSED and proposer.due(one, last_t)]
             messages += [(now, one, STAMP) for alert in due if (one := proposer.update(alert, last_t)) is not None]
             if live is not None and isinstance(message, Sample) and message.uav == diagnosed:
                 hand.now = message.t
                 messages += [(now, result, STAMP) for result in live.run_once([(twin, nullcontext())])]
     return messages
+
+
+def position_at(path: Path, uav: int, seconds: float) -> tuple[int, int]:
+    """Return latitude and longitude of an aircraft `seconds` after its first position [1e-7 deg]."""
+    start = inf
+    for _, news in Recording(str(path), 0).steps():
+        for message in news:
+            if isinstance(message, Sample) and message.uav == uav and message.position is not None:
+                t, x = message.position.t.numpy(), message.position.x.numpy()
+                start = min(start, float(t[0]))
+                if t[-1] >= start + seconds:
+                    return int(x[-1, 0]), int(x[-1, 1])
+    raise ValueError(f"{path.name}: found no position of UAV {uav} after {seconds:.0f} s, expected one; fly longer")
 
 
 def with_replay_link(messages: TimedMessages, name: str) -> TimedMessages:
@@ -115,10 +134,11 @@ def moment(messages: TimedMessages, since: float = SETTLED_S, uav: int | None = 
     return best or otherwise
 
 
-def proposed(messages: TimedMessages, since: float) -> tuple[int, float]:
+def proposed(messages: TimedMessages, since: float, uav: int | None = None) -> tuple[int, float]:
     """Return the UAV of the first proposal with options after `since` [s], and the time 1 s later [s since 1970]."""
     start = messages[0][0] + since
-    first = next(m for t, m, _ in messages if t > start and isinstance(m, Proposal) and m.options)
+    offers = (m for t, m, _ in messages if t > start and isinstance(m, Proposal) and m.options)
+    first = next(m for m in offers if uav in (None, m.uav))
     return first.uav, next(t for t, _, _ in messages if t >= first.t + 1.0)
 
 

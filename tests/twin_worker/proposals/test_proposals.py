@@ -6,7 +6,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from fleet.contract import Alert, AlertKind, Array, Change, Prediction, Proposal
+from fleet.contract import Alert, AlertKind, Array, Change, Item, Prediction, Proposal
+from fleet.frames import Origin, to_geodetic
+from fleet.terrain.areas import POLYGON_OUT, Area
 from tests.support.memory_bus import MemoryBus
 from tests.twin_worker.prediction.test_endurance import battery
 from twin_worker.alerts.conflict_probability import Separation
@@ -15,7 +17,7 @@ from twin_worker.ownership.twin_store import OwnedTwin
 from twin_worker.proposals import candidates as changes
 from twin_worker.proposals import speeds
 from twin_worker.proposals.candidates import Candidate, Deficit, Kind, Plan, to_change
-from twin_worker.proposals.experiment import present, run
+from twin_worker.proposals.experiment import deficit, present, run
 from twin_worker.proposals.mission_edits import insert, remove
 from twin_worker.proposals.proposer import RENEW_S, AvoidedEvent, Proposer
 from twin_worker.service.worker import Worker
@@ -304,3 +306,60 @@ def test_a_worker_publishes_a_proposal_for_its_alert_and_answers_queries(twin, p
     worker.proposals.run_once()
     assert published[-1][0].options == () and published[-1][0].id == proposal.id
     assert [r.kind for r, _ in bus.get(Proposal, 1)] == [None]  # computed on request
+
+
+# --- areas -----------------------------------------------------------------------------------------------------------
+
+AREA_S, AREA_M = 55.0, 60.0  # when the predicted path reaches its middle, half of its side
+
+
+def area_ahead(prediction: Prediction) -> Area:
+    """Give a square no-fly area on a predicted path."""
+    k = int(np.argmin(np.abs(prediction.ahead.numpy() - AREA_S)))
+    centre = prediction.path.numpy()[k].astype(float)
+    corners = centre + AREA_M * np.array([[-1, -1, 0], [-1, 1, 0], [1, 1, 0], [1, -1, 0]])
+    lat, lon, _ = to_geodetic(prediction.ned_origin(), corners).T.astype(int).tolist()
+    return Area("village", tuple(zip(lat, lon, strict=True)), exclusion=True)
+
+
+def geofence_alert(fleet: Fleet) -> Alert:
+    at = fleet.now + AREA_S
+    return Alert(uav=1, t=fleet.now, kind=AlertKind.GEOFENCE, active=True, probability=1.0, predicted_t=at)
+
+
+def test_a_no_fly_area_ahead_is_avoided_and_ways_around_it_are_tried(twin, path):
+    twin.areas = (area_ahead(path),)
+    fleet, plan = Fleet(twin), Plan.of(twin, path)
+    short = deficit(plan, present(twin), AlertKind.GEOFENCE)
+    tried = run(plan, changes.candidates(plan, AlertKind.GEOFENCE, 20.0, None, short))
+    around = [one for one in tried if one.candidate.kind is Kind.DETOUR]
+    assert around and present(twin).hazards[AlertKind.GEOFENCE] > 0.9
+    clear = [one for one in around if one.hazards[AlertKind.GEOFENCE] < 0.1]
+    assert clear and all(one.margin_m[AlertKind.GEOFENCE] > 0.0 for one in clear)
+    sides = {np.sign(one.candidate.value) for one in around}
+    assert sides == {1.0, -1.0}
+    proposal = fleet.proposer.update(geofence_alert(fleet), fleet.now)
+    assert proposal.options and "from the geofence" in proposal.options[0].sentence
+    for option in proposal.options:
+        flown = next(one for one in option.paths if one.uav == 1)
+        depth = twin.areas[0].depth(flown.path.numpy().astype(float), Origin(*flown.origin))
+        assert depth[flown.ahead.numpy() < 90.0].max() < 0.0
+
+
+def test_fence_items_on_board_bind_changed_missions_too(twin, path):
+    """A changed mission is uploaded; the fence on board stays."""
+    area = area_ahead(path)
+    vertices = tuple(
+        Item(seq=k, command=POLYGON_OUT, param1=4.0, lat_e7=lat, lon_e7=lon)
+        for k, (lat, lon) in enumerate(area.vertices)
+    )
+    mission = msgspec.structs.replace(twin.onboard.mission, fence=vertices)
+    twin.onboard.set_mission(mission, twin.first_item)
+    twin.onboard.set_params(
+        msgspec.structs.replace(
+            twin.onboard.params, values=twin.onboard.params.values | {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 4.0}
+        )
+    )
+    plan = Plan.of(twin, path)
+    higher = run(plan, [Candidate(1, Kind.ALTITUDE, 20.0)])
+    assert higher[0].hazards[AlertKind.GEOFENCE] > 0.9  # it passes the area, whatever its height

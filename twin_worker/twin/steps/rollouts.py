@@ -94,7 +94,7 @@ def select_method(
     if due and len(paths) > 1:
         selector.add(t, float(np.linalg.norm(recent.v[-1])), ahead, paths)
     chosen = forecasts[selector.best(tuple(forecasts))]
-    return replace(chosen, sentence=" ".join(filter(None, (selector.describe(chosen.method), chosen.sentence))))
+    return replace(chosen, sentence="; ".join(filter(None, (selector.describe(chosen.method), chosen.sentence))))
 
 
 def _with_failsafe(
