@@ -49,7 +49,7 @@ REAL = "real/alfa_20180718_155331_1_engine_failure.tlog"
 EIGHT = ("--uavs", "0-7", "--for", "232")
 FAULTY = ("--uavs", "0-3", "--for", "260", "--fault", "airspeed_bias,bias_mps=-6,at=120", "--fault-uav", "0")
 MEETING, PROPOSED_S = ("--uavs", "0-1", "--for", "125", "--story", "conflict"), 80.0
-MIXED, AROUND_UAV, AROUND_S = ("--uavs", "0-7", "--for", "232", "--aircraft", "mixed"), 3, 190.0
+MIXED, AROUND_UAV, AROUND_S = ("--uavs", "0-7", "--for", "232", "--aircraft", "mixed"), 5, 190.0
 AREA_M = 120.0  # half side of the no-fly area around the place where that aircraft is then
 FAULTY_UAV = 1  # its id
 CROWD, ROTOR_SHARE = 60, 0.3  # aircraft of the pictures in three sizes; multirotors among them [-]
