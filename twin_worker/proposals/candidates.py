@@ -147,9 +147,13 @@ class Plan:
         return bool(distance[nearest] < _PASSING_M and nearest < len(distance) - 1 and distance[-1] > far)
 
     def is_circling(self, seconds: float) -> bool:
-        """Return whether the aircraft flies a circle of its mission `seconds` ahead, or is about to."""
+        """Return whether the aircraft flies a circle of its mission `seconds` ahead, or is about to.
+
+        A multirotor waits at LOITER_TIME: an upload begins the wait anew, which no other item depends on.
+        """
         seq = self.seq_after(Change(uav=self.uav), seconds)
-        circles = [item for item in self.items if item.seq == seq and is_circle(item)]
+        waits = _LOITER_TIME if is_hovering(self.twin) else None
+        circles = [item for item in self.items if item.seq == seq and is_circle(item) and item.command != waits]
         return any(np.hypot(*(self.at(seconds)[:2] - self.position(item))) < 2 * _PASSING_M for item in circles)
 
     def seq_after(self, change: Change, seconds: float) -> int:

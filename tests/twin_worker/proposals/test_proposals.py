@@ -1,6 +1,7 @@
 """Proposals of a worker: a twin of a simulated flight, and other aircraft that are made to cross its path."""
 
 import copy
+import dataclasses
 
 import msgspec
 import numpy as np
@@ -16,7 +17,7 @@ from twin_worker.alerts.traffic import TrafficPicture
 from twin_worker.ownership.twin_store import OwnedTwin
 from twin_worker.proposals import candidates as changes
 from twin_worker.proposals import speeds
-from twin_worker.proposals.candidates import Candidate, Deficit, Kind, Plan, to_change
+from twin_worker.proposals.candidates import DECISION_S, Candidate, Deficit, Kind, Plan, to_change
 from twin_worker.proposals.experiment import deficit, present, run
 from twin_worker.proposals.mission_edits import insert, remove
 from twin_worker.proposals.proposer import RENEW_S, AvoidedEvent, Proposer
@@ -212,6 +213,17 @@ def test_a_multirotor_flies_its_candidates(hovered):
         (one for one in run(plan, tried) if one.candidate.kind is Kind.ALTITUDE), key=lambda e: e.candidate.value
     )
     assert higher.prediction.path.numpy()[-1, 2] < before[-1, 2] - 10.0
+
+
+def test_a_wait_of_a_multirotor_is_no_circle_that_an_upload_would_begin_anew(hovered):
+    plan = Plan.of(hovered, present(hovered).prediction)
+    current = min(item.seq for item in plan.ahead)
+    for command, circles in ((18, True), (19, False)):  # LOITER_TURNS, LOITER_TIME, at the place that it is at then
+        lat, lon, _ = to_geodetic(plan.prediction.ned_origin(), plan.at(DECISION_S)).astype(int).tolist()
+        here = {"command": command, "lat_e7": lat, "lon_e7": lon, "param1": 60.0}
+        items = tuple(msgspec.structs.replace(i, **here) if i.seq == current else i for i in plan.items)
+        changed = dataclasses.replace(plan, items=items)
+        assert changed.is_circling(DECISION_S) is circles
 
 
 def low_on_battery(twin: Twin, share: float) -> Twin:
