@@ -124,7 +124,7 @@ class Scene:
     """Nodes of the fleet: ground, aircraft, trails, predicted paths, stems, alert rings, routes."""
 
     def __init__(self, scene: Any, palette: Palette, on_click: Callable[[int], None]) -> None:
-        self._palette = palette
+        self._scene, self._palette = scene, palette
         self.ground = GroundGrid(scene, palette)
         self.glyphs = Glyphs(scene, palette, on_click)
         self.trails = [Strokes(scene, f"/fleet/trail{i}", 2.0) for i in range(CHUNKS)]
@@ -132,7 +132,7 @@ class Scene:
         self.predicted = Strokes(scene, "/fleet/predicted", 1.8)
         self.stems = Strokes(scene, "/fleet/stems", 1.2)
         self.routes = Strokes(scene, "/fleet/routes", 1.4)
-        self.areas = Strokes(scene, "/fleet/areas", 2.0)
+        self._areas: Strokes | None = None  # a node of its own where there are areas
         self.alert = Strokes(scene, "/alert", 2.2)
         self._drawn: tuple = (None, -1)  # revision and selection, and closed chunks, when the trails were last drawn
         self._drawn_areas: tuple = ()
@@ -218,8 +218,11 @@ class Scene:
         if key == self._drawn_areas:
             return
         self._drawn_areas, palette = key, self._palette
+        if self._areas is None and not areas:
+            return
+        self._areas = self._areas or Strokes(self._scene, "/fleet/areas", 2.0)
         lines = [(area_lines(area, scene_frame, heights, self.ground.height + 0.05), area.exclusion) for area in areas]
-        self.areas.draw_parts([(x, rgb(palette.mismatch if out else palette.route)) for x, out in lines])
+        self._areas.draw_parts([(x, rgb(palette.mismatch if out else palette.route)) for x, out in lines])
 
 
 def _curves(fleet_arrays: FleetArrays, points: np.ndarray, selected: int | None) -> np.ndarray:
