@@ -67,7 +67,8 @@ def recorded(uav: int, seed: int, kind: AircraftType, drag: float) -> list[Messa
     one = SimulatedUav(uav, seed, setup=setup, autopilot="px4", extra_params=AUTOSTART)
     fdm = one.aircraft
     if drag:
-        present = -fdm["forces/fwx-aero-lbs"] / (fdm["aero/qbar-psf"] * fdm["metrics/Sw-sqft"])
+        present = fdm["forces/fwx-aero-lbs"] / (fdm["aero/qbar-psf"] * fdm["metrics/Sw-sqft"])  # positive backwards
+        assert present > 0.0, f"found a drag coefficient of {present:.3f}"
         fdm["conceal/C_D"] = drag * present
     link, receiver = RadioLink(np.random.default_rng((seed, 6, uav)), LOSS), MavlinkReceiver(-1)
     for frame in one.initial_frames():
