@@ -1,4 +1,7 @@
-"""Compiled functions of `fleet.frames`, which imports them on first use: numba takes 0.25 s to import."""
+"""Compiled functions of `fleet.frames` and `fleet.terrain.areas`, which import them on first use.
+
+Numba takes 0.25 s to import.
+"""
 
 from math import cos, pi, sin
 from typing import Any
@@ -50,3 +53,27 @@ def air_direction(phi: Any, theta: Any, psi: Any, gamma: Any) -> Any:
     alpha sin(phi) = (theta - gamma) tan(phi).  Source: Beard & McLain 2012, section 2.3.
     """
     return psi - (theta - gamma) * np.tan(phi)
+
+
+@nb.njit(cache=True, nogil=True)
+def polygon_depth(points: np.ndarray, vertices: np.ndarray, out: np.ndarray) -> None:
+    """Compute the distance of points (m, 2) to the edge of a polygon (n, 2), negative outside, into `out` (m,).
+
+    Inside is where a ray crosses the edge an odd number of times.
+    """
+    n = len(vertices)
+    for k in range(len(points)):
+        x, y = points[k, 0], points[k, 1]
+        nearest, inside = np.inf, False
+        for i in range(n):
+            ax, ay = vertices[i - 1, 0], vertices[i - 1, 1]
+            bx, by = vertices[i, 0], vertices[i, 1]
+            dx, dy = bx - ax, by - ay
+            if (ay > y) != (by > y) and x < ax + (y - ay) * dx / dy:
+                inside = not inside
+            length2 = dx * dx + dy * dy
+            share = ((x - ax) * dx + (y - ay) * dy) / length2 if length2 > 0.0 else 0.0
+            share = min(max(share, 0.0), 1.0)
+            away_x, away_y = x - ax - share * dx, y - ay - share * dy
+            nearest = min(nearest, away_x * away_x + away_y * away_y)
+        out[k] = np.sqrt(nearest) if inside else -np.sqrt(nearest)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import msgspec
-import numba as nb
 import numpy as np
 
 from fleet.contract import Item
@@ -71,35 +70,13 @@ class Area(NamedTuple):
         if self.radius:
             depth = self.radius - np.hypot(*(flat - self._vertices_ned(origin)).T)
         else:
+            from fleet.compiled_frames import polygon_depth  # here, as a viewer needs no numba
+
             depth = np.empty(len(flat))
-            _polygon_depth(flat, np.ascontiguousarray(self._vertices_ned(origin)), depth)
+            polygon_depth(flat, np.ascontiguousarray(self._vertices_ned(origin)), depth)
         height = origin.alt_mm * 1e-3 - points[..., 2]
         within = (height >= self.floor) & (height <= self.ceiling)
         return np.where(within, depth.reshape(points.shape[:-1]), -np.inf)
-
-
-@nb.njit(cache=True, nogil=True)
-def _polygon_depth(points: np.ndarray, vertices: np.ndarray, out: np.ndarray) -> None:
-    """Compute the distance of points (m, 2) to the edge of a polygon (n, 2), negative outside, into `out` (m,).
-
-    Inside is where a ray crosses the edge an odd number of times.
-    """
-    n = len(vertices)
-    for k in range(len(points)):
-        x, y = points[k, 0], points[k, 1]
-        nearest, inside = np.inf, False
-        for i in range(n):
-            ax, ay = vertices[i - 1, 0], vertices[i - 1, 1]
-            bx, by = vertices[i, 0], vertices[i, 1]
-            dx, dy = bx - ax, by - ay
-            if (ay > y) != (by > y) and x < ax + (y - ay) * dx / dy:
-                inside = not inside
-            length2 = dx * dx + dy * dy
-            share = ((x - ax) * dx + (y - ay) * dy) / length2 if length2 > 0.0 else 0.0
-            share = min(max(share, 0.0), 1.0)
-            away_x, away_y = x - ax - share * dx, y - ay - share * dy
-            nearest = min(nearest, away_x * away_x + away_y * away_y)
-        out[k] = np.sqrt(nearest) if inside else -np.sqrt(nearest)
 
 
 class FenceItems(NamedTuple):

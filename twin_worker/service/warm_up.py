@@ -12,6 +12,7 @@ from fleet.frames import Origin, to_geodetic, wrap
 from fleet.mission import unroll_route
 from fleet.physics import point_mass
 from fleet.physics.simulate import N_STATE, coupled_plant, linear_plant, simulate
+from fleet.terrain.areas import Area
 from fleet.window import Window
 from twin_worker.alerts.traffic import TrafficMonitor
 from twin_worker.confidence.adaptive_conformal import AdaptiveLevels
@@ -117,12 +118,13 @@ def _run_traffic() -> None:
 
 
 def _run_propagation() -> None:
-    """Propagate a prediction, update the wind filter, and detect flight."""
+    """Propagate a prediction, update the wind filter, detect flight, and compare positions with an area."""
     ahead, path = (Array.of(values).numpy() for values in (np.arange(5.0), np.zeros((5, 3))))
     displacement_along_path(np.outer(AHEAD, [_SPEED, 0.0, 0.0]), AHEAD)
     shift_to_position(ahead, path, 1.0, np.zeros(3), np.empty((4, 3), np.float32))  # type: ignore[call-arg]
     widen_tube(ahead, path, 1.0, np.empty((4, 3), np.float32))  # type: ignore[call-arg]
     speed_extremes(np.zeros((3, 3)))  # type: ignore[call-arg]
+    Area("area", ((_HOME.lat_e7, 0), (0, _HOME.lon_e7), (0, 0)), exclusion=True).depth(np.zeros((1, 3)), _HOME)
     WindFilter().update(1e9, np.array([_SPEED, 0.0, 0.0]), _SPEED, reported_direction(0.0, 0.0, 0.0, 0.0, _SPEED))
     for rows in ((), (2,)):
         start, air = np.ones((*rows, point_mass.N_START)), np.ones((*rows, point_mass.N_AIR))
