@@ -61,7 +61,7 @@ def test_fence_items_follow_the_mission_and_are_renewed(loss):
 
 
 def fence_items(n: int) -> tuple[Item, ...]:
-    """Give a polygon of n vertices."""
+    """Return a polygon of n vertices."""
     angles = np.linspace(0.0, 2 * np.pi, n, endpoint=False)
     return tuple(
         Item(

@@ -68,7 +68,7 @@ def read_geofence(
     limits, enabled = _limits_of_params(params, has_items=bool(items))
     on_board = on_board if enabled else ()
     inside = tuple(area for area in on_board if not area.exclusion)
-    is_union = _is_px4(params) or int(params.get("FENCE_OPTIONS", 0.0)) & _UNION
+    is_union = _is_px4(params) or _bits(params.get("FENCE_OPTIONS"), 0) & _UNION
     of_operator = tuple(area for area in areas if not area.exclusion)
     groups = ((inside,) if is_union else tuple((area,) for area in inside), (of_operator,))
     return limits._replace(
@@ -91,8 +91,7 @@ def _limits_of_params(params: Mapping[str, float], *, has_items: bool) -> tuple[
         return GeofenceLimits(max_horizontal, max_vertical), True
     if not (params.get("FENCE_ENABLE", 0.0) > 0 or params.get("FENCE_AUTOENABLE", 0.0) > 0):
         return GeofenceLimits(), False
-    fence_type = params.get("FENCE_TYPE", np.nan)
-    kinds = int(fence_type) if isfinite(fence_type) and 0 <= fence_type < 256 else _CEILING | _CIRCLE | _FLOOR
+    kinds = _bits(params.get("FENCE_TYPE"), _CEILING | _CIRCLE | _FLOOR)
     low = params.get("FENCE_ALT_MIN", np.nan)
     points = params.get("FENCE_TOTAL", 0.0)
     limits = GeofenceLimits(
@@ -102,6 +101,11 @@ def _limits_of_params(params: Mapping[str, float], *, has_items: bool) -> tuple[
         f"its {points:.0f} fence items were not received" if kinds & _POLYGON and points > 0 and not has_items else "",
     )
     return limits, bool(kinds & _POLYGON)
+
+
+def _bits(value: float | None, default: int) -> int:
+    """Return a bit mask; the default if it is absent or no mask of eight bits."""
+    return int(value) if value is not None and 0 <= value < 256 else default
 
 
 def _distance_limit(value: float | None) -> float:

@@ -71,7 +71,7 @@ class Candidate(NamedTuple):
 
     The value is the airspeed [m/s], the altitude offset [m], the waiting time [s], the item that is left out, the
     number of last waypoints that are left out, the distance from home within which all items ahead are moved [m], or
-    the distance that is kept from a no-fly area, positive to pass it on the right [m].
+    the distance to a no-fly area, positive to pass it on the right [m].
     """
 
     uav: int

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from fleet.terrain.areas import Area
+from fleet.contract import Item
+from fleet.terrain.areas import Area, read_fence_items
 from viewer.scene.fleet_arrays import CHUNKS, LOST, MISMATCH, STEPS, FleetArrays
 from viewer.scene.ground import GroundGrid
 from viewer.scene.labels import CameraView
@@ -212,17 +213,27 @@ class Scene:
         lines = [part for r in routes for part in (r.legs, r.circles, dash_lines(r.returns, 4.0))]
         self.routes.draw(np.concatenate([*lines, NOTHING.legs]), mix(self._palette.route, self._palette.ground, 0.45))
 
-    def draw_areas(self, areas: frozenset[Area], scene_frame: SceneFrame, heights: Heights) -> None:
-        """Draw the outlines of geofence areas on the ground, no-fly areas in the colour of alerts."""
-        key = (areas, scene_frame, self.ground.height)
-        if key == self._drawn_areas:
+    def draw_areas(
+        self, areas: tuple[Area, ...], fences: tuple[tuple[Item, ...], ...], scene_frame: SceneFrame, heights: Heights
+    ) -> None:
+        """Draw the outlines of geofence areas and fence items on the ground, no-fly areas in the colour of alerts."""
+        key = (areas, fences, scene_frame, self.ground.height)
+        if _same(key, self._drawn_areas):
             return
         self._drawn_areas, palette = key, self._palette
-        if self._areas is None and not areas:
+        shown = {*areas, *(area for items in fences for area in read_fence_items(items).areas)}
+        if self._areas is None and not shown:
             return
         self._areas = self._areas or Strokes(self._scene, "/fleet/areas", 2.0)
-        lines = [(area_lines(area, scene_frame, heights, self.ground.height + 0.05), area.exclusion) for area in areas]
+        lines = [(area_lines(area, scene_frame, heights, self.ground.height + 0.05), area.exclusion) for area in shown]
         self._areas.draw_parts([(x, rgb(palette.mismatch if out else palette.route)) for x, out in lines])
+
+
+def _same(key: tuple, other: tuple) -> bool:
+    """Return whether areas, fences, frame and height are those drawn; fences are compared by identity, for speed."""
+    if not other or key[0] is not other[0] or key[2:] != other[2:] or len(key[1]) != len(other[1]):
+        return False
+    return all(fence is drawn for fence, drawn in zip(key[1], other[1], strict=True))
 
 
 def _curves(fleet_arrays: FleetArrays, points: np.ndarray, selected: int | None) -> np.ndarray:

@@ -4,12 +4,11 @@ import contextlib
 import time
 from collections.abc import Callable
 from functools import partial
-from itertools import chain
 
 import numpy as np
 import viser
 
-from fleet.terrain.areas import Area, read_fence_items
+from fleet.terrain.areas import Area
 from viewer.browser.http_server import Browser
 from viewer.export import Export
 from viewer.panels.approval import ApprovalDialog
@@ -312,8 +311,8 @@ class View:
             strokes.show(options.trails.value)
         others = [v for v in fleet_arrays.fleet if v.uav != self.selected] if options.routes.value else []
         scene.draw_routes([mission_lines(v.mission, scene_frame, ground) for v in others])
-        on_board = (read_fence_items(v.mission.fence).areas for v in fleet_arrays.fleet if v.mission is not None)
-        scene.draw_areas(frozenset(chain(self.areas, *on_board)), scene_frame, self.heights)
+        fences = tuple(v.mission.fence for v in fleet_arrays.fleet if v.mission is not None and v.mission.fence)
+        scene.draw_areas(self.areas, fences, scene_frame, self.heights)
         self.selection.tube = options.tube.value
         self._draw_selected(now, ground)
 

@@ -18,7 +18,7 @@ SQUARE = [[8.0, 47.0], [8.01, 47.0], [8.01, 47.01], [8.0, 47.01]]
 
 
 def place(n: float, e: float) -> tuple[int, int]:
-    """Give latitude and longitude of a position relative to `HERE` [m]."""
+    """Return latitude and longitude of a position relative to `HERE` [m]."""
     return HERE.lat_e7 + round(n / 6_366_000 * 180 / np.pi * 1e7), HERE.lon_e7 + round(
         e / 4_359_000 * 180 / np.pi * 1e7
     )

@@ -116,6 +116,7 @@ def test_height_is_above_home_wherever_the_origin_is() -> None:
         ),
         ({"FENCE_ENABLE": 1.0, "FENCE_TYPE": 8.0, "FENCE_ALT_MIN": -10.0}, GeofenceLimits(floor=-10.0)),
         ({"FENCE_ENABLE": 1.0, "FENCE_TYPE": NAN, "FENCE_RADIUS": NAN, "FENCE_ALT_MAX": -5.0}, GeofenceLimits()),
+        ({"FENCE_ENABLE": 1.0, "FENCE_TYPE": 3.0, "FENCE_OPTIONS": NAN}, GeofenceLimits()),
         ({"FENCE_ENABLE": 1.0, "FENCE_TYPE": 1e30, "FENCE_RADIUS": INF, "FENCE_ALT_MIN": INF}, GeofenceLimits()),
         ({"GF_MAX_HOR_DIST": 500.0, "GF_MAX_VER_DIST": 0.0}, GeofenceLimits(500.0)),
     ],

@@ -19,14 +19,14 @@ PER_M = 180 / np.pi * 1e7 / np.array([6_366_000, 4_359_000])  # [1e-7 deg / m]
 
 
 def box(south: float, north: float, half: float, *, exclusion: bool = False, **heights: float) -> Area:
-    """Give a rectangle between two distances north of home, `half` wide to both sides [m]."""
+    """Return a rectangle between two distances north of home, `half` wide to both sides [m]."""
     corners = np.array([(south, -half), (south, half), (north, half), (north, -half)]) * PER_M
     vertices = tuple((HOME.lat_e7 + round(n), HOME.lon_e7 + round(e)) for n, e in corners)
     return Area("field", vertices, exclusion, **heights)
 
 
 def forecast(**more: object) -> GaussianForecast:
-    """Give a flight north at 20 m/s, 100 m above home, that begins at home."""
+    """Return a flight north at 20 m/s, 100 m above home, that begins at home."""
     return to_gaussian(straight(**more))
 
 

@@ -17,14 +17,14 @@ ORIGIN = Origin(470_000_000, 80_000_000, 0)
 
 
 def flown(route: np.ndarray, detour: Detour) -> np.ndarray:
-    """Give points every metre along the changed route."""
+    """Return points every metre along the changed route."""
     points = np.vstack([route[: detour.first + 1], detour.corners, route[detour.last :]])
     lines = [a + np.linspace(0, 1, max(int(np.hypot(*(b - a))), 2))[:, None] * (b - a) for a, b in pairwise(points)]
     return np.concatenate(lines)
 
 
 def nearest(points: np.ndarray, outline: np.ndarray) -> float:
-    """Give the smallest distance to the outline, negative inside, by way of latitudes and longitudes [m]."""
+    """Return the smallest distance to the outline, negative inside, by way of latitudes and longitudes [m]."""
     from fleet.frames import to_geodetic
 
     ned = np.column_stack([outline, np.zeros(len(outline))])

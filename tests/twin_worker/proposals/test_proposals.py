@@ -326,7 +326,7 @@ AREA_S, AREA_M = 55.0, 60.0  # when the predicted path reaches its middle, half 
 
 
 def area_ahead(prediction: Prediction) -> Area:
-    """Give a square no-fly area on a predicted path."""
+    """Return a square no-fly area on a predicted path."""
     k = int(np.argmin(np.abs(prediction.ahead.numpy() - AREA_S)))
     centre = prediction.path.numpy()[k].astype(float)
     corners = centre + AREA_M * np.array([[-1, -1, 0], [-1, 1, 0], [1, 1, 0], [1, -1, 0]])

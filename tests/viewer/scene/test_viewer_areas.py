@@ -1,11 +1,16 @@
 """Geofence areas on the map: closed outlines on the ground, at the heights of the terrain where these are known."""
 
+from types import SimpleNamespace
+
 import numpy as np
 
-from fleet.terrain.areas import Area
+from fleet.contract import Item
+from fleet.terrain.areas import CIRCLE_OUT, Area
 from tests.support.pretend_feed import HOME
 from viewer.scene.routes import EDGE_PARTS, area_lines
+from viewer.scene.scene import Scene
 from viewer.store.place import UNIT_M, SceneFrame
+from viewer.theme.palette import DARK
 
 CORNERS = ((0, 0), (0, 40_000), (20_000, 40_000))
 FIELD = Area("field", tuple((HOME.lat_e7 + n, HOME.lon_e7 + e) for n, e in CORNERS), exclusion=True)
@@ -37,3 +42,36 @@ def test_a_circle_is_round() -> None:
     circle = FIELD._replace(vertices=FIELD.vertices[:1], radius=80.0)
     lines = area_lines(circle, SceneFrame(HOME), unknown, 0.0)
     assert np.allclose(np.hypot(*lines[..., :2].reshape(-1, 2).T) * UNIT_M, 80.0, atol=0.5)
+
+
+class Node:
+    """A node that counts how often it is drawn."""
+
+    def __init__(self) -> None:
+        self.drawn = 0
+        self.colors = np.zeros(0)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        super().__setattr__(name, value)
+        if name == "points":
+            self.drawn += 1
+
+
+def test_areas_and_fences_are_drawn_once_and_again_when_they_change() -> None:
+    node = Node()
+    viser_scene = SimpleNamespace(add_line_segments=lambda *_, **__: node)
+    scene = Scene.__new__(Scene)
+    scene._scene, scene._palette, scene._areas, scene._drawn_areas = viser_scene, DARK, None, ()
+    scene.ground = SimpleNamespace(height=0.0)
+    frame, areas, fence = SceneFrame(HOME), (FIELD,), tuple(circle_item(k) for k in range(2))
+    scene.draw_areas((), (), frame, unknown)
+    assert scene._areas is None and not node.drawn
+    for _ in range(3):
+        scene.draw_areas(areas, (fence,), frame, unknown)
+    assert node.drawn == 1 and node.points.shape[0] == (3 + 2 * 72) * EDGE_PARTS
+    scene.draw_areas(areas, (), frame, unknown)
+    assert node.drawn == 2 and node.points.shape[0] == 3 * EDGE_PARTS
+
+
+def circle_item(seq: int) -> Item:
+    return Item(seq=seq, command=CIRCLE_OUT, param1=50.0 + seq, lat_e7=HOME.lat_e7, lon_e7=HOME.lon_e7)

@@ -67,7 +67,7 @@ class FenceCollector:
         self._finish_if_complete()
 
     def _finish_if_complete(self) -> None:
-        if self._count is None or self.missing():
+        if self._count is None or len(self._received) < self._count:
             return
         self.items = tuple(self._received[seq] for seq in range(self._count))
         self.needs_download, self._count, self._received = False, None, {}
