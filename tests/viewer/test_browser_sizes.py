@@ -230,16 +230,17 @@ def compare_places(live: SimpleNamespace, uav: int, *, silent: bool = False) -> 
     page.wait_for_function(
         "uav => document.querySelector('tr.on').dataset.uav === uav", arg=str(uav), timeout=PATIENCE_MS
     )
-    page.evaluate(PLACES, 1.5)  # notes the texts of the labels from now on
     samples: list[dict] = []
-    for _ in range(20):  # a busy machine draws few rows in three seconds
+    shown: list[dict] = []
+    for _ in range(20):  # a busy machine draws few rows in three seconds, and few of them with their labels
         samples += page.evaluate(PLACES, CONSISTENCY_S)
-        if len({tuple(one["row"]) for one in samples}) > 2 and (shown := drawn(samples, with_ring=not silent)):
+        shown = drawn(samples, with_ring=not silent)
+        labelled = any(text.startswith("UAV") for one in shown for text in one["label"])
+        if labelled and len({tuple(one["row"]) for one in samples}) > 2:
             break
-    assert len({tuple(one["row"]) for one in samples}) > 2 and shown
+    assert labelled and len({tuple(one["row"]) for one in samples}) > 2
     assert differing(samples) == []
     assert [(one["row"], one["label"]) for one in labels_differing(shown)] == []
-    assert any(text.startswith("UAV") for one in shown for text in one["label"])
     forecasts = [ScenePrediction(m, live.app.store.scene_frame, 0.0) for m in list(live.predictions) if m.uav == uav]
     ends = np.array([one.position_at(one.horizon_s) for one in forecasts])
     rings = [one for one in shown if one["ring"] is not None and one["row"][1] != "–" and not silent]

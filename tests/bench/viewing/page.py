@@ -66,19 +66,6 @@ PLACES = """seconds => new Promise(done => {
   const count = () => { frame++; if (performance.now() < until) requestAnimationFrame(count); };
   requestAnimationFrame(count);
   const page = window.__viserMutable;
-  if (!page.labels) {  // texts of the labels, as the page takes them from its queue at a frame
-    page.labels = {};
-    page.hidden = new Set();
-    const queue = page.messageQueue, splice = queue.splice;
-    queue.splice = function (...range) {
-      const messages = splice.apply(queue, range);
-      for (const {name, updates, visible} of messages.filter(one => /labels\\/\\d+$/.test(one.name || ''))) {
-        if (updates && updates.text) page.labels[name] = updates.text;
-        if (visible !== undefined) page.hidden[visible ? 'delete' : 'add'](name);
-      }
-      return messages;
-    };
-  }
   const ring = () => {  // centre of the ring at the horizon, scene [10 m]
     const node = window.__viserMutable.nodeRefFromName['/selected/horizon']; let starts = null;
     if (node) node.traverse(o => { starts = o.geometry?.attributes.instanceStart || starts; });
@@ -103,9 +90,9 @@ PLACES = """seconds => new Promise(done => {
         tile: [cards[0].textContent, cards[1].textContent, age ? age[1] : ''],
         alert: [short ? short[1] : '', silent ? silent[1] : ''],
         ring: ring(), name, frame,
-        label: Object.entries(page.labels).filter(
-          ([node, text]) => !page.hidden.has(node) && (text.startsWith(name) || text.startsWith('horizon '))
-        ).map(([node, text]) => text),
+        label: Object.values(page.tags || {}).filter(  // noted by NOTE_LABELS
+          one => one.visible && one.text && (one.text.startsWith(name) || one.text.startsWith('horizon '))
+        ).map(one => one.text),
         state: row && [row.cells[2].textContent.replace(/ [\\d.]+ \\w+$/, ''), text(sheet, '.head b').slice(2)],
       });
     }
