@@ -195,6 +195,36 @@ def with_consistency(verdict: Verdict, plant: Plant, window: Window, start: int)
     )
 
 
+def verify_since_identification(verdict: Verdict, plant: Plant, window: Window, name: str) -> Verdict:
+    """Test an accepted model for consistency with all data since its identification.
+
+    The data were never used for this model, so their power grows as the flight goes on.
+
+    Args:
+        verdict: the accepted verdict on the model
+        plant: the model
+        window: flight up to now, which may begin before or after the end of the identification
+        name: the UAV, for the sentence
+    Returns:
+        a newer verdict; the same where the data neither reject the model nor have power
+    """
+    if not isinstance(plant, DerivativesModel):
+        return verdict
+    start = int(np.searchsorted(window.t, plant.t1, side="right"))
+    errors = estimate_errors(plant, window, start) if start < len(window) else None
+    failed, power = (errors.failed(), errors.power()) if errors is not None else ({}, {})
+    if not failed and not has_power(power):
+        return verdict
+    reason = f"plausible only: {error_text(failed)}" if failed else f"consistent, {power_text(power)}"
+    return msgspec.structs.replace(
+        verdict,
+        outcome=Outcome.PLAUSIBLE if failed else Outcome.VERIFIED,
+        sentence=f"{name}: {(len(window) - start) * window.dt:.0f} s of flight since the identification; {reason}",
+        derivative_error=failed,
+        detectable_error=power,
+    )
+
+
 def with_diagnostics(verdict: Verdict, plant: Plant, window: Window, start: int) -> Verdict:
     """Add diagnostics to a verdict: the fit at other horizons and the whiteness of residuals."""
     held_out = HeldOut(plant, window, start)

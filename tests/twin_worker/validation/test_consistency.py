@@ -11,7 +11,7 @@ from fleet.physics.wrench import NAMES
 from tests.support.coupled_flights import SMALL, aircraft, fly
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel, identify
 from twin_worker.validation.consistency import GROUPS, MAX_DETECTABLE, TOLERANCE, error_text, estimate_errors, limits
-from twin_worker.validation.verify import verify, with_consistency
+from twin_worker.validation.verify import verify, verify_since_identification, with_consistency
 
 SEEN = 1000  # rows identified on; the rest is held out
 
@@ -67,6 +67,30 @@ def test_too_little_data_state_no_power(flown):
     assert estimate_errors(model, short, SEEN) is None
     assert verdict.outcome is Outcome.PLAUSIBLE and not verdict.detectable_error
     assert "these data would not show an error of 50 % in one of the axes" in verdict.sentence
+
+
+def test_data_after_the_identification_verify_a_model_that_was_plausible_only(flown):
+    model, window = flown[1]
+    before = with_consistency(verify(model, window.part(0, SEEN + 300), SEEN), model, window.part(0, SEEN + 300), SEEN)
+    verdict = verify_since_identification(before, model, window, "UAV-001")
+    assert before.outcome is Outcome.PLAUSIBLE and verdict.outcome is Outcome.VERIFIED and verdict.fit == before.fit
+    assert verdict.sentence.startswith("UAV-001: 40 s of flight since the identification; consistent, would have")
+    assert verdict.detectable_error == estimate_errors(model, window, SEEN).power()
+
+
+def test_data_after_the_identification_refute_a_model_that_was_verified(flown):
+    model, window = flown[0]
+    verified = msgspec.structs.replace(verify(model, window, SEEN), outcome=Outcome.VERIFIED)
+    verdict = verify_since_identification(verified, scaled(model, "aileron_effectiveness", 0.7), window, "UAV-001")
+    assert verdict.outcome is Outcome.PLAUSIBLE and "aileron_effectiveness" in verdict.derivative_error
+    assert "plausible only: on held-out data the aircraft has" in verdict.sentence
+
+
+def test_data_without_power_change_no_verdict(flown):
+    model, window = flown[1]
+    verdict = verify(model, window, SEEN)
+    for end in (SEEN, SEEN + 300):  # none, and 12 s
+        assert verify_since_identification(verdict, model, window.part(0, end), "UAV-001") is verdict
 
 
 def test_steady_flight_states_less_power_than_manoeuvres():

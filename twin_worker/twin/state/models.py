@@ -266,6 +266,10 @@ class ModelBank(msgspec.Struct):
         self.active_model, self.active_verdict = best.plant, best.verdict
         return best
 
+    def update_verdict(self, verdict: Verdict) -> None:
+        """Store a newer verdict on the active model, the best of the candidates."""
+        self.active_verdict = self.verified_models[0].verdict = verdict
+
     def activate(self, candidate: VerifiedModel) -> None:
         """Make a verified model the only candidate and the active one."""
         self.active_model, self.active_verdict = candidate.plant, candidate.verdict

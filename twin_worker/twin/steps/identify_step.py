@@ -28,7 +28,7 @@ from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.kinematic_prediction import fit_kinematic_models
 from twin_worker.twin.steps.point_mass_step import update_point_mass
 from twin_worker.validation.held_out import HeldOut
-from twin_worker.validation.verify import verify, with_consistency, with_diagnostics
+from twin_worker.validation.verify import verify, verify_since_identification, with_consistency, with_diagnostics
 
 SHRINKAGE_LOOKAHEAD_S = 10.0  # look-ahead of the published shrinkage weights [s]
 _MIN_DATA_SHARE = 0.5  # reduction of the prior variance above which a parameter counts as determined by the data [-]
@@ -136,6 +136,8 @@ _NEW_MODEL_FACTOR = 1.2  # factor on the error of a new model, which has only on
 def select_model(twin: Twin, window: Window, n_train: int, plant: Plant, verdict: Verdict) -> Verdict:
     """Run every verified model in closed loop over the newest data and activate the one with the lowest error.
 
+    An active model that is older is verified anew, on all data since its identification.
+
     Args:
         twin: its list of verified models is updated
         window: flight; rows from `n_train` on are held out
@@ -157,6 +159,8 @@ def select_model(twin: Twin, window: Window, n_train: int, plant: Plant, verdict
     best = twin.models.select(_MAX_MODELS)
     if best is None:
         return verdict
+    if best.plant is not plant:
+        twin.models.update_verdict(verify_since_identification(best.verdict, best.plant, window, twin.name))
     if verdict.outcome.is_accepted and best.plant is not plant:
         sentence = f"{verdict.sentence}; but an earlier model has a lower closed-loop error and stays active"
         return msgspec.structs.replace(verdict, outcome=Outcome.WORSE_THAN_LAST, sentence=sentence)
