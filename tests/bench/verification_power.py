@@ -2,10 +2,12 @@
 
     python -m tests.bench.verification_power --seed 2000 --flights 16 --json power.json
     python -m tests.bench.verification_power --flights 0 flight.tlog.xz other.tlog
+    python -m tests.bench.verification_power --seed 2200 --flights 16 --later
 
 Simulated aircraft (JSBSim, no equation in common with the model) fly in winds of 0, 2, 4 and 6 m/s with turbulence 0
 to 3, each with a seed of its own; recordings may be added. The twin replays each flight; the newest accepted model and
-its held-out data are stored every 20 s. In these models each group of derivatives with a stated power is made wrong by
+its held-out data are stored every 20 s; with `--later` an active model that is older, and all data since its
+identification. In these models each group of derivatives with a stated power is made wrong by
 0, half, one and one and a half times its detectable error, too large and too small; the trim of the identification
 window is unchanged. Shares of rejections, by size and group, and their range over flights, because flights are
 independent.
@@ -20,6 +22,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from fleet.contract import Message, Outcome, Verdict
@@ -55,38 +58,50 @@ class Case:
     verdict: Verdict
 
 
-def replayed(flight: str, messages: Iterable[Message]) -> list[Case]:
-    """Replay a flight; keep the newest accepted model every 20 s."""
+def replayed(flight: str, messages: Iterable[Message], *, later: bool) -> list[Case]:
+    """Replay a flight; keep the newest accepted model every 20 s, or the active one (`later`)."""
     cases: list[Case] = []
     twins: dict[int, Twin] = {}
-    verify = identify_step.verify
+    verify, verify_later = identify_step.verify, identify_step.verify_since_identification
 
-    def recorded(plant: Any, window: Window, start: int, threshold: float, active: Any) -> Verdict:
-        verdict = verify(plant, window, start, threshold, active)
+    def keep(plant: Any, window: Window, start: int, verdict: Verdict) -> None:
         due = not cases or window.t[-1] - cases[-1].window.t[-1] >= EVERY_S
         if verdict.outcome is Outcome.PLAUSIBLE and due:
             cases.append(Case(flight, plant, window, start, verdict))
+
+    def recorded(plant: Any, window: Window, start: int, threshold: float, active: Any) -> Verdict:
+        verdict = verify(plant, window, start, threshold, active)
+        keep(plant, window, start, verdict)
         return verdict
 
-    identify_step.verify = recorded  # type: ignore[assignment]
+    def recorded_later(verdict: Verdict, plant: Any, window: Window, name: str) -> Verdict:
+        if isinstance(plant, DerivativesModel):
+            start = int(np.searchsorted(window.t, plant.t1, side="right"))
+            keep(plant, window, start, msgspec.structs.replace(verdict, outcome=Outcome.PLAUSIBLE))
+        return verify_later(verdict, plant, window, name)
+
+    if later:
+        identify_step.verify_since_identification = recorded_later
+    else:
+        identify_step.verify = recorded  # type: ignore[assignment]
     try:
         for message in messages:
             if message.uav not in twins:
                 twins[message.uav] = Twin.of(message.uav, schedule=Schedule(predict=20.0, ensemble=3600.0))
             advance(twins[message.uav], (message,))
     finally:
-        identify_step.verify = verify  # type: ignore[assignment]
+        identify_step.verify, identify_step.verify_since_identification = verify, verify_later
     return cases
 
 
-def simulated(seed: int, seconds: int) -> list[Case]:
+def simulated(seed: int, seconds: int, *, later: bool) -> list[Case]:
     """Fly one aircraft and replay its telemetry."""
     wind, turbulence = AIR[seed % len(AIR)]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "flight.tlog"
         uav = SimulatedUav(0, seed, wind=wind, turbulence=turbulence)
         to_tlog(path, [uav], seconds=seconds, loss=0.01, seed=seed)
-        return replayed(str(seed), replay_messages(path))
+        return replayed(str(seed), replay_messages(path), later=later)
 
 
 def made_wrong(case: Case, group: str, error: float) -> DerivativesModel:
@@ -186,16 +201,17 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=2000, help="of the first simulated flight (2000)")
     parser.add_argument("--flights", type=int, default=16, help="simulated flights (16)")
     parser.add_argument("--seconds", type=int, default=240, help="length of each [s] (240)")
+    parser.add_argument("--later", action="store_true", help="all data since the identification")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write what was measured")
     args = parser.parse_args()
     warm_up()
     cases: list[Case] = []
     for seed in range(args.seed, args.seed + args.flights):
-        cases += simulated(seed, args.seconds)
+        cases += simulated(seed, args.seconds, later=args.later)
         print(f"flown {seed}: {len(cases)} models")
     found = {"simulated": summary(cases)} if cases else {}
     for path in args.files:
-        found[path.name] = summary(replayed(path.name, replay_messages(path)))
+        found[path.name] = summary(replayed(path.name, replay_messages(path), later=args.later))
     text = json.dumps({"seed": args.seed, "seconds": args.seconds} | found, indent=1)
     print(text)
     if args.json:
