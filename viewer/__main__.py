@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
     from fleet.bus.session import connect  # here, as --help and --version need none of these
     from fleet.terrain.areas import read_areas
     from fleet.terrain.raster import read_raster
-    from viewer.browser.http_server import serve, without_stdout
+    from viewer.browser.http_server import serve, stop_server
     from viewer.scene.map.tiles import open_tiles
     from viewer.scene.terrain import TerrainLayer
     from viewer.server.app import App
@@ -110,8 +110,7 @@ def run(args: argparse.Namespace) -> int:
             report_status("viewer", f"http://{args.host}:{args.port}")
             app.run(stop)
         finally:
-            with without_stdout():
-                server.stop()
+            stop_server(server)
     return 0
 
 

@@ -12,7 +12,7 @@ import viser
 from PIL import Image
 
 from fleet.frames import to_geodetic
-from viewer.browser.http_server import serve, without_stdout
+from viewer.browser.http_server import serve, stop_server
 from viewer.scene.camera import FOV, IN_VIEW_M, frame, set_initial_view, within_reach
 from viewer.scene.fleet_arrays import FleetArrays
 from viewer.scene.labels import CameraView, Labels
@@ -70,8 +70,7 @@ def flight_html(
             on_progress((k + 1) / len(times))
         text = serializer.as_html(dark_mode=palette.dark)
     finally:
-        with without_stdout():
-            server.stop()
+        stop_server(server)
     return text.replace("<title>Viser</title>", "<title>ParaUAV: a flight</title>", 1)
 
 

@@ -21,7 +21,7 @@ from tests.bench.viewing.page import NOTE_LABELS, PLACES, differing, drawn, labe
 from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import PretendFleet
 from tests.viewer.test_browser import ARGS, FEW_FRAMES, IN_SCENE, PATIENCE_MS, SCHEME
-from viewer.browser.http_server import serve, without_stdout
+from viewer.browser.http_server import serve, stop_server
 from viewer.scene.labels import EM_PX, overlap
 from viewer.server.app import App
 from viewer.store.forecast import ScenePrediction
@@ -160,8 +160,7 @@ def page_of(chromium: str, make: Callable[[MemoryBus], Any]) -> Iterator[SimpleN
     stop.set()
     for thread in threads:
         thread.join()
-    with without_stdout():
-        server.stop()
+    stop_server(server)
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import http.client
 import logging
 import re
 import socket
+import threading
 from collections.abc import Iterator
 from types import SimpleNamespace
 
@@ -31,7 +32,7 @@ from viewer.browser.http_server import (
     _shorten_rejection,
     request_filter,
     serve,
-    without_stdout,
+    stop_server,
 )
 from viewer.server.app import App
 
@@ -100,8 +101,7 @@ def server() -> Iterator[SimpleNamespace]:
     port = unused_port()
     one = serve("127.0.0.1", port)
     yield SimpleNamespace(viser=one, port=port)
-    with without_stdout():
-        one.stop()
+    stop_server(one)
 
 
 def test_over_the_wire_a_stranger_is_refused(server: SimpleNamespace) -> None:
@@ -111,6 +111,14 @@ def test_over_the_wire_a_stranger_is_refused(server: SimpleNamespace) -> None:
         got = line.getresponse()
         assert got.status == status and "frame-ancestors 'none'" in got.headers["Content-Security-Policy"]
         line.close()
+
+
+def test_a_server_that_ends_late_prints_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+    one = serve("127.0.0.1", unused_port())
+    thread = one._websock_server._server_thread
+    one._websock_server._background_event_loop.call_soon_threadsafe(threading.Event().wait, 1.5)  # viser waits 1 s
+    stop_server(one)
+    assert not thread.is_alive() and capfd.readouterr().out == ""
 
 
 def test_only_this_machine_can_reach_it(server: SimpleNamespace) -> None:

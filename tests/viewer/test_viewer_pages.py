@@ -18,7 +18,7 @@ from fleet.contract import Model, Prediction, TwinState
 from tests.bench.viewing.watcher import Watcher
 from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import PretendFleet
-from viewer.browser.http_server import Browser, serve, without_stdout
+from viewer.browser.http_server import Browser, serve, stop_server
 from viewer.server.app import TICKS_PER_S, App
 from viewer.server.view import View
 from viewer.text.missed_events import encode_click, parse_click
@@ -44,8 +44,7 @@ def site() -> Iterator[SimpleNamespace]:
     yield SimpleNamespace(app=app, bus=bus, fleet=fleet, run=run, views=[app.views[n] for n in sorted(app.views)])
     for page in pages:
         page.close()
-    with without_stdout():
-        server.stop()
+    stop_server(server)
 
 
 def broken(view: View) -> str:

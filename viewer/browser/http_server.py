@@ -50,6 +50,7 @@ REFUSED = (  # messages that this page never sends
     _messages.ShareUrlRequest,
     _messages.ShareUrlDisconnect,
 )
+STOP_TIMEOUT_S = 30.0  # for the server thread to end [s]
 BLOCK_MESSAGES = 10_000  # most messages of one block, `atomic()`, and of blocks waiting behind each other
 VIOLATION = 1008  # close code for a policy violation (RFC 6455, 7.4.1)
 RequestHandler = Callable[[Any, Request], Response | None]
@@ -81,8 +82,7 @@ def serve(host: str, port: int, name: str = "") -> viser.ViserServer:
     for kind in REFUSED:
         server._websock_server.unregister_handler(kind)
     if port and server.get_port() != port:
-        with without_stdout():
-            server.stop()
+        stop_server(server)
         raise OSError(
             f"--port: found {port} in use by another program, expected a free port; stop it or choose another"
         )
@@ -110,6 +110,18 @@ def _read_icons() -> None:
                 _icons.svg_from_icon(icon)
         finally:
             _icons.zipfile = original  # type: ignore[assignment]
+
+
+def stop_server(server: viser.ViserServer) -> None:
+    """Stop the server and wait until its thread has ended.
+
+    viser waits 1 s; on a busy machine its thread ends later and prints "Server stopped" then.
+    """
+    thread = server._websock_server._server_thread
+    with without_stdout():
+        server.stop()
+        if thread is not None:
+            thread.join(STOP_TIMEOUT_S)
 
 
 def without_stdout() -> contextlib.redirect_stdout:

@@ -22,7 +22,7 @@ from gateway.links.link import Batch
 from gateway.links.tcp_listener import MOST, TcpListener
 from gateway.record.tape import RETRY_S, DiskBudget, TlogWriter
 from tests.support.talker import T0, Talker
-from viewer.browser.http_server import VIOLATION, serve, without_stdout
+from viewer.browser.http_server import VIOLATION, serve, stop_server
 
 from . import hostile
 from .site import PATIENCE_S, free_port
@@ -100,8 +100,7 @@ def _served() -> Iterator[int]:
     try:
         yield port
     finally:
-        with without_stdout():
-            server.stop()
+        stop_server(server)
 
 
 def _opened(port: int, origin: str = "") -> ClientConnection:

@@ -11,7 +11,7 @@ from playwright.sync_api import TimeoutError as TooLate
 
 from tests.viewer.test_browser import FEW_FRAMES, PATIENCE_MS, SCHEME
 from tests.viewer.test_browser_sizes import SIZES, live, until, view_of
-from viewer.browser.http_server import serve, without_stdout
+from viewer.browser.http_server import serve, stop_server
 
 pytestmark = pytest.mark.browser
 __all__ = ["live"]  # the page of a fleet, a fixture
@@ -287,8 +287,7 @@ def test_the_panel_of_the_client_is_never_shown(live: SimpleNamespace) -> None:
     page.wait_for_function("document.querySelector('#root button')", timeout=PATIENCE_MS)  # the client has drawn itself
     shown = page.inner_text("body")
     page.close()
-    with without_stdout():
-        server.stop()
+    stop_server(server)
     assert "waiting for the viewer" in shown and "Save Canvas" not in shown and "Scene tree" not in shown
     assert not live.page.locator("#opening").is_visible() and live.page.locator("#root").is_visible()
     icon = live.page.locator(".tabler-icon-adjustments").first
