@@ -7,10 +7,9 @@
 Simulated aircraft (JSBSim, no equation in common with the model) fly in winds of 0, 2, 4 and 6 m/s with turbulence 0
 to 3, each with a seed of its own; recordings may be added. The twin replays each flight; the newest accepted model and
 its held-out data are stored every 20 s; with `--later` an active model that is older, and all data since its
-identification. In these models each group of derivatives with a stated power is made wrong by
-0, half, one and one and a half times its detectable error, too large and too small; the trim of the identification
-window is unchanged. Shares of rejections, by size and group, and their range over flights, because flights are
-independent.
+identification. In these models each group of derivatives with a stated power is made wrong by 0, half, one and one and
+a half times its detectable error, too large and too small; the trim of the identification window is unchanged. Shares
+of rejections, by size and group, and their range over flights, because flights are independent.
 Seeds 1000 to 1023 were used for tuning.
 """
 

@@ -11,7 +11,14 @@ from fleet.contract import Outcome, Verdict
 from fleet.window import STATES, Window
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
 from twin_worker.identification.fixed_wing.plant import Plant, is_finite
-from twin_worker.validation.consistency import MAX_DETECTABLE, error_text, estimate_errors, has_power, power_text
+from twin_worker.validation.consistency import (
+    MAX_DETECTABLE,
+    Consistency,
+    error_text,
+    estimate_errors,
+    has_power,
+    power_text,
+)
 from twin_worker.validation.held_out import HeldOut
 
 LAGS = 20  # samples
@@ -175,24 +182,7 @@ def with_consistency(verdict: Verdict, plant: Plant, window: Window, start: int)
     """Test a plausible model for consistency with held-out data; verified if it passes and its power is stated."""
     if verdict.outcome is not Outcome.PLAUSIBLE or not isinstance(plant, DerivativesModel):
         return verdict
-    errors = estimate_errors(plant, window, start)
-    failed, power = (errors.failed(), errors.power()) if errors is not None else ({}, {})
-    verified = not failed and has_power(power)
-    if failed:
-        reason = f"plausible only: {error_text(failed)}"
-    elif not verified:
-        reason = (
-            f"plausible only: these data would not show an error of {100 * MAX_DETECTABLE:.0f} % in one of the axes"
-        )
-    else:
-        reason = f"consistent, {power_text(power)}"
-    return msgspec.structs.replace(
-        verdict,
-        outcome=Outcome.VERIFIED if verified else Outcome.PLAUSIBLE,
-        sentence=f"{verdict.sentence}; {reason}",
-        derivative_error=failed,
-        detectable_error=power,
-    )
+    return _concluded(verdict, estimate_errors(plant, window, start), verdict.sentence)
 
 
 def verify_since_identification(verdict: Verdict, plant: Plant, window: Window, name: str) -> Verdict:
@@ -212,14 +202,28 @@ def verify_since_identification(verdict: Verdict, plant: Plant, window: Window, 
         return verdict
     start = int(np.searchsorted(window.t, plant.t1, side="right"))
     errors = estimate_errors(plant, window, start) if start < len(window) else None
-    failed, power = (errors.failed(), errors.power()) if errors is not None else ({}, {})
-    if not failed and not has_power(power):
+    if errors is None or not (errors.failed() or has_power(errors.power())):
         return verdict
-    reason = f"plausible only: {error_text(failed)}" if failed else f"consistent, {power_text(power)}"
+    seconds = (len(window) - start) * window.dt
+    return _concluded(verdict, errors, f"{name}: {seconds:.0f} s of flight since the identification")
+
+
+def _concluded(verdict: Verdict, errors: Consistency | None, sentence: str) -> Verdict:
+    """Return the verdict of a consistency test, with its reason added to the sentence; `errors` of None: no test."""
+    failed, power = (errors.failed(), errors.power()) if errors is not None else ({}, {})
+    verified = not failed and has_power(power)
+    if failed:
+        reason = f"plausible only: {error_text(failed)}"
+    elif not verified:
+        reason = (
+            f"plausible only: these data would not show an error of {100 * MAX_DETECTABLE:.0f} % in one of the axes"
+        )
+    else:
+        reason = f"consistent, {power_text(power)}"
     return msgspec.structs.replace(
         verdict,
-        outcome=Outcome.PLAUSIBLE if failed else Outcome.VERIFIED,
-        sentence=f"{name}: {(len(window) - start) * window.dt:.0f} s of flight since the identification; {reason}",
+        outcome=Outcome.VERIFIED if verified else Outcome.PLAUSIBLE,
+        sentence=f"{sentence}; {reason}",
         derivative_error=failed,
         detectable_error=power,
     )
