@@ -70,7 +70,7 @@ def normal_at(whitened: WhitenedResiduals, hypothesis: FaultHypothesis) -> tuple
     C = project(J, whitened.Jn)
     profiled = C @ whitened.nuisance_covariance
     A = project(J, J) - profiled @ C.T
-    b = -project(J, e) + profiled @ project(whitened.Jn, e)
+    b = -project(J, e) + profiled @ whitened.project_nuisances(e)
     return A, b
 
 

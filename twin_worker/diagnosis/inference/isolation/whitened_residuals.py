@@ -101,6 +101,7 @@ class WhitenedResiduals:
             scatter = 1.4826 * np.median(np.abs(self.residuals(())[self.ok]), axis=0)
             self.clip = np.maximum(self.clip, _SCATTER_CLIP * scatter)
         self._inverse: tuple[np.ndarray, np.ndarray] | None = None  # a normal matrix and its inverse
+        self._by_channel: tuple[np.ndarray, np.ndarray] | None = None  # slopes, (n, c, k), and the same, (c, n, k)
         self._update()
 
     @property
@@ -109,6 +110,20 @@ class WhitenedResiduals:
         if self._inverse is None or self._inverse[0] is not self.Ann:
             self._inverse = self.Ann, np.linalg.inv(self.Ann)
         return self._inverse[1]
+
+    def project_nuisances(self, e: np.ndarray) -> np.ndarray:
+        """Return the products of the nuisance slopes and whitened residuals, (n, c), over rows and channels, (k,).
+
+        A hypothesis changes few channels, and those only after its onset: the products of the others are known.
+        """
+        if self._by_channel is None or self._by_channel[0] is not self.Jn:
+            self._by_channel = self.Jn, np.ascontiguousarray(np.swapaxes(self.Jn, 0, 1))
+        slopes, change = self._by_channel[1], np.ascontiguousarray((e - self.e).T)
+        out = -self.bn
+        for c in np.flatnonzero(change.any(axis=1)):
+            first = int((change[c] != 0.0).argmax())
+            out += change[c, first:] @ slopes[c, first:]
+        return np.asarray(out)
 
     def part(self, span: np.ndarray) -> "WhitenedResiduals":
         """Return a copy restricted to the rows of `span`, (n,) bool."""
@@ -156,7 +171,7 @@ class WhitenedResiduals:
         out.conditions = (*self.conditions, *conditions)
         out.raw = out.residuals(())
         out.e = np.clip(out.raw, -out.clip, out.clip)
-        out.bn = -project(out.Jn, out.e)
+        out.bn = -self.project_nuisances(out.e)
         out.xn = np.linalg.solve(out.Ann, out.bn)
         return out
 
@@ -233,13 +248,13 @@ class WhitenedResiduals:
     def cost(self, hypotheses: Sequence[FaultHypothesis]) -> float:
         """Return the sum of squares with these hypotheses, the nuisances profiled out."""
         e = self.clipped(hypotheses)
-        b = project(self.Jn, e)
+        b = self.project_nuisances(e)
         return float((e * e).sum() - b @ self.nuisance_covariance @ b)
 
     def channel_cost(self, hypotheses: Sequence[FaultHypothesis]) -> np.ndarray:
         """Return the sum of squares of each channel with these hypotheses, the nuisances profiled out, (c,)."""
         e = self.clipped(hypotheses)
-        profiled = e - self.Jn @ (self.nuisance_covariance @ project(self.Jn, e))
+        profiled = e - self.Jn @ (self.nuisance_covariance @ self.project_nuisances(e))
         return np.asarray((profiled * profiled).sum(axis=0))
 
     def slopes(self, hypothesis: FaultHypothesis, step: np.ndarray) -> np.ndarray:
