@@ -477,6 +477,14 @@ METHOD_TEXTS = {
 """Text of each `Prediction.method`."""
 
 
+class AlternativePath(msgspec.Struct, frozen=True, kw_only=True):
+    """Path that the aircraft may fly instead of the predicted one, at the same look-aheads."""
+
+    probability: Annotated[float, about("of this path; the rest is that of `Prediction.path`, 0..1")]
+    path: Annotated[Array, about("mean position, NED from origin, (n, 3) <f4 [m]")]
+    sentence: Annotated[str, about("what the aircraft does on it, and why the probability")] = ""
+
+
 class Prediction(Message, frozen=True, kw_only=True):
     """Predicted path of one aircraft, its prediction region and confidence horizon."""
 
@@ -505,6 +513,10 @@ class Prediction(Message, frozen=True, kw_only=True):
     ]
     quantile: Annotated[float, about("nominal coverage of the prediction region, 0..1")] = 0.9
     axis_quantile: Annotated[float, about("nominal coverage of each half-axis alone; 0: as of independent axes")] = 0.0
+    alternatives: Annotated[
+        tuple[AlternativePath, ...],
+        about("other paths, where a discrete event is in doubt; the region is the union of the boxes about all paths"),
+    ] = ()
     horizon_s: Annotated[
         float,
         about(

@@ -180,9 +180,9 @@ class Scene:
         if not vehicles:
             return self.predicted.draw(NOTHING.legs)
         dashes = DASHES if len(fleet_arrays.uavs) <= SMALL_FLEET else DASHES // 2
-        forecasts = [(v.forecast, v.data_time(now)) for v in vehicles if v.forecast is not None]
-        lines = [cut_at_horizon(f.ahead, f.path, clock - f.t, f.horizon_s, dashes) for f, clock in forecasts]
-        statuses = fleet_arrays.statuses[[i for v in vehicles if (i := fleet_arrays.index(v.uav)) is not None]]
+        forecasts = [(v, f) for v in vehicles if v.forecast is not None for f in (v.forecast, *v.forecast.alternatives)]
+        lines = [cut_at_horizon(f.ahead, f.path, v.data_time(now) - f.t, f.horizon_s, dashes) for v, f in forecasts]
+        statuses = fleet_arrays.statuses[[i for v, _ in forecasts if (i := fleet_arrays.index(v.uav)) is not None]]
         tints = 0.35 * self._palette.status_colours() + 0.65 * rgb(self._palette.ink)
         shades = faded(tints, rgb(self._palette.ground), np.linspace(0.9, 0.1, 2 * dashes))[:, ::2]
         self.predicted.draw(np.concatenate(lines), shades[statuses].reshape(-1, 2, 3))

@@ -3,12 +3,14 @@
 from functools import cached_property
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from fleet.contract import Prediction
 from viewer.store.place import REACH_M, UNIT_M, SceneFrame
 
 MAX_STEPS, MAX_AHEAD_S = 5_000, 3_600.0  # accepted look-ahead: steps, and time [s]
+MAX_ALTERNATIVES = 8  # accepted alternative paths
 _CHORD_S, _MAX_PARTS = 1.5, 4  # steps longer than this are subdivided, into at most so many parts
 PAST_AHEAD_S = 31.0  # look-ahead kept of a past prediction [s]
 
@@ -54,6 +56,15 @@ class ScenePrediction:
     def position_at(self, ahead: np.ndarray | float) -> np.ndarray:
         """Interpolate the mean path at look-aheads (k,) [s] -> (k, 3) [10 m]; constant beyond both ends."""
         return np.stack([np.interp(ahead, self.ahead, self.path[:, i]) for i in range(3)], axis=-1)
+
+    @cached_property
+    def alternatives(self) -> tuple["ScenePrediction", ...]:
+        """Return the paths that may be flown instead, each with the region of this prediction."""
+        message = self.message
+        return tuple(
+            ScenePrediction(msgspec.structs.replace(message, path=one.path, alternatives=()), self.scene_frame, 0.0)
+            for one in message.alternatives
+        )
 
     def half_axes_at(self, ahead: np.ndarray) -> np.ndarray:
         """Interpolate the half-axes at look-aheads (k,) [s] -> (k, 3) [10 m]."""
@@ -104,7 +115,13 @@ def check_prediction(message: Prediction, scene_frame: SceneFrame, received: flo
     is_rising = (ahead[1:] > ahead[:-1]).all() and abs(ahead[0]) <= MAX_AHEAD_S and abs(ahead[-1]) <= MAX_AHEAD_S
     if not is_rising or not np.isfinite(message.t):
         raise ValueError(f"uav-{message.uav}: prediction has times that do not increase within one hour; resend")
-    if not np.abs(path).max() <= REACH_M:  # also rejects NaN
+    others = [one.path.numpy() for one in message.alternatives]
+    if len(others) > MAX_ALTERNATIVES or any(other.shape != (n, 3) for other in others):
+        raise ValueError(
+            f"uav-{message.uav}: prediction has {len(others)} alternatives of shapes {[x.shape for x in others[:3]]}, "
+            f"expected at most {MAX_ALTERNATIVES} of (n, 3); resend"
+        )
+    if not all(np.abs(one).max() <= REACH_M for one in (path, *others)):  # also rejects NaN
         raise ValueError(f"uav-{message.uav}: prediction has a path that is not finite or beyond 100 km; resend")
     scene_frame.from_geodetic_point(*message.origin)
     return ScenePrediction(message, scene_frame, received)

@@ -1,5 +1,6 @@
 """Modes without a mission: predicted from the mode change on; and the failsafe that follows a link loss."""
 
+import copy
 from itertools import pairwise
 
 import msgspec
@@ -221,9 +222,22 @@ def test_a_lost_link_is_followed_by_the_return_that_the_parameters_describe(wing
     assert np.linalg.norm((late - home_of(winged))[:, :2], axis=1) == pytest.approx(radius_of(winged), abs=40.0)
 
 
+def test_the_mission_that_a_failsafe_ends_is_an_alternative(winged):
+    with_params(winged, **RADIO, FS_SHORT_ACTN=0.0, FS_LONG_ACTN=0.0)
+    ahead, mission = path_of(lost(copy.deepcopy(winged)))
+    with_params(winged, FS_LONG_ACTN=1.0)
+    made = lost(winged)
+    (other,) = made.alternatives
+    path, near = other.path.numpy(), ahead < 60
+    assert other.probability == 0.5 and "continues the mission" in other.sentence and path.shape == made.path.shape
+    assert np.linalg.norm(path[near] - mission[near], axis=1).max() < 10.0
+    assert np.linalg.norm(path - made.path.numpy(), axis=1)[ahead > 60].max() > 100.0
+
+
 def test_a_lost_link_without_failsafe_continues_the_mission(winged):
     with_params(winged, **RADIO, FS_SHORT_ACTN=0.0, FS_LONG_ACTN=0.0)
     made = lost(winged)
+    assert not made.alternatives
     assert "failsafe: AUTO continues by the parameters" in made.sentence and made.seq >= 1
 
 

@@ -1,10 +1,14 @@
 """The prediction region in the scene: a smooth surface that fades with its width, and time marks in order."""
 
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
+import msgspec
 import numpy as np
 import pytest
 
+from fleet.contract import AlternativePath, Array, Prediction
+from tests.support.pretend_feed import HOME, STAMP, Clock, PretendUav, T, feed_of
 from viewer.scene.selection.pins import (
     SIDES,
     TURN_STEPS,
@@ -19,9 +23,13 @@ from viewer.scene.selection.selected import (
     BANDS,
     FAR_OPACITY,
     NEAR_OPACITY,
+    Selection,
     band_opacities,
     slice_times,
 )
+from viewer.store.forecast import MAX_ALTERNATIVES, ScenePrediction, check_prediction
+from viewer.store.place import SceneFrame
+from viewer.theme.palette import DARK
 
 N = BANDS * BAND_STEPS + 1
 
@@ -107,3 +115,50 @@ def test_slices_follow_the_turns_of_a_path() -> None:
     assert sharpest(at) < 31.0 < sharpest(np.linspace(2.0, 180.0, N))
     hovering = SimpleNamespace(position_at=lambda at: np.zeros((len(at), 3)))
     assert np.allclose(slice_times(hovering, 0.0, 60.0), np.linspace(0.0, 60.0, N))
+
+
+# --- alternative paths -----------------------------------------------------------------------------------------------
+
+
+def doubtful(n: int = 1, rows: int | None = None) -> Prediction:
+    """A prediction with other paths, each 200 m further north."""
+    message = PretendUav(0).prediction(T, 0.0)
+    paths = [message.path.numpy()[:rows] + np.array([200.0 * (k + 1), 0.0, 0.0]) for k in range(n)]
+    others = tuple(
+        AlternativePath(probability=0.25, path=Array.of(path), sentence="continues the mission: why") for path in paths
+    )
+    return msgspec.structs.replace(message, alternatives=others)
+
+
+@pytest.mark.parametrize("message", [doubtful(rows=3), doubtful(MAX_ALTERNATIVES + 1)])
+def test_alternatives_of_another_shape_or_too_many_are_refused(message: Prediction) -> None:
+    assert check_prediction(doubtful(2), SceneFrame(HOME), 0.0) is not None
+    with pytest.raises(ValueError, match="alternatives of shapes"):
+        check_prediction(message, SceneFrame(HOME), 0.0)
+
+
+def test_an_alternative_has_the_region_of_the_prediction_on_a_path_of_its_own() -> None:
+    forecast = ScenePrediction(doubtful(), SceneFrame(HOME), 0.0)
+    (other,) = forecast.alternatives
+    at = np.linspace(0.0, 20.0, 5)
+    assert other.position_at(at) - forecast.position_at(at) == pytest.approx(np.tile([0.0, 20.0, 0.0], (5, 1)), abs=0.1)
+    assert np.array_equal(other.half_axes_at(at), forecast.half_axes_at(at))
+
+
+def test_an_alternative_is_drawn_dashed_with_its_region_and_probability() -> None:
+    feed, _, bus = feed_of(Clock())
+    scene = MagicMock()
+    scene.add_mesh_simple.return_value.opacity = 0.0
+    selection = Selection(scene, DARK)
+    drawn = []
+    for message in (doubtful(0), doubtful(2)):
+        bus.publish(msgspec.structs.replace(message, t=message.t + 0.1 * (len(drawn) + 1)), STAMP)
+        vehicle = feed.get(0)
+        assert vehicle is not None
+        selection._thin.draw_parts = lambda parts: drawn.append(sum(len(x.reshape(-1, 2, 3)) for x, _ in parts))  # type: ignore[method-assign]
+        selection.draw(vehicle, feed, 0.5, ground=0.0, unit=1.0)
+    assert drawn[1] > drawn[0] + 2 * 50
+    assert [tag.text for tag in selection.tags if tag.key.startswith("alternative")] == [
+        "25%: continues the mission",
+        "25%: continues the mission",
+    ]

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from math import isfinite
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from fleet.contract import BatteryForecast, Mission
 from fleet.mission import route_items
 from twin_worker.prediction import kinematic
 from twin_worker.prediction.autopilot_parameters import ControllerTwin, RouteOverride, multirotor_controller
+from twin_worker.prediction.failsafe_route import FailsafePlan
 from twin_worker.prediction.method_selection import STEP, imm_with_variance
 from twin_worker.prediction.multirotor import fit, rollout
 from twin_worker.prediction.multirotor.config import MultirotorConfig, multirotor_config, with_wing_limits
@@ -36,6 +38,20 @@ _VELOCITY_ROWS = 11  # rows used for a multirotor's velocity and acceleration
 _MANUAL_AFTER_S = 6.0  # a multirotor in a hold mode that still moves after this time is under manual control [s]
 
 
+class PathAlternative(NamedTuple):
+    """A path that may be flown instead of the predicted one.
+
+    Attributes:
+        probability: of this path [-]
+        path: NED, (k, 3) [m]
+        sentence: what the aircraft does on it
+    """
+
+    probability: float
+    path: np.ndarray
+    sentence: str
+
+
 @dataclass(frozen=True)
 class PathForecast:
     """A predicted path on the route, or the reason why there is none.
@@ -47,6 +63,7 @@ class PathForecast:
         sentence: basis of the prediction, or the reason why there is none
         control: controller model used
         known_s: look-ahead at which a failsafe begins whose route is not known [s]
+        alternatives: paths that may be flown instead
     """
 
     path: np.ndarray | None
@@ -56,6 +73,7 @@ class PathForecast:
     sentence: str
     control: ControllerTwin | None = None
     known_s: float = np.inf
+    alternatives: tuple[PathAlternative, ...] = ()
 
 
 def no_prediction(sentence: str, seq: int = -1) -> PathForecast:
@@ -225,14 +243,35 @@ def predict_without_model(twin: Twin, recent: Track, ahead: np.ndarray) -> PathF
         )
         unbroken = unbroken.part(int(hover_rows[-1]) + 1 if len(hover_rows) else 0, len(unbroken))
     seq = rollout.items_in_force(unbroken.t, twin.telemetry.history.rows_since("leg"), twin.onboard.mission)
-    forecast = kinematic.fly(unbroken, seq, fixed_wing_config(twin), twin.models.kinematic, ahead)
+    config = fixed_wing_config(twin)
+    forecast = kinematic.fly(unbroken, seq, config, twin.models.kinematic, ahead)
     if forecast.path is None:
         return no_prediction(forecast.sentence, forecast.seq)
     text = f"{kinematic.describe(twin.models.kinematic)}. {forecast.sentence}".strip(". ")
     reported = reported_path(twin)
     path = forecast.path if reported is None or reported.repeats else _turn_after(forecast.path, ahead, reported)
     control, known_s = forecast.controller, forecast.known_s
-    return PathForecast(path, "greybox", greybox.LAW, forecast.seq, text, control, known_s)
+    made = PathForecast(path, "greybox", greybox.LAW, forecast.seq, text, control, known_s)
+    if known_s < np.inf or not mission_may_continue(twin, config.failsafe):
+        return made
+    other = kinematic.fly(unbroken, seq, replace(config, failsafe=None), twin.models.kinematic, ahead)
+    return replace(made, alternatives=continued_mission(other.path))
+
+
+_ONLY_DOWNLINK = 0.5  # nothing received tells which radio links are lost: both cases count alike [-]
+
+
+def mission_may_continue(twin: Twin, plan: FailsafePlan | None) -> bool:
+    """Return whether a mission is flown that a failsafe ends, unless the aircraft still receives its ground station."""
+    return plan is not None and bool(plan.steps) and twin.mode in ROUTE_MODES
+
+
+def continued_mission(path: np.ndarray | None) -> tuple[PathAlternative, ...]:
+    """Return the path of the mission, (k, 3) [m], as alternative to a failsafe; none where it is not predicted."""
+    if path is None or not np.isfinite(path).all():
+        return ()
+    text = "continues the mission: only telemetry is lost; which links are lost is not known, both cases count alike"
+    return (PathAlternative(_ONLY_DOWNLINK, path, text),)
 
 
 def _turn_after(path: np.ndarray, ahead: np.ndarray, reported: ReportedPath) -> np.ndarray:

@@ -6,7 +6,17 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from fleet.contract import EVENT_TEXTS, Array, Controller, Event, Message, Outcome, Prediction, TwinState
+from fleet.contract import (
+    EVENT_TEXTS,
+    AlternativePath,
+    Array,
+    Controller,
+    Event,
+    Message,
+    Outcome,
+    Prediction,
+    TwinState,
+)
 from twin_worker.confidence.table_files import INCOMPLETE, UNCONFIRMED, airframe_class, group_name
 from twin_worker.confidence.tube_and_horizon import AHEAD, NOMINAL_COVERAGE, Confidence, PointForecast
 from twin_worker.identification.fixed_wing.plant import DYNAMICS
@@ -82,6 +92,10 @@ def predict(twin: Twin, now: float) -> list[Message]:
         ),
         coast_s=coast_s,
         law=path_forecast.law,
+        alternatives=tuple(
+            AlternativePath(probability=one.probability, path=Array.of(one.path[:n]), sentence=one.sentence)
+            for one in path_forecast.alternatives
+        ),
         controller=_changed_controller(twin, path_forecast, now),
         battery=twin.environment.battery_forecast,
         **_event_fields(twin),

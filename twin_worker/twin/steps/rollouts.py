@@ -18,7 +18,13 @@ from twin_worker.prediction.replay_window import PredictionContext, Rollout
 from twin_worker.telemetry.track import Track
 from twin_worker.twin.state.budget import EARLY_FRACTION, Work
 from twin_worker.twin.state.state import Twin
-from twin_worker.twin.steps.kinematic_prediction import PathForecast, no_prediction, predict_without_model
+from twin_worker.twin.steps.kinematic_prediction import (
+    PathForecast,
+    continued_mission,
+    mission_may_continue,
+    no_prediction,
+    predict_without_model,
+)
 from twin_worker.twin.steps.route_lines import SIMPLE_METHODS, simple_paths
 
 HYBRID, BOTH, GREYBOX = "hybrid", "both", "greybox"
@@ -39,6 +45,7 @@ def predict_route(twin: Twin, window: Window, recent: Track, ahead: np.ndarray) 
     if isinstance(initial, Rollout):
         return no_prediction(initial.sentence, initial.seq)
     _store_controller_state(twin, situation.onboard.law, initial)
+    before = initial
     initial, failsafe_text, known_s = _with_failsafe(twin, situation, initial)
     t = float(window.t[-1])
     due = twin.prediction.selector.is_due(t)
@@ -57,7 +64,11 @@ def predict_route(twin: Twin, window: Window, recent: Track, ahead: np.ndarray) 
         )
         if kinematic.path is not None and not twin.telemetry.link_lost:
             forecasts[GREYBOX] = kinematic
-    return select_method(twin, t, forecasts, recent, ahead)
+    chosen = select_method(twin, t, forecasts, recent, ahead)
+    if chosen.method == GREYBOX or known_s < np.inf or not mission_may_continue(twin, situation.onboard.failsafe):
+        return chosen
+    paths, _ = method_paths(twin, (situation, before), ahead, due)
+    return replace(chosen, alternatives=continued_mission(paths.get(chosen.method, next(iter(paths.values()), None))))
 
 
 def _store_controller_state(twin: Twin, law: str, initial: InitialCondition) -> None:

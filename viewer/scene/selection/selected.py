@@ -37,6 +37,8 @@ from viewer.text.words import (
 from viewer.theme.palette import Palette, mix, rgb
 from viewer.theme.shapes import digit_strokes, face_camera
 
+MAX_CLAIM = 40  # length of the text of an alternative path [characters]
+ALTERNATIVE_STEPS, ALTERNATIVE_RINGS = 24, 5  # of an alternative path: steps between rings, and rings
 MAX_NUMBERS = 60  # items up to which numbers are drawn
 NUMBER_SIZE, NUMBER_SHIFT = 0.36, 0.34  # height of a number and its offset from the item [drawn spans of an aircraft]
 Parts = list[tuple[np.ndarray, np.ndarray]]  # segments (n, 2, 3) [10 m] and their colour (3,)
@@ -193,6 +195,10 @@ class Selection:
             paths = sample_paths(path, axes, SAMPLES, vehicle.uav)
             thin.append((chain(paths), mix(p.tube, p.ground, 0.6)))
         self._draw_marks(forecast, record, start, thin)
+        for k, (other, claim) in enumerate(zip(forecast.alternatives, forecast.message.alternatives, strict=True)):
+            self._draw_alternative(other, (start, horizon_s), thin)
+            text = f"{claim.probability:.0%}: {claim.sentence.partition(':')[0][:MAX_CLAIM]}"
+            self.tags.append(Tag(f"alternative{k}", text, other.position_at(horizon_s), "bottom-left"))
         thin.append((_beyond_horizon(forecast, horizon_s), rgb(p.muted)))
 
     def _draw_marks(self, forecast: ScenePrediction, record: StatusRecord, start: float, thin: Parts) -> None:
@@ -210,6 +216,13 @@ class Selection:
         path = forecast.position_at(np.arange(start, horizon_s, MARK_STEP_S))
         passes = [pass_number(path, int((step - start) / MARK_STEP_S), self._unit) for step in steps]
         self.tags += mark_tags(steps, lows, passes, self._unit)
+
+    def _draw_alternative(self, other: ScenePrediction, span: tuple[float, float], thin: Parts) -> None:
+        """Draw a path that may be flown instead between two look-aheads [s]: dashed, with rings of the region."""
+        p, at = self._palette, np.linspace(*span, ALTERNATIVE_STEPS * ALTERNATIVE_RINGS)
+        thin.append((dashed(other.position_at(at)), rgb(p.ink)))
+        at = at[ALTERNATIVE_STEPS - 1 :: ALTERNATIVE_STEPS]
+        thin.append((closed_loops(rings(other.position_at(at), other.half_axes_at(at))), mix(p.tube, p.ink, 0.7)))
 
     def _hide_tube(self) -> None:
         for node in (*self._bands, self._curtain):
