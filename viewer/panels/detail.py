@@ -94,7 +94,7 @@ def limitations(vehicle: Vehicle, now: float, workers: Sequence[str] = ()) -> li
         note = "the twin predicts the position shown" if vehicle.forecast is not None else "no twin yet"
         texts.append(f"No sample for {age_text(record.sample_age_s)}: {note}; check the radio link.")
         others = vehicle.forecast.message.alternatives if vehicle.forecast is not None else ()
-        texts += [f"With a probability of {one.probability:.0%} it {one.sentence[:200]}." for one in others]
+        texts += [f"With a probability of {100 * one.probability:.0f} % it {one.sentence[:200]}." for one in others]
     elif not isfinite(vehicle.result_accepted) and vehicle.model is None and workers:
         texts.append(f"Its twin is not ready: {'; '.join(workers)}.")
     elif not isfinite(vehicle.result_accepted) and vehicle.model is None:

@@ -159,6 +159,6 @@ def test_an_alternative_is_drawn_dashed_with_its_region_and_probability() -> Non
         selection.draw(vehicle, feed, 0.5, ground=0.0, unit=1.0)
     assert drawn[1] > drawn[0] + 2 * 50
     assert [tag.text for tag in selection.tags if tag.key.startswith("alternative")] == [
-        "25%: continues the mission",
-        "25%: continues the mission",
+        "25 %: continues the mission",
+        "25 %: continues the mission",
     ]

@@ -197,7 +197,7 @@ class Selection:
         self._draw_marks(forecast, record, start, thin)
         for k, (other, claim) in enumerate(zip(forecast.alternatives, forecast.message.alternatives, strict=True)):
             self._draw_alternative(other, (start, horizon_s), thin)
-            text = f"{claim.probability:.0%}: {claim.sentence.partition(':')[0][:MAX_CLAIM]}"
+            text = f"{100 * claim.probability:.0f} %: {claim.sentence.partition(':')[0][:MAX_CLAIM]}"
             self.tags.append(Tag(f"alternative{k}", text, other.position_at(horizon_s), "bottom-left"))
         thin.append((_beyond_horizon(forecast, horizon_s), rgb(p.muted)))
 
