@@ -135,17 +135,13 @@ def _airspeed_setpoint(context: PredictionContext, t: float, cruise: float) -> f
     """Return the airspeed set-point: reported, else the flown one of the mission speeds; nan if unknown [m/s].
 
     A mode change resets the set-point of ArduPlane to cruise. With others the speed flown before it tells nothing: PX4
-    flies a mode without mission at cruise, and commands the speed of the mission again when it returns to it. Nor does
-    the speed before the mission commanded another one.
+    flies a mode without mission at cruise, and commands the speed of the mission again when it returns to it.
     """
     entry = context.onboard.entry
     entered_t = -np.inf if entry is None else entry.t
-    commanded_t = _speed_command_t(context, t)
-    setpoint = reported_setpoint(context.history, t, max(entered_t, commanded_t) + _REPORT_DELAY_S)
+    setpoint = reported_setpoint(context.history, t, entered_t + _REPORT_DELAY_S)
     if np.isfinite(setpoint):
         return setpoint
-    if t < commanded_t + STEADY_S:
-        return float("nan")
     if context.onboard.law == "arduplane" and t < entered_t + _RESET_S:
         return cruise
     if context.onboard.law != "arduplane" and t < entered_t + STEADY_S:
@@ -158,17 +154,6 @@ def _airspeed_setpoint(context: PredictionContext, t: float, cruise: float) -> f
         if mission_speeds
         else setpoint
     )
-
-
-def _speed_command_t(context: PredictionContext, t: float) -> float:
-    """Return when the mission last went past a speed command, at most `STEADY_S` before `t`; -inf if not since."""
-    leg_t, leg = context.history.rows_since("leg", t - STEADY_S)
-    items = leg[leg_t <= t, 0]
-    commands = [item.seq for item in context.onboard.items if item.command == SPEED and 0 < item.param2 < np.inf]
-    for k in np.flatnonzero(np.diff(items))[::-1]:
-        if any(items[k] < seq < items[k + 1] for seq in commands):
-            return float(leg_t[k + 1])
-    return -np.inf
 
 
 def _altitude(context: PredictionContext, window: Window) -> float:

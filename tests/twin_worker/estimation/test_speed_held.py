@@ -1,15 +1,11 @@
 """Which of its mission's speeds an aircraft holds that does not say what it aims at."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
-from fleet.contract import Array, Item, Rows, Sample
-from fleet.mission import SPEED
+from fleet.contract import Array, Rows, Sample
 from tests.support.flights import T0
 from twin_worker.estimation.airspeed_setpoint import inferred_setpoint, reported_demand, reported_setpoint
-from twin_worker.prediction.closed_loop import _airspeed_setpoint
 from twin_worker.telemetry.history import TelemetryHistory
 
 SPEEDS = np.array([20.0, 22.5, 25.0])
@@ -65,21 +61,3 @@ def test_reports_from_before_a_mode_change_do_not_count():
     history, t = reporting(np.full(45, 18.0))
     assert np.isnan(reported_setpoint(history, t, since=t + 0.1))
     assert np.isnan(reported_demand(heard(np.full(100, 20.0)), T0 + 9.9))
-
-
-@pytest.mark.parametrize(
-    ("before", "after", "expected"),
-    [(9, 11, np.nan), (9, 9, 18.0), (13, 1, 18.0), (10, 11, 18.0)],  # past the command; none; a jump back; behind it
-)
-@pytest.mark.parametrize("law", ["arduplane", "px4"])
-def test_the_speed_before_the_mission_commands_another_is_no_set_point(
-    before: int, after: int, expected: float, law: str
-) -> None:
-    """Item 10 commands 23 m/s; the demand that is reported follows later, at limited acceleration."""
-    history, t = reporting(np.full(45, 18.0)) if law == "arduplane" else (heard(np.full(300, 18.0)), T0 + 29.0)
-    leg_t, items = np.linspace(t - 8.2, t - 0.2, 9), np.array([before] * 8 + [after])
-    history.add(Sample(uav=1, t=t, leg=Rows(Array.of(leg_t, "<f8"), Array.of(items[:, None].astype(float)))))
-    commands = tuple(Item(seq=k, command=SPEED, param2=v) for k, v in ((5, 18.0), (10, 23.0)))
-    context = SimpleNamespace(history=history, onboard=SimpleNamespace(items=commands, entry=None, law=law))
-    found = _airspeed_setpoint(context, t, 20.0)
-    assert found == pytest.approx(expected, nan_ok=True)
