@@ -234,7 +234,7 @@ def main(argv: list[str] | None = None) -> int:
         metavar="WORK=S,…",
         help="shortest periods of rollouts, identifications, ensembles, renewals "
         "(predict=1,identify=1,ensemble=10,renew=1), changes below which rollouts and identifications wait up "
-        "to 10 s (departure=0.05,information=0.1; 0: never), size and look-ahead of an ensemble (members=24,span=180)",
+        "to 10 s (departure=0.1,information=0.2; 0: never), size and look-ahead of an ensemble (members=24,span=180)",
     )
     parser.add_argument(
         "--terrain",
