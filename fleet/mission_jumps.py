@@ -34,6 +34,13 @@ def repetitions(item: Item) -> float:
     return item.param2 if isfinite(item.param2) else 0.0
 
 
+def next_repeated_jump(items: Mapping[int, Item], seq: int) -> Item | None:
+    """Return the next jump after an item if it ends after some repetitions; None if there is none."""
+    jumps = (items[number] for number in sorted(items) if number > seq and items[number].command in JUMPS)
+    jump = next(jumps, None)
+    return jump if jump is not None and repetitions(jump) > 0 else None
+
+
 def resets_counters(params: Mapping[str, float], first: int) -> bool:
     """Return whether the autopilot sets the counter of a completed jump to zero: ArduPilot, by default."""
     options = params.get("MIS_OPTIONS", 0.0)

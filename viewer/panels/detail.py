@@ -93,8 +93,6 @@ def limitations(vehicle: Vehicle, now: float, workers: Sequence[str] = ()) -> li
     elif state is TwinState.LINK_LOST:
         note = "the twin predicts the position shown" if vehicle.forecast is not None else "no twin yet"
         texts.append(f"No sample for {age_text(record.sample_age_s)}: {note}; check the radio link.")
-        others = vehicle.forecast.message.alternatives if vehicle.forecast is not None else ()
-        texts += [f"With a probability of {100 * one.probability:.0f} % it {one.sentence[:200]}." for one in others]
     elif not isfinite(vehicle.result_accepted) and vehicle.model is None and workers:
         texts.append(f"Its twin is not ready: {'; '.join(workers)}.")
     elif not isfinite(vehicle.result_accepted) and vehicle.model is None:
@@ -111,6 +109,8 @@ def limitations(vehicle: Vehicle, now: float, workers: Sequence[str] = ()) -> li
         rows = vehicle.track_rows()
         observed_s = record.t - float(rows[0, 0]) if len(rows) else 0.0
         texts.append(f"No horizon yet after {age_text(observed_s)} of telemetry; it needs a plausible model.")
+    others = vehicle.forecast.message.alternatives if vehicle.forecast is not None else ()
+    texts += [f"With a probability of {100 * one.probability:.0f} % it {one.sentence[:200]}." for one in others]
     if record.prediction_lag_s:
         replay_advice = "play the recording more slowly, or " if vehicle.recorded else ""
         advice = f": its worker is overloaded; {replay_advice}assign fewer UAVs to each worker"

@@ -1,6 +1,7 @@
 """Received state of one aircraft: telemetry, what the autopilot reports, and what is estimated of the environment."""
 
 from collections import deque
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -10,7 +11,7 @@ from fleet.airframes.servo_learning import MIN_ROWS, learn_servo_map
 from fleet.autopilots.modes import ModeEntry
 from fleet.contract import BatteryForecast, Item, Mission, Params, Sample, Status, WindField
 from fleet.frames import Origin
-from fleet.mission_jumps import JUMPS, count_jumps, resets_counters
+from fleet.mission_jumps import JUMPS, count_jumps, next_repeated_jump, repetitions, resets_counters
 from twin_worker.estimation.battery import BatteryModel
 from twin_worker.estimation.wind_filter import WindFilter, update_from_history
 from twin_worker.prediction.autopilot_identification import AutopilotEstimate
@@ -158,6 +159,31 @@ def _first_position(history: TelemetryHistory) -> Origin | None:
     return None
 
 
+def _perhaps_taken(mission: Mission, first: int) -> frozenset[int]:
+    """Return the jumps that may have been taken before, unless the mission is at its first item."""
+    begun = mission.seq > min((item.seq for item in mission.items if item.seq >= first), default=mission.seq)
+    return frozenset(item.seq for item in mission.items if item.command in JUMPS) if begun else frozenset()
+
+
+def _is_completed(jump: int, before: dict[int, int], taken: dict[int, int]) -> bool:
+    """Return whether a jump was passed without being taken, by the jumps taken before and after."""
+    return jump in taken and taken[jump] not in (before.get(jump, -1), before.get(jump, 0) + 1)
+
+
+class SkippedJump(NamedTuple):
+    """The case that a jump ahead is not taken again.
+
+    Attributes:
+        seq: number of the jump
+        probability: of this case [-]
+        jumps: jumps taken in this case, as of `OnboardState`
+    """
+
+    seq: int
+    probability: float
+    jumps: tuple[JumpCounts, ...]
+
+
 class OnboardState(msgspec.Struct):
     """What the autopilot reports of itself.
 
@@ -170,6 +196,7 @@ class OnboardState(msgspec.Struct):
         controller_memory: of the controller just before that change
         received_items: items of the newest mission as received, before home was completed
         jumps: jumps taken at each jump after each change of the current item, oldest first
+        uncounted: jumps that were perhaps taken before the first report
         entry: where the present mode was entered; None: before telemetry began
         target: newest guidance target in a mode that flies to it, latitude, longitude, height [1e-7 deg, mm]; None:
             none reported in this mode
@@ -183,6 +210,7 @@ class OnboardState(msgspec.Struct):
     controller_memory: ControllerMemory = ("", ())
     received_items: tuple[Item, ...] = ()
     jumps: deque[JumpCounts] = msgspec.field(default_factory=lambda: deque(maxlen=_ITEM_CHANGES))
+    uncounted: frozenset[int] = frozenset()
     entry: ModeEntry | None = None
     target: tuple[float, float, float] | None = None
 
@@ -204,22 +232,41 @@ class OnboardState(msgspec.Struct):
         """Store a mission as received, and count its jumps; `first`: number of its first item to fly."""
         same = self.received_items[first:] == mission.items[first:]
         previous = self.mission.seq if self.mission is not None and same else -1
-        self.mission, self.received_items = mission, mission.items
         if not same:
+            self.uncounted = frozenset() if self.received_items else _perhaps_taken(mission, first)
             self.jumps.clear()
+        self.mission, self.received_items = mission, mission.items
         if previous == mission.seq or not any(item.command in JUMPS for item in mission.items):
             return
         taken = self.jumps[-1][2] if self.jumps else {}
         items = {item.seq: item for item in mission.items}
         resets = resets_counters(self.params.values if self.params else {}, first)
         if previous >= first:
-            taken = count_jumps(items, taken, (previous, mission.seq), first=first, resets=resets)
+            before, taken = taken, count_jumps(items, taken, (previous, mission.seq), first=first, resets=resets)
+            open_jumps = self.uncounted if taken else self.uncounted & _perhaps_taken(mission, first)  # restarted
+            self.uncounted = frozenset(jump for jump in open_jumps if not _is_completed(jump, before, taken))
         self.jumps.append((mission.t, mission.seq, taken))
 
     @property
     def jumps_taken(self) -> dict[int, int]:
         """Return the jumps taken so far at each jump of the mission."""
         return self.jumps[-1][2] if self.jumps else {}
+
+    def skipped_jump(self) -> SkippedJump | None:
+        """Return the case that the next jump is not taken again; None if its repetitions are known.
+
+        Each number of repetitions before the first report is equally likely.
+        """
+        assert self.mission is not None
+        jump = next_repeated_jump({item.seq: item for item in self.mission.items}, self.mission.seq)
+        if jump is None or jump.seq not in self.uncounted:
+            return None
+        left = int(repetitions(jump)) - self.jumps_taken.get(jump.seq, 0)
+        if left <= 0:
+            return None
+        jumps = ((t, seq, taken | {jump.seq: taken.get(jump.seq, 0) + left}) for t, seq, taken in self.jumps)
+        before = (-np.inf, -1, {jump.seq: left})  # before the first report
+        return SkippedJump(jump.seq, 1.0 / (left + 1), (before, *jumps))
 
     def complete_mission(self, items: tuple[Item, ...]) -> None:
         """Replace the items of the mission by those with home completed."""

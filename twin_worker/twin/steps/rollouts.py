@@ -17,8 +17,10 @@ from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_point_mass,
 from twin_worker.prediction.replay_window import PredictionContext, Rollout
 from twin_worker.telemetry.track import Track
 from twin_worker.twin.state.budget import EARLY_FRACTION, Work
+from twin_worker.twin.state.routes import ROUTE_MODES
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.kinematic_prediction import (
+    PathAlternative,
     PathForecast,
     continued_mission,
     mission_may_continue,
@@ -28,6 +30,7 @@ from twin_worker.twin.steps.kinematic_prediction import (
 from twin_worker.twin.steps.route_lines import SIMPLE_METHODS, simple_paths
 
 HYBRID, BOTH, GREYBOX = "hybrid", "both", "greybox"
+_SAME_PATH_M = 1.0  # paths nowhere further apart are the same [m]
 _DYNAMICS_SPAN_S = 60.0  # look-ahead of the identified dynamics; beyond it the point-mass path continues [s]
 
 
@@ -65,10 +68,32 @@ def predict_route(twin: Twin, window: Window, recent: Track, ahead: np.ndarray) 
         if kinematic.path is not None and not twin.telemetry.link_lost:
             forecasts[GREYBOX] = kinematic
     chosen = select_method(twin, t, forecasts, recent, ahead)
-    if chosen.method == GREYBOX or known_s < np.inf or not mission_may_continue(twin, situation.onboard.failsafe):
+    if chosen.method == GREYBOX:
         return chosen
+    if known_s < np.inf or not mission_may_continue(twin, situation.onboard.failsafe):
+        return replace(chosen, alternatives=_without_jump(twin, situation, chosen, ahead))
     paths, _ = method_paths(twin, (situation, before), ahead, due)
     return replace(chosen, alternatives=continued_mission(paths.get(chosen.method, next(iter(paths.values()), None))))
+
+
+def _without_jump(
+    twin: Twin, situation: PredictionContext, chosen: PathForecast, ahead: np.ndarray
+) -> tuple[PathAlternative, ...]:
+    """Return the path on which the next jump is not taken again, if its count is unknown."""
+    skipped = twin.onboard.skipped_jump() if twin.mode in ROUTE_MODES and situation.onboard.override is None else None
+    if skipped is None:
+        return ()
+    other = replace(situation, onboard=replace(situation.onboard, jumps=skipped.jumps))
+    initial = synchronise_controller(other)
+    if isinstance(initial, Rollout):
+        return ()
+    path = method_paths(twin, (other, initial), ahead, False)[0].get(chosen.method)
+    if path is None or chosen.path is None or not np.isfinite(path).all():
+        return ()
+    if np.abs(path - chosen.path).max() < _SAME_PATH_M:
+        return ()
+    text = f"passes the jump of item {skipped.seq}: earlier jumps are unknown, each count is equally likely"
+    return (PathAlternative(skipped.probability, path, text),)
 
 
 def _store_controller_state(twin: Twin, law: str, initial: InitialCondition) -> None:

@@ -112,3 +112,28 @@ def test_jumps_are_counted_with_the_reported_items():
     assert [counts for *_, counts in twin.onboard.jumps] == [{}] * 3 + [{4: 1}] * 3 + [{4: 2}] * 2
     ingest(twin, mission(*items[:4], seq=1, t=f.T0 + 100.0))
     assert twin.onboard.jumps_taken == {}
+
+
+def test_jumps_before_the_first_report_are_unknown_until_the_jump_is_passed_or_the_mission_restarts():
+    loop = [Item(seq=k, command=16, frame=3, lat_e7=470_000_000 + k * 90_000, lon_e7=80_000_000) for k in range(4)]
+    items = (
+        *loop,
+        Item(seq=4, command=177, param1=2, param2=3),
+        *(msgspec.structs.replace(loop[3], seq=k) for k in (5, 6)),
+    )
+
+    def reported(*sequence):
+        twin = twin_of("ardupilot", standing(0.0, 400_000.0))
+        for k, seq in enumerate(sequence):
+            ingest(twin, mission(*items, seq=seq, t=f.T0 + 10.0 * k))
+        return twin.onboard.skipped_jump()
+
+    assert reported(1, 2, 3) is None and reported(1, 2, 3, 2) is None  # counted from the start
+    joined = reported(2, 3)
+    assert (joined.seq, joined.probability) == (4, 1 / 4) and [taken for *_, taken in joined.jumps] == [{4: 3}] * 3
+    again = reported(3, 2, 3)  # three times at most, once since then
+    assert again.probability == 1 / 3 and [taken for *_, taken in again.jumps] == [{4: 2}, {4: 2}, {4: 3}, {4: 3}]
+    assert reported(3, 2, 3, 2, 3, 2) is None  # all three seen
+    assert reported(2, 3, 5) is None and reported(2, 3, 5, 1, 2) is None
+    assert reported(2, 3, 1, 2, 3) is None  # restarted
+    assert reported(2, 3, 5, 3) is None  # passed before
