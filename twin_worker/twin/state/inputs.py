@@ -243,8 +243,9 @@ class OnboardState(msgspec.Struct):
         resets = resets_counters(self.params.values if self.params else {}, first)
         if previous >= first:
             before, taken = taken, count_jumps(items, taken, (previous, mission.seq), first=first, resets=resets)
-            open_jumps = self.uncounted if taken else self.uncounted & _perhaps_taken(mission, first)  # restarted
-            self.uncounted = frozenset(jump for jump in open_jumps if not _is_completed(jump, before, taken))
+            if not taken and not _perhaps_taken(mission, first):  # the mission has restarted
+                self.uncounted = frozenset()
+            self.uncounted = frozenset(jump for jump in self.uncounted if not _is_completed(jump, before, taken))
         self.jumps.append((mission.t, mission.seq, taken))
 
     @property
@@ -257,7 +258,8 @@ class OnboardState(msgspec.Struct):
 
         Each number of repetitions before the first report is equally likely.
         """
-        assert self.mission is not None
+        if self.mission is None:
+            return None
         jump = next_repeated_jump({item.seq: item for item in self.mission.items}, self.mission.seq)
         if jump is None or jump.seq not in self.uncounted:
             return None

@@ -30,6 +30,7 @@ from twin_worker.twin.steps.kinematic_prediction import (
 from twin_worker.twin.steps.route_lines import SIMPLE_METHODS, simple_paths
 
 HYBRID, BOTH, GREYBOX = "hybrid", "both", "greybox"
+_MIN_PROBABILITY = 0.05  # of an alternative: half of what a prediction region misses [-]
 _SAME_PATH_M = 1.0  # paths nowhere further apart are the same [m]
 _DYNAMICS_SPAN_S = 60.0  # look-ahead of the identified dynamics; beyond it the point-mass path continues [s]
 
@@ -81,7 +82,7 @@ def _without_jump(
 ) -> tuple[PathAlternative, ...]:
     """Return the path on which the next jump is not taken again, if its count is unknown."""
     skipped = twin.onboard.skipped_jump() if twin.mode in ROUTE_MODES and situation.onboard.override is None else None
-    if skipped is None:
+    if skipped is None or skipped.probability < _MIN_PROBABILITY:
         return ()
     other = replace(situation, onboard=replace(situation.onboard, jumps=skipped.jumps))
     initial = synchronise_controller(other)
