@@ -190,7 +190,7 @@ def labels_fit(page, view, height: int) -> bool:
 def settle_to_nothing(page, faults: str) -> None:
     """Wait until a script finds no faults of the page; fail with those that remain."""
     with contextlib.suppress(TooLate):
-        page.wait_for_function(f"({faults})().length === 0", timeout=5_000)
+        page.wait_for_function(f"({faults})().length === 0", timeout=PATIENCE_MS)
     assert page.evaluate(faults) == []
 
 
@@ -291,9 +291,8 @@ def test_nothing_is_cut_or_covered_at_this_size(live: SimpleNamespace, size: str
     assert page.evaluate(CONTRAST) == [] and page.evaluate(AT_ZERO_SCROLL)
     until(page, lambda: (view.browser.layout.bottom > 0.4 * height) == (width < 600))  # the sheet, or the timeline
     until(page, lambda: 0 < view.browser.layout.top < 80)  # the header may be measured after the sheet
-    layout = view.browser.layout
-    until(page, lambda: view.camera.view().bottom_px == layout.bottom and drawn_since(view, live))
-    boxes = list(view._labels.boxes)
+    until(page, lambda: view.camera.view().bottom_px == view.browser.layout.bottom and drawn_since(view, live))
+    layout, boxes = view.browser.layout, list(view._labels.boxes)
     assert not any(overlap(a, b) for a, b in combinations(boxes, 2))
     assert all(box[0, 1] >= -0.5 + layout.bottom / height and box[1, 1] <= 0.5 - layout.top / height for box in boxes)
     until(page, lambda: labels_fit(page, view, height))  # labels come and go between two looks

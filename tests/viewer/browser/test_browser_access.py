@@ -67,7 +67,7 @@ def show(page, live: SimpleNamespace, size: str, *, light: bool) -> None:
     page.wait_for_function(SCHEME, arg="light" if light else "dark", timeout=PATIENCE_MS)
     until(page, lambda: view_of(live).browser.layout[:2] == (width, height) and view_of(live).palette.dark != light)
     page.locator("tr.on").first.wait_for(state="attached", timeout=PATIENCE_MS)
-    page.wait_for_function(NAMED, timeout=10_000)
+    page.wait_for_function(NAMED, timeout=PATIENCE_MS)
 
 
 def serious(page) -> list[str]:
@@ -89,7 +89,7 @@ def test_axe_finds_nothing_serious(live: SimpleNamespace, size: str, *, light: b
     assert serious(page) == []
     for tab in ("Alerts", "Display"):
         page.get_by_role("tab", name=tab).or_(page.locator(f'[title="{tab}"]')).first.click()
-        page.wait_for_function(NAMED, timeout=10_000)
+        page.wait_for_function(NAMED, timeout=PATIENCE_MS)
         assert serious(page) == [], tab
     page.get_by_role("tab", name="Fleet").or_(page.locator('[title="Fleet"]')).first.click()
 
@@ -112,7 +112,7 @@ def test_axe_would_notice(live: SimpleNamespace) -> None:
 def test_no_line_of_text_overlaps_another_or_is_cut(live: SimpleNamespace, size: str, *, light: bool) -> None:
     page = live.page
     show(page, live, size, light=light)
-    page.wait_for_function(f"({CUT_OR_OVERLAPPING})().length === 0", timeout=5_000)
+    page.wait_for_function(f"({CUT_OR_OVERLAPPING})().length === 0", timeout=PATIENCE_MS)
     assert page.evaluate(f"({TEXTS})().length") > 30
 
 
@@ -154,7 +154,9 @@ def test_keys_set_the_camera_and_follow(live: SimpleNamespace) -> None:
     until(page, lambda: view.selected == 2)
     page.locator("canvas").first.focus()
     turn(page, "t", "z < -0.99")
-    page.wait_for_function("document.querySelector('#compass svg').style.transform === 'rotate(0deg)'", timeout=20_000)
+    page.wait_for_function(
+        "document.querySelector('#compass svg').style.transform === 'rotate(0deg)'", timeout=PATIENCE_MS
+    )
     turn(page, "v", "z > -0.2 && z < 0")
     psi = view.selected_vehicle().attitude[2]
     turn(page, "c", f"x * {np.sin(psi)} + y * {np.cos(psi)} > 0.5")  # where the aircraft flies to
@@ -177,7 +179,8 @@ def test_search_by_id_focuses_and_letters_in_it_are_no_keys(live: SimpleNamespac
     page.locator("canvas").first.focus()
     page.keyboard.press("/")
     page.keyboard.type("9tp")
-    assert page.evaluate("document.activeElement.value") == "9tp" and view.timeline.player.live
+    page.wait_for_function("document.activeElement.value === '9tp'", timeout=PATIENCE_MS)
+    assert view.timeline.player.live
     page.keyboard.press("Control+a")
     page.keyboard.type("009")
     before = page.evaluate(CAMERA)
@@ -187,7 +190,7 @@ def test_search_by_id_focuses_and_letters_in_it_are_no_keys(live: SimpleNamespac
     page.keyboard.press("Control+a")
     page.keyboard.press("Delete")
     page.keyboard.press("Escape")
-    assert page.evaluate("document.activeElement.tagName") != "INPUT"
+    page.wait_for_function("document.activeElement.tagName !== 'INPUT'", timeout=PATIENCE_MS)
 
 
 def test_the_timeline_obeys_keys(live: SimpleNamespace) -> None:
@@ -263,7 +266,7 @@ def test_the_scale_bar_has_the_length_it_states(live: SimpleNamespace) -> None:
       const bar = document.querySelector('#compass i').getBoundingClientRect().width;
       return [bar, (x(parseFloat(text) * unit / 10) - x(0)) / 2 * w]; }"""
     agree = f"() => {{ const [bar, ground] = ({measure})(); return Math.abs(bar - ground) < 0.06 * bar; }}"
-    page.wait_for_function(agree, timeout=20_000)  # the bar follows the camera five times a second
+    page.wait_for_function(agree, timeout=PATIENCE_MS)  # the bar follows the camera five times a second
 
 
 def test_local_time_is_shown_beside_utc_where_it_differs(live: SimpleNamespace) -> None:
