@@ -140,13 +140,13 @@ def arrays_in(value: Any) -> list[Array]:
     return []
 
 
-@settings(max_examples=150, deadline=None, derandomize=True, database=None)
+@settings(max_examples=150)
 @given(st.sampled_from(KINDS), st.binary(max_size=200))
 def test_random_bytes_raise_only_value_error(kind: type, payload: bytes) -> None:
     refused_or_read(kind, payload)
 
 
-@settings(max_examples=300, deadline=None, derandomize=True, database=None)
+@settings(max_examples=300)
 @given(st.sampled_from(KINDS), st.data())
 def test_damaged_bytes_raise_only_value_error(kind: type, data: st.DataObject) -> None:
     payload = bytearray(golden_bytes(kind))

@@ -300,7 +300,7 @@ an_item = st.builds(
 )
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=300)
 @given(
     st.lists(an_item, max_size=14),
     st.integers(-2, 14),

@@ -22,6 +22,7 @@ from twin_worker.mismatch.job import (
     TelemetryRows,
     mark_unconfirmed,
     mismatch_message,
+    move_past,
     shift_times,
     telemetry_rows,
     with_adaptation,
@@ -109,8 +110,10 @@ class DiagnosisState:
         full = (
             newest - self.diagnosed_t >= DIAGNOSIS_PERIOD_S or not self._model_valid(twin) or self._needs_confirmation
         )
-        rows = telemetry_rows(twin.telemetry.history, newest - FLIGHT_S, self.past)
-        past_end = None if self.past is None else self.past_t
+        past, past_end = None, None
+        if self.past is not None:
+            past, past_end = move_past(self.past, self.past_t, newest - FLIGHT_S)
+        rows = telemetry_rows(twin.telemetry.history, newest - FLIGHT_S, past)
         params = dict(twin.config.airframe.servo_params or twin.received_params)
         return DiagnosisJob(twin.config.uav, rows, params, self.card, self.baseline, past_end, newest - FLIGHT_S, full)
 

@@ -23,6 +23,7 @@ from twin_worker.mismatch.effect_increments import EffectOutputs, effect_outputs
 from twin_worker.telemetry.history import TelemetryHistory
 
 RECENT_S = 20.0  # newest flight whose residuals are monitored [s]
+_JOIN_GAP_S = 10.0  # between the past and the recent flight; longer than a filter, so that it is left out [s]
 MIN_GROWTH = 1.5  # mean square of the recent residuals over the earlier ones that triggers a diagnosis [-]
 _MIN_ROWS = 50  # of both parts, one row every 0.2 s
 
@@ -93,6 +94,15 @@ def telemetry_rows(history: TelemetryHistory, start: float, past: TelemetryRows 
             t, x = np.concatenate([past_t, t[new]]), np.concatenate([past_x, x[new]])
         out[kind] = t, x
     return out
+
+
+def move_past(past: TelemetryRows, end: float, start: float) -> tuple[TelemetryRows, float]:
+    """Return the past, and its end [s since 1970], moved to shortly before the recent flight that begins at `start`.
+
+    The time between them has no rows. Resampled, it would cost more with every minute of flight.
+    """
+    delay = max(start - _JOIN_GAP_S - end, 0.0)
+    return {kind: (t + delay, x) for kind, (t, x) in past.items()}, end + delay
 
 
 def failed_result(job: DiagnosisJob, reason: str, *, cpu_s: float = 0.0, details: str = "") -> DiagnosisResult:

@@ -80,7 +80,8 @@ def _crosses(start: np.ndarray, end: np.ndarray, normals: np.ndarray, limits: np
     slack, slope = limits - normals @ start, normals @ (end - start)
     if (slack[slope == 0.0] <= 0.0).any():
         return False
-    t = slack[slope != 0.0] / slope[slope != 0.0]
+    with np.errstate(over="ignore"):  # nearly parallel to an edge: the leg meets it at infinity
+        t = slack[slope != 0.0] / slope[slope != 0.0]
     is_exit = slope[slope != 0.0] > 0.0
     enter, leave = t[~is_exit].max(initial=0.0), t[is_exit].min(initial=1.0)
     return bool(enter < leave)

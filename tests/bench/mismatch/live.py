@@ -27,7 +27,7 @@ FAULTS = (
     "thrust_loss,fraction=0.3",
     "drag_increase,dCD=0.05",
     "airspeed_bias,bias_mps=-6",
-    "control_effectiveness_loss:aileron,fraction=0.5",
+    "control_effectiveness_loss:aileron,loss=0.5",
 )
 HEALTHY = 8
 _ROUTER, _LINK = "tcp/127.0.0.1:7461", "127.0.0.1:14661"
@@ -87,6 +87,8 @@ def _fly(args: argparse.Namespace) -> tuple[dict[int, list[Mismatch]], dict[int,
             never, begun, reported = threading.Event(), 0.0, 0.0
             while not begun or time.monotonic() < begun + args.seconds:
                 never.wait(1.0)
+                if ended := [command for command, child in zip(commands, children, strict=True) if child.poll()]:
+                    raise SystemExit(f"python {' '.join(ended[0])}: ended before the measurement; start it alone")
                 begun = begun or (time.monotonic() if len(first) == count else 0.0)
                 if begun and time.monotonic() > reported + _REPORT_S:
                     reported = time.monotonic()

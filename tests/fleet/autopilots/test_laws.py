@@ -316,7 +316,7 @@ any_leg = st.builds(
 
 
 @pytest.mark.parametrize("law", NEW)
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=150)
 @given(
     st.lists(any_leg, max_size=4), vector, vector, angles, st.one_of(st.floats(-10, 1e3), st.just(float("nan"))),
     st.floats(-1e3, 1e3), st.floats(0.0, 0.2), st.integers(-5, 9),

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.contract import Item
@@ -35,7 +35,6 @@ def at(n: float, e: float, height: float = 600.0) -> np.ndarray:
 BOX = [(-100.0, -200.0), (-100.0, 200.0), (100.0, 200.0), (100.0, -200.0)]
 
 
-@settings(deadline=None)  # the first example compiles
 @given(st.floats(-300, 300), st.floats(-400, 400))
 def test_the_depth_in_a_box_is_the_distance_to_its_edge(n: float, e: float) -> None:
     inside = min(100.0 - abs(n), 200.0 - abs(e))

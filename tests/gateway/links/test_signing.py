@@ -114,7 +114,7 @@ def test_whose_clock_is_ahead_is_answered_on_its_time_and_shuts_nobody_else_out(
     assert int.from_bytes(frame[-12:-6], "little") > NOW + 10**9
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.integers(0, 25), st.integers(1, 255))
 def test_no_changed_byte_of_a_signed_frame_passes(at, by):
     frame = bytearray(Signer().heartbeat())

@@ -3,7 +3,7 @@
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
@@ -81,7 +81,6 @@ def laid(made: Prediction):
     return flight
 
 
-@settings(deadline=None)  # the first example may compile
 @given(height=st.floats(40, 200), sigma=st.floats(1, 30), sink=st.floats(0, 1))
 def test_sinking_has_its_closed_form(height: float, sigma: float, sink: float) -> None:
     made = straight(p=(0, 0, -height), v=(20.0, 0.0, sink), half=(5.0, 5.0, axis_z(0.9) * sigma))

@@ -37,7 +37,7 @@ def crossing(miss: float, above: float, sigma: float, at: float = 60.0) -> tuple
     return a, b
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     miss=st.floats(-400, 400),
     above=st.floats(-60, 60),
@@ -92,7 +92,7 @@ def test_heights_that_cross_elsewhere_are_no_conflict() -> None:
     assert probability(a, b) == 0.0
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(lat=st.floats(-60, 60), lon=st.floats(-180, 179.9), north=st.floats(-2e4, 2e4), east=st.floats(-2e4, 2e4))
 def test_origins_do_not_matter(lat: float, lon: float, north: float, east: float) -> None:
     """The same flight about another origin, also across the date line."""

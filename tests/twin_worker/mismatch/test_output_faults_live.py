@@ -11,7 +11,7 @@ from twin_worker.diagnosis.data.card import UNKNOWN
 from twin_worker.diagnosis.inference.report import OUTPUT_CHANNEL, ReportOutcome
 from twin_worker.diagnosis.model.baseline import Baseline
 from twin_worker.mismatch.coordinator import BASELINE_S, FLIGHT_S, DiagnosisState
-from twin_worker.mismatch.job import DiagnosisJob, DiagnosisResult, run_job, telemetry_rows
+from twin_worker.mismatch.job import DiagnosisJob, DiagnosisResult, move_past, run_job, telemetry_rows
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.twin.step import Twin
 
@@ -62,3 +62,21 @@ def test_beside_a_comparison_model_a_long_mission_shows_the_law(twin: Twin, monk
     assert state.urgency(twin) is not None
     job, newest = state.create_job(twin), twin.telemetry.history.newest
     assert job.past_end == newest and job.recent_start == newest - FLIGHT_S and job.baseline is not None
+
+
+def test_a_job_hours_after_its_past_is_as_long_as_one_minutes_after_it(twin: Twin) -> None:
+    newest = twin.telemetry.history.newest
+    start = newest - 30.0
+    past = telemetry_rows(twin.telemetry.history, newest - 60.0)
+    recent = telemetry_rows(twin.telemetry.history, start)["attitude"]
+    lengths = []
+    for hours in (0.1, 3.0):
+        earlier = {kind: (t - hours * 3600.0, x) for kind, (t, x) in past.items()}
+        moved, end = move_past(earlier, newest - hours * 3600.0, start)
+        t, x = telemetry_rows(twin.telemetry.history, start, moved)["attitude"]
+        assert start - 20.0 < end < start - 5.0 and (np.diff(t) > 0).all()
+        assert np.diff(t)[t[:-1] > end - 1.0].max() > 5.0  # a gap, which a diagnosis leaves out
+        np.testing.assert_array_equal(t[t >= start], recent[0])
+        np.testing.assert_array_equal(x[t >= start], recent[1])
+        lengths.append(np.ptp(t))
+    assert lengths[1] == pytest.approx(lengths[0], abs=1e-3)

@@ -321,8 +321,6 @@ TestFleet = Fleet.TestCase
 TestFleet.settings = settings(
     max_examples=150,
     stateful_step_count=25,
-    deadline=None,
-    derandomize=True,
     phases=(Phase.explicit, Phase.generate),
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
 )

@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from fleet.frames import Origin
@@ -63,7 +63,7 @@ def test_where_there_is_no_way_around_there_is_none(route: list[list[float]]) ->
 POINT = st.tuples(st.floats(-3000, 3000), st.floats(-3000, 3000))
 
 
-@settings(deadline=None)
+@example(route=[(0.0, 0.0), (2.225e-313, -2.0)], corners=[(0.0, 0.0), (0.0, 6.0), (6.0, 0.0)], margin=10.0, right=False)
 @given(
     st.lists(POINT, min_size=2, max_size=6), st.lists(POINT, min_size=3, max_size=7), st.floats(10, 200), st.booleans()
 )
