@@ -39,10 +39,10 @@ HEAVY = (  # files by the time they take, so that none begins when the others ha
     *("calibration", "diagnose_real", "late_arrival", "mismatch_live", "live_offline", "conceal", "every_vehicle"),
 )
 """The first two begin at once: one compiles the twin's physics, the other has no need of it."""
+# Properties are checked on the same examples in every run; `--hypothesis-profile explore` looks for new ones.
 hypothesis.settings.register_profile("seeded", derandomize=True, database=None, deadline=None)
 hypothesis.settings.register_profile("explore", max_examples=5_000, deadline=None)
 hypothesis.settings.load_profile("seeded")
-"""Properties are checked on the same examples in every run; `--hypothesis-profile explore` looks for new ones."""
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 
 

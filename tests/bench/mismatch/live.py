@@ -88,7 +88,7 @@ def _fly(args: argparse.Namespace) -> tuple[dict[int, list[Mismatch]], dict[int,
             while not begun or time.monotonic() < begun + args.seconds:
                 never.wait(1.0)
                 if ended := [command for command, child in zip(commands, children, strict=True) if child.poll()]:
-                    raise SystemExit(f"python {' '.join(ended[0])}: ended before the measurement; start it alone")
+                    raise SystemExit(f"python {' '.join(ended[0])}: ended during the measurement; start it alone")
                 begun = begun or (time.monotonic() if len(first) == count else 0.0)
                 if begun and time.monotonic() > reported + _REPORT_S:
                     reported = time.monotonic()
