@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgpack
 import msgspec
 import numpy as np
 import pytest
@@ -116,6 +117,7 @@ def test_a_foreign_tool_asks_what_if(tmp_path: Path, holder: Worker) -> None:
     (held,) = holder.owned_twins()
     held.twin.config = msgspec.structs.replace(held.twin.config, uav=7)
     seven = QueryHandlers(MemoryBus().writer, lambda: [held])
+    seven.predictions(7, {}, msgpack.packb({"speed": 18.0}))  # compiles what a running worker has compiled
     (line,) = run_tool(tools()[1], tmp_path, seven.predictions)
     assert line.startswith("what if it flew at 18 m/s, the wind blew 3 m/s north and -1 east, NAVL1_PERIOD were 25")
     assert line.endswith("{'NAVL1_PERIOD': 25.0, 'AIRSPEED_CRUISE': 18.0}")
