@@ -55,7 +55,7 @@ def calibrate_recordings(
     if until is None:
         base = calibrate(flights, card, log_progress)
     elif len(flights) == 1:
-        base = calibrate_past(flights[0], until, card, log_progress)
+        base = calibrate_past(part_before(flights[0], until), card, log_progress).baseline(flights[0])
     else:
         base = calibrate([part_before(flight, until) for flight in flights], card, log_progress)
     for limitation in uncovered_axes(base):

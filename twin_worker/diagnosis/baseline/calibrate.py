@@ -65,58 +65,76 @@ def calibrate(
     _check_plausible(base)
     winds = [fit_wind(modelled, np.zeros(4)) for modelled in modelled_flights]
     _check_consistent(modelled_flights, winds)
-    return with_statistics(base, modelled_flights, winds, progress)
+    base = with_statistics(base, modelled_flights, winds)
+    return with_chance_gains(base, modelled_flights, winds, progress)
 
 
 def with_statistics(
     base: Baseline,
     modelled_flights: Sequence[ModelledFlight],
     winds: Sequence[np.ndarray],
-    progress: ReportProgress,
     remove_mean: bool = False,
 ) -> Baseline:
-    """Return the baseline with noise, spreads, usual residuals and chance gains from left-out flights.
+    """Return the baseline with noise, spreads and usual residuals from left-out flights.
 
     Args:
         base: fitted on all flights
         modelled_flights: each flight under the coefficients of the others
         winds: weather of each flight, (4,)
-        progress: callback for progress messages
         remove_mean: subtract the mean residual of each flight
     """
     base = _with_noise(base, modelled_flights, winds, remove_mean)
-    progress("computing the chance gains of nominal flights")
-    chance: dict[str, float] = {}
-    block_chance: dict[str, float] = {}
-    flights = []
-    for modelled, w in zip(modelled_flights, winds, strict=True):
-        own = replace(modelled.base, noise=base.noise, spread=base.spread, usual=base.usual, others=base.others)
-        with_noise = ModelledFlight(modelled.flight, own, template=modelled)
-        flights.append(WhitenedResiduals(with_noise, weather_hypotheses(w) if wind_is_nominal(base) else ()))
+    flights = _whitened_flights(base, modelled_flights, winds)
     usual = np.median([whitened.mean_square() for whitened in flights], axis=0)
     floor = base.noise.sigma / np.sqrt(BLOCK_ROWS)  # of white noise
     sigma = np.maximum(np.sqrt(np.mean([block_sigma(whitened) ** 2 for whitened in flights], axis=0)), floor)
-    for whitened in flights:
+    return replace(base, usual=np.maximum(usual, _MIN_USUAL), block_sigma=sigma)
+
+
+def with_chance_gains(
+    base: Baseline,
+    modelled_flights: Sequence[ModelledFlight],
+    winds: Sequence[np.ndarray],
+    progress: ReportProgress,
+) -> Baseline:
+    """Return the baseline with the gains that each effect and change reaches on left-out flights.
+
+    Args:
+        base: with the statistics of these flights
+        modelled_flights: each flight under the coefficients of the others
+        winds: weather of each flight, (4,)
+        progress: callback for progress messages
+    """
+    progress("computing the chance gains of nominal flights")
+    chance: dict[str, float] = {}
+    block_chance: dict[str, float] = {}
+    for whitened in _whitened_flights(base, modelled_flights, winds):
         scanned = scan(whitened)
         reached = [
             scored for scored in scanned if has_size(scored.hypothesis)
         ]  # the gain of a wrong sign is not reached
         for scored in (*reached, *best_hypotheses(whitened, scanned)):
             chance[scored.kind] = max(chance.get(scored.kind, 0.0), scored.gain)
-        means = BlockMeans(whitened, sigma)
+        means = BlockMeans(whitened, base.block_sigma)
         without = means.cost(())
         for scored in reached:
             gain = without - means.cost((scored.hypothesis,))
             block_chance[scored.kind] = max(block_chance.get(scored.kind, 0.0), gain)
         for anomaly in (*find_anomalies(whitened), *find_changed_coefficients(whitened)):
             chance[anomaly.kind] = max(chance.get(anomaly.kind, 0.0), anomaly.net_gain)
-    return replace(
-        base,
-        chance=chance,
-        block_chance=block_chance,
-        usual=np.maximum(usual, _MIN_USUAL),
-        block_sigma=sigma,
-    )
+    return replace(base, chance=chance, block_chance=block_chance)
+
+
+def _whitened_flights(
+    base: Baseline, modelled_flights: Sequence[ModelledFlight], winds: Sequence[np.ndarray]
+) -> list[WhitenedResiduals]:
+    """Return the residuals of left-out flights under the noise and the nuisances of the baseline."""
+    flights = []
+    for modelled, w in zip(modelled_flights, winds, strict=True):
+        own = replace(modelled.base, noise=base.noise, spread=base.spread, others=base.others)
+        weather = weather_hypotheses(w) if wind_is_nominal(base) else ()
+        flights.append(WhitenedResiduals(modelled.with_base(own), weather))
+    return flights
 
 
 def _check_plausible(base: Baseline) -> None:

@@ -109,8 +109,10 @@ class OwnPast:
                 f"{flight.name}: found {format_below(after, MIN_AFTER_S)} s of trusted flight after "
                 f"{self.until:.0f} s, expected {MIN_AFTER_S:.0f} s at least to diagnose; trust a shorter past"
             )
-        visible = conceal_channels(flight, conceal, part_before(flight, self.until))
-        base = calibrate_past(flight, self.until, self.card, progress, visible if conceal else None)
+        past = part_before(flight, self.until)
+        visible = conceal_channels(flight, conceal, past)
+        concealed = part_before(visible, self.until) if conceal else None
+        base = calibrate_past(past, self.card, progress, concealed).baseline(flight)
         limitation = (
             f"calibrated on {flight.seconds - after:.0f} s of its own past: effects present from the start and a mean "
             "wind count as nominal; the barometer is not checked"

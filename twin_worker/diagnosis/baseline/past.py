@@ -1,18 +1,19 @@
 """Calibrate on the trusted first part of a flight, to diagnose the rest without other flights.
 
-A short past excites few axes. Every uncertain direction of the coefficients that the rest of the flight excites becomes
-a nuisance. An equation that does not predict the left-out pieces is not covered. Effects present from the start are
+A short past excites few axes. Every uncertain direction of the coefficients that the later flight excites becomes a
+nuisance. An equation that does not predict the left-out pieces is not covered. Effects present from the start are
 part of the baseline and never a finding.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from fleet.effects import Onset, Stage, catalogue
+from fleet.effects import Stage
 from fleet.process.sanitise import format_below
-from twin_worker.diagnosis.baseline.calibrate import with_statistics
+from twin_worker.diagnosis.baseline.calibrate import with_chance_gains, with_statistics
 from twin_worker.diagnosis.baseline.fit import (
     RegressionData,
     axial_regression,
@@ -23,21 +24,22 @@ from twin_worker.diagnosis.baseline.fit import (
     stacked_coef,
     terms_in_wind,
 )
-from twin_worker.diagnosis.data.card import AircraftCard
+from twin_worker.diagnosis.data.card import AircraftCard, FaultHypothesis
 from twin_worker.diagnosis.data.flight import FlightData
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 from twin_worker.diagnosis.model.baseline import CHANNELS, IGNORED_SIGMA, Baseline, Noise, exclude_equations
+from twin_worker.diagnosis.model.equations import TERMS
 from twin_worker.diagnosis.model.residual import EquationTerms, ModelledFlight
 from twin_worker.diagnosis.model.weather import RAW_ROWS_PER_SAMPLE, weather_hypotheses
 
 PIECES = 4  # pieces of the past, each predicted from the others
 MIN_PAST_S = 40.0  # least length of valid past
 CONTEXT_S = 30.0  # past included in the diagnosed part, as data before an onset
-UNREACHABLE_GAIN = 1e9  # a gain that no hypothesis reaches
 _RIDGE = 0.02  # ridge share for short data
 _ROWS_PER_SAMPLE = 4.0  # whitened rows per independent sample: whitening is incomplete
 _MIN_VISIBLE_SHARE = 0.1  # least effect of an uncertain direction, as a share of the equation scatter
-_MIN_GAIN = 400.0  # least chance gain of any effect
+_MIN_DETERMINED = 3.0  # least derivative of a surface, in standard deviations
+_DERIVATIVES = {"aileron": ("L", "delta_a"), "elevator": ("M", "delta_e"), "rudder": ("N", "delta_r")}
 _WIND_SPREAD = 2.5  # least spread of the mean wind [m/s]
 _BIAS_RANGE = 50.0  # prior of a sensor bias, in floors
 _MIN_AIRSPEED_STD = 0.3  # least scatter of airspeed [m/s]
@@ -47,32 +49,61 @@ _MIN_R2 = -0.5  # least share of variance predicted; equations below are ignored
 ReportProgress = Callable[[str], None]
 
 
+class CoefficientUncertainty(NamedTuple):
+    """Square root of the posterior covariance of one equation's coefficients, (k, k), and scatter of the equation."""
+
+    root: np.ndarray
+    scatter: float
+
+
+@dataclass(frozen=True)
+class PastModel:
+    """Calibration on a trusted part of flight, for any later part.
+
+    Attributes:
+        base: with the uncertain directions that the past excites
+        uncertainty: equation -> uncertainty of its coefficients
+        weather: of the past, (4,)
+        seconds: valid flight [s]
+    """
+
+    base: Baseline
+    uncertainty: dict[str, CoefficientUncertainty]
+    weather: np.ndarray
+    seconds: float
+
+    def baseline(self, flight: FlightData) -> Baseline:
+        """Return the baseline to diagnose a later flight with."""
+        ratio = max(flight.seconds / self.seconds, 1.0)  # the longer the flight, the larger a gain by chance
+        return replace(
+            self.base,
+            others=_visible_directions(flight, self.base, self.uncertainty, self.weather),
+            chance={kind: ratio * gain for kind, gain in self.base.chance.items()},
+        )
+
+
 def calibrate_past(
-    flight: FlightData,
-    until: float,
+    past: FlightData,
     card: AircraftCard,
     progress: ReportProgress = lambda message: None,
     concealed: FlightData | None = None,
-) -> Baseline:
-    """Calibrate on the part of a flight before `until` [s, on its own clock].
+) -> PastModel:
+    """Calibrate on a trusted part of flight.
 
     Args:
-        flight: whole recording; the part after `until` only determines which directions it excites
-        until: end of the trusted past
+        past: the trusted part
         card: the aircraft, or `card.UNKNOWN`
         progress: callback for progress messages
-        concealed: the same flight with concealed channels, to estimate noise and chance gains
+        concealed: the same part with concealed channels, to estimate noise and chance gains
     Raises:
         ValueError: if the past is too short; the message gives its length.
     """
-    past = part_before(flight, until)
     if past.seconds < MIN_PAST_S:
         raise ValueError(
-            f"{flight.name}: found {format_below(past.seconds, MIN_PAST_S)} s of trusted flight before "
-            f"{until:.0f} s, expected "
+            f"{past.name}: found {format_below(past.seconds, MIN_PAST_S)} s of trusted flight, expected "
             f"{MIN_PAST_S:.0f} s at least; trust a longer past, or calibrate on other flights"
         )
-    progress(f"{flight.name}: calibrating on its own past, {past.seconds:.0f} s of trusted flight")
+    progress(f"{past.name}: calibrating on its own past, {past.seconds:.0f} s of trusted flight")
     timing = fit_timing([past], card, past.vane)
     card = replace(card, body=replace(card.body, lag=timing.servo + timing.delay))
     base, (weather,) = fit([past], card, timing, past.vane, _RIDGE)
@@ -80,24 +111,59 @@ def calibrate_past(
     partial_fits = [fit([replace(past, ok=past.ok & ~piece.ok)], card, timing, past.vane, _RIDGE) for piece in pieces]
     partial_bases, winds = [partial for partial, _ in partial_fits], [w for _, (w,) in partial_fits]
     modelled_flights = list(map(ModelledFlight, pieces, partial_bases))
-    r2 = _predicted_share(modelled_flights, winds)
-    base = replace(base, others=_uncertain_directions(flight, past, base, weather), r2=r2)
-    if concealed is not None:
-        concealed_pieces = [replace(part_before(concealed, until), ok=piece.ok) for piece in pieces]
-        modelled_flights = list(map(ModelledFlight, concealed_pieces, partial_bases))
-    base = with_statistics(base, modelled_flights, winds, progress, remove_mean=True)
-    later_s = part_after(flight, until).seconds
-    base = exclude_equations(base, [name for name, share in base.r2.items() if share < _MIN_R2])
     modelled_past = ModelledFlight(past, base)
+    uncertainty = _coefficient_uncertainty(modelled_past, weather)
+    base = replace(
+        base,
+        others=_visible_directions(past, base, uncertainty, weather),
+        r2=_predicted_share(modelled_flights, winds),
+        undetermined=_undetermined_surfaces(base, uncertainty),
+    )
+    if concealed is not None:
+        concealed_pieces = [replace(concealed, ok=piece.ok) for piece in pieces]
+        modelled_flights = list(map(ModelledFlight, concealed_pieces, partial_bases))
+    base = with_statistics(base, modelled_flights, winds, remove_mean=True)
+    base = with_chance_gains(base, [_LeftOut(modelled_flights, base)], [weather], progress)
+    base = exclude_equations(base, [name for name, share in base.r2.items() if share < _MIN_R2])
+    modelled_past = modelled_past.with_base(base)
     # the barometer drifts over minutes, and the pieces of the past are too short: ignore it
     is_baro = np.arange(len(CHANNELS)) == CHANNELS.index("baro")
-    return replace(
+    base = replace(
         base,
         noise=Noise(base.noise.ar, np.where(is_baro, IGNORED_SIGMA, base.noise.sigma)),
         block_sigma=np.where(is_baro, IGNORED_SIGMA, base.block_sigma),
         spread=base.spread | _bias_spreads(modelled_past, weather) | _weather_spreads(modelled_past, weather),
-        chance=_chance_gains(base, max(later_s, past.seconds) * len(pieces) / past.seconds),
     )
+    return PastModel(base, uncertainty, weather, past.seconds)
+
+
+class _LeftOut(ModelledFlight):
+    """The past as one flight, each piece under the coefficients of the others.
+
+    Args:
+        pieces: the same flight with disjoint valid rows, each under a baseline
+        base: of all pieces
+    """
+
+    def __init__(self, pieces: list[ModelledFlight], base: Baseline) -> None:
+        flight = replace(pieces[0].flight, ok=np.logical_or.reduce([piece.flight.ok for piece in pieces]))
+        super().__init__(flight, base, template=pieces[0])
+        self._pieces = pieces
+        self._which = np.argmax([piece.ok for piece in pieces], axis=0)
+
+    def with_base(self, base: Baseline) -> "_LeftOut":
+        """Return the same flight, the coefficients of each piece changed like those of the baseline."""
+        pieces = []
+        for piece in self._pieces:
+            coef = {name: x + base.coef[name] - self.base.coef[name] for name, x in piece.base.coef.items()}
+            pieces.append(piece.with_base(replace(base, coef=coef, airspeed=piece.base.airspeed)))
+        return _LeftOut(pieces, base)
+
+    def _compute_residuals(self, hypotheses: tuple[FaultHypothesis, ...]) -> np.ndarray:
+        rows = np.arange(len(self.t))
+        out = np.stack([piece.residuals(hypotheses) for piece in self._pieces])[self._which, rows]
+        out.flags.writeable = False
+        return out
 
 
 def part_before(flight: FlightData, until: float) -> FlightData:
@@ -145,30 +211,53 @@ def _predicted_share(modelled_flights: list[ModelledFlight], winds: list[np.ndar
     return out
 
 
-def _uncertain_directions(
-    flight: FlightData, past: FlightData, base: Baseline, weather: np.ndarray
-) -> tuple[dict[str, np.ndarray], ...]:
-    """Return the uncertain coefficient directions that the flight excites, one standard deviation each.
+def _coefficient_uncertainty(modelled: ModelledFlight, weather: np.ndarray) -> dict[str, CoefficientUncertainty]:
+    """Return the posterior uncertainty of the coefficients of every equation.
 
-    The posterior covariance of the coefficients of each equation, under a prior in which each term alone may explain
-    all variance, in the principal axes of its effect on the whole flight.
-    Source: Klein & Morelli 2006, section 5.1 (Bayesian estimation); Golub & Van Loan 2013, section 8.7.
+    The prior lets each term alone explain all variance.
+    Source: Klein & Morelli 2006, section 5.1 (Bayesian estimation).
     """
-    past_data, flight_data = (
-        _regressions(ModelledFlight(part, base).equation_terms(weather_hypotheses(weather))) for part in (past, flight)
-    )
-    out = []
-    for name, data in past_data.items():
-        x = stacked_coef(base.coef, name)
+    out = {}
+    for name, data in _regressions(modelled.equation_terms(weather_hypotheses(weather))).items():
+        x = stacked_coef(modelled.base.coef, name)
         whiten = data.whitener(x)
         A, e = whiten(data.A)[data.lagged_ok], whiten(data.y - data.A @ x)[data.lagged_ok]
         prior_std = np.sqrt((data.y[data.ok] ** 2).mean() / ((data.A[data.ok] ** 2).mean(axis=0) + 1e-12))
         precision = A.T @ A / (_ROWS_PER_SAMPLE * e.var()) + np.diag(prior_std**-2.0)
         root = np.linalg.cholesky(np.linalg.inv(precision))
-        B = flight_data[name].A[flight_data[name].ok] @ root
+        out[name] = CoefficientUncertainty(root, float(data.residuals(x).std()))
+    return out
+
+
+def _visible_directions(
+    flight: FlightData, base: Baseline, uncertainty: dict[str, CoefficientUncertainty], weather: np.ndarray
+) -> tuple[dict[str, np.ndarray], ...]:
+    """Return the uncertain coefficient directions that a flight excites, one standard deviation each.
+
+    The principal axes of the uncertainty in its effect on the flight.
+    Source: Golub & Van Loan 2013, section 8.7.
+    """
+    out = []
+    for name, data in _regressions(ModelledFlight(flight, base).equation_terms(weather_hypotheses(weather))).items():
+        root, scatter = uncertainty[name]
+        B = data.A[data.ok] @ root
         eigenvalues, eigenvectors = np.linalg.eigh(B.T @ B / len(B))
-        visible = np.sqrt(np.maximum(eigenvalues, 0.0)) > _MIN_VISIBLE_SHARE * data.residuals(x).std()
+        visible = np.sqrt(np.maximum(eigenvalues, 0.0)) > _MIN_VISIBLE_SHARE * scatter
         out += [coef_change(base.coef, name, d) for d in (root @ eigenvectors[:, visible]).T]
+    return tuple(out)
+
+
+def _undetermined_surfaces(base: Baseline, uncertainty: dict[str, CoefficientUncertainty]) -> tuple[str, ...]:
+    """Return the surfaces whose derivative is within `_MIN_DETERMINED` standard deviations of zero.
+
+    A surface that moves in proportion to another, as a rudder mixed with the aileron, has no derivative of its own:
+    a fault of either shows as one of the other.
+    """
+    out = []
+    for surface, (equation, term) in _DERIVATIVES.items():
+        k = TERMS[equation].index(term)
+        if abs(base.coef[equation][k]) < _MIN_DETERMINED * np.linalg.norm(uncertainty[equation].root[k]):
+            out.append(surface)
     return tuple(out)
 
 
@@ -200,20 +289,4 @@ def _weather_spreads(modelled: ModelledFlight, weather: np.ndarray) -> dict[str,
     out = {"airspeed_scale:log_scale": max(scale, modelled.base.spread["airspeed_scale:log_scale"])}
     for axis in ("w_n", "w_e"):
         out[f"wind_steady:{axis}"] = max(_WIND_SPREAD, modelled.base.spread[f"wind_steady:{axis}"])
-    return out
-
-
-def _chance_gains(base: Baseline, duration_ratio: float) -> dict[str, float]:
-    """Return the chance gains for the rest of the flight, `duration_ratio` times longer than a piece.
-
-    A permanent effect was active in the past and is part of the baseline: its gain is unreachable.
-    """
-    out = {kind: max(_MIN_GAIN, duration_ratio * gain) for kind, gain in base.chance.items()}
-    for effect in catalogue().values():
-        for target in effect.targets or ("",):
-            label = f"{effect.name}:{target}" if target else effect.name
-            for onset in effect.onsets:
-                out.setdefault(f"{label}|{onset}", _MIN_GAIN)
-                if onset is Onset.ALWAYS:
-                    out[f"{label}|{onset}"] = UNREACHABLE_GAIN
     return out

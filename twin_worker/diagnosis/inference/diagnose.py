@@ -145,14 +145,19 @@ def _check_same_aircraft(flight: FlightData, base: Baseline) -> None:
 
 
 def uncovered_axes(base: Baseline) -> tuple[str, ...]:
-    """Describe the axes that the nominal flights did not calibrate."""
+    """Describe the axes and surfaces that the nominal flights did not calibrate."""
     surfaces = {"L": "aileron", "M": "elevator", "N": "rudder"}
-    return tuple(
+    axes = tuple(
         f"{CHANNEL_OF[name]} not covered: the calibration explains {base.r2.get(name, 0.0):.0%} of its variance; "
         f"calibrate on flights with {surface} doublets"
         for name, surface in surfaces.items()
         if base.r2.get(name, 1.0) <= MIN_R2
     )
+    if not base.undetermined:
+        return axes
+    names = " and ".join(base.undetermined)
+    effect = "their effects are" if len(base.undetermined) > 1 else "its effect is"
+    return (*axes, f"{names} not covered: {effect} not determined, as if moved together with another surface")
 
 
 def _ranking(ranked: Sequence[ScoredHypothesis], named: Sequence[ScoredHypothesis]) -> tuple[RankedCandidate, ...]:

@@ -93,6 +93,7 @@ class Baseline:
         block_sigma: standard deviation of the raw residual's mean over 10 s on left-out nominal flights, (c,)
         flights: names of the nominal flights
         envelope: conditions of the nominal flights; None where the flight itself is its baseline
+        undetermined: surfaces whose derivative the nominal flights do not determine
     """
 
     card: AircraftCard
@@ -111,6 +112,7 @@ class Baseline:
     block_sigma: np.ndarray = field(default_factory=lambda: np.full(len(CHANNELS), IGNORED_SIGMA))
     flights: tuple[str, ...] = ()
     envelope: Envelope | None = None
+    undetermined: tuple[str, ...] = ()
 
     def varied(self, k: int) -> "Baseline":
         """Return the baseline with the coefficients of the k-th entry of `others`."""

@@ -19,7 +19,7 @@ from twin_worker.diagnosis.multirotor.baseline import FORMAT as ROTOR_FORMAT
 from twin_worker.diagnosis.multirotor.baseline import RotorBaseline, load_rotors
 
 FORMAT = "parauav.simulation.2"
-_OPTIONAL = ("envelope", "block_sigma", "block_chance")  # fields that earlier models lack
+_OPTIONAL = ("envelope", "block_sigma", "block_chance", "undetermined")  # fields that earlier models lack
 
 
 def save(path: Path, base: Baseline, findings: Sequence[DiagnosisFinding] = ()) -> None:

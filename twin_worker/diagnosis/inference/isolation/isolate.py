@@ -125,9 +125,11 @@ def candidates(whitened: WhitenedResiduals) -> Iterator[tuple[Effect, str]]:
 
 
 def covered(base: Baseline, effect: Effect, target: str) -> bool:
-    """Return whether the equation that an effect acts on is sufficiently calibrated."""
+    """Return whether the surface and the equation that an effect acts on are sufficiently calibrated."""
     if effect.channel in ("gyro", "imu"):
         return base.vane  # an estimator's rates and velocity no longer contain the fault
+    if target in base.undetermined:
+        return False
     equation = _SURFACE.get(target) or _SHOWS_IN.get(effect.channel)
     return equation is None or base.r2.get(equation, 1.0) > MIN_R2
 

@@ -45,7 +45,8 @@ class Search:
             tuple[str, frozenset[str]], float
         ] = {}  # gain of an effect without an onset, given others
         # a fast accelerometer tells the air apart from the equations; the own past has the same constants
-        self._constants_differ = not whitened.base.vane and whitened.base.envelope is not None
+        self._own_past = whitened.base.envelope is None
+        self._constants_differ = not whitened.base.vane and not self._own_past
         nominal = [x for kind, x in whitened.base.chance.items() if kind.endswith(f"|{Onset.ALWAYS}")]
         self._nominal_constant = max(self.weights.rows_per_sample, *nominal)
         self._explanations: dict[tuple[str, ...], Explanation] = {}
@@ -190,6 +191,8 @@ class Search:
         """Return the best plausible further effects, given the members."""
         taken = {member.hypothesis.label for member in members}
         scanned = [scored for scored in self._scanner.scan(given) if scored.hypothesis.label not in taken]
+        if self._own_past:  # effects present from the start are part of the baseline
+            scanned = [scored for scored in scanned if scored.hypothesis.onset.kind is not Onset.ALWAYS]
         for scored in scanned:
             if scored.hypothesis.onset.kind is Onset.ALWAYS:
                 self._constants[(scored.hypothesis.label, frozenset(taken))] = scored.gain
