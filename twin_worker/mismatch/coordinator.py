@@ -12,6 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from fleet.contract import DiagnosisOutcome, Mismatch, Outcome
+from twin_worker.diagnosis.baseline.past import PastModel
 from twin_worker.diagnosis.data.card import UNKNOWN, AircraftCard
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.model.baseline import Baseline
@@ -26,6 +27,7 @@ from twin_worker.mismatch.job import (
     shift_times,
     telemetry_rows,
     with_adaptation,
+    with_earlier_onsets,
 )
 from twin_worker.mismatch.process import DiagnosisProcess
 from twin_worker.twin.state.routes import ROUTE_MODES
@@ -33,7 +35,7 @@ from twin_worker.twin.state.state import Twin
 
 BASELINE_S = 105.0  # own past used as the comparison model [s]
 FLIGHT_S = 120.0  # flight used for a diagnosis [s]
-CHECK_PERIOD_S, DIAGNOSIS_PERIOD_S = 8.0, 25.0  # between residual checks, and between full diagnoses [s]
+CHECK_PERIOD_S, DIAGNOSIS_PERIOD_S = 8.0, 25.0  # between residual checks, and between full diagnoses if idle [s]
 MIN_FLIGHT_S = 45.0  # flight before the first comparison with a model [s]
 _CONFIRM_AFTER_S = 5.0  # before a finding is checked again for confirmation [s]
 _RETRY_S = 30.0  # after a refusal [s]
@@ -52,6 +54,7 @@ class DiagnosisState:
         card: the aircraft, or `card.UNKNOWN`
         baseline: comparison model; None: the aircraft's own past
         past: telemetry of the own past, which also shows the controller's law; None until it is long enough
+        past_model: calibration on it; None until the first job has calibrated it
         published: newest published mismatch
         reason: why there is no baseline or no diagnosis
         defect: internal error of the newest diagnosis, or empty
@@ -61,6 +64,7 @@ class DiagnosisState:
     card: AircraftCard = UNKNOWN
     baseline: Baseline | None = None
     past: TelemetryRows | None = None
+    past_model: PastModel | None = None
     published: Mismatch | None = None
     reason: str = ""
     defect: str = ""
@@ -97,25 +101,32 @@ class DiagnosisState:
             return None
         if newest < (self.first_t + MIN_FLIGHT_S if self.baseline is not None else self.past_t + CHECK_PERIOD_S):
             return None
-        return (
-            2.0 * (not self._model_valid(twin))
-            + 4.0 * self._needs_confirmation
-            + (newest - self.diagnosed_t) / DIAGNOSIS_PERIOD_S
-        )
+        return 2.0 * (not self._model_valid(twin)) + 4.0 * self._needs_confirmation + self.overdue(newest)
 
-    def create_job(self, twin: Twin) -> DiagnosisJob:
-        """Return the job that is due."""
+    def overdue(self, newest: float) -> float:
+        """Return how long a check is overdue at the newest telemetry [check periods]."""
+        return (newest - max(self.next_t, self.first_t)) / CHECK_PERIOD_S
+
+    def create_job(self, twin: Twin, *, idle: bool = True) -> DiagnosisJob:
+        """Return the job that is due.
+
+        Args:
+            twin: the aircraft
+            idle: no aircraft waits for a check, so that there is time for a diagnosis without a sign of a mismatch
+        """
         newest = twin.telemetry.history.newest
         self.next_t = newest + CHECK_PERIOD_S
-        full = (
-            newest - self.diagnosed_t >= DIAGNOSIS_PERIOD_S or not self._model_valid(twin) or self._needs_confirmation
-        )
+        is_aged = newest - self.diagnosed_t >= DIAGNOSIS_PERIOD_S
+        full = (idle and is_aged) or not self._model_valid(twin) or self._needs_confirmation
+        start = newest - FLIGHT_S
         past, past_end = None, None
         if self.past is not None:
-            past, past_end = move_past(self.past, self.past_t, newest - FLIGHT_S)
-        rows = telemetry_rows(twin.telemetry.history, newest - FLIGHT_S, past)
+            past, past_end = move_past(self.past, self.past_t, start)
+        rows = telemetry_rows(twin.telemetry.history, start, past)
         params = dict(twin.config.airframe.servo_params or twin.received_params)
-        return DiagnosisJob(twin.config.uav, rows, params, self.card, self.baseline, past_end, newest - FLIGHT_S, full)
+        return DiagnosisJob(
+            twin.config.uav, rows, params, self.card, self.baseline, past_end, self.past_model, start, full
+        )
 
     @property
     def _is_suspicious(self) -> bool:
@@ -132,6 +143,7 @@ class DiagnosisState:
             self.suspend(result.uav, result.end, result.defect)
             return None
         self.reason, self.defect, self.failures = result.refusal, "", 0
+        self.past_model = result.past_model or self.past_model
         if result.refusal:
             self.next_t = result.end + _RETRY_S
             return None
@@ -139,9 +151,12 @@ class DiagnosisState:
             return None
         self.diagnosed_t = result.end
         report = result.report
+        if self.last_report is not None:
+            shift, start = self.last_begin - result.begin, result.recent_start - result.begin
+            report = with_earlier_onsets(report, self.last_report, shift, start + _SAME_ONSET_S)
         shifted = shift_times(report, result.begin - self.first_t)
         mismatch = mismatch_message(result.uav, shifted, result.begin, result.end)
-        if mismatch.outcome in _CONFIRMED and not self._is_confirmed(report, result.begin):
+        if mismatch.outcome in _CONFIRMED and not self._is_confirmed(report, result):
             self.next_t = result.end + _CONFIRM_AFTER_S
             mismatch = mark_unconfirmed(mismatch)
         self.last_report, self.last_begin = report, result.begin
@@ -160,8 +175,11 @@ class DiagnosisState:
             f"uav-{uav}: diagnosis failed with an internal error ({reason}); retried in {pause_s:.0f} s, report it"
         )
 
-    def _is_confirmed(self, report: Report, begin: float) -> bool:
-        """Return whether the previous diagnosis agrees with this report."""
+    def _is_confirmed(self, report: Report, result: DiagnosisResult) -> bool:
+        """Return whether the previous diagnosis agrees with this report.
+
+        The onset of an effect older than the newest flight is only known to precede it.
+        """
         if self.last_report is None:
             return False
         if report.outcome is ReportOutcome.UNKNOWN:
@@ -169,10 +187,11 @@ class DiagnosisState:
         names = {
             name for finding in self.last_report.findings for name in (finding.hypothesis.effect.name, *finding.rivals)
         }
-        onsets = [self.last_begin + one.segments[0][0] for one in self.last_report.findings]
+        start = result.recent_start
+        onsets = [max(self.last_begin + one.segments[0][0], start) for one in self.last_report.findings]
         return any(
             one.hypothesis.effect.name in names
-            and any(abs(begin + one.segments[0][0] - onset) < _SAME_ONSET_S for onset in onsets)
+            and any(abs(max(result.begin + one.segments[0][0], start) - onset) < _SAME_ONSET_S for onset in onsets)
             for one in report.findings
         )
 
@@ -248,8 +267,9 @@ class Coordinator:
                 due.append((urgency, twin))
         if due:
             twin = max(due, key=lambda entry: entry[0])[1]
+            idle = all(self.state(one.config.uav).overdue(one.telemetry.history.newest) < 1.0 for _, one in due)
             uav, newest = twin.config.uav, twin.telemetry.history.newest
-            job = self._run_isolated(uav, newest, partial(self.state(uav).create_job, twin))
+            job = self._run_isolated(uav, newest, partial(self.state(uav).create_job, twin, idle=idle))
             if job is not None:
                 self._executor.submit(job)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from fleet.contract import COLUMNS, Cause, DiagnosisOutcome, Mismatch
 from twin_worker.diagnosis.baseline.own_past import find_output_faults, only_new_findings
-from twin_worker.diagnosis.baseline.past import CONTEXT_S, calibrate_past, part_after
+from twin_worker.diagnosis.baseline.past import CONTEXT_S, PastModel, calibrate_past, part_after, part_before
 from twin_worker.diagnosis.data.card import AircraftCard
 from twin_worker.diagnosis.data.flight import STEP_S, FlightData, resample_flight
 from twin_worker.diagnosis.inference.diagnose import diagnose
@@ -24,7 +24,7 @@ from twin_worker.telemetry.history import TelemetryHistory
 
 RECENT_S = 20.0  # newest flight whose residuals are monitored [s]
 _JOIN_GAP_S = 10.0  # between the past and the recent flight; longer than a filter, so that it is left out [s]
-MIN_GROWTH = 1.5  # mean square of the recent residuals over the earlier ones that triggers a diagnosis [-]
+MIN_GROWTH = 2.5  # mean square of the recent residuals over the earlier ones that triggers a diagnosis [-]
 _MIN_ROWS = 50  # of both parts, one row every 0.2 s
 
 TelemetryRows = dict[str, tuple[np.ndarray, np.ndarray]]
@@ -41,7 +41,8 @@ class DiagnosisJob:
         card: the aircraft
         baseline: comparison model; None: the aircraft's own past
         past_end: end of the past in `rows` [s since 1970]; None: `rows` have none
-        recent_start: start of the newest flight in `rows`, which is diagnosed with a comparison model [s since 1970]
+        past_model: calibration on that past, from an earlier result; None: calibrate
+        recent_start: start of the newest flight in `rows`, which is diagnosed [s since 1970]
         full: diagnose without a residual check
     """
 
@@ -51,6 +52,7 @@ class DiagnosisJob:
     card: AircraftCard
     baseline: Baseline | None
     past_end: float | None = None
+    past_model: PastModel | None = None
     recent_start: float = -inf
     full: bool = False
 
@@ -62,6 +64,8 @@ class DiagnosisResult:
     Attributes:
         uav: UAV id
         begin, end: flight of the diagnosis [s since 1970]
+        recent_start: start of its newest part without a gap [s since 1970]
+        past_model: calibration on the own past, for the next job
         residual_growth: mean square of the recent residuals over the earlier ones, worst channel; nan if undetermined
         report: the diagnosis; None if the residuals did not require one
         effect_outputs: what the diagnosed effects add to the aircraft's dynamics, row by row
@@ -74,6 +78,8 @@ class DiagnosisResult:
     uav: int
     begin: float
     end: float
+    recent_start: float = -inf
+    past_model: PastModel | None = None
     residual_growth: float = float("nan")
     report: Report | None = None
     effect_outputs: EffectOutputs | None = None
@@ -112,7 +118,8 @@ def failed_result(job: DiagnosisJob, reason: str, *, cpu_s: float = 0.0, details
 
 def _empty_result(job: DiagnosisJob) -> DiagnosisResult:
     t = job.rows["attitude"][0]
-    return DiagnosisResult(job.uav, float(t[0]) if len(t) else 0.0, float(t[-1]) if len(t) else 0.0)
+    begin, end = (float(t[0]), float(t[-1])) if len(t) else (0.0, 0.0)
+    return DiagnosisResult(job.uav, begin, end, job.recent_start)
 
 
 def run_job(job: DiagnosisJob) -> DiagnosisResult:
@@ -137,8 +144,10 @@ def _run(job: DiagnosisJob, result: DiagnosisResult) -> DiagnosisResult:
     if baseline is not None:
         flight = part_after(flight, job.recent_start - flight.t_start)
     elif past_end is not None:
-        baseline = calibrate_past(flight, past_end, job.card)
+        past_model = job.past_model or calibrate_past(part_before(flight, past_end), job.card)
         flight = part_after(flight, past_end - CONTEXT_S)
+        baseline = past_model.baseline(flight)
+        result = replace(result, past_model=past_model)
     else:
         raise ValueError(f"{flight.name}: found neither a model nor a past, expected one of them; fly longer")
     result = replace(result, begin=flight.t_start, residual_growth=residual_growth(flight, baseline))
@@ -193,6 +202,28 @@ def mismatch_message(uav: int, report: Report, begin: float, end: float) -> Mism
         flight_t0=begin,
         sentence=report.sentence,
     )
+
+
+def with_earlier_onsets(report: Report, earlier: Report, shift: float, start: float) -> Report:
+    """Return the report with the onsets of an earlier one where the flight no longer contains them.
+
+    Args:
+        report: newer report
+        earlier: its onsets hold for effects of the same name
+        shift: what its times must be increased by to count like those of the report [s]
+        start: up to here an onset may lie in the gap or before it [s]
+    """
+    known = {finding.hypothesis.label: finding.segments[0][0] + shift for finding in earlier.findings}
+    findings = []
+    for finding in report.findings:
+        (onset, end), *rest = finding.segments
+        first = known.get(finding.hypothesis.label, onset)
+        if max(first, onset) < start:
+            hypothesis = finding.hypothesis
+            moved = replace(hypothesis, onset=hypothesis.onset.shifted(first - onset))
+            finding = replace(finding, hypothesis=moved, segments=((first, end), *rest))
+        findings.append(finding)
+    return with_sentence(replace(report, findings=tuple(findings)))
 
 
 def shift_times(report: Report, shift: float) -> Report:
