@@ -77,6 +77,7 @@ class DiagnosisState:
     last_report: Report | None = None  # newest diagnosis; start of its flight below
     last_begin: float = 0.0
     clear_count: int = 0
+    is_unconfirmed: bool = False  # the newest diagnosis awaits a second one
 
     def urgency(self, twin: Twin) -> float | None:
         """Return the urgency of a diagnosis; None if it is not due."""
@@ -101,7 +102,7 @@ class DiagnosisState:
             return None
         if newest < (self.first_t + MIN_FLIGHT_S if self.baseline is not None else self.past_t + CHECK_PERIOD_S):
             return None
-        return 2.0 * (not self._model_valid(twin)) + 4.0 * self._needs_confirmation + self.overdue(newest)
+        return 2.0 * (not self._model_valid(twin)) + 4.0 * self.is_unconfirmed + self.overdue(newest)
 
     def overdue(self, newest: float) -> float:
         """Return how long a check is overdue at the newest telemetry [check periods]."""
@@ -117,7 +118,7 @@ class DiagnosisState:
         newest = twin.telemetry.history.newest
         self.next_t = newest + CHECK_PERIOD_S
         is_aged = newest - self.diagnosed_t >= DIAGNOSIS_PERIOD_S
-        full = (idle and is_aged) or not self._model_valid(twin) or self._needs_confirmation
+        full = (idle and is_aged) or not self._model_valid(twin) or self.is_unconfirmed
         start = newest - FLIGHT_S
         past, past_end = None, None
         if self.past is not None:
@@ -131,11 +132,6 @@ class DiagnosisState:
     @property
     def _is_suspicious(self) -> bool:
         return self.published is not None and self.published.outcome is not DiagnosisOutcome.NONE
-
-    @property
-    def _needs_confirmation(self) -> bool:
-        unsettled = (DiagnosisOutcome.SUSPECTED, DiagnosisOutcome.UNKNOWN)
-        return self.published is not None and self.published.outcome in unsettled
 
     def handle_result(self, result: DiagnosisResult) -> Mismatch | None:
         """Handle a result; return the mismatch to publish, None if nothing changed."""
@@ -156,7 +152,8 @@ class DiagnosisState:
             report = with_earlier_onsets(report, self.last_report, shift, start + _SAME_ONSET_S)
         shifted = shift_times(report, result.begin - self.first_t)
         mismatch = mismatch_message(result.uav, shifted, result.begin, result.end)
-        if mismatch.outcome in _CONFIRMED and not self._is_confirmed(report, result):
+        self.is_unconfirmed = mismatch.outcome in _CONFIRMED and not self._is_confirmed(report, result)
+        if self.is_unconfirmed:
             self.next_t = result.end + _CONFIRM_AFTER_S
             mismatch = mark_unconfirmed(mismatch)
         self.last_report, self.last_begin = report, result.begin

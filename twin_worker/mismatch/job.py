@@ -11,7 +11,7 @@ from fleet.contract import COLUMNS, Cause, DiagnosisOutcome, Mismatch
 from twin_worker.diagnosis.baseline.own_past import find_output_faults, only_new_findings
 from twin_worker.diagnosis.baseline.past import CONTEXT_S, PastModel, calibrate_past, part_after, part_before
 from twin_worker.diagnosis.data.card import AircraftCard
-from twin_worker.diagnosis.data.flight import STEP_S, FlightData, resample_flight
+from twin_worker.diagnosis.data.flight import FlightData, resample_flight
 from twin_worker.diagnosis.inference.diagnose import diagnose
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
 from twin_worker.diagnosis.inference.output_faults import with_frozen_outputs
@@ -22,10 +22,10 @@ from twin_worker.diagnosis.model.weather import own_weather
 from twin_worker.mismatch.effect_increments import EffectOutputs, effect_outputs
 from twin_worker.telemetry.history import TelemetryHistory
 
-RECENT_S = 20.0  # newest flight whose residuals are monitored [s]
+RECENT_S = 40.0  # newest flight whose residuals are monitored [s]
 _JOIN_GAP_S = 10.0  # between the past and the recent flight; longer than a filter, so that it is left out [s]
-MIN_GROWTH = 2.5  # mean square of the recent residuals over the earlier ones that triggers a diagnosis [-]
-_MIN_ROWS = 50  # of both parts, one row every 0.2 s
+MIN_RATIO = 2.0  # ratio that triggers a diagnosis; 10 % of the checks of six healthy flights exceed it [-]
+_MIN_ROWS = 50  # of the recent flight, one row every 0.2 s
 
 TelemetryRows = dict[str, tuple[np.ndarray, np.ndarray]]
 
@@ -66,7 +66,7 @@ class DiagnosisResult:
         begin, end: flight of the diagnosis [s since 1970]
         recent_start: start of its newest part without a gap [s since 1970]
         past_model: calibration on the own past, for the next job
-        residual_growth: mean square of the recent residuals over the earlier ones, worst channel; nan if undetermined
+        residual_ratio: mean square of the recent residuals over the usual one, worst channel; nan if undetermined
         report: the diagnosis; None if the residuals did not require one
         effect_outputs: what the diagnosed effects add to the aircraft's dynamics, row by row
         refusal: reason for no diagnosis, or empty
@@ -80,7 +80,7 @@ class DiagnosisResult:
     end: float
     recent_start: float = -inf
     past_model: PastModel | None = None
-    residual_growth: float = float("nan")
+    residual_ratio: float = float("nan")
     report: Report | None = None
     effect_outputs: EffectOutputs | None = None
     refusal: str = ""
@@ -123,7 +123,7 @@ def _empty_result(job: DiagnosisJob) -> DiagnosisResult:
 
 
 def run_job(job: DiagnosisJob) -> DiagnosisResult:
-    """Check the recent residuals and diagnose if they grew; a `ValueError` becomes a refusal."""
+    """Check the recent residuals and diagnose if they are larger than usual; a `ValueError` becomes a refusal."""
     started = time.process_time()
     result = _empty_result(job)
     try:
@@ -150,8 +150,8 @@ def _run(job: DiagnosisJob, result: DiagnosisResult) -> DiagnosisResult:
         result = replace(result, past_model=past_model)
     else:
         raise ValueError(f"{flight.name}: found neither a model nor a past, expected one of them; fly longer")
-    result = replace(result, begin=flight.t_start, residual_growth=residual_growth(flight, baseline))
-    if not (job.full or output_faults or result.residual_growth > MIN_GROWTH):
+    result = replace(result, begin=flight.t_start, residual_ratio=residual_ratio(flight, baseline))
+    if not (job.full or output_faults or result.residual_ratio > MIN_RATIO):
         return result
     report = diagnose(flight, baseline)
     if job.baseline is None and past_end is not None:
@@ -160,16 +160,14 @@ def _run(job: DiagnosisJob, result: DiagnosisResult) -> DiagnosisResult:
     return replace(result, report=with_frozen_outputs(report, output_faults), effect_outputs=outputs)
 
 
-def residual_growth(flight: FlightData, baseline: Baseline) -> float:
-    """Return the mean square of the recent residuals over the earlier ones, of the channel with the largest growth."""
-    flight_model = ModelledFlight(flight, baseline)
-    whitened = WhitenedResiduals(flight_model, own_weather(flight_model))
-    is_recent = flight_model.t > flight_model.t[-1] - RECENT_S
-    recent, earlier = whitened.part(is_recent), whitened.part(~is_recent)
-    if min(recent.ok.sum(), earlier.ok.sum()) < min(_MIN_ROWS, 0.5 * RECENT_S / STEP_S):
+def residual_ratio(flight: FlightData, baseline: Baseline) -> float:
+    """Return the mean square of the recent residuals over the usual one, of the channel with the largest ratio."""
+    modelled = ModelledFlight(flight, baseline)
+    whitened = WhitenedResiduals(modelled, own_weather(modelled))
+    recent = whitened.part(modelled.t > modelled.t[-1] - RECENT_S)
+    if recent.ok.sum() < _MIN_ROWS:
         return float("nan")
-    mean_square = [((part.e + part.Jn @ whitened.xn)[part.ok] ** 2).mean(axis=0) for part in (recent, earlier)]
-    return float((mean_square[0] / np.maximum(mean_square[1], baseline.usual * 0.5)).max())
+    return float((((recent.e + recent.Jn @ whitened.xn)[recent.ok] ** 2).mean(axis=0) / baseline.usual).max())
 
 
 _MAX_FORCE_ERROR = 100.0  # larger errors come from a diverged simulation and are not published [m/s2]

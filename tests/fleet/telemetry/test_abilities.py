@@ -125,7 +125,7 @@ def test_a_past_that_is_a_little_too_short_is_not_said_to_be_enough():
     lain = flight.resample_flight("it", history, {}, UNKNOWN)
     ok = lain.ok & (np.cumsum(lain.ok) <= round(past.MIN_PAST_S / smooth.DT) - 2)
     with pytest.raises(ValueError, match=r"found 39\.\d+ s of trusted flight before .* expected 40 s"):
-        past.calibrate_past(dataclasses.replace(lain, ok=ok), 1e3, UNKNOWN)
+        past.calibrate_past(dataclasses.replace(lain, ok=ok), UNKNOWN)
 
 
 def test_a_plane_with_everything_can_everything():

@@ -95,7 +95,7 @@ def test_a_real_flight_without_a_fault_is_left_in_peace(thor: FlightData) -> Non
 def test_wind_found_without_airspeed_foretells_the_concealed_airspeed(thor: FlightData) -> None:
     dark = hidden.conceal_channels(thor, ("airspeed",), thor)
     later = part_after(dark, 400.0)
-    case = ModelledFlight(later, calibrate_past(dark, 400.0, UNKNOWN))
+    case = ModelledFlight(later, calibrate_past(part_before(dark, 400.0), UNKNOWN).baseline(dark))
     w = fit_wind(case, np.zeros(4))
     s = case.corrected_readings(())
     pitot = np.interp(case.t, thor.t, thor.readings["Va"])[case.ok]

@@ -6,6 +6,7 @@ import signal
 import threading
 from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -130,8 +131,8 @@ def test_what_is_seen_once_says_so_and_where():
 
 def test_by_its_own_past_nothing_is_named_that_began_in_it(twin, monkeypatch):
     for name, gives in {
-        "calibrate_past": BASE,
-        "residual_growth": 1.0,
+        "calibrate_past": SimpleNamespace(baseline=lambda flight: BASE),
+        "residual_ratio": 1.0,
         "diagnose": made(),
         "effect_outputs": None,
     }.items():
@@ -148,7 +149,7 @@ def test_by_its_own_past_nothing_is_named_that_began_in_it(twin, monkeypatch):
 def test_who_waits_to_be_confirmed_goes_first(twin):
     calm, waiting = DiagnosisState(baseline=BASE), DiagnosisState(baseline=BASE)
     answered(waiting, twin.telemetry.history.newest - 10.0, made())
-    calm.diagnosed_t = waiting.diagnosed_t - 30.0  # and has waited longer
+    calm.next_t = waiting.next_t - 20.0  # and has waited longer
     assert waiting.urgency(twin) > calm.urgency(twin)
 
 
@@ -258,15 +259,12 @@ def test_a_defect_met_by_one_aircraft_leaves_the_diagnosis_of_the_others(looking
     other = copy.copy(twin)
     other.config = msgspec.structs.replace(other.config, uav=2)
     live.state(1).baseline = None
-    live.state(1).published = "no message"  # what is looked at raises
-    live.state(1).past = {}
+    live.state(1).past, live.state(1).past_t = {}, None  # what is looked at raises
     held = [(twin, nullcontext()), (other, nullcontext())]
     assert list(live.run_once(held)) == []
     assert [job.uav for job in hand.jobs] == [2]
     (said,) = live.defects([1, 2])
-    assert (
-        said.startswith("uav-1: diagnosis failed with an internal error (AttributeError") and "retried in 60 s" in said
-    )
+    assert said.startswith("uav-1: diagnosis failed with an internal error (TypeError") and "retried in 60 s" in said
 
 
 def test_a_defect_in_taking_an_answer_is_that_aircrafts_alone_and_passes(looking, monkeypatch):

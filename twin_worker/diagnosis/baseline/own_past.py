@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fleet.effects import catalogue
 from fleet.frames import G
 from fleet.process.sanitise import format_below
 from twin_worker.diagnosis.baseline.air_movement import energy_evidence
@@ -22,6 +23,7 @@ from twin_worker.diagnosis.inference.output_faults import (
 from twin_worker.diagnosis.inference.report import Report, ReportOutcome, with_sentence
 from twin_worker.diagnosis.model.baseline import Baseline, exclude_equations
 
+_AIR = "air"  # channel of the effects that are weather
 ENERGY, TURN, PITCH = "energy held", "turn by bank", "pitch attitude"
 _ENERGY_EFFECTS = ("thrust_loss", "drag_increase", "battery_sag", "icing", "flap_deployed")
 _MEAN_S = 2.0  # running mean
@@ -160,12 +162,16 @@ def only_new_findings(report: Report, tracking_loss: tuple[str, float] | None, u
     """Return the report without mismatches in the trusted past alone, and with a tracking loss after it.
 
     An effect that starts in the trusted past contradicts the assumption: the outcome is suspected instead of named.
-    Turbulence has no onset and varies between minutes: it counts as weather, like the wind.
+    Wind, gusts and turbulence vary between minutes, and the past is one sample of them: they are weather, no finding,
+    and an effect not separable from them is suspected.
     """
-    if any(finding.hypothesis.effect.variance for finding in report.findings):
-        report = replace(report, outcome=ReportOutcome.NONE, findings=())
-    in_past = any(finding.segments[0][0] < until - _ONSET_MARGIN_S for finding in report.findings)
-    if in_past and report.outcome is ReportOutcome.NAMED:
+    findings = tuple(finding for finding in report.findings if finding.hypothesis.effect.channel != _AIR)
+    if len(findings) < len(report.findings):
+        is_explained = not findings and report.outcome is not ReportOutcome.UNKNOWN
+        report = replace(report, findings=findings, outcome=ReportOutcome.NONE if is_explained else report.outcome)
+    in_past = any(finding.segments[0][0] < until - _ONSET_MARGIN_S for finding in findings)
+    may_be_weather = any(catalogue()[name].channel == _AIR for finding in findings for name in finding.rivals)
+    if (in_past or may_be_weather) and report.outcome is ReportOutcome.NAMED:
         report = replace(report, outcome=ReportOutcome.SUSPECTED)
     channel, segments = report.where
     segments = tuple(pair for pair in segments if pair[1] > until)

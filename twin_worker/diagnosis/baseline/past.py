@@ -100,8 +100,9 @@ def calibrate_past(
     """
     if past.seconds < MIN_PAST_S:
         raise ValueError(
-            f"{past.name}: found {format_below(past.seconds, MIN_PAST_S)} s of trusted flight, expected "
-            f"{MIN_PAST_S:.0f} s at least; trust a longer past, or calibrate on other flights"
+            f"{past.name}: found {format_below(past.seconds, MIN_PAST_S)} s of trusted flight before "
+            f"{past.t[-1] if len(past.t) else 0.0:.0f} s, expected {MIN_PAST_S:.0f} s at least; trust a longer past, "
+            "or calibrate on other flights"
         )
     progress(f"{past.name}: calibrating on its own past, {past.seconds:.0f} s of trusted flight")
     timing = fit_timing([past], card, past.vane)

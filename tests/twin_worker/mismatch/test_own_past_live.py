@@ -1,0 +1,91 @@
+"""Live diagnosis against the own past: a simulated aircraft with a fast accelerometer, in two jobs after the past."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleet.contract import Params, Sample
+from fleet.simulator.faults.kinds import parse_fault
+from fleet.simulator.flight.drive import to_tlog
+from fleet.simulator.flight.uav import SimulatedUav
+from fleet.telemetry.recording.recordings import replay_messages
+from tests.support.diagnosed import made
+from twin_worker.diagnosis.data.card import UNKNOWN, OnsetProfile
+from twin_worker.diagnosis.inference.diagnose import uncovered_axes
+from twin_worker.diagnosis.inference.report import ReportOutcome
+from twin_worker.mismatch import job
+from twin_worker.mismatch.coordinator import BASELINE_S, FLIGHT_S
+from twin_worker.mismatch.job import DiagnosisJob, move_past, run_job, telemetry_rows, with_earlier_onsets
+from twin_worker.telemetry.history import TelemetryHistory
+
+SEED, TAKEOFF_S, ONSET_S = 202, 60.0, 300.0
+FAULT = parse_fault(f"thrust_loss,fraction=0.3,at={ONSET_S:.0f}", "small")
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> tuple[TelemetryHistory, dict[str, float]]:
+    """Telemetry and parameters of an aircraft whose engine loses 30 % of its thrust after 300 s."""
+    path = tmp_path_factory.mktemp("own") / "flight.tlog"
+    to_tlog(path, [SimulatedUav(0, SEED, faults=(FAULT,))], seconds=350, loss=0.02, seed=SEED)
+    history, params = TelemetryHistory(keep_s=np.inf), {}
+    for message in replay_messages(path):
+        if isinstance(message, Sample):
+            history.add(message)
+        elif isinstance(message, Params):
+            params.update(message.values)
+    return history, params
+
+
+def job_at(flight: tuple[TelemetryHistory, dict[str, float]], now: float) -> DiagnosisJob:
+    """Return the job that a coordinator gives `now` seconds after the first attitude."""
+    history, params = flight
+    begin = float(history.rows("attitude")[0][0])
+    kept = {kind: (t[t <= begin + now], x[t <= begin + now]) for kind, (t, x) in telemetry_rows(history, 0.0).items()}
+    past_end = begin + TAKEOFF_S + BASELINE_S
+    past = {kind: (t[(t > begin + TAKEOFF_S) & (t < past_end)],) for kind, (t, _) in kept.items()}
+    past = {kind: (*t, kept[kind][1][np.isin(kept[kind][0], t[0])]) for kind, t in past.items()}
+    start = begin + now - FLIGHT_S
+    moved, moved_end = move_past(past, past_end, start)
+    rows = {}
+    for kind, (t, x) in kept.items():
+        recent = t > start
+        rows[kind] = np.concatenate([moved[kind][0], t[recent]]), np.concatenate([moved[kind][1], x[recent]])
+    return DiagnosisJob(1, rows, params, UNKNOWN, None, moved_end, None, start)
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_a_loss_of_thrust_is_named_and_nothing_before_it(
+    flight: tuple[TelemetryHistory, dict[str, float]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    healthy = run_job(replace(job_at(flight, ONSET_S - 5.0), full=True))
+    assert not healthy.refusal and healthy.report.outcome is not ReportOutcome.NAMED
+    monkeypatch.setattr(job, "calibrate_past", None)  # the past is calibrated once
+    result = run_job(replace(job_at(flight, ONSET_S + 40.0), past_model=healthy.past_model))
+    assert not result.refusal and result.past_model is healthy.past_model
+    assert result.residual_ratio > job.MIN_RATIO  # so that it is diagnosed
+    (found,) = result.report.findings
+    assert result.report.outcome is ReportOutcome.NAMED
+    assert "thrust_loss" in {found.hypothesis.effect.name, *found.rivals}
+    begin = float(flight[0].rows("attitude")[0][0])
+    assert result.begin + found.segments[0][0] == pytest.approx(begin + ONSET_S, abs=3.0)
+
+
+def test_surfaces_that_move_together_are_not_told_apart(flight: tuple[TelemetryHistory, dict[str, float]]) -> None:
+    """The rudder of the simulated aircraft is mixed with its aileron."""
+    past_model = run_job(job_at(flight, ONSET_S - 5.0)).past_model
+    assert past_model.base.undetermined == ("aileron", "rudder")
+    assert any(line.startswith("aileron and rudder not covered: ") for line in uncovered_axes(past_model.base))
+
+
+def test_an_onset_before_the_newest_flight_is_that_of_the_earlier_report() -> None:
+    earlier, newer = made(), made()
+    (finding,) = newer.findings
+    onset = earlier.findings[0].segments[0][0]
+    moved = replace(finding.hypothesis, onset=OnsetProfile(finding.hypothesis.onset.kind, 60.0))
+    newer = replace(newer, findings=(replace(finding, hypothesis=moved, segments=((60.0, 110.0),)),))
+    (kept,) = with_earlier_onsets(newer, earlier, -40.0, 65.0).findings
+    assert kept.segments[0][0] == pytest.approx(onset - 40.0)
+    assert kept.hypothesis.onset.t0 == pytest.approx(onset - 40.0)
+    (own,) = with_earlier_onsets(newer, earlier, -40.0, 59.0).findings  # seen to begin in the newest flight
+    assert own.segments[0][0] == 60.0
