@@ -118,7 +118,8 @@ class DiagnosisState:
         newest = twin.telemetry.history.newest
         self.next_t = newest + CHECK_PERIOD_S
         is_aged = newest - self.diagnosed_t >= DIAGNOSIS_PERIOD_S
-        full = (idle and is_aged) or not self._model_valid(twin) or self.is_unconfirmed
+        has_time = idle or self._is_suspicious  # a finding that passed must be withdrawn
+        full = (has_time and is_aged) or not self._model_valid(twin) or self.is_unconfirmed
         start = newest - FLIGHT_S
         past, past_end = None, None
         if self.past is not None:

@@ -153,6 +153,15 @@ def test_who_waits_to_be_confirmed_goes_first(twin):
     assert waiting.urgency(twin) > calm.urgency(twin)
 
 
+def test_where_others_wait_only_what_is_stated_is_diagnosed_without_a_sign(twin):
+    calm, stated = DiagnosisState(baseline=BASE), DiagnosisState(baseline=BASE)
+    for _ in range(2):
+        answered(stated, twin.telemetry.history.newest - 30.0, made())
+    assert stated.published.outcome is DiagnosisOutcome.NAMED and not stated.is_unconfirmed
+    assert calm.create_job(twin).full and not calm.create_job(twin, idle=False).full
+    assert stated.create_job(twin, idle=False).full  # so that a name can be withdrawn
+
+
 def test_another_name_or_onset_at_a_second_look_is_no_confirmation():
     watch = DiagnosisState(baseline=BASE)
     watch.first_t = 1000.0
