@@ -357,6 +357,24 @@ class Derivatives(msgspec.Struct, frozen=True, kw_only=True):
     siblings: Annotated[int, about("aircraft of its type that the prior was learnt from; 0: none")] = 0
 
 
+class RotorDynamics(msgspec.Struct, frozen=True, kw_only=True):
+    """Model of a multirotor: thrust and drag over mass from its motor inputs, answer of its attitude to the command.
+
+    Terms and letters: `twin_worker.identification.multirotor.rotor_model`.
+    """
+
+    names: Annotated[tuple[str, ...], about("k e k_c k_h d c w_n w_e phi_0 theta_0 wn_phi zeta_phi b_phi ...")]
+    value: Annotated[Array, about("(n,) <f8")]
+    covariance: Annotated[Array, about("(n, n) <f8")]
+    variance_reduction: Annotated[Array, about("relative reduction of each prior variance by the data, (n,) 0..1")]
+    hover_input: Annotated[float, about("mean motor input of the window, 0..1")]
+    airspeed: Annotated[float, about("mean airspeed of the window, with the estimated wind [m/s]")]
+    has_command: Annotated[bool, about("the commanded attitude was received; else its parameters are the prior's")]
+    window_t0: Annotated[float, about("first instant of the identification window [s since 1970]")] = 0.0
+    window_s: Annotated[float, about("length of the identification window [s]")] = 0.0
+    sentence: Annotated[str, about("thrust, drag and wind with their standard deviations")] = ""
+
+
 class Model(Message, frozen=True, kw_only=True):
     """Active model (none before the first accepted one), newest identification window and its verdict."""
 
@@ -369,6 +387,7 @@ class Model(Message, frozen=True, kw_only=True):
     longitudinal: LinearModel | None = None
     lateral: LinearModel | None = None
     derivatives: Annotated[Derivatives | None, about("of the coupled model; null for method paper")] = None
+    rotors: Annotated[RotorDynamics | None, about("of a multirotor; null for wings")] = None
     shrinkage_weights: Annotated[
         dict[str, float], about("weight of the model against persistence in a 10 s free run, from held-out data, 0..1")
     ] = {}

@@ -15,12 +15,16 @@ from fleet.contract import (
     Model,
     Params,
     Prediction,
+    RotorDynamics,
     Rows,
     Sample,
     Status,
+    Verdict,
 )
 from fleet.physics.wrench import N_PAR, NAMES
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel, prior
+from twin_worker.identification.multirotor.output_error import FIRST_STD
+from twin_worker.identification.multirotor.rotor_model import HIGH, LOW, PARAMETERS, RotorModel
 from twin_worker.twin.state.models import VerifiedModel
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.extrapolate import MAX_ROLLOUT_AGE_S
@@ -94,15 +98,50 @@ def restore_model(twin: Twin, model: Model) -> bool:
     The message contains neither the point-mass model nor the prior. The complete covariance counts as information from
     the model's own window, so that no data count twice when that window is identified again.
     """
-    plant = _decode_model(twin, model)
-    if plant is None or model.active_verdict is None or not model.active_verdict.outcome.is_accepted:
+    if model.active_verdict is None or not model.active_verdict.outcome.is_accepted:
         return False
     sentence = f"{model.active_verdict.sentence}; taken over from another worker"
     verdict = msgspec.structs.replace(model.active_verdict, sentence=sentence)
+    if model.rotors is not None:
+        return _restore_rotors(twin, model, model.rotors, verdict)
+    plant = _decode_model(twin, model)
+    if plant is None:
+        return False
     twin.models.activate(VerifiedModel(plant, verdict, model.t, float("nan")))
     twin.identification.restore(model, verdict, plant)
     twin.prediction.set_state(twin.models.state)
     twin.environment.wind.reset_wind(model.t, np.array([model.wind_n, model.wind_e, 0.0]))
+    return True
+
+
+def _restore_rotors(twin: Twin, model: Model, rotors: RotorDynamics, verdict: Verdict) -> bool:
+    """Restore the rotor model of a message; return whether it is valid."""
+    try:
+        par, covariance = rotors.value.numpy().astype(float), rotors.covariance.numpy().astype(float)
+        information = np.linalg.inv(covariance)
+    except (ValueError, np.linalg.LinAlgError):
+        return False
+    n = len(PARAMETERS)
+    if rotors.names != PARAMETERS or par.shape != (n,) or information.shape != (n, n):
+        return False
+    if not (np.isfinite(par).all() and np.isfinite(information).all() and (par >= LOW).all() and (par <= HIGH).all()):
+        return False
+    restored = RotorModel(
+        par=par,
+        information=0.5 * (information + information.T),
+        prior_precision=information,
+        weight=FIRST_STD**-2.0,
+        has_command=rotors.has_command,
+        hover=rotors.hover_input,
+        speed=rotors.airspeed,
+        t0=rotors.window_t0,
+        t1=rotors.window_t0 + rotors.window_s,
+        steps=0,
+    )
+    twin.models.rotors.restore(restored)
+    twin.models.activate_rotors(restored, verdict)
+    twin.identification.restore(model, verdict)
+    twin.prediction.set_state(twin.models.state)
     return True
 
 

@@ -22,6 +22,8 @@ from twin_worker.identification.fixed_wing.derivatives_model import identify, li
 from twin_worker.identification.fixed_wing.energy_balance import fit_attitude_lag
 from twin_worker.identification.fixed_wing.plant import bias_corrected
 from twin_worker.identification.linear.linear_model import AXES, identify_axis
+from twin_worker.identification.multirotor.rotor_model import HIGH, free_run, start_states
+from twin_worker.identification.multirotor.rotor_window import RotorWindow
 from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.numerics.prediction_errors import AHEAD, displacement_along_path
 from twin_worker.prediction.fixed_wing.point_mass_rollout import unexplained_velocity
@@ -96,6 +98,9 @@ def _run_multirotors() -> None:
     states, simulated = np.empty((5, copter_legs.N_STATE)), np.empty((5, 4, 3))
     copter_legs.simulated_states(segments, 1, par, 0.1, states, simulated)
     position_loop.drag_integrator(np.zeros((2, 2)), np.zeros((2, 2)), par, 0.1, 1.0)
+    x, first = np.zeros((4, 3)), np.zeros(1, int)
+    window = RotorWindow(x[:, 0], x, x, x[:, :2].copy(), x[:, :2].copy(), np.full((4, 4), 0.5), np.ones(4, bool))
+    free_run(HIGH, window, first, start_states(window, first), 2, commanded=True)
 
 
 def _run_traffic() -> None:

@@ -1,6 +1,6 @@
-"""Consistency of a derivatives model with held-out data, and the errors of derivatives that the test detects.
+"""Consistency of an identified model with held-out data, and the errors of its parameters that the test detects.
 
-Each group of derivatives is scaled by 1 + eps; one least-squares step on free runs of 4 s estimates eps:
+Each group of parameters is scaled by 1 + eps; one least-squares step on free runs of 4 s estimates eps:
 
     eps_hat = sum z' e / I,   I = sum z' z,   z = d y_hat / d eps
     var(eps_hat) = k / (k - 1) sum_s (z_s' e_s - z_s' z_s eps_hat)^2 / I^2 (1 + I / I_identified)
@@ -13,6 +13,7 @@ A group fails if |eps_hat| exceeds `TOLERANCE` by more than chance allows at 5 %
 Source: Liang & Zeger 1986 (cluster-robust variance); Chow 1960 (test of one model on two samples).
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -43,11 +44,12 @@ GROUPS = {  # derivatives that an error scales together
     "thrust_and_drag": ("X_u", "X_dt"),
 }
 MASK = np.array([[name in names for names in GROUPS.values()] for name in NAMES], float)  # (37, groups)
-LONGITUDINAL = ("elevator_effectiveness", "pitch_damping", "pitch_stability", "thrust_and_drag")
+_LONGITUDINAL = ("elevator_effectiveness", "pitch_damping", "pitch_stability", "thrust_and_drag")
+AXIS_OF = {name: "longitudinal" if name in _LONGITUDINAL else "lateral" for name in GROUPS}
 TOLERANCE = 0.07  # relative error of a group that counts as right, chosen on tuning flights (seeds 1000 to 1023) [-]
 MAX_DETECTABLE = 0.5  # largest relative error for which the power is stated [-]
 _RUN_S = 4.0  # free run [s]
-_MIN_RUNS = 6  # fewer do not give a variance
+MIN_RUNS = 6  # fewer do not give a variance
 _SIGNIFICANCE, _POWER = 0.05, 0.95  # false rejections, over all groups; detections of an error of the stated size
 _NUISANCE = (*OFFSETS, WIND, WIND + 1)  # trim and wind differ between two stretches of one flight
 _N, _M = len(GROUPS), len(_NUISANCE)
@@ -55,14 +57,16 @@ _N, _M = len(GROUPS), len(_NUISANCE)
 
 @dataclass(frozen=True)
 class Consistency:
-    """Result of the test, by group in the order of `GROUPS`.
+    """Result of the test, by group.
 
     Attributes:
+        axis_of: axis of each group of parameters
         error: estimated relative error of the model, positive where the aircraft has more, (groups,) [-]
         threshold: error above which a group fails, (groups,) [-]
         detectable: smallest error, too large or too small, that fails with 95 % probability, (groups,) [-]
     """
 
+    axis_of: Mapping[str, str]
     error: np.ndarray
     threshold: np.ndarray
     detectable: np.ndarray
@@ -70,30 +74,28 @@ class Consistency:
     def failed(self) -> dict[str, float]:
         """Return the estimated error of each group that fails, largest first [%]; groups without power cannot fail."""
         excess = np.where(self.threshold <= MAX_DETECTABLE, np.abs(self.error) - self.threshold, -1.0)
-        return {name: 100.0 * float(self.error[k]) for k, name in _sorted(-excess) if excess[k] > 0.0}
+        return {name: 100.0 * float(self.error[k]) for k, name in self._sorted(-excess) if excess[k] > 0.0}
 
     def power(self) -> dict[str, float]:
         """Return the detectable error of each group up to `MAX_DETECTABLE`, smallest first [%]."""
-        stated = _sorted(self.detectable)
+        stated = self._sorted(self.detectable)
         return {name: 100.0 * float(self.detectable[k]) for k, name in stated if self.detectable[k] <= MAX_DETECTABLE}
 
+    @property
+    def has_power(self) -> bool:
+        """Return whether the power is stated for every axis."""
+        return {self.axis_of[name] for name in self.power()} == set(self.axis_of.values())
 
-def _sorted(key: np.ndarray) -> list[tuple[int, str]]:
-    names = tuple(GROUPS)
-    return [(int(k), names[k]) for k in np.argsort(key)]
+    def power_text(self) -> str:
+        """Describe the smallest detectable error of each axis."""
+        best: dict[str, str] = {}
+        for name, value in self.power().items():
+            best.setdefault(self.axis_of[name], f"{value:.0f} % in {name.replace('_', ' ')}")
+        return f"would have detected an error of {' and '.join(best.values())}"
 
-
-def has_power(power: dict[str, float]) -> bool:
-    """Return whether the power is stated for both axes."""
-    return len({name in LONGITUDINAL for name in power}) == 2
-
-
-def power_text(power: dict[str, float]) -> str:
-    """Describe the smallest detectable error of each axis."""
-    best: dict[bool, str] = {}
-    for name, value in power.items():
-        best.setdefault(name in LONGITUDINAL, f"{value:.0f} % in {name.replace('_', ' ')}")
-    return f"would have detected an error of {' and '.join(best.values())}"
+    def _sorted(self, key: np.ndarray) -> list[tuple[int, str]]:
+        names = tuple(self.axis_of)
+        return [(int(k), names[k]) for k in np.argsort(key)]
 
 
 def error_text(failed: dict[str, float]) -> str:
@@ -118,19 +120,30 @@ def estimate_errors(model: DerivativesModel, window: Window, start: int) -> Cons
     grams = _gram_matrices(model, window, unbroken_segments(held_out, window.dt, _RUN_S))
     if grams is None:
         return None
-    total, k = grams.sum(axis=0), len(grams)
-    groups, rest = slice(0, _N), slice(_N, _N + _M)
-    explained = _solve(total[rest, rest], total[rest])  # of each column by offsets and wind
+    return compare(grams, AXIS_OF, _identified_information(model))
+
+
+def compare(grams: np.ndarray, axis_of: Mapping[str, str], identified: np.ndarray) -> Consistency:
+    """Estimate the relative errors of the groups from the products of sensitivities and residuals.
+
+    Args:
+        grams: of each free run, [sensitivities to the groups, to offsets and wind, residuals], (k, p, p)
+        axis_of: groups and their axes
+        identified: information on each group in the model itself, in the unit of these data, (groups,)
+    """
+    total, k, n = grams.sum(axis=0), len(grams), len(axis_of)
+    rest = slice(n, total.shape[0] - 1)
+    explained = solve(total[rest, rest], total[rest])  # of each column by offsets and wind
     Q = np.eye(len(total))
     Q[rest] -= explained
     projected = Q.T @ grams @ Q
-    zz, ze = np.diagonal(projected, axis1=1, axis2=2)[:, groups], projected[:, groups, -1]
+    zz, ze = np.diagonal(projected, axis1=1, axis2=2)[:, :n], projected[:, :n, -1]
     I = np.maximum(zz.sum(axis=0), 1e-12)
     error = ze.sum(axis=0) / I
     variance = k / (k - 1) * ((ze - zz * error) ** 2).sum(axis=0) / I**2
-    variance *= 1.0 + I / np.maximum(_identified_information(model), 1e-12)
+    variance *= 1.0 + I / np.maximum(identified, 1e-12)
     threshold, detectable = limits(np.sqrt(variance), k - 1)
-    return Consistency(error, threshold, detectable)
+    return Consistency(axis_of, error, threshold, detectable)
 
 
 def limits(std: np.ndarray, dof: int) -> tuple[np.ndarray, np.ndarray]:
@@ -138,15 +151,15 @@ def limits(std: np.ndarray, dof: int) -> tuple[np.ndarray, np.ndarray]:
 
     A model is itself off by up to the tolerance, uniformly; an error of s, too large, is s / (1 + s) of the model.
     """
-    critical, reserve = _quantiles(dof)
+    critical, reserve = _quantiles(len(std), dof)
     threshold = TOLERANCE + critical * std
     x = threshold + reserve * np.sqrt(std**2 + TOLERANCE**2 / 3.0)
     return threshold, np.where(x < 1.0, x / np.maximum(1.0 - x, 1e-9), np.inf)
 
 
 @lru_cache
-def _quantiles(dof: int) -> tuple[float, float]:
-    return float(student_t.ppf(1.0 - _SIGNIFICANCE / (2 * _N), dof)), float(student_t.ppf(_POWER, dof))
+def _quantiles(groups: int, dof: int) -> tuple[float, float]:
+    return float(student_t.ppf(1.0 - _SIGNIFICANCE / (2 * groups), dof)), float(student_t.ppf(_POWER, dof))
 
 
 def _gram_matrices(model: DerivativesModel, window: Window, runs: np.ndarray) -> np.ndarray | None:
@@ -154,7 +167,7 @@ def _gram_matrices(model: DerivativesModel, window: Window, runs: np.ndarray) ->
 
     What the start state explains is removed, as the identification does.
     """
-    if len(runs) < _MIN_RUNS:
+    if len(runs) < MIN_RUNS:
         return None
     y, delta = window.over_ground, lagged(window.u, window.dt, TAU)
     starts = np.array([line_fit_start(y[a:b]) for a, b in runs])
@@ -188,11 +201,11 @@ def _identified_information(model: DerivativesModel) -> np.ndarray:
     identified = model.fisher_information + (model.prior_precision if model.siblings else 0.0)
     information = identified / EFFECTIVE_FRACTION
     cross = information[list(_NUISANCE)] @ D
-    by_nuisance = _solve(information[np.ix_(_NUISANCE, _NUISANCE)], cross)
+    by_nuisance = solve(information[np.ix_(_NUISANCE, _NUISANCE)], cross)
     return np.einsum("ag,ab,bg->g", D, information, D) - np.einsum("ng,ng->g", cross, by_nuisance)
 
 
-def _solve(A: np.ndarray, b: np.ndarray) -> np.ndarray:
+def solve(A: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Solve A x = b, (n, n) and (n, m), for a symmetric A whose rows differ in scale and may be dependent."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(A), 1e-12))
     return scale[:, None] * (

@@ -16,8 +16,6 @@ from twin_worker.validation.consistency import (
     Consistency,
     error_text,
     estimate_errors,
-    has_power,
-    power_text,
 )
 from twin_worker.validation.held_out import HeldOut
 
@@ -182,7 +180,7 @@ def with_consistency(verdict: Verdict, plant: Plant, window: Window, start: int)
     """Test a plausible model for consistency with held-out data; verified if it passes and its power is stated."""
     if verdict.outcome is not Outcome.PLAUSIBLE or not isinstance(plant, DerivativesModel):
         return verdict
-    return _concluded(verdict, estimate_errors(plant, window, start), verdict.sentence)
+    return concluded(verdict, estimate_errors(plant, window, start), verdict.sentence)
 
 
 def verify_since_identification(verdict: Verdict, plant: Plant, window: Window, name: str) -> Verdict:
@@ -202,30 +200,30 @@ def verify_since_identification(verdict: Verdict, plant: Plant, window: Window, 
         return verdict
     start = int(np.searchsorted(window.t, plant.t1, side="right"))
     errors = estimate_errors(plant, window, start) if start < len(window) else None
-    if errors is None or not (errors.failed() or has_power(errors.power())):
+    if errors is None or not (errors.failed() or errors.has_power):
         return verdict
     seconds = (len(window) - start) * window.dt
-    return _concluded(verdict, errors, f"{name}: {seconds:.0f} s of flight since the identification")
+    return concluded(verdict, errors, f"{name}: {seconds:.0f} s of flight since the identification")
 
 
-def _concluded(verdict: Verdict, errors: Consistency | None, sentence: str) -> Verdict:
+def concluded(verdict: Verdict, errors: Consistency | None, sentence: str) -> Verdict:
     """Return the verdict of a consistency test, with its reason added to the sentence; `errors` of None: no test."""
-    failed, power = (errors.failed(), errors.power()) if errors is not None else ({}, {})
-    verified = not failed and has_power(power)
+    failed = errors.failed() if errors is not None else {}
+    verified = errors is not None and not failed and errors.has_power
     if failed:
         reason = f"plausible only: {error_text(failed)}"
-    elif not verified:
+    elif errors is None or not verified:
         reason = (
             f"plausible only: these data would not show an error of {100 * MAX_DETECTABLE:.0f} % in one of the axes"
         )
     else:
-        reason = f"consistent, {power_text(power)}"
+        reason = f"consistent, {errors.power_text()}"
     return msgspec.structs.replace(
         verdict,
         outcome=Outcome.VERIFIED if verified else Outcome.PLAUSIBLE,
         sentence=f"{sentence}; {reason}",
         derivative_error=failed,
-        detectable_error=power,
+        detectable_error=errors.power() if errors is not None else {},
     )
 
 

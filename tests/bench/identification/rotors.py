@@ -21,10 +21,11 @@ from fleet.simulator.conceal.multirotor.exam import RotorJob, fly_rotor_flight
 from fleet.simulator.conceal.multirotor.faults import AIRFRAMES, FaultyMultirotor
 from fleet.simulator.multirotor.tuning import motor_pulses
 from twin_worker.diagnosis.multirotor.baseline import RotorBaseline, calibrate_rotors
-from twin_worker.diagnosis.multirotor.flight import DT, RotorFlight, motor_inputs
+from twin_worker.diagnosis.multirotor.flight import DT, RotorFlight
 from twin_worker.diagnosis.multirotor.linearise import LinearFlight, solve
 from twin_worker.diagnosis.multirotor.model import CHANNELS, PARAMETERS, rotation, rotor_speeds
 from twin_worker.diagnosis.multirotor.recordings import before, read_rotorcraft
+from twin_worker.telemetry.motors import motor_inputs
 
 SPEEDS = np.array([3.0, 6.0, 9.0])  # airspeeds of the comparison [m/s]
 SHORT_S, LONG_S = 1.0, 10.0

@@ -14,9 +14,9 @@ from math import degrees
 import numpy as np
 
 from fleet.frames import G
-from twin_worker.diagnosis.multirotor.flight import RotorFrame, motor_inputs, rotor_frame
 from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.telemetry.history import TelemetryHistory
+from twin_worker.telemetry.motors import RotorFrame, motor_inputs, rotor_frame
 
 MIN_HZ = 8.0  # of attitude and motor outputs
 _WINDOW_S = 0.3

@@ -1,4 +1,4 @@
-"""Telemetry of one multirotor on an equally spaced grid, with the places of its motors."""
+"""Telemetry of one multirotor on an equally spaced grid."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,6 +7,7 @@ import numpy as np
 
 from fleet.frames import Origin, to_ned
 from twin_worker.telemetry.history import TelemetryHistory
+from twin_worker.telemetry.motors import RotorFrame, motor_inputs, rotor_frame
 
 DT = 0.02  # of the grid [s]
 MIN_HZ = 20.0  # of accelerometer and motor outputs; slower samples alias the answers of the attitude control
@@ -15,65 +16,6 @@ _MIN_HEIGHT_M = 3.0  # lower rows are on or near the ground
 _MIN_INPUT = 0.08  # mean motor input of a flying multirotor [-]
 _MAX_GAP_S, _AROUND_S = 0.5, 0.5
 _SEA_LEVEL, _POWER, _LAPSE = 101_325.0, 5.25588, 2.25577e-5  # standard atmosphere [Pa, -, 1/m]
-
-
-@dataclass(frozen=True)
-class RotorFrame:
-    """Places of the motors: right, forward and sense of the reaction torque of each, in arm lengths, (3, m) [-].
-
-    The third row is +1 where the reaction torque turns the frame to the right.
-    """
-
-    name: str
-    places: np.ndarray
-
-    @property
-    def mixer(self) -> np.ndarray:
-        """Return the roll, pitch and yaw moment of the thrust of each motor, (m, 3) [-]."""
-        right, forward, turn = self.places
-        return np.stack([-right, forward, turn], axis=1)
-
-    @property
-    def sides(self) -> tuple[str, ...]:
-        """Return the side of each motor in words."""
-        rows = zip(*self.places[:2].tolist(), strict=True)
-        return tuple(" ".join(filter(None, (_word(x, "rear", "front"), _word(y, "left", "right")))) for y, x in rows)
-
-
-def _word(x: float, negative: str, positive: str) -> str:
-    return "" if abs(x) < 0.3 else positive if x > 0 else negative
-
-
-_H = np.sqrt(0.75)
-FRAMES: dict[tuple[int, int], RotorFrame] = {  # ArduCopter FRAME_CLASS, FRAME_TYPE
-    (1, 0): RotorFrame("quadrotor +", np.array([[1, -1, 0, 0], [0, 0, 1, -1], [1, 1, -1, -1]], float)),
-    (1, 1): RotorFrame("quadrotor X", np.array([[1, -1, -1, 1], [1, -1, 1, -1], [1, 1, -1, -1]], float)),
-    (2, 0): RotorFrame(
-        "hexarotor +", np.array([[0, 0, -_H, _H, -_H, _H], [1, -1, -0.5, 0.5, 0.5, -0.5], [-1, 1, -1, 1, 1, -1]])
-    ),
-    (2, 1): RotorFrame(
-        "hexarotor X", np.array([[1, -1, 0.5, -0.5, -0.5, 0.5], [0, 0, _H, -_H, _H, -_H], [-1, 1, -1, 1, 1, -1]])
-    ),
-}
-"""Motors as ArduCopter numbers them. Source: ArduPilot documentation, "Connect ESCs and motors"."""
-
-
-def rotor_frame(params: Mapping[str, float]) -> RotorFrame | None:
-    """Return the frame of the parameters: ArduCopter's class and type, older FRAME, PX4 quadrotor; None: unknown."""
-    if "FRAME" in params:  # before ArduCopter 3.6; the class was that of the firmware
-        return FRAMES.get((1, min(int(params["FRAME"]), 2)))
-    if "FRAME_CLASS" in params or "FRAME_TYPE" in params:
-        return FRAMES.get((int(params.get("FRAME_CLASS", 1)), int(params.get("FRAME_TYPE", 1))))
-    if params.get("CA_ROTOR_COUNT", 4.0) == 4.0:  # PX4 numbers the motors of a quadrotor X alike
-        return FRAMES[1, 1]
-    return None
-
-
-def motor_inputs(pulses: np.ndarray, params: Mapping[str, float]) -> np.ndarray:
-    """Convert motor outputs [us] to inputs between idle and full, same shape [-]."""
-    low, high = params.get("MOT_PWM_MIN", 0.0) or 1000.0, params.get("MOT_PWM_MAX", 0.0) or 2000.0
-    idle, full = params.get("MOT_SPIN_MIN", 0.0), params.get("MOT_SPIN_MAX", 1.0)
-    return np.clip(((pulses - low) / (high - low) - idle) / (full - idle), 0.0, 1.0)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Iterable
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
 import msgspec
@@ -14,6 +14,7 @@ from twin_worker.estimation.wind_filter import WindFilter
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
 from twin_worker.identification.fixed_wing.plant import Plant
 from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel
+from twin_worker.identification.multirotor.rotor_model import RotorModel
 from twin_worker.prediction.kinematic import KinematicModel
 from twin_worker.prediction.multirotor.rollout import MultirotorModel
 from twin_worker.twin.state.budget import Timer
@@ -142,8 +143,8 @@ class Identification(msgspec.Struct):
         self.message = message
         self.published.restart(t)
 
-    def restore(self, message: Model, verdict: Verdict, model: DerivativesModel) -> None:
-        """Store a verified model that another worker published."""
+    def restore(self, message: Model, verdict: Verdict, model: DerivativesModel | None = None) -> None:
+        """Store a verified model that another worker published; None: a rotor model, which is stored elsewhere."""
         self.message, self.verdict, self.prior_model = message, verdict, model
 
     def restart(self, data_from: float, prior_model: DerivativesModel | None) -> None:
@@ -160,6 +161,43 @@ class Identification(msgspec.Struct):
     def shift_clock(self, step: float) -> None:
         """Date the data `step` later [s]."""
         self.data_from += step
+
+
+class RotorModels(msgspec.Struct):
+    """Rotor models of a multirotor.
+
+    Attributes:
+        active: the accepted model; None before any
+        newest: newest model, accepted or not: the next search begins there
+        base: model of the flight before the identification window, its prior; None: none yet
+        timer: of identifications
+    """
+
+    active: RotorModel | None = None
+    newest: RotorModel | None = None
+    base: RotorModel | None = None
+    timer: Timer = msgspec.field(default_factory=Timer)
+
+    def store(self, newest: RotorModel, *, becomes_base: bool) -> None:
+        """Store the newest model."""
+        self.newest = newest
+        self.base = newest if becomes_base else self.base
+
+    def activate(self, model: RotorModel) -> None:
+        """Make a model the active one."""
+        self.active = model
+
+    def restore(self, model: RotorModel) -> None:
+        """Store a model that another worker published."""
+        self.active = self.newest = self.base = model
+
+    def forget_times(self) -> None:
+        """Forget when the models were identified: the clock was set back."""
+        self.timer.expire()
+        if self.base is not None:
+            self.base = replace(self.base, t0=-np.inf, t1=-np.inf)
+        if self.active is not None:
+            self.active = replace(self.active, t0=-np.inf, t1=-np.inf)
 
 
 class VerifiedModel(msgspec.Struct):
@@ -215,6 +253,7 @@ class ModelBank(msgspec.Struct):
         active_effect: missing physics that was added to the models
         checkpoints: of the last minutes
         multirotor, kinematic: models that need no identification
+        rotors: identified models of a multirotor
     """
 
     active_model: Plant | None = None
@@ -233,11 +272,12 @@ class ModelBank(msgspec.Struct):
     checkpoints: deque[Checkpoint] = msgspec.field(default_factory=lambda: deque(maxlen=MAX_CHECKPOINTS))
     multirotor: MultirotorModel = msgspec.field(default_factory=MultirotorModel)
     kinematic: KinematicModel = msgspec.field(default_factory=KinematicModel)
+    rotors: RotorModels = msgspec.field(default_factory=RotorModels)
 
     @property
     def state(self) -> TwinState:
         """Return the state of a twin that has these models and no path: waiting without an active model."""
-        if self.active_model is None:
+        if self.active_model is None and self.rotors.active is None:
             return TwinState.WAITING
         plausible = self.active_verdict is not None and self.active_verdict.outcome is Outcome.PLAUSIBLE
         return TwinState.PLAUSIBLE if plausible else TwinState.VERIFIED
@@ -268,7 +308,9 @@ class ModelBank(msgspec.Struct):
 
     def update_verdict(self, verdict: Verdict) -> None:
         """Store a newer verdict on the active model, the best of the candidates."""
-        self.active_verdict = self.verified_models[0].verdict = verdict
+        self.active_verdict = verdict
+        if self.verified_models:
+            self.verified_models[0].verdict = verdict
 
     def activate(self, candidate: VerifiedModel) -> None:
         """Make a verified model the only candidate and the active one."""
@@ -313,6 +355,11 @@ class ModelBank(msgspec.Struct):
     def store_multirotor(self, model: MultirotorModel) -> None:
         """Store the newest multirotor model."""
         self.multirotor = model
+
+    def activate_rotors(self, model: RotorModel, verdict: Verdict) -> None:
+        """Make an accepted rotor model the active one."""
+        self.rotors.activate(model)
+        self.active_verdict = verdict
 
     def store_kinematic(self, model: KinematicModel) -> None:
         """Store the newest kinematic model."""

@@ -27,6 +27,7 @@ from twin_worker.twin.state.models import VerifiedModel
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.kinematic_prediction import fit_kinematic_models
 from twin_worker.twin.steps.point_mass_step import update_point_mass
+from twin_worker.twin.steps.rotor_step import identify_rotors
 from twin_worker.validation.held_out import HeldOut
 from twin_worker.validation.verify import verify, verify_since_identification, with_consistency, with_diagnostics
 
@@ -237,6 +238,8 @@ _PUBLISH_PERIOD_S = 5.0  # between published models without a changed outcome [s
 def identify_and_verify(twin: Twin) -> list[Message]:
     """Identify and verify once; return the model with its verdict if it is due, nothing if data are insufficient."""
     fit_kinematic_models(twin)
+    if twin.vehicle_class.is_rotorcraft:
+        return identify_rotors(twin)
     if twin.vehicle_class.has_wings:
         update_point_mass(twin)
     window = _fixed_wing_part(twin, twin.window(_window_length_s(twin) + _max_hold_out_s(twin)))
@@ -321,9 +324,6 @@ def _hold_out_limits(twin: Twin) -> tuple[float, float]:
 
 def _insufficient_data(twin: Twin, window: Window | None) -> Verdict | None:
     """Return a verdict with the reason if identification is not possible yet; None otherwise."""
-    if twin.vehicle_class.is_rotorcraft:
-        sentence = f"{twin.name}: a {twin.vehicle} has no wings to identify; {twin.models.multirotor}"
-        return Verdict(outcome=Outcome.NOT_IDENTIFIABLE, sentence=sentence)
     available_s = 0.0 if window is None else float(window.ok.sum() * DT)
     needed_s = MIN_WINDOW_S if window is None or _type_prior(twin, window) is None else _MIN_SIBLING_WINDOW_S
     if window is not None and available_s >= needed_s:

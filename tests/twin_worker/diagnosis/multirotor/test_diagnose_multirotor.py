@@ -23,11 +23,12 @@ from twin_worker.diagnosis.multirotor.baseline import (
 )
 from twin_worker.diagnosis.multirotor.control_loss import find_control_loss, unjudged
 from twin_worker.diagnosis.multirotor.diagnose import diagnose_rotors
-from twin_worker.diagnosis.multirotor.flight import DT, FRAMES, RotorFlight, rotor_frame
+from twin_worker.diagnosis.multirotor.flight import DT, RotorFlight
 from twin_worker.diagnosis.multirotor.model import PARAMETERS
 from twin_worker.diagnosis.multirotor.recordings import RotorRecording, before, diagnose_recording
 from twin_worker.diagnosis.multirotor.search import nominal_gains
 from twin_worker.telemetry.history import TelemetryHistory
+from twin_worker.telemetry.motors import FRAMES, rotor_frame
 
 HOME = Origin(536_500_000, 80_500_000, 5_000)
 BEGIN_S, ONSET_S, END_S, LOSS = 12.0, 60.0, 85.0, 0.2
