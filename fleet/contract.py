@@ -358,7 +358,7 @@ class Derivatives(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RotorDynamics(msgspec.Struct, frozen=True, kw_only=True):
-    """Model of a multirotor: thrust and drag over mass from its motor inputs, answer of its attitude to the command.
+    """Model of a multirotor: thrust and drag over mass, and the answer of the attitude to its command.
 
     Terms and letters: `twin_worker.identification.multirotor.rotor_model`.
     """

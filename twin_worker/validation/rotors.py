@@ -7,7 +7,7 @@ component that hardly varies, as the climb rate in level flight, has no fit of i
 import numpy as np
 
 from fleet.contract import Outcome, Verdict
-from twin_worker.identification.multirotor.output_error import EFFECTIVE_FRACTION, RUN_S, START_STD, Problem
+from twin_worker.identification.multirotor.output_error import EFFECTIVE_FRACTION, RUN_S, START_STD, RotorProblem
 from twin_worker.identification.multirotor.rotor_model import PARAMETERS, RotorModel, free_run, start_states
 from twin_worker.identification.multirotor.rotor_window import DT, RotorWindow
 from twin_worker.validation.consistency import MIN_RUNS, Consistency, compare, solve
@@ -34,10 +34,10 @@ def rotor_fit(model: RotorModel, window: RotorWindow, seconds: float) -> tuple[d
     run = free_run(model.par, window, rows, starts, length, commanded=model.has_command)
     measured = np.concatenate([window.velocity, window.attitude[:, :2]], axis=1)[rows[:, None] + np.arange(length + 1)]
     parts = _PARTS if model.has_command else {"velocity": _PARTS["velocity"]}
-    held = np.broadcast_to(measured[:, :1], measured.shape)
+    last_value = np.broadcast_to(measured[:, :1], measured.shape)
     return (
         {name: _vector_fit(measured[..., part], run[..., part]) for name, part in parts.items()},
-        {name: _vector_fit(measured[..., part], held[..., part]) for name, part in parts.items()},
+        {name: _vector_fit(measured[..., part], last_value[..., part]) for name, part in parts.items()},
     )
 
 
@@ -130,7 +130,7 @@ def rotor_consistency(model: RotorModel, held_out: RotorWindow) -> Consistency |
     rows = held_out.runs(length)
     if len(rows) < MIN_RUNS:
         return None
-    problem = Problem(held_out, rows, length, commanded=False)
+    problem = RotorProblem(held_out, rows, length, commanded=False)
     grams = _grams(model, problem)
     return compare(grams, _AXIS_OF, _identified(model, problem)) if np.isfinite(grams).all() else None
 
@@ -145,7 +145,7 @@ def _columns(model: RotorModel) -> np.ndarray:
     return columns
 
 
-def _grams(model: RotorModel, problem: Problem) -> np.ndarray:
+def _grams(model: RotorModel, problem: RotorProblem) -> np.ndarray:
     """Return the products of [sensitivities to groups and nuisances, residuals] of each run, (k, p, p).
 
     What start state and gust of the run explain is removed, as the identification does.
@@ -163,7 +163,7 @@ def _grams(model: RotorModel, problem: Problem) -> np.ndarray:
     return np.asarray(np.swapaxes(rows, 1, 2) @ (rows - explained))
 
 
-def _identified(model: RotorModel, problem: Problem) -> np.ndarray:
+def _identified(model: RotorModel, problem: RotorProblem) -> np.ndarray:
     """Return the information on each group in the model, in the unit of held-out data, (groups,)."""
     used, columns, n = problem.parameters, _columns(model)[problem.parameters], len(_GROUPS)
     H = columns.T @ model.information[used, used] @ columns / EFFECTIVE_FRACTION

@@ -50,7 +50,7 @@ def test_it_follows_its_route_by_its_own_law(mission, answered):
     assert {p.method for p in late} == {"copter"} and {p.law for p in late} == {copter_legs.LAW}
     assert all(p.state is TwinState.PREDICTING and p.seq >= 1 for p in late)
     assert "kinematic twin: lag" in late[-1].sentence
-    assert "no wings to identify" in twin.identification.verdict.sentence and twin.models.active_model is None
+    assert "no motor outputs yet" in twin.identification.verdict.sentence and twin.models.active_model is None
 
 
 def test_it_stays_near_the_flight_for_a_minute(mission, answered):

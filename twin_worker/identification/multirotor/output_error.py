@@ -37,7 +37,7 @@ _STEPS = np.array([0.05, 0.02, 0.02, 5e-4, 0.01, 1e-3, 0.1, 0.1, 2e-3, 2e-3, 0.1
 _START_STEPS = np.array([0.05, 0.05, 0.05, 2e-3, 2e-3, 0.02, 0.02, 0.1, 0.1])
 
 
-class Problem(NamedTuple):
+class RotorProblem(NamedTuple):
     """Free runs of one part of the model.
 
     Attributes:
@@ -117,11 +117,11 @@ def identify(
     par = mean.copy() if warm_start is None else warm_start.par.copy()
     information, weight, steps = precision.copy(), FIRST_STD**-2.0, 0
     for commanded in (False, True) if window.has_command else (False,):
-        problem = Problem(window, rows, length, commanded)
+        problem = RotorProblem(window, rows, length, commanded)
         most = COLD_STEPS if warm_start is None else WARM_STEPS
-        found, H, part_weight, count = _search(problem, par, (mean, precision), most)
+        values, H, part_weight, count = _search(problem, par, (mean, precision), most)
         used = problem.parameters
-        par[used], information[used, used] = found[used], H
+        par[used], information[used, used] = values[used], H
         weight[problem.outputs], steps = part_weight, max(steps, count)
     through_air = window.velocity[window.ok] - np.array([par[6], par[7], 0.0])
     return RotorModel(
@@ -139,7 +139,7 @@ def identify(
 
 
 def _search(
-    problem: Problem, par: np.ndarray, prior_of: tuple[np.ndarray, np.ndarray], most: int
+    problem: RotorProblem, par: np.ndarray, prior_of: tuple[np.ndarray, np.ndarray], most: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """Return parameters, their information, the weights of the residuals and the number of steps."""
     mean, precision = prior_of[0][problem.parameters], prior_of[1][problem.parameters, problem.parameters]

@@ -82,10 +82,9 @@ class RotorModel:
         return np.linalg.inv(self.information)
 
     def __str__(self) -> str:
-        thrust_std, drag_std = 100 * self.thrust_std / self.thrust, 100 * self.drag_std / self.drag
         return (
-            f"thrust over mass {self.thrust:.2f} m/s2 at a motor input of {100 * self.hover:.0f} % (standard deviation "
-            f"{thrust_std:.1f} %), drag {self.drag:.2f} 1/s at {self.speed:.0f} m/s ({drag_std:.0f} %), wind "
+            f"thrust over mass {self.thrust:.2f} ± {self.thrust_std:.2f} m/s2 at a motor input of "
+            f"{100 * self.hover:.0f} %, drag {self.drag:.3f} ± {self.drag_std:.3f} 1/s at {self.speed:.0f} m/s, wind "
             f"{np.hypot(*self.wind):.1f} m/s"
         )
 
