@@ -21,6 +21,7 @@ from twin_worker.mismatch.job import (
     DiagnosisJob,
     DiagnosisResult,
     TelemetryRows,
+    mark_extrapolated,
     mark_unconfirmed,
     mismatch_message,
     move_past,
@@ -37,6 +38,7 @@ BASELINE_S = 105.0  # own past used as the comparison model [s]
 FLIGHT_S = 120.0  # flight used for a diagnosis [s]
 CHECK_PERIOD_S, DIAGNOSIS_PERIOD_S = 8.0, 25.0  # between residual checks, and between full diagnoses if idle [s]
 MIN_FLIGHT_S = 45.0  # flight before the first comparison with a model [s]
+_CONFIRM_FIRST = 1e3  # urgency of a confirmation: before all that is overdue [check periods]
 _CONFIRM_AFTER_S = 5.0  # before a finding is checked again for confirmation [s]
 _RETRY_S = 30.0  # after a refusal [s]
 _SUSPEND_S, _MAX_SUSPEND_S = 60.0, 3600.0  # after an internal error, doubled each time; upper limit [s]
@@ -102,7 +104,12 @@ class DiagnosisState:
             return None
         if newest < (self.first_t + MIN_FLIGHT_S if self.baseline is not None else self.past_t + CHECK_PERIOD_S):
             return None
-        return 2.0 * (not self._model_valid(twin)) + 4.0 * self.is_unconfirmed + self.overdue(newest)
+        first = _CONFIRM_FIRST * self.is_unconfirmed + 1.0 * self._is_suspected
+        return 2.0 * (not self._model_valid(twin)) + first + self.overdue(newest)
+
+    @property
+    def _is_suspected(self) -> bool:
+        return self.published is not None and self.published.outcome is DiagnosisOutcome.SUSPECTED
 
     def overdue(self, newest: float) -> float:
         """Return how long a check is overdue at the newest telemetry [check periods]."""
@@ -126,9 +133,9 @@ class DiagnosisState:
             past, past_end = move_past(self.past, self.past_t, start)
         rows = telemetry_rows(twin.telemetry.history, start, past)
         params = dict(twin.config.airframe.servo_params or twin.received_params)
-        return DiagnosisJob(
-            twin.config.uav, rows, params, self.card, self.baseline, past_end, self.past_model, start, full
-        )
+        models = self.baseline, past_end, self.past_model
+        urgent = self.is_unconfirmed or self._is_suspected or (self.past_model is None and self.baseline is None)
+        return DiagnosisJob(twin.config.uav, rows, params, self.card, *models, start, full, urgent)
 
     @property
     def _is_suspicious(self) -> bool:
@@ -153,10 +160,14 @@ class DiagnosisState:
             report = with_earlier_onsets(report, self.last_report, shift, start + _SAME_ONSET_S)
         shifted = shift_times(report, result.begin - self.first_t)
         mismatch = mismatch_message(result.uav, shifted, result.begin, result.end)
+        if self._is_extrapolated(report, result.extrapolated):
+            mismatch = mark_extrapolated(mismatch)
         self.is_unconfirmed = mismatch.outcome in _CONFIRMED and not self._is_confirmed(report, result)
         if self.is_unconfirmed:
             self.next_t = result.end + _CONFIRM_AFTER_S
             mismatch = mark_unconfirmed(mismatch)
+        elif mismatch.outcome in _CONFIRMED:  # nothing more to learn soon, and the others wait
+            self.next_t = result.end + DIAGNOSIS_PERIOD_S
         self.last_report, self.last_begin = report, result.begin
         confirmed_before = self.published is not None and self.published.outcome in _CONFIRMED
         self.clear_count = 0 if mismatch.outcome in _CONFIRMED else self.clear_count + 1
@@ -164,6 +175,15 @@ class DiagnosisState:
             return None  # a single diagnosis without the finding does not clear it
         self.published = mismatch
         return mismatch
+
+    def _is_extrapolated(self, report: Report, extrapolated: frozenset[str]) -> bool:
+        """Return whether another airspeed may explain what a report names, and nothing of it is known already."""
+        names = {finding.hypothesis.effect.name for finding in report.findings}
+        names |= {"unknown"} if report.outcome is ReportOutcome.UNKNOWN else set()
+        published = self.published
+        if published is not None and published.outcome in _CONFIRMED and any(c.name in names for c in published.causes):
+            return False
+        return report.outcome in (ReportOutcome.NAMED, ReportOutcome.UNKNOWN) and bool(names & extrapolated)
 
     def suspend(self, uav: int, t: float, reason: str) -> None:
         """Suspend the diagnosis after an internal error at data time `t`, longer each time."""

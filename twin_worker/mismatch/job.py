@@ -9,7 +9,15 @@ import numpy as np
 
 from fleet.contract import COLUMNS, Cause, DiagnosisOutcome, Mismatch
 from twin_worker.diagnosis.baseline.own_past import find_output_faults, only_new_findings
-from twin_worker.diagnosis.baseline.past import CONTEXT_S, PastModel, calibrate_past, part_after, part_before
+from twin_worker.diagnosis.baseline.past import (
+    CONTEXT_S,
+    ROWS_PER_SAMPLE,
+    PastModel,
+    calibrate_past,
+    commanded_airspeed,
+    part_after,
+    part_before,
+)
 from twin_worker.diagnosis.data.card import AircraftCard
 from twin_worker.diagnosis.data.flight import FlightData, resample_flight
 from twin_worker.diagnosis.inference.diagnose import diagnose
@@ -24,7 +32,8 @@ from twin_worker.telemetry.history import TelemetryHistory
 
 RECENT_S = 40.0  # newest flight whose residuals are monitored [s]
 _JOIN_GAP_S = 10.0  # between the past and the recent flight; longer than a filter, so that it is left out [s]
-MIN_RATIO = 2.0  # ratio that triggers a diagnosis; 10 % of the checks of six healthy flights exceed it [-]
+# limits of the check, above which a diagnosis follows; 20 and 10 % of the checks of eleven healthy flights exceed them
+MIN_RATIO, MIN_MEAN = 2.0, 3.5  # mean square over the usual one, and mean in its standard deviations [-]
 _MIN_ROWS = 50  # of the recent flight, one row every 0.2 s
 
 TelemetryRows = dict[str, tuple[np.ndarray, np.ndarray]]
@@ -44,6 +53,7 @@ class DiagnosisJob:
         past_model: calibration on that past, from an earlier result; None: calibrate
         recent_start: start of the newest flight in `rows`, which is diagnosed [s since 1970]
         full: diagnose without a residual check
+        is_urgent: a finding or the first calibration awaits it
     """
 
     uav: int
@@ -55,6 +65,7 @@ class DiagnosisJob:
     past_model: PastModel | None = None
     recent_start: float = -inf
     full: bool = False
+    is_urgent: bool = False
 
 
 @dataclass(frozen=True)
@@ -66,8 +77,9 @@ class DiagnosisResult:
         begin, end: flight of the diagnosis [s since 1970]
         recent_start: start of its newest part without a gap [s since 1970]
         past_model: calibration on the own past, for the next job
-        residual_ratio: mean square of the recent residuals over the usual one, worst channel; nan if undetermined
+        check: mean square and mean of the recent residuals over their limits, the larger; nan if undetermined
         report: the diagnosis; None if the residuals did not require one
+        extrapolated: its effects that may come from another commanded airspeed
         effect_outputs: what the diagnosed effects add to the aircraft's dynamics, row by row
         refusal: reason for no diagnosis, or empty
         defect: internal error that ended the job without a result, or empty
@@ -80,8 +92,9 @@ class DiagnosisResult:
     end: float
     recent_start: float = -inf
     past_model: PastModel | None = None
-    residual_ratio: float = float("nan")
+    check: float = float("nan")
     report: Report | None = None
+    extrapolated: frozenset[str] = frozenset()
     effect_outputs: EffectOutputs | None = None
     refusal: str = ""
     defect: str = ""
@@ -150,24 +163,61 @@ def _run(job: DiagnosisJob, result: DiagnosisResult) -> DiagnosisResult:
         result = replace(result, past_model=past_model)
     else:
         raise ValueError(f"{flight.name}: found neither a model nor a past, expected one of them; fly longer")
-    result = replace(result, begin=flight.t_start, residual_ratio=residual_ratio(flight, baseline))
-    if not (job.full or output_faults or result.residual_ratio > MIN_RATIO):
+    result = replace(result, begin=flight.t_start, check=check_residuals(flight, baseline))
+    if not (job.full or output_faults or result.check > 1.0):
         return result
     report = diagnose(flight, baseline)
     if job.baseline is None and past_end is not None:
-        report = only_new_findings(report, None, past_end)  # the newest seconds can be a climb: no permanent loss yet
+        # the newest seconds can be a climb: no permanent loss yet; where the past is joined, filters begin anew
+        report = only_new_findings(report, None, past_end + 0.5 * _JOIN_GAP_S)
+        if result.past_model is not None:
+            result = replace(result, extrapolated=extrapolated_effects(report, flight, result.past_model))
     outputs = effect_outputs(flight, baseline, report)  # of the airframe: the recorded outputs contain their faults
     return replace(result, report=with_frozen_outputs(report, output_faults), effect_outputs=outputs)
 
 
-def residual_ratio(flight: FlightData, baseline: Baseline) -> float:
-    """Return the mean square of the recent residuals over the usual one, of the channel with the largest ratio."""
+def check_residuals(flight: FlightData, baseline: Baseline) -> float:
+    """Return how far the recent residuals exceed the usual ones, of the channel with the largest excess [limits].
+
+    A lasting change of force or airspeed shows in their mean before it shows in their mean square.
+    """
     modelled = ModelledFlight(flight, baseline)
     whitened = WhitenedResiduals(modelled, own_weather(modelled))
     recent = whitened.part(modelled.t > modelled.t[-1] - RECENT_S)
-    if recent.ok.sum() < _MIN_ROWS:
+    n = int(recent.ok.sum())
+    if n < _MIN_ROWS:
         return float("nan")
-    return float((((recent.e + recent.Jn @ whitened.xn)[recent.ok] ** 2).mean(axis=0) / baseline.usual).max())
+    e = (recent.e + recent.Jn @ whitened.xn)[recent.ok]
+    ratio = (e**2).mean(axis=0) / baseline.usual
+    mean = np.abs(e.mean(axis=0)) * np.sqrt(n / ROWS_PER_SAMPLE)
+    return float(max((ratio / MIN_RATIO).max(), (mean / MIN_MEAN).max()))
+
+
+def extrapolated_effects(report: Report, flight: FlightData, past: PastModel) -> frozenset[str]:
+    """Return the names of the effects that begin where the commanded airspeed leaves that of the past.
+
+    The past does not tell how the aircraft flies at another airspeed: what changes with it is no fault yet. That is
+    the commanded airspeed, as a fault changes the one that is flown. `unknown` stands for an unexplained mismatch at
+    airspeeds that the past does not contain.
+    """
+    speed, flown = commanded_airspeed(flight), past.airspeeds
+    if speed is None or flown is None:
+        return frozenset()
+
+    def median(rows: np.ndarray) -> float:
+        return float(np.median(speed[rows & flight.ok])) if (rows & flight.ok).any() else float("nan")
+
+    names = set()
+    for finding in report.findings:
+        before = flight.t < finding.segments[0][0]
+        sides = median(before), median(~before)
+        if abs(sides[0] - sides[1]) > flown.scatter and not all(map(flown.contain, sides)):
+            names.add(finding.hypothesis.effect.name)
+    _, segments = report.where
+    there = np.any([(flight.t >= a) & (flight.t <= b) for a, b in segments], axis=0) if segments else None
+    if there is not None and not flown.contain(median(there)):
+        names.add("unknown")
+    return frozenset(names)
 
 
 _MAX_FORCE_ERROR = 100.0  # larger errors come from a diverged simulation and are not published [m/s2]
@@ -234,6 +284,12 @@ def shift_times(report: Report, shift: float) -> Report:
     where = channel, tuple((a + shift, b + shift) for a, b in segments)
     shifted = with_sentence(replace(report, findings=tuple(findings), where=where))
     return replace(report, sentence=shifted.sentence)
+
+
+def mark_extrapolated(mismatch: Mismatch) -> Mismatch:
+    """Return the mismatch as suspected: it begins at an airspeed that the own past does not contain."""
+    sentence = f"at an airspeed that its own past does not contain, not confirmed: {mismatch.sentence}"
+    return msgspec.structs.replace(mismatch, outcome=DiagnosisOutcome.SUSPECTED, sentence=sentence)
 
 
 def mark_unconfirmed(mismatch: Mismatch) -> Mismatch:

@@ -18,7 +18,7 @@ from multiprocessing.context import SpawnProcess
 
 from twin_worker.mismatch.job import DiagnosisJob, DiagnosisResult, failed_result, run_job
 
-CPU_SHARE = 0.2  # average share of one core [-]
+CPU_SHARE, URGENT_SHARE = 0.2, 0.8  # share of one core: usually, and after urgent jobs and unusual residuals [-]
 LIMIT_CPU_S = 180.0  # CPU time of one job, including compilation [s]
 LIMIT_S = 900.0  # wall time of one job; longer only if it waits indefinitely [s]
 _NICE_INCREMENT = 15  # increment of the nice value
@@ -49,7 +49,7 @@ class DiagnosisProcess:
         self._pipe: Connection | None = None
         self._thread: threading.Thread | None = None  # of the running job
         self._result: DiagnosisResult | None = None
-        self._busy = self._closed = self._timed_out = False
+        self._busy = self._closed = self._timed_out = self._is_urgent = False
         self._free_at = 0.0  # monotonic [s]
         self._lock = threading.Lock()  # protects start and end of the process
 
@@ -60,7 +60,7 @@ class DiagnosisProcess:
 
     def submit(self, job: DiagnosisJob) -> None:
         """Start a job; `poll` returns its result."""
-        self._busy, self._result = True, None
+        self._busy, self._result, self._is_urgent = True, None, job.is_urgent
         self._thread = threading.Thread(target=self._exchange, args=(job,), daemon=True, name="diagnosis")
         self._thread.start()
 
@@ -68,7 +68,9 @@ class DiagnosisProcess:
         """Return a finished result; None if there is none."""
         result = self._result
         if result is not None:
-            self._free_at = time.monotonic() + result.cpu_s * (1.0 / self._share - 1.0)
+            is_urgent = self._is_urgent or result.check > 1.0
+            share = max(URGENT_SHARE, self._share) if is_urgent else self._share
+            self._free_at = time.monotonic() + result.cpu_s * (1.0 / share - 1.0)
             self._result, self._busy = None, False
         return result
 

@@ -131,8 +131,8 @@ def test_what_is_seen_once_says_so_and_where():
 
 def test_by_its_own_past_nothing_is_named_that_began_in_it(twin, monkeypatch):
     for name, gives in {
-        "calibrate_past": SimpleNamespace(baseline=lambda flight: BASE),
-        "residual_ratio": 1.0,
+        "calibrate_past": SimpleNamespace(baseline=lambda flight: BASE, airspeeds=None),
+        "check_residuals": 1.0,
         "diagnose": made(),
         "effect_outputs": None,
     }.items():

@@ -63,7 +63,7 @@ def test_a_loss_of_thrust_is_named_and_nothing_before_it(
     monkeypatch.setattr(job, "calibrate_past", None)  # the past is calibrated once
     result = run_job(replace(job_at(flight, ONSET_S + 40.0), past_model=healthy.past_model))
     assert not result.refusal and result.past_model is healthy.past_model
-    assert result.residual_ratio > job.MIN_RATIO  # so that it is diagnosed
+    assert result.check > 1.0  # so that it is diagnosed
     (found,) = result.report.findings
     assert result.report.outcome is ReportOutcome.NAMED
     assert "thrust_loss" in {found.hypothesis.effect.name, *found.rivals}

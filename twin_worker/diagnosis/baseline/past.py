@@ -36,11 +36,12 @@ PIECES = 4  # pieces of the past, each predicted from the others
 MIN_PAST_S = 40.0  # least length of valid past
 CONTEXT_S = 30.0  # past included in the diagnosed part, as data before an onset
 _RIDGE = 0.02  # ridge share for short data
-_ROWS_PER_SAMPLE = 4.0  # whitened rows per independent sample: whitening is incomplete
+ROWS_PER_SAMPLE = 4.0  # whitened rows per independent sample: whitening is incomplete
 _MIN_VISIBLE_SHARE = 0.1  # least effect of an uncertain direction, as a share of the equation scatter
 _MIN_DETERMINED = 3.0  # least derivative of a surface, in standard deviations
 _DERIVATIVES = {"aileron": ("L", "delta_a"), "elevator": ("M", "delta_e"), "rudder": ("N", "delta_r")}
 _WIND_SPREAD = 2.5  # least spread of the mean wind [m/s]
+_MIN_AT_AIRSPEED = 0.3  # least share of the past at an airspeed that it tells the flight at [-]
 _BIAS_RANGE = 50.0  # prior of a sensor bias, in floors
 _MIN_AIRSPEED_STD = 0.3  # least scatter of airspeed [m/s]
 _PRIOR_STD = (0.1, 10.0, 10.0, 1.0, 1.0)  # airspeed scale, wind [m/s], wind shear [m/s per 100 m]
@@ -56,6 +57,17 @@ class CoefficientUncertainty(NamedTuple):
     scatter: float
 
 
+class CommandedAirspeeds(NamedTuple):
+    """Quantiles of the commanded airspeed in the past, (101,), and scatter of the flown one about it [m/s]."""
+
+    quantiles: np.ndarray
+    scatter: float
+
+    def contain(self, speed: float) -> bool:
+        """Return whether enough of the past was flown at an airspeed [m/s]."""
+        return float((np.abs(self.quantiles - speed) <= self.scatter).mean()) >= _MIN_AT_AIRSPEED
+
+
 @dataclass(frozen=True)
 class PastModel:
     """Calibration on a trusted part of flight, for any later part.
@@ -65,12 +77,14 @@ class PastModel:
         uncertainty: equation -> uncertainty of its coefficients
         weather: of the past, (4,)
         seconds: valid flight [s]
+        airspeeds: commanded airspeeds; None: not reported
     """
 
     base: Baseline
     uncertainty: dict[str, CoefficientUncertainty]
     weather: np.ndarray
     seconds: float
+    airspeeds: CommandedAirspeeds | None = None
 
     def baseline(self, flight: FlightData) -> Baseline:
         """Return the baseline to diagnose a later flight with."""
@@ -135,7 +149,22 @@ def calibrate_past(
         block_sigma=np.where(is_baro, IGNORED_SIGMA, base.block_sigma),
         spread=base.spread | _bias_spreads(modelled_past, weather) | _weather_spreads(modelled_past, weather),
     )
-    return PastModel(base, uncertainty, weather, past.seconds)
+    return PastModel(base, uncertainty, weather, past.seconds, _airspeeds(past))
+
+
+def commanded_airspeed(flight: FlightData) -> np.ndarray | None:
+    """Return the airspeed setpoint, (n,) [m/s]; None where the autopilot does not report it."""
+    if not {"Va", "slow"} <= set(flight.readings):
+        return None
+    return np.asarray(flight.readings["Va"] + flight.readings["slow"])
+
+
+def _airspeeds(past: FlightData) -> CommandedAirspeeds | None:
+    speed = commanded_airspeed(past)
+    if speed is None:
+        return None
+    quantiles = np.quantile(speed[past.ok], np.linspace(0.0, 1.0, 101))
+    return CommandedAirspeeds(quantiles, float(past.readings["slow"][past.ok].std()))
 
 
 class _LeftOut(ModelledFlight):
@@ -224,7 +253,7 @@ def _coefficient_uncertainty(modelled: ModelledFlight, weather: np.ndarray) -> d
         whiten = data.whitener(x)
         A, e = whiten(data.A)[data.lagged_ok], whiten(data.y - data.A @ x)[data.lagged_ok]
         prior_std = np.sqrt((data.y[data.ok] ** 2).mean() / ((data.A[data.ok] ** 2).mean(axis=0) + 1e-12))
-        precision = A.T @ A / (_ROWS_PER_SAMPLE * e.var()) + np.diag(prior_std**-2.0)
+        precision = A.T @ A / (ROWS_PER_SAMPLE * e.var()) + np.diag(prior_std**-2.0)
         root = np.linalg.cholesky(np.linalg.inv(precision))
         out[name] = CoefficientUncertainty(root, float(data.residuals(x).std()))
     return out
