@@ -13,7 +13,7 @@ from twin_worker.diagnosis.inference.report import ReportOutcome
 from twin_worker.diagnosis.model.baseline import Baseline
 from twin_worker.mismatch.coordinator import DIAGNOSIS_PERIOD_S, DiagnosisState
 from twin_worker.mismatch.job import DiagnosisJob, DiagnosisResult, extrapolated_effects
-from twin_worker.mismatch.process import CPU_SHARE, URGENT_SHARE, DiagnosisProcess
+from twin_worker.mismatch.process import URGENT_SHARE, DiagnosisProcess
 
 EFFECT = "actuator_lag"
 BASE = Baseline(UNKNOWN, {}, 20.0)
