@@ -16,6 +16,7 @@ from twin_worker.identification.multirotor.rotor_window import DT, RotorWindow, 
 from twin_worker.ownership.cold_start import restore_model
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.motors import motor_inputs
+from twin_worker.twin.state.models import RotorModels
 from twin_worker.twin.state.state import Twin, ingest
 from twin_worker.twin.steps.rotor_step import PERIOD_S, identify_rotors
 from twin_worker.validation.rotors import rotor_consistency, rotor_fit, verify_rotors, verify_since_identification
@@ -243,6 +244,17 @@ def test_the_prior_of_a_later_window_is_the_model_before_it(
     rotors.timer.restart(rotors.timer.last - PERIOD_S)
     assert identify_rotors(identified[0]) == []  # the flight since the base is too short: nothing is lost
     assert rotors.active is not None
+
+
+def test_two_contradictions_in_a_row_discard_the_flight_before(model: RotorModel) -> None:
+    rotors = RotorModels()
+    rotors.store(model, fails=False, becomes_base=True)
+    assert rotors.base is model
+    for fails in (True, False, True):
+        rotors.store(replace(model, steps=1), fails=fails, becomes_base=False)
+        assert rotors.base is model and rotors.newest is not model
+    rotors.store(replace(model, steps=2), fails=True, becomes_base=True)
+    assert rotors.base is None and rotors.newest is None and rotors.failures == 0
 
 
 def test_a_clock_set_back_keeps_the_model(flown: FlownAircraft, identified: tuple[Twin, Model]) -> None:

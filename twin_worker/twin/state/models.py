@@ -163,6 +163,9 @@ class Identification(msgspec.Struct):
         self.data_from += step
 
 
+_MAX_FAILURES = 2  # a single contradiction may be chance: 5 % of right models have one
+
+
 class RotorModels(msgspec.Struct):
     """Rotor models of a multirotor.
 
@@ -170,18 +173,28 @@ class RotorModels(msgspec.Struct):
         active: the accepted model; None before any
         newest: newest model, accepted or not: the next search begins there
         base: model of the flight before the identification window, its prior; None: none yet
+        failures: models in a row that held-out flight contradicts
         timer: of identifications
     """
 
     active: RotorModel | None = None
     newest: RotorModel | None = None
     base: RotorModel | None = None
+    failures: int = 0
     timer: Timer = msgspec.field(default_factory=Timer)
 
-    def store(self, newest: RotorModel, *, becomes_base: bool) -> None:
-        """Store the newest model."""
-        self.newest = newest
-        self.base = newest if becomes_base else self.base
+    def store(self, newest: RotorModel, *, fails: bool, becomes_base: bool) -> None:
+        """Store the newest model; after several that held-out flight contradicts, the aircraft itself has changed.
+
+        Args:
+            newest: the model
+            fails: held-out flight contradicts it
+            becomes_base: it is the prior of the models after it
+        """
+        self.newest, self.failures = newest, self.failures + 1 if fails else 0
+        self.base = newest if becomes_base and not fails else self.base
+        if self.failures >= _MAX_FAILURES:
+            self.base, self.newest, self.failures = None, None, 0
 
     def activate(self, model: RotorModel) -> None:
         """Make a model the active one."""
@@ -277,10 +290,15 @@ class ModelBank(msgspec.Struct):
     @property
     def state(self) -> TwinState:
         """Return the state of a twin that has these models and no path: waiting without an active model."""
-        if self.active_model is None and self.rotors.active is None:
+        if not self.is_identified:
             return TwinState.WAITING
         plausible = self.active_verdict is not None and self.active_verdict.outcome is Outcome.PLAUSIBLE
         return TwinState.PLAUSIBLE if plausible else TwinState.VERIFIED
+
+    @property
+    def is_identified(self) -> bool:
+        """Return whether an identified model of its dynamics was accepted."""
+        return self.active_model is not None or self.rotors.active is not None
 
     @property
     def is_compared(self) -> bool:

@@ -213,7 +213,7 @@ def _best_forecast(twin: Twin, recent: Track, ahead: np.ndarray) -> tuple[PathFo
 
 def _state_without_route(twin: Twin) -> TwinState:
     """Return the state of a twin that predicts no route, as the identification sees it."""
-    if twin.models.active_model is not None:
+    if twin.models.is_identified:
         return twin.models.state
     waits = twin.identification.verdict.outcome is Outcome.INSUFFICIENT_DATA
     return TwinState.WAITING if waits or not twin.vehicle_class.has_wings else TwinState.IDENTIFYING

@@ -44,7 +44,8 @@ def identify_rotors(twin: Twin) -> list[Message]:
     active = rotors.active
     verdict = verify_rotors(model, window, n_train, name=twin.name, threshold=twin.config.omega, active=active)
     is_valid = verdict.outcome.is_accepted or verdict.outcome is Outcome.WORSE_THAN_LAST
-    rotors.store(model, becomes_base=is_valid and model.t1 - model.t0 >= _BASE_S)
+    fails = not is_valid or bool(verdict.derivative_error)
+    rotors.store(model, fails=fails, becomes_base=model.t1 - model.t0 >= _BASE_S)
     if active is not None and twin.models.active_verdict is not None:
         twin.models.update_verdict(verify_since_identification(twin.models.active_verdict, active, window, twin.name))
     if _replaces_active(twin, verdict):
