@@ -197,11 +197,11 @@ def extrapolated_effects(report: Report, flight: FlightData, past: PastModel) ->
     """Return the names of the effects that begin where the commanded airspeed leaves that of the past.
 
     The past does not tell how the aircraft flies at another airspeed: what changes with it is no fault yet. That is
-    the commanded airspeed, as a fault changes the one that is flown. `unknown` stands for an unexplained mismatch at
+    the commanded airspeed, as a fault changes the flown one. `unknown` stands for an unexplained mismatch at
     airspeeds that the past does not contain.
     """
-    speed, flown = commanded_airspeed(flight), past.airspeeds
-    if speed is None or flown is None:
+    speed, airspeeds = commanded_airspeed(flight), past.airspeeds
+    if speed is None or airspeeds is None:
         return frozenset()
 
     def median(rows: np.ndarray) -> float:
@@ -211,11 +211,11 @@ def extrapolated_effects(report: Report, flight: FlightData, past: PastModel) ->
     for finding in report.findings:
         before = flight.t < finding.segments[0][0]
         sides = median(before), median(~before)
-        if abs(sides[0] - sides[1]) > flown.scatter and not all(map(flown.contain, sides)):
+        if abs(sides[0] - sides[1]) > airspeeds.scatter and not all(map(airspeeds.contain, sides)):
             names.add(finding.hypothesis.effect.name)
     _, segments = report.where
     there = np.any([(flight.t >= a) & (flight.t <= b) for a, b in segments], axis=0) if segments else None
-    if there is not None and not flown.contain(median(there)):
+    if there is not None and not airspeeds.contain(median(there)):
         names.add("unknown")
     return frozenset(names)
 

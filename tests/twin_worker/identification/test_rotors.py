@@ -16,7 +16,7 @@ from twin_worker.identification.multirotor.rotor_window import DT, RotorWindow, 
 from twin_worker.ownership.cold_start import restore_model
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.motors import motor_inputs
-from twin_worker.twin.state.models import RotorModels
+from twin_worker.twin.state.rotor_models import RotorModels
 from twin_worker.twin.state.state import Twin, ingest
 from twin_worker.twin.steps.rotor_step import PERIOD_S, identify_rotors
 from twin_worker.validation.rotors import rotor_consistency, rotor_fit, verify_rotors, verify_since_identification
