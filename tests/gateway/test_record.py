@@ -16,7 +16,7 @@ from fleet.bus.codec import Stamp, encode, encoding
 from fleet.bus.session import connect
 from fleet.commands.live import record
 from fleet.commands.live.record import BusRecorder
-from fleet.contract import TOPICS, Alert, FleetState, Message, Mission, Model, Prediction, Sample, Status
+from fleet.contract import COLUMNS, TOPICS, Alert, FleetState, Message, Mission, Model, Prediction, Sample, Status
 from fleet.telemetry.recording.fleet_log import MAX_UNRECOGNISED, BusRecord
 from fleet.telemetry.recording.fleet_news import RESULT_TYPES, TELEMETRY_TYPES
 from fleet.telemetry.recording.recordings import Recording, replay_messages
@@ -26,6 +26,7 @@ from gateway.pipeline import Pipeline
 from gateway.publication import Publisher
 from tests.support.examples import EXAMPLES, MESSAGES
 from tests.support.fake_link import untimed
+from tests.support.flights import rows
 from tests.support.memory_bus import MemoryBus
 from tests.support.pretend_feed import STAMP, PretendFleet, T
 from viewer.store.store import FleetStore
@@ -145,6 +146,25 @@ def test_a_sound_record_of_nonsense_is_refused_with_its_place(tmp_path, message,
     assert len([m for _, step in recording.steps() for m in step]) == 2
     (sentence,) = recording.skipped
     assert words in sentence and f"near byte {len(good)}" in sentence
+
+
+@pytest.mark.parametrize(
+    ("kind", "column", "valid"), [("command", 2, True), ("battery", 1, True), ("battery", 0, False)]
+)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_what_an_autopilot_does_not_report_is_nan_and_is_played(tmp_path, kind, column, valid, value):
+    x = np.ones((2, len(COLUMNS[kind])))
+    x[:, column:] = value
+    sample = Sample(uav=1, t=T, **{kind: rows(T + np.arange(2.0), x)})
+    path = tmp_path / "optional.parauav"
+    good = BusRecord(T, encoding(Status), encode(EXAMPLES[Status])).pack()
+    path.write_bytes(good + BusRecord(T, encoding(Sample), encode(sample)).pack())
+    recording = Recording(path)
+    played = [m for _, step in recording.steps() for m in step if isinstance(m, Sample)]
+    if valid and np.isnan(value):
+        assert np.isnan(getattr(played[0], kind).x.numpy()[:, column:]).all() and not recording.skipped
+    else:
+        assert not played and any(f"invalid rows of {kind}" in sentence for sentence in recording.skipped)
 
 
 def test_other_versions_and_broken_payloads_are_refused(tmp_path):

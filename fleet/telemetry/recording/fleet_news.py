@@ -11,6 +11,7 @@ from msgspec.structs import replace
 from fleet.bus.codec import Stamp, decode, encoding, is_plausible_epoch
 from fleet.contract import (
     COLUMNS,
+    FIRST_OPTIONAL_COLUMN,
     MAX_ITEMS,
     ROW_WIDTHS,
     TOPICS,
@@ -199,7 +200,7 @@ def _validate(message: Any) -> None:
     if isinstance(message, Sample):
         for field in COLUMNS:
             rows: Rows | None = getattr(message, field)
-            if rows is not None and not _rows_valid(rows, ROW_WIDTHS[field]):
+            if rows is not None and not _rows_valid(rows, ROW_WIDTHS[field], FIRST_OPTIONAL_COLUMN.get(field)):
                 raise ValueError(f"Sample with invalid rows of {field}")
     if isinstance(message, Mission):
         numbers = [n for item in message.items for n in (item.param1, item.param2, item.param3, item.alt_m)]
@@ -209,8 +210,12 @@ def _validate(message: Any) -> None:
         raise ValueError("Params with a non-finite value")
 
 
-def _rows_valid(rows: Rows, widths: tuple[int, ...]) -> bool:
+def _rows_valid(rows: Rows, widths: tuple[int, ...], optional: int | None) -> bool:
+    """Return whether shapes, times and values are valid; columns from `optional` on may be nan: not reported."""
     t, x = rows.t.numpy(), rows.x.numpy()
     if t.ndim != 1 or x.ndim != 2 or len(x) != len(t) or x.shape[1] not in widths or not len(t):
         return False
-    return bool(np.isfinite(x).all() and (t > 0).all() and (t < _MAX_TIME_S).all())
+    finite = np.isfinite(x)
+    if optional is not None:
+        finite[:, optional:] |= np.isnan(x[:, optional:])
+    return bool(finite.all() and (t > 0).all() and (t < _MAX_TIME_S).all())
