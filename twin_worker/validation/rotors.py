@@ -14,7 +14,6 @@ from twin_worker.validation.consistency import MIN_RUNS, Consistency, compare, s
 from twin_worker.validation.verify import FIT_THRESHOLD, concluded
 
 HORIZONS_S = (10.0, 4.0)  # longest first: the longest that passes
-MIN_HELD_OUT_S = 12.0  # shorter flight is not verified [s]
 _FIT_TOLERANCE = 1.0  # allowed loss against the active model: chance [%]
 _DIVERGED_FIT = -99.0  # mean fit of a diverging run [%]
 _HOVER_SPEED, _HOVER_TILT = 0.5, 0.02  # standard deviations of velocity and tilt below which flight is a hover
@@ -32,7 +31,7 @@ def rotor_fit(model: RotorModel, window: RotorWindow, seconds: float) -> tuple[d
         return {}, {}
     starts = start_states(window, rows)
     run = free_run(model.par, window, rows, starts, length, commanded=model.has_command)
-    measured = np.concatenate([window.velocity, window.attitude[:, :2]], axis=1)[rows[:, None] + np.arange(length + 1)]
+    measured = window.states[rows[:, None] + np.arange(length + 1)]
     parts = _PARTS if model.has_command else {"velocity": _PARTS["velocity"]}
     last_value = np.broadcast_to(measured[:, :1], measured.shape)
     return (
@@ -68,12 +67,10 @@ def verify_rotors(
         active: the active model
     """
     held_out = window.part(start, len(window))
-    fit: dict[str, float] = {}
-    persistence: dict[str, float] = {}
-    for horizon in HORIZONS_S:
-        fit, persistence = rotor_fit(model, held_out, horizon)
-        if fit and not _shortfall(fit, persistence, threshold):
-            break
+    fits = {seconds: rotor_fit(model, held_out, seconds) for seconds in HORIZONS_S}
+    passed = (seconds for seconds, pair in fits.items() if pair[0] and not _shortfall(*pair, threshold))
+    horizon = next(passed, HORIZONS_S[-1])
+    fit, persistence = fits[horizon]
     if not fit:
         sentence = f"{name}: {held_out.seconds:.0f} s held out without a run of {horizon:.0f} s; wait for more flight"
         return Verdict(outcome=Outcome.INSUFFICIENT_DATA, sentence=sentence)
@@ -83,11 +80,7 @@ def verify_rotors(
         active_fit = _mean(rotor_fit(active, held_out, horizon)[0])
         if mean < active_fit - _FIT_TOLERANCE:
             outcome, reason = Outcome.WORSE_THAN_LAST, f"the active model has {active_fit:.0f} % and stays active"
-    by_length = {
-        f"{part}{seconds:.0f}": value
-        for seconds in HORIZONS_S
-        for part, value in rotor_fit(model, held_out, seconds)[0].items()
-    }
+    by_length = {f"{part}{seconds:.0f}": value for seconds, (one, _) in fits.items() for part, value in one.items()}
     verdict = Verdict(
         outcome=outcome,
         sentence=f"{name}: mean fit {mean:.0f} % over {horizon:.0f} s of held-out data, {reason}",

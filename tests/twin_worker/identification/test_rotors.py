@@ -178,8 +178,8 @@ def test_rows_on_the_ground_and_at_gaps_are_not_used(flown: FlownAircraft) -> No
     whole = rotor_window(history, uav.params, seconds=SECONDS, ground_mm=float(uav.origin.alt_mm))
     assert whole is not None and not whole.ok[: round(2.0 / DT)].any() and whole.ok[round(FIRST_S / DT) :].all()
     t, x = sample.velocity.t.numpy(), sample.velocity.x.numpy()  # type: ignore[union-attr]
-    kept = (t < 1e9 + 60.0) | (t > 1e9 + 63.0)
-    gap = window_of(flown, velocity=rows(t[kept], x[kept]))
+    received = (t < 1e9 + 60.0) | (t > 1e9 + 63.0)
+    gap = window_of(flown, velocity=rows(t[received], x[received]))
     assert 3.0 < (~gap.ok).sum() * DT < 6.0
     lengths = gap.runs(40)
     assert (np.diff(lengths) >= 40).all() and all(gap.ok[k : k + 41].all() for k in lengths)

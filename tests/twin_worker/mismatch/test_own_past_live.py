@@ -41,14 +41,16 @@ def job_at(flight: tuple[TelemetryHistory, dict[str, float]], now: float) -> Dia
     """Return the job that a coordinator gives `now` seconds after the first attitude."""
     history, params = flight
     begin = float(history.rows("attitude")[0][0])
-    kept = {kind: (t[t <= begin + now], x[t <= begin + now]) for kind, (t, x) in telemetry_rows(history, 0.0).items()}
+    received = {
+        kind: (t[t <= begin + now], x[t <= begin + now]) for kind, (t, x) in telemetry_rows(history, 0.0).items()
+    }
     past_end = begin + TAKEOFF_S + BASELINE_S
-    past = {kind: (t[(t > begin + TAKEOFF_S) & (t < past_end)],) for kind, (t, _) in kept.items()}
-    past = {kind: (*t, kept[kind][1][np.isin(kept[kind][0], t[0])]) for kind, t in past.items()}
+    past = {kind: (t[(t > begin + TAKEOFF_S) & (t < past_end)],) for kind, (t, _) in received.items()}
+    past = {kind: (*t, received[kind][1][np.isin(received[kind][0], t[0])]) for kind, t in past.items()}
     start = begin + now - FLIGHT_S
     moved, moved_end = move_past(past, past_end, start)
     rows = {}
-    for kind, (t, x) in kept.items():
+    for kind, (t, x) in received.items():
         recent = t > start
         rows[kind] = np.concatenate([moved[kind][0], t[recent]]), np.concatenate([moved[kind][1], x[recent]])
     return DiagnosisJob(1, rows, params, UNKNOWN, None, moved_end, None, start)
@@ -84,8 +86,8 @@ def test_an_onset_before_the_newest_flight_is_that_of_the_earlier_report() -> No
     onset = earlier.findings[0].segments[0][0]
     moved = replace(finding.hypothesis, onset=OnsetProfile(finding.hypothesis.onset.kind, 60.0))
     newer = replace(newer, findings=(replace(finding, hypothesis=moved, segments=((60.0, 110.0),)),))
-    (kept,) = with_earlier_onsets(newer, earlier, -40.0, 65.0).findings
-    assert kept.segments[0][0] == pytest.approx(onset - 40.0)
-    assert kept.hypothesis.onset.t0 == pytest.approx(onset - 40.0)
+    (finding,) = with_earlier_onsets(newer, earlier, -40.0, 65.0).findings
+    assert finding.segments[0][0] == pytest.approx(onset - 40.0)
+    assert finding.hypothesis.onset.t0 == pytest.approx(onset - 40.0)
     (own,) = with_earlier_onsets(newer, earlier, -40.0, 59.0).findings  # seen to begin in the newest flight
     assert own.segments[0][0] == 60.0

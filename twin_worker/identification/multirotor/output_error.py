@@ -28,9 +28,8 @@ RUN_S = 4.0  # free run [s]
 EFFECTIVE_FRACTION = 0.075  # effective share of the residuals: three in four seconds, as on wings; gusts correlate them
 MIN_RUNS = 4
 COLD_STEPS, WARM_STEPS = 10, 2  # most steps of a first and of a repeated search
-START_STD = np.array(
-    [0.3, 0.3, 0.3, 0.01, 0.01, 0.2, 0.2, 1.0, 1.0]
-)  # of the measured start states and of gusts [m/s, rad, rad/s]
+# of the measured start states and of gusts [m/s, rad, rad/s]
+START_STD = np.array([0.3, 0.3, 0.3, 0.01, 0.01, 0.2, 0.2, 1.0, 1.0])
 FIRST_STD = np.array([0.3, 0.3, 0.3, 0.03, 0.03])  # of the residuals before the first run
 _LEAST_STD = np.array([0.05, 0.05, 0.05, 0.003, 0.003])
 _STEPS = np.array([0.05, 0.02, 0.02, 5e-4, 0.01, 1e-3, 0.1, 0.1, 2e-3, 2e-3, 0.1, 0.02, 2e-3, 0.1, 0.02, 2e-3])
@@ -70,7 +69,7 @@ class RotorProblem(NamedTuple):
     def measured(self) -> np.ndarray:
         """Return the measured states of the runs, (k, length + 1, c)."""
         rows = self.rows[:, None] + np.arange(self.length + 1)
-        return np.concatenate([self.window.velocity, self.window.attitude[:, :2]], axis=1)[rows][..., self.outputs]
+        return self.window.states[rows][..., self.outputs]
 
     def simulated(self, par: np.ndarray, starts: np.ndarray) -> np.ndarray:
         """Return the simulated states of the runs, (k, length + 1, c)."""

@@ -94,31 +94,34 @@ class RotorModel:
         return self.par[[PARAMETERS.index("w_n"), PARAMETERS.index("w_e")]]
 
     @property
+    def _relative_thrust(self) -> float:
+        """Return the thrust at the mean motor input of the flight over that at full input [-]."""
+        e = float(self.par[PARAMETERS.index("e")])
+        return (1 - e) * self.hover + e * self.hover**2
+
+    @property
     def drag(self) -> float:
         """Return the drag over airspeed at the rotor speed and the airspeed of the flight [1/s]."""
-        e, d, c = self.par[[PARAMETERS.index(name) for name in ("e", "d", "c")]]
-        return float(d * np.sqrt((1 - e) * self.hover + e * self.hover**2) + c * self.speed)
+        d, c = self.par[[PARAMETERS.index(name) for name in ("d", "c")]]
+        return float(d * np.sqrt(self._relative_thrust) + c * self.speed)
 
     @property
     def drag_std(self) -> float:
         """Return the standard deviation of `drag` [1/s]."""
-        e = self.par[PARAMETERS.index("e")]
         slope = np.zeros(N_PAR)
-        slope[PARAMETERS.index("d")] = np.sqrt((1 - e) * self.hover + e * self.hover**2)
+        slope[PARAMETERS.index("d")] = np.sqrt(self._relative_thrust)
         slope[PARAMETERS.index("c")] = self.speed
         return float(np.sqrt(slope @ self.covariance @ slope))
 
     @property
     def thrust(self) -> float:
         """Return the thrust over mass at the mean motor input of the flight [m/s2]."""
-        k, e = self.par[:2].tolist()
-        return float(k * ((1 - e) * self.hover + e * self.hover**2))
+        return float(self.par[0] * self._relative_thrust)
 
     @property
     def thrust_std(self) -> float:
         """Return the standard deviation of `thrust` [m/s2]."""
-        k, e = self.par[:2].tolist()
-        slope = np.array([(1 - e) * self.hover + e * self.hover**2, k * (self.hover**2 - self.hover)])
+        slope = np.array([self._relative_thrust, self.par[0] * (self.hover**2 - self.hover)])
         return float(np.sqrt(slope @ self.covariance[:2, :2] @ slope))
 
 

@@ -50,9 +50,9 @@ class RotorWindow:
         return float(self.ok.sum() * DT)
 
     @property
-    def dt(self) -> float:
-        """Return the sample time [s]."""
-        return DT
+    def states(self) -> np.ndarray:
+        """Return velocity, phi and theta, (n, 5) [m/s, rad]."""
+        return np.concatenate([self.velocity, self.attitude[:, :2]], axis=1)
 
     @property
     def duration(self) -> float:

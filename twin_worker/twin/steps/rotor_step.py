@@ -6,7 +6,7 @@ from fleet.contract import Array, Message, Model, Outcome, RotorDynamics, TwinSt
 from fleet.process.sanitise import format_below
 from twin_worker.identification.multirotor.output_error import identify
 from twin_worker.identification.multirotor.rotor_model import PARAMETERS, RotorModel
-from twin_worker.identification.multirotor.rotor_window import RotorWindow, missing_telemetry, rotor_window
+from twin_worker.identification.multirotor.rotor_window import DT, RotorWindow, missing_telemetry, rotor_window
 from twin_worker.twin.state.state import Twin
 from twin_worker.validation.rotors import verify_rotors, verify_since_identification
 
@@ -32,7 +32,7 @@ def identify_rotors(twin: Twin) -> list[Message]:
         return []
     rotors.timer.restart(newest)
     share, most = _HELD_OUT
-    n_train = len(window) - round(min(share * window.duration, most) / window.dt)
+    n_train = len(window) - round(min(share * window.duration, most) / DT)
     begin = int(np.searchsorted(window.t, rotors.base.t1, side="right")) if rotors.base is not None else 0
     try:
         model = identify(window.part(begin, n_train), twin.received_params, rotors.base, rotors.newest)
@@ -90,7 +90,6 @@ def rotor_message(twin: Twin, window: RotorWindow) -> Model:
         rotors=rotor_dynamics(model) if model is not None else None,
         window_t0=float(window.t[0]),
         window_s=window.duration,
-        interpolated=0.0,
         wind_n=float(model.wind[0]) if model is not None else 0.0,
         wind_e=float(model.wind[1]) if model is not None else 0.0,
     )
