@@ -167,7 +167,10 @@ def grade(
             surfaces.append(location["surface"] == effect["surface"])
         if effect.get("t0") and location["segments"]:
             onset_errors.append((location["segments"][0][0] - effect["t0"], 5.0 + 0.2 * effect.get("ramp_s", 0.0)))
-        values, sigma = diagnosis["parameters"][i], diagnosis["sigma"][i]
+        values, sigma = (
+            {name.removesuffix("_relative"): x for name, x in diagnosis[key][i].items()}  # as labels: without an airframe
+            for key in ("parameters", "sigma")
+        )
         for name, truth in effect["params"].items():
             sizes.append((effect["name"], ScoredParameter(name, truth, values.get(name), sigma.get(name))))
     return GradedFlight(

@@ -119,6 +119,11 @@ class Body:
     D: float = 1.0
     lag: float = 0.0
 
+    @property
+    def is_unit(self) -> bool:
+        """Return whether mass and geometry are unknown."""
+        return (self.mass, self.S, self.b, self.c, self.D) == (1.0, 1.0, 1.0, 1.0, 1.0)
+
 
 @dataclass
 class Flow:
@@ -168,7 +173,8 @@ class Effect:
         equation, source: for display
         parameters: parameters in the order of `act`
         act: function of the stage, see the module docstring
-        reported: `(effect, par, body)` to reported values by name with unit
+        reported: `(effect, par, body)` to values by name with unit
+        of_airframe: names of values that depend on mass, inertia or geometry
         onsets: possible time profiles
         targets: affected parts, e.g. surfaces; empty: the aircraft. Passed to `act` as `of=`, except at stage delta
         initial_guesses: start values of the search where the slope at zero is uninformative
@@ -187,6 +193,7 @@ class Effect:
     act: Callable[..., Any]
     examples: tuple[tuple[float, ...], ...]
     reported: Callable[["Effect", np.ndarray, Body], dict[str, float]] = _parameter_values
+    of_airframe: tuple[str, ...] = ()
     onsets: tuple[Onset, ...] = (Onset.ALWAYS, Onset.STEP)
     targets: tuple[str, ...] = ()
     initial_guesses: tuple[tuple[float, ...], ...] = ()
@@ -203,6 +210,22 @@ class Effect:
     def degrees_of_freedom(self) -> int:
         """Return the number of parameters without nuisance parameters."""
         return sum(not p.nuisance for p in self.parameters)
+
+    def values(self, par: np.ndarray, body: Body) -> dict[str, float]:
+        """Return the reported values by name with unit.
+
+        Without an airframe, mass, moments of inertia, area and lengths count as 1: what depends on them has the suffix
+        `_relative` instead of a unit, as `dCD_relative` = dCD S / m [m2/kg] and `dmass_relative`, a share of the mass.
+        """
+        values = self.reported(self, par, body)
+        if not body.is_unit:
+            return values
+        return {_relative_name(name) if name in self.of_airframe else name: x for name, x in values.items()}
+
+
+def _relative_name(name: str) -> str:
+    """Return the name of a value without its unit: dmass_kg becomes dmass_relative."""
+    return f"{name.removesuffix('_kg').removesuffix('_m')}_relative"
 
 
 @cache

@@ -18,6 +18,7 @@ EFFECT = Effect(
     source="Stevens, Lewis & Johnson 2016, section 2.4 (moments about another point)",
     parameters=(Parameter("dx_m", "m", "shift forward", step=0.01, low=-0.5, high=0.5),),
     act=act,
+    of_airframe=("dx_m",),
     examples=((0.015,), (-0.03,), (0.06,)),
     confusable_with={
         "mass_change": "changes lift too; a dropped payload often causes both: fly pull-ups",

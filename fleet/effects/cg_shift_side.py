@@ -18,6 +18,7 @@ EFFECT = Effect(
     source="Stevens, Lewis & Johnson 2016, section 2.4 (moments about another point)",
     parameters=(Parameter("dy_m", "m", "shift to the right", step=0.01, low=-1.0, high=1.0),),
     act=act,
+    of_airframe=("dy_m",),
     examples=((0.01,), (-0.03,), (0.06,)),
     confusable_with={
         "actuator_offset": "the moment of an aileron offset grows with dynamic pressure: fly at two speeds",

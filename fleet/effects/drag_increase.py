@@ -21,6 +21,7 @@ EFFECT = Effect(
         Parameter("dCm", "-", "associated pitching moment coefficient", step=0.002, low=-0.3, high=0.3, nuisance=True),
     ),
     act=act,
+    of_airframe=("dCD", "dCm"),
     onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
     examples=((0.01, 0.0), (0.03, 0.002), (0.08, -0.004)),
     confusable_with={"thrust_loss": "drag grows with dynamic pressure, thrust with throttle: fly at two speeds"},

@@ -22,6 +22,7 @@ EFFECT = Effect(
         Parameter("dCm", "-", "pitching moment coefficient added", step=0.005, low=-0.3, high=0.3),
     ),
     act=act,
+    of_airframe=("dCL", "dCD", "dCm"),
     examples=((0.1, 0.006, -0.01), (0.2, 0.015, -0.02), (0.35, 0.035, -0.035)),
     confusable_with={
         "drag_increase": "changes neither lift nor moment: compare the angle of attack",

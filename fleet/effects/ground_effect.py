@@ -30,6 +30,7 @@ EFFECT = Effect(
         Parameter("dCm", "-", "associated pitching moment coefficient", step=0.002, low=-0.3, high=0.3, nuisance=True),
     ),
     act=act,
+    of_airframe=("dCm",),
     onsets=(Onset.ALWAYS,),
     examples=((0.2, 0.8, -0.03), (0.3, 1.0, -0.05), (0.45, 1.0, -0.08)),
     confusable_with={

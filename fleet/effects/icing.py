@@ -22,6 +22,7 @@ EFFECT = Effect(
         Parameter("dCm", "-", "associated pitching moment coefficient", step=0.002, low=-0.3, high=0.3, nuisance=True),
     ),
     act=act,
+    of_airframe=("dCD", "dCm"),
     onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
     examples=((0.06, 0.01, 0.0), (0.12, 0.02, 0.002), (0.2, 0.04, 0.004)),
     confusable_with={

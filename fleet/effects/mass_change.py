@@ -25,6 +25,7 @@ EFFECT = Effect(
     source="Beard & McLain 2012, eq. 3.16 (translational dynamics)",
     parameters=(Parameter("share", "-", "relative increment of mass", step=0.02, low=-0.6, high=1.0),),
     act=act,
+    of_airframe=("dmass_kg",),
     reported=reported,
     examples=((0.05,), (-0.09,), (0.15,)),
     confusable_with={

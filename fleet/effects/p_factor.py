@@ -28,6 +28,7 @@ EFFECT = Effect(
         ),
     ),
     act=act,
+    of_airframe=("ratio",),
     examples=((0.3,), (-0.6,), (1.0,)),
     confusable_with={
         "thrust_asymmetry": "does not follow the angle of attack: fly slow and fast at one power",

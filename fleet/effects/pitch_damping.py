@@ -20,6 +20,7 @@ EFFECT = Effect(
         Parameter("dC_m_q", "1/rad", "change of C_m_q; above zero: less damping", step=1.0, low=-100.0, high=100.0),
     ),
     act=act,
+    of_airframe=("dC_m_q",),
     examples=((3.0,), (-5.0,), (7.0,)),
     confusable_with={
         "control_effectiveness_loss": "lost effectiveness attenuates slow elevator movements too",

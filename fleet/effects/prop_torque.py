@@ -22,6 +22,7 @@ EFFECT = Effect(
         Parameter("ratio", "-", "torque relative to full thrust times diameter", step=0.02, low=-2.0, high=2.0),
     ),
     act=act,
+    of_airframe=("ratio",),
     examples=((0.03,), (-0.08,), (0.15,)),
     confusable_with={
         "actuator_offset": "an offset follows dynamic pressure, torque follows the throttle: fly at two power settings",

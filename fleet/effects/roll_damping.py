@@ -20,6 +20,7 @@ EFFECT = Effect(
         Parameter("dC_l_p", "1/rad", "change of C_l_p; above zero: less damping", step=0.05, low=-3.0, high=3.0),
     ),
     act=act,
+    of_airframe=("dC_l_p",),
     examples=((0.1,), (-0.2,), (0.3,)),
     confusable_with={
         "control_effectiveness_loss": "lost effectiveness attenuates slow and fast rolls alike: fly both",

@@ -25,6 +25,7 @@ EFFECT = Effect(
     source="McCormick 1995, chapter 6 (momentum theory); Selig 2014, J. Aircraft 51(6) (surfaces in the slipstream)",
     parameters=(Parameter("share", "-", "fraction of the tail in the slipstream", step=0.1, low=-1.0, high=3.0),),
     act=act,
+    of_airframe=("share",),
     examples=((0.3,), (0.6,), (1.0,)),
     confusable_with={
         "control_effectiveness_loss": "does not follow the throttle: fly inputs at two power settings",

@@ -26,6 +26,7 @@ EFFECT = Effect(
         Parameter("drag_slope_per_rad", "1/rad", "drag slope gained beyond the break", step=0.2, low=0.0, high=5.0),
     ),
     act=act,
+    of_airframe=("slope_lost_per_rad", "drag_slope_per_rad"),
     onsets=(Onset.ALWAYS,),
     targets=tuple(STALL_ANGLES),
     initial_guesses=((2.0, 0.5), (5.0, 1.0), (8.0, 2.0)),

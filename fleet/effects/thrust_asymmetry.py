@@ -18,6 +18,7 @@ EFFECT = Effect(
     source="Stevens, Lewis & Johnson 2016, section 2.5 (moments of thrust); Etkin & Reid 1996, section 3.5",
     parameters=(Parameter("arm_m", "m", "thrust line left of the centre of gravity", step=0.02, low=-3.0, high=3.0),),
     act=act,
+    of_airframe=("arm_m",),
     examples=((0.03,), (-0.08,), (0.2,)),
     confusable_with={
         "p_factor": "follows the angle of attack: fly slow and fast at one power",

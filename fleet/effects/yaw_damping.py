@@ -20,6 +20,7 @@ EFFECT = Effect(
         Parameter("dC_n_r", "1/rad", "change of C_n_r; above zero: less damping", step=0.02, low=-2.0, high=2.0),
     ),
     act=act,
+    of_airframe=("dC_n_r",),
     examples=((0.03,), (-0.06,), (-0.12,)),
     confusable_with={
         "control_effectiveness_loss": "damping acts in steady turns without rudder too",

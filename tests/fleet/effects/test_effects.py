@@ -232,6 +232,22 @@ def test_told_numbers_have_the_names_people_want(effect: Effect) -> None:
     assert all(np.isfinite(x) for x in told.values())
 
 
+@EVERY
+def test_without_an_airframe_no_value_has_a_unit_of_mass_or_length(effect: Effect) -> None:
+    par = np.array(effect.examples[1])
+    assert effect.values(par, BODY) == effect.reported(effect, par, BODY)
+    values = effect.values(par, Body(lag=0.1))
+    assert list(values.values()) == list(effect.reported(effect, par, Body(lag=0.1)).values())
+    assert not any(name.startswith("dC") or name.endswith("_kg") for name in values if "_relative" not in name)
+    assert sum(name.endswith("_relative") for name in values) == len(effect.of_airframe)
+
+
+def test_relative_values_have_the_names_people_want() -> None:
+    named = {name: set(ALL[name].values(np.array(ALL[name].examples[1]), Body())) for name in ("drag_increase", "cg_shift")}
+    assert named == {"drag_increase": {"dCD_relative", "dCm_relative"}, "cg_shift": {"dx_relative"}}
+    assert ALL["mass_change"].values(np.array([-0.2]), Body()) == {"dmass_relative": -0.2}
+
+
 def test_channels_are_those_the_recordings_are_scored_by(recordings: Path) -> None:
     spec = importlib.util.spec_from_file_location("concealed_score", recordings / "concealed-open" / "score.py")
     assert spec and spec.loader

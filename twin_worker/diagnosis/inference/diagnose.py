@@ -221,7 +221,7 @@ def _findings(
             DiagnosisFinding(
                 hypothesis=hypothesis,
                 gain=selected.gain,
-                reported=hypothesis.effect.reported(hypothesis.effect, np.array(hypothesis.par), body),
+                reported=hypothesis.effect.values(np.array(hypothesis.par), body),
                 sigma=reported_sigma(hypothesis, covariance, body),
                 parameter_sigma=tuple(np.sqrt(np.diag(covariance)).tolist()),
                 rivals=tuple(rival.effect.name for rival in rivals),
@@ -256,7 +256,7 @@ def _turbulence_finding(whitened: WhitenedResiduals, decision: Decision) -> Diag
     eq_terms = whitened.modelled.equation_terms(whitened.conditions)
     beta = np.radians(whitened.modelled.residuals(whitened.conditions)[after][:, CHANNELS.index("side")])
     intensity = float(np.sqrt(1.0 - 1.0 / variance_ratio) * beta.std() * np.median(eq_terms.flow.Va))
-    reported = effect.reported(effect, np.array([intensity]), whitened.base.card.body)
+    reported = effect.values(np.array([intensity]), whitened.base.card.body)
     return DiagnosisFinding(
         hypothesis=FaultHypothesis(effect, "", (intensity,), profile),
         gain=float(gain.sum()),

@@ -158,7 +158,7 @@ def _describe_finding(finding: DiagnosisFinding) -> str:
     numbers = ", ".join(
         f"{name} {x:.3g} ± {finding.sigma.get(name, 0.0):.2g}"
         for name, x in finding.reported.items()
-        if x == x and name != "dCm"
+        if x == x and not name.startswith("dCm")
     )
     surface = f" of the {finding.surface}" if finding.surface else ""
     rivals = f"; not separable from {' or '.join(finding.rivals)}" if finding.rivals else ""

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from fleet.effects import Onset
+from fleet.effects import Body, Onset
 from twin_worker.diagnosis.data.card import FaultHypothesis
 from twin_worker.diagnosis.data.flight import DT, STEP_S, FlightData, decimated
 from twin_worker.diagnosis.inference.isolation.refine import refine, slope_steps
@@ -55,14 +55,14 @@ def _floor(whitened: WhitenedResiduals, hypothesis: FaultHypothesis) -> np.ndarr
     return times * _CLOCK_S**2 + (_MODEL_ERROR * np.array(hypothesis.par)) ** 2 + usual**2
 
 
-def reported_sigma(hypothesis: FaultHypothesis, covariance: np.ndarray, body: object) -> dict[str, float]:
+def reported_sigma(hypothesis: FaultHypothesis, covariance: np.ndarray, body: Body) -> dict[str, float]:
     """Propagate a parameter covariance to the standard deviations of the reported values."""
     effect, par = hypothesis.effect, np.array(hypothesis.par)
-    reference = effect.reported(effect, par, body)  # type: ignore[arg-type]
+    reference = effect.values(par, body)
     h = slope_steps(hypothesis) * 1e-2
     J: dict[str, np.ndarray] = {}
     for k in range(len(par)):
-        moved = effect.reported(effect, par + h[k] * np.eye(len(par))[k], body)  # type: ignore[arg-type]
+        moved = effect.values(par + h[k] * np.eye(len(par))[k], body)
         for name, x in moved.items():
             change = x - reference[name]
             if name == "from_deg":
