@@ -168,7 +168,9 @@ def grade(
         if effect.get("t0") and location["segments"]:
             onset_errors.append((location["segments"][0][0] - effect["t0"], 5.0 + 0.2 * effect.get("ramp_s", 0.0)))
         values, sigma = (
-            {name.removesuffix("_relative"): x for name, x in diagnosis[key][i].items()}  # as labels: without an airframe
+            {
+                name.removesuffix("_relative"): x for name, x in diagnosis[key][i].items()
+            }  # as labels: without an airframe
             for key in ("parameters", "sigma")
         )
         for name, truth in effect["params"].items():

@@ -18,6 +18,7 @@ from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.diagnosis.model.baseline import Baseline
 from twin_worker.mismatch.adapt_models import adapt_models
 from twin_worker.mismatch.job import (
+    FLIGHT_S,
     DiagnosisJob,
     DiagnosisResult,
     TelemetryRows,
@@ -35,7 +36,6 @@ from twin_worker.twin.state.routes import ROUTE_MODES
 from twin_worker.twin.state.state import Twin
 
 BASELINE_S = 105.0  # own past used as the comparison model [s]
-FLIGHT_S = 120.0  # flight used for a diagnosis [s]
 CHECK_PERIOD_S, DIAGNOSIS_PERIOD_S = 8.0, 25.0  # between residual checks, and between full diagnoses if idle [s]
 MIN_FLIGHT_S = 45.0  # flight before the first comparison with a model [s]
 _CONFIRM_FIRST = 1e3  # urgency of a confirmation: before all that is overdue [check periods]

@@ -34,6 +34,9 @@ RECENT_S = 40.0  # newest flight whose residuals are monitored [s]
 _JOIN_GAP_S = 10.0  # between the past and the recent flight; longer than a filter, so that it is left out [s]
 # limits of the check, above which a diagnosis follows; 20 and 10 % of the checks of eleven healthy flights exceed them
 MIN_RATIO, MIN_MEAN = 2.0, 3.5  # mean square over the usual one, and mean in its standard deviations [-]
+_NEAR_S = 30.0  # flight before and after an onset, whose commanded airspeeds are compared [s]
+FLIGHT_S = 120.0  # newest flight that is diagnosed [s]
+_FAULT_INTERVAL_S = 36_000.0  # prior mean flight time of an aircraft between two faults [s]
 _MIN_ROWS = 50  # of the recent flight, one row every 0.2 s
 
 TelemetryRows = dict[str, tuple[np.ndarray, np.ndarray]]
@@ -166,10 +169,10 @@ def _run(job: DiagnosisJob, result: DiagnosisResult) -> DiagnosisResult:
     result = replace(result, begin=flight.t_start, check=check_residuals(flight, baseline))
     if not (job.full or output_faults or result.check > 1.0):
         return result
-    report = diagnose(flight, baseline)
+    report = diagnose(flight, baseline, fault_odds=FLIGHT_S / _FAULT_INTERVAL_S)
     if job.baseline is None and past_end is not None:
         # the newest seconds can be a climb: no permanent loss yet; where the past is joined, filters begin anew
-        report = only_new_findings(report, None, past_end + 0.5 * _JOIN_GAP_S)
+        report = only_new_findings(report, None, past_end, past_end + 0.5 * _JOIN_GAP_S)
         if result.past_model is not None:
             result = replace(result, extrapolated=extrapolated_effects(report, flight, result.past_model))
     outputs = effect_outputs(flight, baseline, report)  # of the airframe: the recorded outputs contain their faults
@@ -209,8 +212,8 @@ def extrapolated_effects(report: Report, flight: FlightData, past: PastModel) ->
 
     names = set()
     for finding in report.findings:
-        before = flight.t < finding.segments[0][0]
-        sides = median(before), median(~before)
+        since = flight.t - finding.segments[0][0]
+        sides = median((since < 0.0) & (since > -_NEAR_S)), median((since >= 0.0) & (since < _NEAR_S))
         if abs(sides[0] - sides[1]) > airspeeds.scatter and not all(map(airspeeds.contain, sides)):
             names.add(finding.hypothesis.effect.name)
     _, segments = report.where

@@ -175,7 +175,8 @@ def main() -> int:
         "flights": "{} controls, {} single, {} compound, {} unknown".format(*roles),
         "command": "python -m tests.bench.mismatch.fit_decision",
     }
-    table = DecisionTable(provenance, msgspec.structs.replace(fit(flights), missed=missed))
+    odds = sum(roles[1:]) / roles[0]
+    table = DecisionTable(provenance, msgspec.structs.replace(fit(flights), missed=missed, fault_odds=odds))
     args.out.write_bytes(msgspec.json.format(msgspec.json.encode(table), indent=1) + b"\n")
     return 0
 

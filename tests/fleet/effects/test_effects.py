@@ -243,7 +243,9 @@ def test_without_an_airframe_no_value_has_a_unit_of_mass_or_length(effect: Effec
 
 
 def test_relative_values_have_the_names_people_want() -> None:
-    named = {name: set(ALL[name].values(np.array(ALL[name].examples[1]), Body())) for name in ("drag_increase", "cg_shift")}
+    named = {
+        name: set(ALL[name].values(np.array(ALL[name].examples[1]), Body())) for name in ("drag_increase", "cg_shift")
+    }
     assert named == {"drag_increase": {"dCD_relative", "dCm_relative"}, "cg_shift": {"dx_relative"}}
     assert ALL["mass_change"].values(np.array([-0.2]), Body()) == {"dmass_relative": -0.2}
 

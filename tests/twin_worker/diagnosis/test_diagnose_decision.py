@@ -139,10 +139,20 @@ def test_held_out_blocks_confirm_only_what_predicts_them() -> None:
     assert proof.probability(1) < 0.6 and proof.probability(2) < 0.2 and proof.probability(3) == 0.5
 
 
+def test_where_faults_are_rare_the_same_evidence_says_less() -> None:
+    loss = explained({"force_x": 400.0}, "thrust_loss")
+    usual, rare = decide([loss], WEIGHTS, 1.0), decide([loss], WEIGHTS, 1.0 / 300.0)
+    assert usual == decide([loss], WEIGHTS)
+    odds = [one.effects / one.none for one in (usual, rare)]
+    assert odds[0] / odds[1] == pytest.approx(300.0)
+    assert rare.best is not None and usual.best is not None and rare.best.names == usual.best.names
+
+
 def test_the_table_tells_what_it_was_fitted_on() -> None:
     table = load_table()
     assert {"fitted_on", "flights", "command"} <= set(table.provenance)
     weights = table.weights
+    assert weights.fault_odds == pytest.approx((51 + 13 + 23) / 32)  # as its provenance says
     assert weights.rows_per_sample > 1.0 and weights.model_error > 0.0 and max(weights.further) < 0.0
 
 

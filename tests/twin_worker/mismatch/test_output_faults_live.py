@@ -10,8 +10,8 @@ from fleet.telemetry.recording.recordings import replay_messages
 from twin_worker.diagnosis.data.card import UNKNOWN
 from twin_worker.diagnosis.inference.report import OUTPUT_CHANNEL, ReportOutcome
 from twin_worker.diagnosis.model.baseline import Baseline
-from twin_worker.mismatch.coordinator import BASELINE_S, FLIGHT_S, DiagnosisState
-from twin_worker.mismatch.job import DiagnosisJob, DiagnosisResult, move_past, run_job, telemetry_rows
+from twin_worker.mismatch.coordinator import BASELINE_S, DiagnosisState
+from twin_worker.mismatch.job import FLIGHT_S, DiagnosisJob, DiagnosisResult, move_past, run_job, telemetry_rows
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.twin.step import Twin
 

@@ -15,8 +15,8 @@ from twin_worker.diagnosis.data.card import UNKNOWN, OnsetProfile
 from twin_worker.diagnosis.inference.diagnose import uncovered_axes
 from twin_worker.diagnosis.inference.report import ReportOutcome
 from twin_worker.mismatch import job
-from twin_worker.mismatch.coordinator import BASELINE_S, FLIGHT_S
-from twin_worker.mismatch.job import DiagnosisJob, move_past, run_job, telemetry_rows, with_earlier_onsets
+from twin_worker.mismatch.coordinator import BASELINE_S
+from twin_worker.mismatch.job import FLIGHT_S, DiagnosisJob, move_past, run_job, telemetry_rows, with_earlier_onsets
 from twin_worker.telemetry.history import TelemetryHistory
 
 SEED, TAKEOFF_S, ONSET_S = 202, 60.0, 300.0

@@ -158,8 +158,12 @@ def find_output_faults(flight: FlightData, until: float | None = None) -> list[F
     return find_frozen_outputs(outputs, until)
 
 
-def only_new_findings(report: Report, tracking_loss: tuple[str, float] | None, until: float) -> Report:
+def only_new_findings(
+    report: Report, tracking_loss: tuple[str, float] | None, until: float, settled: float | None = None
+) -> Report:
     """Return the report without mismatches in the trusted past alone, and with a tracking loss after it.
+
+    The past ends at `until`; filters that begin anew after it have settled at `settled`, by default immediately.
 
     An effect that starts in the trusted past contradicts the assumption: the outcome is suspected instead of named.
     Wind, gusts and turbulence vary between minutes, and the past is one sample of them: they are weather, no finding,
@@ -174,7 +178,7 @@ def only_new_findings(report: Report, tracking_loss: tuple[str, float] | None, u
     if (in_past or may_be_weather) and report.outcome is ReportOutcome.NAMED:
         report = replace(report, outcome=ReportOutcome.SUSPECTED)
     channel, segments = report.where
-    segments = tuple(pair for pair in segments if pair[1] > until)
+    segments = tuple(pair for pair in segments if pair[1] > (until if settled is None else settled))
     if report.outcome is ReportOutcome.NAMED or segments:
         return with_sentence(replace(report, where=(channel, segments)))
     if tracking_loss is not None:

@@ -49,13 +49,20 @@ _JUDGED_CHANNELS = [
 ReportProgress = Callable[[str], None]
 
 
-def diagnose(flight: FlightData, base: Baseline, progress: ReportProgress = lambda message: None) -> Report:
+def diagnose(
+    flight: FlightData,
+    base: Baseline,
+    progress: ReportProgress = lambda message: None,
+    *,
+    fault_odds: float | None = None,
+) -> Report:
     """Diagnose one flight.
 
     Args:
         flight: recorded flight
         base: calibrated simulation
         progress: callback for progress messages
+        fault_odds: prior odds of a fault in this flight [-]; None: those of the flights of the decision table
     Raises:
         ValueError: if the flight cannot belong to this aircraft; the message names the reason.
     """
@@ -68,7 +75,7 @@ def diagnose(flight: FlightData, base: Baseline, progress: ReportProgress = lamb
     progress("searching for explanations")
     search = Search(whitened)
     search.run(progress)
-    decision = decide(search.explanations, search.weights)
+    decision = decide(search.explanations, search.weights, fault_odds)
     progress("validating on held-out data")
     named, validation, confirmed = _validated(search, decision, before)
     whitened.condition_on((*weather, *decision.nominal, *(member.hypothesis for member in named)))

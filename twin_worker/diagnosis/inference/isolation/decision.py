@@ -3,7 +3,9 @@
     P(explanation) = (1 - missed) exp(ln p) / sum exp(ln p)
 
 with the log evidence of `evidence`, and the probability that the search misses the cause, so that no statement is
-more certain than the search was on flights with known labels. Source: Platt 1999; Guo et al. 2017 (calibration).
+more certain than the search was on flights with known labels. Where faults are rarer than among these flights, the
+evidence against none is less by the logarithm of the ratio of their odds.
+Source: Platt 1999; Guo et al. 2017 (calibration); Saerens et al. 2002, Neural Computation 14, 21 (other priors).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -63,9 +65,16 @@ def posterior(log_evidences: np.ndarray) -> np.ndarray:
     return np.asarray(weight / weight.sum())
 
 
-def decide(explanations: Sequence[Explanation], weights: Weights) -> Decision:
-    """Return the posterior of all explanations, and the most probable set of effects with its classes."""
-    probability = (1.0 - weights.missed) * posterior(EvidenceTerms(explanations).log_evidence(weights))
+def decide(explanations: Sequence[Explanation], weights: Weights, fault_odds: float | None = None) -> Decision:
+    """Return the posterior of all explanations, and the most probable set of effects with its classes.
+
+    Args:
+        explanations: found by the search
+        weights: of the log evidence
+        fault_odds: prior odds of a fault in this flight [-]; None: those of the flights of the weights
+    """
+    rarer = 0.0 if fault_odds is None else float(np.log(weights.fault_odds / fault_odds))
+    probability = (1.0 - weights.missed) * posterior(EvidenceTerms(explanations).log_evidence(weights) - rarer)
     sets: dict[frozenset[str], float] = {frozenset(): float(probability[-1])}
     acting = []
     unmodelled, anomaly, highest = 0.0, None, -1.0

@@ -48,6 +48,7 @@ class Weights(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         changes: prior of each kind of change without an effect, and of turbulence [nat]
         beside: prior of such a change beside effects, in addition [nat]
         missed: probability that the search misses the cause [-]
+        fault_odds: odds of a fault among the flights that the weights were fitted on [-]
     """
 
     rows_per_sample: float
@@ -60,6 +61,7 @@ class Weights(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     changes: dict[str, float]
     beside: float = 0.0
     missed: float = 0.0
+    fault_odds: float = 1.0
 
 
 class DecisionTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
