@@ -4,7 +4,7 @@ import logging
 from _thread import LockType
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from types import MappingProxyType
 from typing import TypeVar
@@ -21,15 +21,17 @@ from twin_worker.mismatch.job import (
     FLIGHT_S,
     DiagnosisJob,
     DiagnosisResult,
+    ObservedOnsets,
     TelemetryRows,
     mark_extrapolated,
     mark_unconfirmed,
+    mark_unobserved,
     mismatch_message,
     move_past,
     shift_times,
     telemetry_rows,
     with_adaptation,
-    with_earlier_onsets,
+    with_observed_onsets,
 )
 from twin_worker.mismatch.process import DiagnosisProcess
 from twin_worker.twin.state.routes import ROUTE_MODES
@@ -78,6 +80,7 @@ class DiagnosisState:
     diagnosed_t: float = float("-inf")  # end of the newest flight diagnosed
     last_report: Report | None = None  # newest diagnosis; start of its flight below
     last_begin: float = 0.0
+    observed: ObservedOnsets = field(default_factory=dict)  # onsets that diagnoses have observed
     clear_count: int = 0
     is_unconfirmed: bool = False  # the newest diagnosis awaits a second one
 
@@ -155,13 +158,16 @@ class DiagnosisState:
             return None
         self.diagnosed_t = result.end
         report = result.report
-        if self.last_report is not None:
-            shift, start = self.last_begin - result.begin, result.recent_start - result.begin
-            report = with_earlier_onsets(report, self.last_report, shift, start + _SAME_ONSET_S)
+        if report.outcome is ReportOutcome.NONE and self._was_clear:
+            self.observed.clear()
+        start = result.recent_start + _SAME_ONSET_S
+        report, unobserved = with_observed_onsets(report, self.observed, result.begin, start)
         shifted = shift_times(report, result.begin - self.first_t)
         mismatch = mismatch_message(result.uav, shifted, result.begin, result.end)
-        if self._is_extrapolated(report, result.extrapolated):
+        if self._is_new(report, result.extrapolated):
             mismatch = mark_extrapolated(mismatch)
+        elif self.baseline is None and report.outcome is ReportOutcome.NAMED and self._is_new(report, unobserved):
+            mismatch = mark_unobserved(mismatch)
         self.is_unconfirmed = mismatch.outcome in _CONFIRMED and not self._is_confirmed(report, result)
         if self.is_unconfirmed:
             self.next_t = result.end + _CONFIRM_AFTER_S
@@ -176,14 +182,18 @@ class DiagnosisState:
         self.published = mismatch
         return mismatch
 
-    def _is_extrapolated(self, report: Report, extrapolated: frozenset[str]) -> bool:
-        """Return whether another airspeed may explain what a report names, and nothing of it is known already."""
+    @property
+    def _was_clear(self) -> bool:
+        return self.last_report is not None and self.last_report.outcome is ReportOutcome.NONE
+
+    def _is_new(self, report: Report, doubtful: frozenset[str]) -> bool:
+        """Return whether a report states an effect of `doubtful`, and nothing of it is confirmed already."""
         names = {finding.hypothesis.effect.name for finding in report.findings}
         names |= {"unknown"} if report.outcome is ReportOutcome.UNKNOWN else set()
         published = self.published
         if published is not None and published.outcome in _CONFIRMED and any(c.name in names for c in published.causes):
             return False
-        return report.outcome in (ReportOutcome.NAMED, ReportOutcome.UNKNOWN) and bool(names & extrapolated)
+        return report.outcome in (ReportOutcome.NAMED, ReportOutcome.UNKNOWN) and bool(names & doubtful)
 
     def suspend(self, uav: int, t: float, reason: str) -> None:
         """Suspend the diagnosis after an internal error at data time `t`, longer each time."""

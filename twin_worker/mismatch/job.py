@@ -40,6 +40,7 @@ _FAULT_INTERVAL_S = 36_000.0  # prior mean flight time of an aircraft between tw
 _MIN_ROWS = 50  # of the recent flight, one row every 0.2 s
 
 TelemetryRows = dict[str, tuple[np.ndarray, np.ndarray]]
+ObservedOnsets = dict[tuple[str, str], float]  # by effect and its target [s since 1970]
 
 
 @dataclass(frozen=True)
@@ -255,26 +256,33 @@ def mismatch_message(uav: int, report: Report, begin: float, end: float) -> Mism
     )
 
 
-def with_earlier_onsets(report: Report, earlier: Report, shift: float, start: float) -> Report:
-    """Return the report with the onsets of an earlier one where the flight no longer contains them.
+def with_observed_onsets(
+    report: Report, observed: ObservedOnsets, begin: float, start: float
+) -> tuple[Report, frozenset[str]]:
+    """Return the report with the onsets that diagnoses observed, and the effects whose onset none has observed.
+
+    An effect older than the newest flight is a difference to the past; its onset is estimated between the two.
 
     Args:
-        report: newer report
-        earlier: its onsets hold for effects of the same name
-        shift: what its times must be increased by to count like those of the report [s]
-        start: up to here an onset may lie in the gap or before it [s]
+        report: its times count from `begin`
+        observed: onsets so far, extended in place; effects that are not separable share one
+        begin: start of its flight [s since 1970]
+        start: from here on an onset counts as observed [s since 1970]
     """
-    known = {finding.hypothesis.label: finding.segments[0][0] + shift for finding in earlier.findings}
-    findings = []
+    findings, unobserved = [], set()
     for finding in report.findings:
         (onset, end), *rest = finding.segments
-        first = known.get(finding.hypothesis.label, onset)
-        if max(first, onset) < start:
-            hypothesis = finding.hypothesis
-            moved = replace(hypothesis, onset=hypothesis.onset.shifted(first - onset))
-            finding = replace(finding, hypothesis=moved, segments=((first, end), *rest))
-        findings.append(finding)
-    return with_sentence(replace(report, findings=tuple(findings)))
+        hypothesis = finding.hypothesis
+        keys = [(name, hypothesis.target) for name in (hypothesis.effect.name, *finding.rivals)]
+        known = [observed[key] for key in keys if key in observed]
+        first = onset if begin + onset >= start or not known else min(known) - begin
+        if begin + onset >= start or known:
+            observed.update(dict.fromkeys(keys, begin + first))
+        else:
+            unobserved.add(hypothesis.effect.name)
+        moved = replace(hypothesis, onset=hypothesis.onset.shifted(first - onset))
+        findings.append(replace(finding, hypothesis=moved, segments=((first, end), *rest)))
+    return with_sentence(replace(report, findings=tuple(findings))), frozenset(unobserved)
 
 
 def shift_times(report: Report, shift: float) -> Report:
@@ -291,14 +299,22 @@ def shift_times(report: Report, shift: float) -> Report:
 
 def mark_extrapolated(mismatch: Mismatch) -> Mismatch:
     """Return the mismatch as suspected: it begins at an airspeed that the own past does not contain."""
-    sentence = f"at an airspeed that its own past does not contain, not confirmed: {mismatch.sentence}"
-    return msgspec.structs.replace(mismatch, outcome=DiagnosisOutcome.SUSPECTED, sentence=sentence)
+    return _suspected(mismatch, "at an airspeed that its own past does not contain, not confirmed")
+
+
+def mark_unobserved(mismatch: Mismatch) -> Mismatch:
+    """Return the mismatch as suspected: no diagnosis has seen it begin, so that slow changes may explain it."""
+    return _suspected(mismatch, "differs from its own past without an observed onset, not confirmed")
 
 
 def mark_unconfirmed(mismatch: Mismatch) -> Mismatch:
     """Mark a mismatch as suspected until a second diagnosis confirms it."""
+    return _suspected(mismatch, "detected once, not confirmed")
+
+
+def _suspected(mismatch: Mismatch, reason: str) -> Mismatch:
     return msgspec.structs.replace(
-        mismatch, outcome=DiagnosisOutcome.SUSPECTED, sentence=f"detected once, not confirmed: {mismatch.sentence}"
+        mismatch, outcome=DiagnosisOutcome.SUSPECTED, sentence=f"{reason}: {mismatch.sentence}"
     )
 
 

@@ -136,7 +136,7 @@ def test_by_its_own_past_nothing_is_named_that_began_in_it(twin, monkeypatch):
         "diagnose": made(),
         "effect_outputs": None,
     }.items():
-        monkeypatch.setattr(f"twin_worker.mismatch.job.{name}", lambda *_, gives=gives: gives)
+        monkeypatch.setattr(f"twin_worker.mismatch.job.{name}", lambda *_, gives=gives, **__: gives)
     rows = telemetry_rows(twin.telemetry.history, -np.inf)
     begin = rows["attitude"][0][0]
     named, suspected = (

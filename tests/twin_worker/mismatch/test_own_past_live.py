@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleet.contract import Params, Sample
+from fleet.contract import DiagnosisOutcome, Params, Sample
+from fleet.effects import catalogue
 from fleet.simulator.faults.kinds import parse_fault
 from fleet.simulator.flight.drive import to_tlog
 from fleet.simulator.flight.uav import SimulatedUav
@@ -13,10 +14,19 @@ from fleet.telemetry.recording.recordings import replay_messages
 from tests.support.diagnosed import made
 from twin_worker.diagnosis.data.card import UNKNOWN, OnsetProfile
 from twin_worker.diagnosis.inference.diagnose import uncovered_axes
-from twin_worker.diagnosis.inference.report import ReportOutcome
+from twin_worker.diagnosis.inference.report import Report, ReportOutcome
 from twin_worker.mismatch import job
-from twin_worker.mismatch.coordinator import BASELINE_S
-from twin_worker.mismatch.job import FLIGHT_S, DiagnosisJob, move_past, run_job, telemetry_rows, with_earlier_onsets
+from twin_worker.mismatch.coordinator import BASELINE_S, DiagnosisState
+from twin_worker.mismatch.job import (
+    FLIGHT_S,
+    DiagnosisJob,
+    DiagnosisResult,
+    ObservedOnsets,
+    move_past,
+    run_job,
+    telemetry_rows,
+    with_observed_onsets,
+)
 from twin_worker.telemetry.history import TelemetryHistory
 
 SEED, TAKEOFF_S, ONSET_S = 202, 60.0, 300.0
@@ -80,14 +90,53 @@ def test_surfaces_that_move_together_are_not_told_apart(flight: tuple[TelemetryH
     assert any(line.startswith("aileron and rudder not covered: ") for line in uncovered_axes(past_model.base))
 
 
-def test_an_onset_before_the_newest_flight_is_that_of_the_earlier_report() -> None:
-    earlier, newer = made(), made()
-    (finding,) = newer.findings
-    onset = earlier.findings[0].segments[0][0]
-    moved = replace(finding.hypothesis, onset=OnsetProfile(finding.hypothesis.onset.kind, 60.0))
-    newer = replace(newer, findings=(replace(finding, hypothesis=moved, segments=((60.0, 110.0),)),))
-    (finding,) = with_earlier_onsets(newer, earlier, -40.0, 65.0).findings
-    assert finding.segments[0][0] == pytest.approx(onset - 40.0)
-    assert finding.hypothesis.onset.t0 == pytest.approx(onset - 40.0)
-    (own,) = with_earlier_onsets(newer, earlier, -40.0, 59.0).findings  # seen to begin in the newest flight
-    assert own.segments[0][0] == 60.0
+def with_onset(report: Report, onset: float) -> Report:
+    """Return a report whose only effect begins at `onset`."""
+    (finding,) = report.findings
+    moved = replace(finding.hypothesis, onset=OnsetProfile(finding.hypothesis.onset.kind, onset))
+    return replace(report, findings=(replace(finding, hypothesis=moved, segments=((onset, 110.0),)),))
+
+
+def test_an_onset_before_the_newest_flight_is_the_one_that_was_observed() -> None:
+    observed: ObservedOnsets = {}
+    first, unobserved = with_observed_onsets(with_onset(made(), 83.0), observed, 1000.0, 1020.0)
+    assert first.findings[0].segments[0][0] == 83.0 and not unobserved
+    later, unobserved = with_observed_onsets(with_onset(made(), 5.0), observed, 1200.0, 1220.0)
+    (finding,) = later.findings
+    assert finding.segments == ((-117.0, 110.0),) and finding.hypothesis.onset.t0 == -117.0 and not unobserved
+    again, _ = with_observed_onsets(with_onset(made(), 60.0), observed, 1200.0, 1220.0)  # begins anew
+    assert again.findings[0].segments[0][0] == 60.0
+
+
+def test_effects_that_are_not_separable_share_the_observed_onset() -> None:
+    (lag,) = made().findings
+    assert "actuator_delay" in lag.rivals
+    observed: ObservedOnsets = {}
+    with_observed_onsets(with_onset(made(), 83.0), observed, 1000.0, 1020.0)
+    delay = replace(lag.hypothesis, effect=catalogue()["actuator_delay"])
+    renamed = replace(made(), findings=(replace(lag, hypothesis=delay, rivals=()),))
+    report, unobserved = with_observed_onsets(with_onset(renamed, 5.0), observed, 1200.0, 1220.0)
+    assert report.findings[0].segments[0][0] == -117.0 and not unobserved
+
+
+def test_an_effect_that_no_diagnosis_saw_begin_is_suspected() -> None:
+    state = DiagnosisState()
+    state.first_t = 1000.0
+
+    def answer(end: float, onset: float) -> DiagnosisOutcome:
+        """Diagnose the 120 s before `end`; the onset counts from their start."""
+        report = with_onset(made(), onset)
+        mismatch = state.handle_result(DiagnosisResult(1, end - 120.0, end, end - 120.0, report=report))
+        assert mismatch is not None
+        return mismatch.outcome
+
+    assert answer(1200.0, 5.0) is DiagnosisOutcome.SUSPECTED and answer(1208.0, 5.0) is DiagnosisOutcome.SUSPECTED
+    assert "without an observed onset" in state.published.sentence  # type: ignore[union-attr]
+    assert not state.is_unconfirmed
+    answer(1216.0, 83.0)
+    assert answer(1224.0, 75.0) is DiagnosisOutcome.NAMED
+    assert answer(1424.0, 5.0) is DiagnosisOutcome.NAMED  # observed before
+    state.published, cleared = None, made(outcome=ReportOutcome.NONE)
+    for end in (1432.0, 1440.0):
+        state.handle_result(DiagnosisResult(1, end - 120.0, end, end - 120.0, report=cleared))
+    assert answer(1448.0, 5.0) is DiagnosisOutcome.SUSPECTED
