@@ -4,6 +4,7 @@ import ast
 import functools
 import importlib
 import importlib.metadata
+import os
 import re
 import subprocess
 import sys
@@ -82,6 +83,22 @@ def third_party(*folders: str) -> set[str]:
                 assert top in offered, f"{path} imports {top}, which is not installed"
                 found |= {bare(offer) for offer in offered[top]}
     return found
+
+
+def test_every_bench_can_be_imported() -> None:
+    """Benches run in no suite: a name that moved would be noticed only by who measures next."""
+    files = [path for path in (ROOT / "tests" / "bench").rglob("*.py") if path.name != "__init__.py"]
+    code = "import importlib, sys\nfor name in sys.argv[1:]: importlib.import_module(name)"
+    names = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in files]
+    paths = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+    done = subprocess.run(
+        [sys.executable, "-c", code, *sorted(names)],
+        env=os.environ | {"PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert len(names) > 50 and done.returncode == 0, done.stderr[-2000:]
 
 
 def test_what_is_imported_is_declared_and_what_is_declared_is_imported() -> None:

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, TypeVar
 from scipy.stats import beta
 
 from fleet.blind_test.mark import GradedFlight, grade, score
-from fleet.cli import check_parent
+from fleet.process.file_options import output_file
 from twin_worker.diagnosis.baseline import calibrate as calibration
 from twin_worker.diagnosis.data.card import read_card
 from twin_worker.diagnosis.data.flight import FlightData, read_flights
@@ -222,9 +222,8 @@ def main() -> int:
     parser.add_argument("--cache", type=Path, required=True)
     parser.add_argument("--held-out", action="store_true", help="the held-out flights, instead of the others")
     parser.add_argument("--only", nargs="+", help="flights")
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=output_file, metavar="FILE", help="write the results to FILE")
     args = parser.parse_args()
-    check_parent("--json", args.json)
     cache, rows = Cache(args.cache), []
     version = source_hash("baseline", "model", "data", "inference")
     for name in args.sets:
