@@ -167,12 +167,7 @@ def grade(
             surfaces.append(location["surface"] == effect["surface"])
         if effect.get("t0") and location["segments"]:
             onset_errors.append((location["segments"][0][0] - effect["t0"], 5.0 + 0.2 * effect.get("ramp_s", 0.0)))
-        values, sigma = (
-            {
-                name.removesuffix("_relative"): x for name, x in diagnosis[key][i].items()
-            }  # as labels: without an airframe
-            for key in ("parameters", "sigma")
-        )
+        values, sigma = (_by_label_name(diagnosis[key][i]) for key in ("parameters", "sigma"))
         for name, truth in effect["params"].items():
             sizes.append((effect["name"], ScoredParameter(name, truth, values.get(name), sigma.get(name))))
     return GradedFlight(
@@ -205,6 +200,11 @@ def _is_in_forces(named: tuple[str, ...], diagnosis: Mapping[str, Any]) -> bool:
     return any(
         name not in NOT_IN_FORCES and channel != OUTPUT_CHANNEL for name, channel in zip(named, channels, strict=False)
     )
+
+
+def _by_label_name(values: Mapping[str, float]) -> dict[str, float]:
+    """Return reported values by the names of labels, which are relative too where no airframe is given."""
+    return {name.removesuffix("_relative"): x for name, x in values.items()}
 
 
 def _statements(

@@ -14,14 +14,8 @@ FORMAT = "parauav.detection_limits.1"
 TABLE = Path(__file__).with_suffix(".json")
 PROBABILITY = 0.9
 MIN_FLIGHTS = 4  # flights with an effect that say something about it
-_OF_ONE_AIRCRAFT = (
-    "dCD",
-    "dCD_relative",
-    "dmass_kg",
-    "dmass_relative",
-    "dx_m",
-    "dx_relative",
-)  # depend on the size of the aircraft or on its card
+# depend on the size of the aircraft or on its card
+_OF_ONE_AIRCRAFT = ("dCD", "dCD_relative", "dmass_kg", "dmass_relative", "dx_m", "dx_relative")
 _MAX_SPEED_RATIO = 1.7  # flights of another speed are of another kind of aircraft
 _SHARES = ("loss", "scale", "fraction", "density_ratio", "lift_loss")
 _UNITS = {"mps": "m/s", "mps2": "m/s2", "dps": "deg/s", "deg": "deg", "m": "m", "s": "s", "kg": "kg"}
