@@ -86,7 +86,7 @@ def third_party(*folders: str) -> set[str]:
 
 
 def test_every_bench_can_be_imported() -> None:
-    """Benches run in no suite: a name that moved would be noticed only by who measures next."""
+    """The suite does not run the benches, so that a renamed import in one of them would go unnoticed."""
     files = [path for path in (ROOT / "tests" / "bench").rglob("*.py") if path.name != "__init__.py"]
     code = "import importlib, sys\nfor name in sys.argv[1:]: importlib.import_module(name)"
     names = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in files]

@@ -94,8 +94,8 @@ def test_a_rival_is_in_the_class() -> None:
 def test_where_when_and_how_much(name: str) -> None:
     """Without an airframe the magnitude of a label is relative as well."""
     concealed = effect("drag_increase", dCD=0.02) | {"t0": 57.0}
-    told = report("drag_increase", parameters=[{name: 0.022}], sigma=[{name: 0.002}])
-    one = grade("one", label("single", concealed), told)
+    diagnosis = report("drag_increase", parameters=[{name: 0.022}], sigma=[{name: 0.002}])
+    one = grade("one", label("single", concealed), diagnosis)
     assert one.located == (True,) and one.late == ((3.0, 5.0),)
     (_, size) = one.sizes[0]
     assert size.error == pytest.approx(0.1) and size.covered

@@ -275,8 +275,9 @@ def with_observed_onsets(
         hypothesis = finding.hypothesis
         keys = [(name, hypothesis.target) for name in (hypothesis.effect.name, *finding.rivals)]
         known = [observed[key] for key in keys if key in observed]
-        first = onset if begin + onset >= start or not known else min(known) - begin
-        if begin + onset >= start or known:
+        is_recent = begin + onset >= start
+        first = onset if is_recent or not known else min(known) - begin
+        if is_recent or known:
             observed.update(dict.fromkeys(keys, begin + first))
         else:
             unobserved.add(hypothesis.effect.name)

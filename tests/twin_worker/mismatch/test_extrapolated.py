@@ -39,9 +39,8 @@ def test_an_effect_that_begins_with_another_airspeed_is_extrapolated() -> None:
     assert effects(ONSET) == {EFFECT} and effects(ONSET - 2.0) == {EFFECT}
     assert effects() == set()  # the same airspeed throughout
     assert effects(20.0) == set()  # it begins a minute after the change
-    assert (
-        effects(ONSET - 40.0, ONSET + 40.0) == set()
-    )  # at an airspeed that the past does not contain, before and after
+    # at an airspeed that the past does not contain, before and after
+    assert effects(ONSET - 40.0, ONSET + 40.0) == set()
     assert effects(20.0, ONSET) == {EFFECT}  # back, but the flight before it was at another airspeed
 
 
