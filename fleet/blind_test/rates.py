@@ -13,6 +13,7 @@ from scipy.stats import binom, binomtest, chi2
 
 CONFIDENCE = 0.95
 N_BINS = 10  # of the reliability diagram
+_N_DRAWN = 2000  # samples of outcomes of calibrated probabilities
 
 
 class Interval(NamedTuple):
@@ -65,11 +66,17 @@ class ReliabilityBin:
 
 @dataclass(frozen=True)
 class ProbabilityScores:
-    """Scores of stated probabilities: mean squared error, expected calibration error, reliability diagram."""
+    """Scores of stated probabilities: mean squared error, expected calibration error, reliability diagram.
+
+    `calibrated_median` and `calibrated_limit` are the median and the 95 % quantile of the calibration error that exact
+    probabilities have with as many statements: a small sample has an error of its own.
+    """
 
     n: int
     brier: float
     calibration_error: float
+    calibrated_median: float
+    calibrated_limit: float
     bins: tuple[ReliabilityBin, ...]
 
 
@@ -88,5 +95,13 @@ def score_probabilities(statements: Sequence[Statement]) -> ProbabilityScores | 
         interval = wilson(int(y[rows].sum()), int(rows.sum()))
         assert interval is not None
         bins.append(ReliabilityBin(float(p[rows].mean()), float(y[rows].mean()), interval, int(rows.sum())))
-    error = sum(b.n * abs(b.stated - b.share) for b in bins) / len(p)
-    return ProbabilityScores(len(p), float(((p - y) ** 2).mean()), float(error), tuple(bins))
+    error = float(_calibration_errors(p, y[None], which)[0])
+    drawn = np.random.default_rng(0).random((_N_DRAWN, len(p))) < p
+    usual, limit = np.quantile(_calibration_errors(p, drawn, which), (0.5, CONFIDENCE)).tolist()
+    return ProbabilityScores(len(p), float(((p - y) ** 2).mean()), error, usual, limit, tuple(bins))
+
+
+def _calibration_errors(p: np.ndarray, y: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """Return the calibration error of probabilities p, (n,) in bins `which`, for each row of outcomes y, (m, n)."""
+    members = which == np.arange(N_BINS)[:, None]
+    return np.asarray(np.abs((y - p) @ members.T).sum(axis=1) / len(p))

@@ -48,7 +48,18 @@ def test_calibrated_probabilities_have_no_calibration_error_and_boasts_have_one(
     boasting = score_probabilities([Statement(0.99, bool(k % 2)) for k in range(200)])
     assert honest is not None and honest.calibration_error < 0.03 and honest.brier == pytest.approx(1 / 6, abs=0.01)
     assert boasting is not None and boasting.calibration_error == pytest.approx(0.49) and len(boasting.bins) == 1
+    assert honest.calibration_error < honest.calibrated_limit < 0.03 and boasting.calibrated_limit < 0.03
     assert sum(one.n for one in honest.bins) == 4000 and score_probabilities([]) is None
+
+
+def test_the_calibration_error_of_a_small_sample_is_compared_with_that_of_exact_probabilities() -> None:
+    rng = np.random.default_rng(3)
+    below = 0
+    for _ in range(200):
+        scores = score_probabilities([Statement(p, bool(rng.random() < p)) for p in rng.choice([0.3, 0.7, 0.9], 80)])
+        assert scores is not None and 0.02 < scores.calibrated_median < scores.calibrated_limit < 0.15
+        below += scores.calibration_error <= scores.calibrated_limit
+    assert 0.9 < below / 200 < 0.99
 
 
 def label(*names: str) -> dict[str, Any]:

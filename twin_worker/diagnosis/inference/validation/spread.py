@@ -14,7 +14,7 @@ from twin_worker.diagnosis.inference.isolation.whitened_residuals import Whitene
 _BLOCK = 50  # rows of a block of the sandwich, 10 s
 _PARTS = 4  # parts of the jackknife
 _MIN_GATE = 0.01  # least gate value at which an effect is active
-_MODEL_ERROR = 0.02  # relative model error of a parameter
+_MODEL_ERROR = 0.05  # relative model error of a parameter: 91 % of 147 true values of blind tests lie within 2 sigma
 _CLOCK_S = 0.01  # uncertainty of message time stamps [s]
 
 
