@@ -271,7 +271,9 @@ def score_rows(scores: Mapping[str, Any]) -> Iterator[tuple[bool | None, str, st
     for key, meaning in PROBABILITIES.items():
         if (stated := scores[key]) is not None:
             error = stated["calibration_error"]
-            exact = f"exact probabilities: {stated['calibrated_median']:.3f}, 95 % below {stated['calibrated_limit']:.3f}"
+            exact = (
+                f"exact probabilities: {stated['calibrated_median']:.3f}, 95 % below {stated['calibrated_limit']:.3f}"
+            )
             text = f"{error:.3f} ({exact}), Brier score {stated['brier']:.3f}, {stated['n']} stated"
             bound = f"at most {MAX_CALIBRATION_ERROR:g}"
             yield error <= MAX_CALIBRATION_ERROR, f"calibration error, {meaning}", bound, text

@@ -1,5 +1,14 @@
 """Compile the twin's physics before the first aircraft needs it, on a synthetic straight flight."""
 
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+
 import numpy as np
 
 from fleet.airframes import GENERIC, load
@@ -10,7 +19,7 @@ from fleet.autopilots.shadow import NO_MEMORY, replay_controller
 from fleet.contract import Array, Item, Prediction, TwinState
 from fleet.frames import Origin, to_geodetic, wrap
 from fleet.mission import unroll_route
-from fleet.physics import point_mass
+from fleet.physics import point_mass, wrench
 from fleet.physics.simulate import N_STATE, coupled_plant, linear_plant, simulate
 from fleet.terrain.areas import Area
 from fleet.window import Window
@@ -34,6 +43,7 @@ from twin_worker.twin.steps.extrapolate import shift_to_position, widen_tube
 from twin_worker.validation.held_out import HeldOut
 from twin_worker.validation.verify import verify
 
+_COMPLETE = "complete"  # file in the compile cache once it holds all functions
 _SPEED = 22.0  # [m/s]
 _HOME = Origin(470_000_000, 80_000_000, 100_000)
 _ITEMS = tuple(
@@ -42,9 +52,59 @@ _ITEMS = tuple(
 
 
 def warm_up() -> None:
-    """Run every compiled function of the worker once; about one second from the disk cache."""
+    """Run every compiled function of the worker once; about one second from the disk cache.
+
+    With an empty cache two processes compile at once. Workers that start together wait for the first one's cache.
+    """
+    folder = Path(os.environ["NUMBA_CACHE_DIR"])
+    complete = folder / _COMPLETE
+    if not complete.exists():
+        with _locked(folder / "lock"):
+            if not complete.exists():
+                _compile_in_two_processes()
+                complete.touch()
+    for group in _GROUPS:
+        group()
+
+
+def _compile_in_two_processes() -> None:
+    """Compile the first group here and the other in a process of its own, which ends with this one."""
+    spawn = multiprocessing.get_context("spawn")
+    ours, theirs = spawn.Pipe()
+    other = spawn.Process(target=_compile_second_group, args=(theirs,), daemon=True, name="compiler")
+    other.start()
+    theirs.close()
+    _GROUPS[0]()
+    other.join()  # what it failed to compile is compiled here, with its error
+    ours.close()
+
+
+def _compile_second_group(parent: Connection) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
+    threading.Thread(target=_exit_at_end_of, args=(parent,), daemon=True).start()
+    _GROUPS[1]()
+
+
+def _exit_at_end_of(parent: Connection) -> None:
+    with contextlib.suppress(EOFError, OSError):
+        parent.recv()
+    os._exit(1)
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Hold a lock against other processes; without one on Windows, where every process compiles."""
+    with path.open("w", encoding="ascii") as file:
+        with contextlib.suppress(ImportError, OSError):
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _run_fixed_wings() -> None:
+    """Run the predictions of fixed wings."""
     window = _synthetic_flight()
-    axes = [identify_axis(axis, window, 2.0)[1] for axis in AXES]
     par, _ = arduplane.parameters({})
     legs = unroll_route(_ITEMS, seq=1, origin=_HOME, params={}).legs
     n = len(window)
@@ -54,8 +114,8 @@ def warm_up() -> None:
     ctl, _ = replay_controller(par, legs, window.p[0], *rows, NO_MEMORY)  # type: ignore
     remember(ctl, par, 0.0)
     state = np.concatenate([window.p[-1], window.x[-1]])
-    linear = linear_plant(*(part for axis in axes for part in (axis.physical(), axis.means)))
-    coupled = coupled_plant(identify(window, np.zeros(2), load(GENERIC)).par, np.array([_SPEED, 0.0]))
+    linear = linear_plant(np.zeros((4, 8)), np.full(7, _SPEED), np.zeros((5, 8)), np.zeros(7))
+    coupled = coupled_plant(np.zeros(wrench.N_PAR), np.array([_SPEED, 0.0]))
     air = np.array([0.0, 0.0, 1.0, 0.0])
     kinematic_ctl = ctl.copy()
     for plant in (linear, coupled):
@@ -65,11 +125,7 @@ def warm_up() -> None:
     ahead, factors = np.empty((5, 3)), np.ones(greybox.N_PAR)
     start = np.array([*window.p[-1], _SPEED, 0.0, 0.0, 0.0])
     greybox.follow(kinematic_ctl, par, legs, factors, start, np.zeros(2), 0.1, ahead)  # type: ignore
-    _run_multirotors()
-    _run_traffic()
     _run_propagation()
-    _run_telemetry(window)
-    _run_identification()
 
 
 def _run_point_mass(control: tuple[np.ndarray, np.ndarray, np.ndarray], window: Window) -> None:
@@ -152,6 +208,8 @@ def _run_telemetry(window: Window) -> None:
 
 def _run_identification() -> None:
     """Identify, verify and compute the shrinkage sample, as the first identification holds an aircraft's lock."""
+    for axis in AXES:
+        identify_axis(axis, _synthetic_flight(), 2.0)
     window = _synthetic_flight(60.0)
     plant, n_train = identify(window, np.zeros(2), load(GENERIC)), len(window) // 2
     verify(plant, window, n_train, 0.0, None)
@@ -159,6 +217,17 @@ def _run_identification() -> None:
     HeldOut(plant, window, n_train).shrinkage_sample(20.0, 5.0)
     linearise(plant, window)
     wrap(np.zeros((2, 3))[:, 2])
+
+
+def _run_others() -> None:
+    """Run the identification, multirotors, resampling, and the conflict detection."""
+    _run_identification()
+    _run_multirotors()
+    _run_telemetry(_synthetic_flight())
+    _run_traffic()
+
+
+_GROUPS = _run_fixed_wings, _run_others  # each takes half of the time of all
 
 
 def _synthetic_flight(seconds: float = 20.0, dt: float = 0.04) -> Window:

@@ -1,6 +1,10 @@
 """Fit the weights of the decision on flights with known labels, by multinomial logistic regression.
 
-    python -m tests.bench.mismatch.fit_decision --cache /tmp/cache --sets open sitl /tmp/exam/26011 --out decision.json
+    python -m tests.bench.mismatch.fit_decision --cache cache --sets open exam/26011 --unseen exam/27102 --out out.json
+    python -m tests.bench.mismatch.fit_decision --cache cache --unseen exam/27102 --out out.json   # weights as they are
+
+The probability that the search misses the cause is a logistic function of the log odds of the most probable outcome,
+fitted to the classes named on flights that the weights were not fitted on (`--unseen`).
 
 Sets as in `tests.bench.mismatch.offline`. Every explanation that the search found is one outcome of its flight; right
 are those with exactly the concealed effects and surfaces, of a control none, of an effect outside the catalogue every
@@ -24,13 +28,15 @@ from twin_worker.diagnosis.baseline.calibrate import calibrate
 from twin_worker.diagnosis.data.card import read_card
 from twin_worker.diagnosis.data.flight import FlightData, read_flights
 from twin_worker.diagnosis.inference.diagnose import NAMED_PROBABILITY
-from twin_worker.diagnosis.inference.isolation.decision import decide, posterior
+from twin_worker.diagnosis.inference.isolation.decision import decide, outcome_log_odds, posterior
 from twin_worker.diagnosis.inference.isolation.evidence import (
+    NEVER_MISSED,
     TURBULENCE,
     DecisionTable,
     EvidenceTerms,
     Explanation,
     Weights,
+    load_table,
 )
 from twin_worker.diagnosis.inference.isolation.search import Search
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import WhitenedResiduals
@@ -113,14 +119,45 @@ def fit(flights: Sequence[LabelledFlight]) -> Weights:
     return weights(minimize(loss, mean, method="L-BFGS-B", options={"maxiter": 80}).x)
 
 
-def cross_validated(flights: Sequence[LabelledFlight]) -> float:
-    """Print the decisions of four-fold cross-validation; return the probability that the search misses the cause.
+class ClassStatement(NamedTuple):
+    """Probability of a named class, given that the search found the cause, and whether an effect of it is concealed."""
 
-    It makes the mean of the stated probabilities of named classes their share of true ones.
-    """
+    log_odds: float
+    probability: float
+    true: bool
+
+
+def class_statements(flight: LabelledFlight, at: Weights) -> list[ClassStatement]:
+    """Return the named classes of one flight, without validation on held-out data."""
+    at = msgspec.structs.replace(at, missed=NEVER_MISSED)
+    decision = decide(flight.explanations, at)
+    if decision.best is None or decision.effects <= NAMED_PROBABILITY:
+        return []
+    log_odds = outcome_log_odds(flight.explanations, posterior(EvidenceTerms(flight.explanations).log_evidence(at)))
+    out = []
+    for member in decision.best.members:
+        names = {one.hypothesis.effect.name for one in (member, *member.rivals)}
+        out.append(ClassStatement(log_odds, decision.probability(names), not flight.concealed.isdisjoint(names)))
+    return out
+
+
+def fit_missed(statements: Sequence[ClassStatement]) -> tuple[float, float, float]:
+    """Fit `Weights.missed` by maximum likelihood; its largest log odds are those of the statements."""
+    log_odds, p, true = np.array(statements, float).T
+
+    def loss(x: np.ndarray) -> float:
+        stated = np.clip(p / (1.0 + np.exp(-x[0] - x[1] * log_odds)), 1e-6, 1.0 - 1e-6)
+        return -float(np.where(true > 0.5, np.log(stated), np.log1p(-stated)).sum())
+
+    intercept, slope = minimize(loss, [1.0, 0.3], method="Nelder-Mead").x.tolist()
+    return intercept, slope, float(log_odds.max())
+
+
+def cross_validated(flights: Sequence[LabelledFlight]) -> None:
+    """Print the decisions of four-fold cross-validation."""
     fold = np.random.default_rng(1).integers(_FOLDS, size=len(flights))
     counts: dict[str, list[int]] = {}
-    stated, true_classes = [0.0], [0.0]
+    named: list[ClassStatement] = []
     for k in range(_FOLDS):
         at = fit([flight for flight, other in zip(flights, fold, strict=True) if other != k])
         for flight in (one for one, own in zip(flights, fold, strict=True) if own == k):
@@ -135,27 +172,51 @@ def cross_validated(flights: Sequence[LabelledFlight]) -> float:
             row = counts.setdefault(flight.role, [0, 0])
             row[0] += true >= max(rows.values()) - 1e-6
             row[1] += 1
-            if decision.best is not None and decision.effects > NAMED_PROBABILITY:
-                for member in decision.best.members:
-                    names = {one.hypothesis.effect.name for one in (member, *member.rivals)}
-                    stated.append(decision.probability(names))
-                    true_classes.append(float(not flight.concealed.isdisjoint(names)))
-    print(counts, f"named classes: {len(stated) - 1}, stated {sum(stated):.1f}, true {sum(true_classes):.0f}")
-    return max(1.0 - sum(true_classes) / max(sum(stated), 1e-9), 0.0)
+            named += class_statements(flight, at)
+    stated, true = (sum(values) for values in ([one[k] for one in named] for k in (1, 2)))
+    print(counts, f"named classes: {len(named)}, stated {stated:.1f}, true {true:.0f}")
 
 
 def main() -> int:
     """Fit, cross-validate and write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sets", nargs="+", required=True)
+    parser.add_argument("--sets", nargs="+", default=[], help="fit the weights on these; without it they stay")
+    parser.add_argument("--unseen", nargs="+", required=True, help="other sets, for the probability of a missed cause")
     parser.add_argument("--recordings", type=Path, default=os.environ.get("PARAUAV_RECORDINGS", "recordings"))
     parser.add_argument("--cache", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
-    cache, flights = Cache(args.cache), []
+    cache = Cache(args.cache)
+    table = load_table()
+    if args.sets:
+        flights = labelled_flights(args.sets, args.recordings, cache)
+        cross_validated(flights)
+        roles = [
+            sum(flight.role == role for flight in flights) for role in ("control", "single", "compound", "unknown")
+        ]
+        provenance = {
+            "fitted_on": ", ".join(Path(name).name for name in args.sets),
+            "flights": "{} controls, {} single, {} compound, {} unknown".format(*roles),
+            "command": "python -m tests.bench.mismatch.fit_decision",
+        }
+        fitted = msgspec.structs.replace(fit(flights), fault_odds=sum(roles[1:]) / roles[0])
+        table = DecisionTable(provenance, fitted)
+    unseen = labelled_flights(args.unseen, args.recordings, cache)
+    named = [statement for flight in unseen for statement in class_statements(flight, table.weights)]
+    missed = fit_missed(named)
+    print(f"{len(named)} classes named on {len(unseen)} unseen flights: missed {missed}")
+    table.provenance["missed_fitted_on"] = f"{', '.join(Path(name).name for name in args.unseen)}: {len(named)} classes"
+    table = DecisionTable(table.provenance, msgspec.structs.replace(table.weights, missed=missed))
+    args.out.write_bytes(msgspec.json.format(msgspec.json.encode(table), indent=1) + b"\n")
+    return 0
+
+
+def labelled_flights(sets: Sequence[str], recordings: Path, cache: Cache) -> list[LabelledFlight]:
+    """Search the explanations of all flights of some sets, or take them from the cache."""
+    flights = []
     version = source_hash("baseline", "model", "data", "inference/isolation")
-    for name in args.sets:
-        found, nominal = cases(name, args.recordings, held_out=False)
+    for name in sets:
+        found, nominal = cases(name, recordings, held_out=False)
         for case in found:
             files, card_path = nominal[case.base]
             card = read_card(card_path)
@@ -168,17 +229,7 @@ def main() -> int:
                 right = right_explanations(case.label, explanations)
                 concealed = frozenset(effect["name"] for effect in case.label["effects"])
                 flights.append(LabelledFlight(flight.name, case.label["role"], concealed, explanations, right))
-    missed = cross_validated(flights)
-    roles = [sum(flight.role == role for flight in flights) for role in ("control", "single", "compound", "unknown")]
-    provenance = {
-        "fitted_on": ", ".join(Path(name).name for name in args.sets),
-        "flights": "{} controls, {} single, {} compound, {} unknown".format(*roles),
-        "command": "python -m tests.bench.mismatch.fit_decision",
-    }
-    odds = sum(roles[1:]) / roles[0]
-    table = DecisionTable(provenance, msgspec.structs.replace(fit(flights), missed=missed, fault_odds=odds))
-    args.out.write_bytes(msgspec.json.format(msgspec.json.encode(table), indent=1) + b"\n")
-    return 0
+    return flights
 
 
 def cached_flights(cache: Cache, base: str, card_path: Path, path: Path) -> list[FlightData]:

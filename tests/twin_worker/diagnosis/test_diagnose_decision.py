@@ -70,9 +70,22 @@ def test_the_class_holds_what_is_close_and_leaves_out_what_is_not() -> None:
 
 def test_no_statement_is_more_certain_than_the_search() -> None:
     found = [explained({"force_x": 5000.0}, "thrust_loss")]
-    decision = decide(found, msgspec.structs.replace(WEIGHTS, missed=0.06))
-    assert decision.probability(("thrust_loss",)) == pytest.approx(0.94, abs=1e-6)
-    assert decision.effects == pytest.approx(0.94, abs=1e-6) and decision.missed == 0.06
+    decision = decide(found, msgspec.structs.replace(WEIGHTS, missed=(1.0, 0.3, 6.0)))
+    missed = 1.0 / (1.0 + np.exp(1.0 + 0.3 * 6.0))  # log odds above 6 count as 6
+    assert decision.probability(("thrust_loss",)) == pytest.approx(1.0 - missed, abs=1e-6)
+    assert decision.effects == pytest.approx(1.0 - missed, abs=1e-6) and decision.missed == pytest.approx(missed)
+
+
+def test_an_outcome_that_barely_prevails_was_more_often_missed() -> None:
+    """Onsets of one set, and changes without an effect, are one outcome each."""
+    loss = explained({"force_x": 5000.0}, "thrust_loss")
+    later = replace(loss, channel_gain=loss.channel_gain - 1.0)
+    drag = explained({"force_x": 4990.0}, "drag_increase")
+    weights = msgspec.structs.replace(WEIGHTS, missed=(1.0, 0.3, 6.0))
+    barely, clearly = decide([loss, later, drag], weights), decide([loss, later], weights)
+    odds = (barely.sets[frozenset({"thrust_loss"})]) / barely.sets[frozenset({"drag_increase"})]
+    assert barely.missed == pytest.approx(1.0 / (1.0 + np.exp(1.0 + 0.3 * np.log(odds))), abs=1e-3)
+    assert barely.missed > clearly.missed == pytest.approx(1.0 / (1.0 + np.exp(1.0 + 0.3 * 6.0)))
 
 
 def test_a_change_beside_effects_has_its_own_prior() -> None:

@@ -2,9 +2,10 @@
 
     P(explanation) = (1 - missed) exp(ln p) / sum exp(ln p)
 
-with the log evidence of `evidence`, and the probability that the search misses the cause, so that no statement is
-more certain than the search was on flights with known labels. Where faults are rarer than among these flights, the
-evidence against none is less by the logarithm of the ratio of their odds.
+with the log evidence of `evidence`, and the probability that the search misses the cause: a logistic function of the
+log odds of the most probable outcome, fitted on flights with known labels that the evidence was not fitted on. Where
+faults are rarer than among those flights, the evidence against none is less by the logarithm of the ratio of their
+odds.
 Source: Platt 1999; Guo et al. 2017 (calibration); Saerens et al. 2002, Neural Computation 14, 21 (other priors).
 """
 
@@ -74,7 +75,9 @@ def decide(explanations: Sequence[Explanation], weights: Weights, fault_odds: fl
         fault_odds: prior odds of a fault in this flight [-]; None: those of the flights of the weights
     """
     rarer = 0.0 if fault_odds is None else float(np.log(weights.fault_odds / fault_odds))
-    probability = (1.0 - weights.missed) * posterior(EvidenceTerms(explanations).log_evidence(weights) - rarer)
+    probability = posterior(EvidenceTerms(explanations).log_evidence(weights) - rarer)
+    missed = weights.missed_at(outcome_log_odds(explanations, probability))
+    probability *= 1.0 - missed
     sets: dict[frozenset[str], float] = {frozenset(): float(probability[-1])}
     acting = []
     unmodelled, anomaly, highest = 0.0, None, -1.0
@@ -94,7 +97,22 @@ def decide(explanations: Sequence[Explanation], weights: Weights, fault_odds: fl
         best = _with_classes(explanations[max(own, key=lambda k: probability[k])], explanations, probability)
     most_probable = int(np.argmax(probability))
     nominal = explanations[most_probable].nominal if most_probable < len(explanations) else ()
-    return Decision(best, sets, unmodelled, anomaly, weights.missed, tuple(acting), nominal)
+    return Decision(best, sets, unmodelled, anomaly, missed, tuple(acting), nominal)
+
+
+def outcome_log_odds(explanations: Sequence[Explanation], probability: np.ndarray) -> float:
+    """Return the log odds of the most probable outcome: a set of names, a change without an effect, or none.
+
+    Args:
+        explanations: m of them
+        probability: of each and, last, of none, (m + 1,)
+    """
+    total: dict[frozenset[str] | None, float] = {frozenset(): float(probability[-1])}
+    for one, p in zip(explanations, probability.tolist(), strict=False):
+        names = one.names if one.anomaly is None else None
+        total[names] = total.get(names, 0.0) + p
+    *others, most = sorted(total.values())
+    return float(np.log(most / max(sum(others), np.finfo(float).tiny)))
 
 
 def _with_classes(best: Explanation, explanations: Sequence[Explanation], probability: np.ndarray) -> Explanation:

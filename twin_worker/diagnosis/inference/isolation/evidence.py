@@ -32,6 +32,7 @@ from twin_worker.diagnosis.inference.isolation.unmodelled import Anomaly
 
 TABLE = Path(__file__).with_name("decision.json")
 TURBULENCE = "turbulence"
+NEVER_MISSED = (np.inf, 0.0, 0.0)  # see `Weights.missed`
 
 
 class Weights(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -47,7 +48,7 @@ class Weights(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         further: prior of at least 1, 2 and 3 effects, each against one fewer [nat]
         changes: prior of each kind of change without an effect, and of turbulence [nat]
         beside: prior of such a change beside effects, in addition [nat]
-        missed: probability that the search misses the cause [-]
+        missed: intercept, slope and largest log odds of the logistic regression `missed_at`
         fault_odds: odds of a fault among the flights that the weights were fitted on [-]
     """
 
@@ -60,8 +61,13 @@ class Weights(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     further: tuple[float, float, float]
     changes: dict[str, float]
     beside: float = 0.0
-    missed: float = 0.0
+    missed: tuple[float, float, float] = NEVER_MISSED
     fault_odds: float = 1.0
+
+    def missed_at(self, log_odds: float) -> float:
+        """Return the probability that the search misses the cause, at log odds of the most probable outcome [-]."""
+        intercept, slope, largest = self.missed
+        return float(1.0 / (1.0 + np.exp(intercept + slope * min(log_odds, largest))))
 
 
 class DecisionTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
