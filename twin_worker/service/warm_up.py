@@ -1,12 +1,12 @@
 """Compile the twin's physics before the first aircraft needs it, on a synthetic straight flight."""
 
 import contextlib
-import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
@@ -68,26 +68,22 @@ def warm_up() -> None:
 
 
 def _compile_in_two_processes() -> None:
-    """Compile the first group here and the other in a process of its own, which ends with this one."""
-    spawn = multiprocessing.get_context("spawn")
-    ours, theirs = spawn.Pipe()
-    other = spawn.Process(target=_compile_second_group, args=(theirs,), daemon=True, name="compiler")
-    other.start()
-    theirs.close()
-    _GROUPS[0]()
-    other.join()  # what it failed to compile is compiled here, with its error
-    ours.close()
+    """Compile the first group here and the second in a process of its own, which ends with this one."""
+    command = f"from {__name__} import compile_second_group; compile_second_group()"
+    with subprocess.Popen([sys.executable, "-c", command], stdin=subprocess.PIPE) as other:
+        _GROUPS[0]()
+        other.wait()  # what it failed to compile is compiled here
 
 
-def _compile_second_group(parent: Connection) -> None:
+def compile_second_group() -> None:
+    """Compile what the parent does not; end when the parent ends and closes standard input."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
-    threading.Thread(target=_exit_at_end_of, args=(parent,), daemon=True).start()
+    threading.Thread(target=_exit_at_end_of_input, daemon=True).start()
     _GROUPS[1]()
 
 
-def _exit_at_end_of(parent: Connection) -> None:
-    with contextlib.suppress(EOFError, OSError):
-        parent.recv()
+def _exit_at_end_of_input() -> None:
+    os.read(sys.stdin.fileno(), 1)  # not through a buffer, which the interpreter could not close meanwhile
     os._exit(1)
 
 
