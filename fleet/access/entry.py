@@ -28,6 +28,8 @@ _ALL = (
 )
 _UAV_KEYS = f"{ROOT}/**"
 _LIVE_KEYS = f"{ROOT}/{LIVE}/**"
+_NO_SAMPLES, _OTHER_REGIONS = "no samples", "other regions"  # a rule, and its subject
+_ALLOW_ALL = {"enabled": True, "default_permission": "allow", "rules": [], "subjects": [], "policies": []}
 
 
 def access_control(identified_by: str = CERTIFICATE) -> dict[str, Any]:
@@ -61,6 +63,24 @@ def access_control(identified_by: str = CERTIFICATE) -> dict[str, Any]:
         "subjects": [{"id": role, identified_by: [role]} for role in role_rules],
         "policies": [{"subjects": [role], "rules": names} for role, names in role_rules.items()],
     }
+
+
+def without_samples(control: dict[str, Any], interfaces: list[str]) -> dict[str, Any]:
+    """Return access control that also forwards no sample to routers of other regions.
+
+    Where roles are known these are all routers, else whatever is connected over `interfaces`.
+    """
+    rule = _rule(_NO_SAMPLES, ("put",), "egress", [f"{ROOT}/*/sample"]) | {"permission": "deny"}
+    subjects, policies = control["subjects"], control["policies"]
+    if subjects:  # an interface would not do: what one subject of a connection may do, is allowed
+        policies = [
+            one | {"rules": [*one["rules"], _NO_SAMPLES]} if one["subjects"] == [ROUTER_ROLE] else one
+            for one in policies
+        ]
+    else:
+        subjects = [{"id": _OTHER_REGIONS, "interfaces": interfaces}]
+        policies = [{"subjects": [_OTHER_REGIONS], "rules": [_NO_SAMPLES]}]
+    return control | {"rules": [*control["rules"], rule], "subjects": subjects, "policies": policies}
 
 
 def message_limits() -> dict[str, Any]:
@@ -173,12 +193,15 @@ class BusConfig:
             out |= {f"{_AUTH}/user": self.role, f"{_AUTH}/password": read_password(self.passwords, self.role)}
         return out
 
-    def router_settings(self, listen: list[str] | None = None, peers: list[str] | None = None) -> dict[str, Any]:
+    def router_settings(
+        self, listen: list[str] | None = None, peers: list[str] | None = None, between: list[str] | None = None
+    ) -> dict[str, Any]:
         """Return the settings of the router by Zenoh configuration path.
 
         Args:
             listen: endpoints; None: `endpoint`
             peers: other routers of the site
+            between: network interfaces to routers of other regions, to which no sample is forwarded; with roles, to all
         Raises:
             ValueError: as `session_settings`.
             OSError: as `session_settings`.
@@ -203,6 +226,8 @@ class BusConfig:
                 out |= {f"{_AUTH}/user": ROUTER_ROLE, f"{_AUTH}/password": password}
         if self.identifies_roles:
             out["access_control"] = access_control(CERTIFICATE if self.mutual_tls else PASSWORD)
+        if between:
+            out["access_control"] = without_samples(out.get("access_control", _ALLOW_ALL), between)
         return out
 
 

@@ -13,6 +13,7 @@ EXAMPLES = """
   fleet router > zenohd.json5                                                    loopback, unencrypted
   fleet router --config fleet.toml --listen tls/0.0.0.0:7447 > zenohd.json5      certificates and rules by role
   fleet router --config fleet.toml --listen tls/0.0.0.0:7447 --beside tls/north.example:7447 > zenohd.json5
+  fleet router --config fleet.toml --listen tls/0.0.0.0:7447 --beside tls/north.example:7447 --between eth1
 """
 
 
@@ -23,6 +24,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--listen", action="append", metavar="ENDPOINT", help="endpoint to listen on (that of --router)"
     )
     parser.add_argument("--beside", action="append", metavar="ENDPOINT", help="another router of the site; repeatable")
+    parser.add_argument(
+        "--between", action="append", metavar="INTERFACE",
+        help="interface to routers of other regions, which get no samples; with roles, no router does; repeatable",
+    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
@@ -31,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     for option in ("listen", "beside"):
         for address in getattr(args, option) or ():
             parse_endpoint(address, f"--{option}")
-    print(format_settings(bus_config.router_settings(args.listen, args.beside)))
+    print(format_settings(bus_config.router_settings(args.listen, args.beside, args.between)))
     return 0
 
 

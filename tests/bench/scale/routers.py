@@ -8,7 +8,7 @@ viewer in the first region reads all predictions. Three layouts are compared:
 
 separate   regions share nothing; the viewer sees its own
 joined     routers connected to each other
-limited    the same, but routers pass no samples to other routers (access control on the interface between them;
+limited    the same, but routers pass no samples to other routers (`fleet router --between INTERFACE`;
            processes of a region connect to its router by the loopback interface)
 """
 
@@ -129,16 +129,8 @@ def route(args: argparse.Namespace) -> None:
 
     peers = [address(k) for k in range(args.region)] if args.layout != "separate" else []
     config = zenoh.Config()
-    settings: dict[str, Any] = BusConfig(LOCAL).router_settings([address(args.region), LOCAL], peers)
-    if args.layout == "limited":
-        rule = {"id": "no samples", "messages": ["put"], "flows": ["egress"], "permission": "deny"}
-        settings["access_control"] = {
-            "enabled": True,
-            "default_permission": "allow",
-            "rules": [rule | {"key_exprs": ["parauav/*/sample"]}],
-            "subjects": [{"id": "other routers", "interfaces": [f"puin{args.region}"]}],
-            "policies": [{"rules": ["no samples"], "subjects": ["other routers"]}],
-        }
+    between = [f"puin{args.region}"] if args.layout == "limited" else None
+    settings = BusConfig(LOCAL).router_settings([address(args.region), LOCAL], peers, between)
     for path, value in settings.items():
         config.insert_json5(path, json.dumps(value))
     with zenoh.open(config):

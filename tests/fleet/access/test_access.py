@@ -9,6 +9,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+import zenoh
 from conftest import ROOT, unused_port
 
 from fleet import cli
@@ -16,10 +17,11 @@ from fleet.access.entry import PASSWORD, ROUTER, BusConfig, access_control
 from fleet.access.knock import probe_router
 from fleet.access.papers import expiry_of, find_certificate, read_password
 from fleet.access.roles import ROLES, ROUTER_ROLE
-from fleet.bus.session import connect, open_router
+from fleet.bus.session import _config, connect, open_router
 from fleet.config import bus_config_from, router_arguments, router_options
 from gateway import __main__ as gateway
 from tests.bench.security.site import SCRIPT, expired, make_papers, make_passwords
+from tests.support.fake_link import until
 from twin_worker import __main__ as twin_worker
 from viewer import __main__ as viewer
 
@@ -162,6 +164,31 @@ def test_a_wrong_password_is_said(papers: Path, tmp_path: Path, monkeypatch: pyt
     refused = pytest.raises(ConnectionError, match="expected it to accept the password of viewer")
     with open_router(BusConfig(at, passwords=site)), refused:
         connect(BusConfig(at, "viewer", None, other))
+
+
+@pytest.mark.parametrize("with_roles", [False, True])
+def test_a_router_forwards_samples_to_its_clients_and_not_to_other_regions(papers: Path, with_roles: bool) -> None:
+    at, passwords = f"tcp/127.0.0.1:{unused_port()}", make_passwords(papers) if with_roles else None
+    elsewhere = "router" if with_roles else "tools"  # roles tell routers apart, without roles the interface does
+    counts = []
+    for role, interface in ((elsewhere, "lo"), ("viewer", "eth-of-another-machine")):
+        keys: list[str] = []
+        settings = BusConfig(at, passwords=passwords).router_settings(between=[interface])
+        with (
+            zenoh.open(_config(settings)),
+            connect(BusConfig(at, role, None, passwords)) as reader,
+            connect(BusConfig(at, "gateway", None, passwords)) as sender,
+        ):
+            reader._session.declare_subscriber(
+                "parauav/*/*", lambda sample, keys=keys: keys.append(str(sample.key_expr))
+            )
+            until(lambda sender=sender, keys=keys: sender._session.put("parauav/1/status", b"x") or keys)
+            for _ in range(5):
+                sender._session.put("parauav/2/sample", b"x")
+            sender._session.put("parauav/2/status", b"x")
+            until(lambda keys=keys: "parauav/2/status" in keys)
+            counts.append(keys.count("parauav/2/sample"))
+    assert counts == [0, 5]
 
 
 # --- the script ------------------------------------------------------------------------------------------------------
