@@ -1,6 +1,6 @@
 """Cost of bus and routers for many aircraft in several regions, each region in a network namespace of its own.
 
-    sudo python -m tests.bench.scale.routers --feeds 1000 --regions 4 --seconds 60 --json routers.json
+    python -m tests.bench.scale.routers --feeds 1000 --regions 4 --seconds 60 --json routers.json    # as root
 
 Every region has a router, a gateway that publishes samples of its share of the aircraft at 10 Hz, and a worker that
 reads them and publishes a prediction of each aircraft every second; the messages are those of a simulated flight. A
@@ -109,11 +109,11 @@ def _until_ready(folder: Path, layout: str, running: dict[tuple[int, str], subpr
         TimeoutError: when one is not within two minutes.
     """
     missing = {folder / f"{layout}-{role}{region}.ready" for region, role in running}
-    begun = time.monotonic()
+    begun, never = time.monotonic(), threading.Event()
     while missing := {path for path in missing if not path.exists()}:
         if time.monotonic() - begun > _PATIENCE_S:
             raise TimeoutError(f"routers: {', '.join(path.stem for path in missing)} did not connect")
-        time.sleep(0.2)
+        never.wait(0.2)
 
 
 def _end(child: subprocess.Popen) -> None:
@@ -190,6 +190,7 @@ def measure(args: argparse.Namespace, layout: str, folder: Path) -> dict[str, An
     """Run one layout and return rates and costs."""
     roles = [(k, role) for role in ("router", "gateway", "worker") for k in range(args.regions)] + [(0, "viewer")]
     running: dict[tuple[int, str], subprocess.Popen] = {}
+    never = threading.Event()
     with namespaces(args.regions):
         try:
             for region, role in roles:
@@ -200,10 +201,10 @@ def measure(args: argparse.Namespace, layout: str, folder: Path) -> dict[str, An
                 if (region, role) == (args.regions - 1, "router"):
                     _until_ready(folder, layout, running)
             _until_ready(folder, layout, running)
-            time.sleep(_SETTLE_S)
+            never.wait(_SETTLE_S)
             before = {key: cpu_s(child.pid) for key, child in running.items()}
             sent, begun = bytes_between(args.regions), time.monotonic()
-            time.sleep(args.seconds)
+            never.wait(args.seconds)
             took = time.monotonic() - begun
             cores = {key: (cpu_s(child.pid) - before[key]) / took for key, child in running.items()}
             between = (bytes_between(args.regions) - sent) / took
