@@ -1,16 +1,20 @@
-"""Publish a fallback prediction for a late or locked twin: its last path, shifted to the newest position."""
+"""What a worker does instead where CPU time is short: fallback predictions, and the newest telemetry only.
+
+A fallback prediction of a late or locked twin is its last path, shifted to the newest position.
+"""
 
 import time
 from collections.abc import Callable
 
 import numpy as np
 
-from fleet.contract import Message, Prediction
+from fleet.contract import Message, Prediction, Sample
 from twin_worker.ownership.twin_store import OwnedTwin
 from twin_worker.twin.state.budget import EARLY_FRACTION
 from twin_worker.twin.steps.extrapolate import MAX_OVERDUE_AGE_S, MAX_ROLLOUT_AGE_S, propagate
 
 CHECK_PERIOD_S = 0.4  # between checks for aircraft without a prediction [s]
+KEPT_S = 2.0  # of the telemetry of an aircraft that an overloaded worker processes [s]
 MIN_OVERDUE_S = 1.0  # minimum age of the last published prediction before a fallback is due [s]
 _OVERDUE_PERIODS = 1.2  # the same in scheduled prediction periods [-]
 _MISSING_FACTOR = 2.0  # multiple of that age at which the aircraft counts as without a prediction [-]
@@ -36,6 +40,17 @@ def fallback_prediction(owned: OwnedTwin) -> Prediction | None:
     if prediction is not None:
         owned.fallback_t = prediction.t
     return prediction
+
+
+def take_backlog(owned: OwnedTwin, n: int, *, overloaded: bool) -> list[Message]:
+    """Take n messages from the inbox; when overloaded drop and count samples older than the newest by over `KEPT_S`."""
+    taken = [owned.inbox.popleft() for _ in range(n)]
+    if not overloaded:
+        return taken
+    newest = max((message.t for message in taken if isinstance(message, Sample)), default=0.0)
+    kept = [message for message in taken if not isinstance(message, Sample) or message.t > newest - KEPT_S]
+    owned.dropped += len(taken) - len(kept)
+    return kept
 
 
 def publish_fallbacks(owned_twins: list[OwnedTwin], publish: Callable[[Message, OwnedTwin], None]) -> None:

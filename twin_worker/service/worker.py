@@ -40,6 +40,7 @@ from twin_worker.service.busy_fallback import (
     is_superseded,
     lacks_prediction,
     publish_fallbacks,
+    take_backlog,
 )
 from twin_worker.service.identification_thread import CpuShareLimiter, IdentificationThread
 from twin_worker.service.proposal_thread import ProposalThread
@@ -313,9 +314,8 @@ class Worker:
         dropped = sum(entry.dropped for entry in self.owned_twins())
         messages = [f"{dropped} messages dropped: too many UAVs for this worker"] if dropped else []
         messages += self.rates.overload_messages(self.schedule, len(self.owned_twins()), time.monotonic())
-        messages += [owned.defect for owned in self.owned_twins() if owned.defect]
+        messages += filter(None, [*(owned.defect for owned in self.owned_twins()), self._diagnosis_defect])
         if self.diagnosis is not None:
-            messages += [self._diagnosis_defect] if self._diagnosis_defect else []
             messages += self.diagnosis.defects(owned.twin.config.uav for owned in self.owned_twins())
         done = {work.value: n for work, n in self.rates.total.items()}
         sentence = self.sentence or " ".join(messages[:3])
@@ -382,7 +382,7 @@ def _advance_all(owned: OwnedTwin, waiting: int, traffic: TrafficMonitor) -> Ite
             if not owned.ready:
                 return
             twin.budget.backlog = True
-            results = catch_up(twin, [owned.inbox.popleft() for _ in range(waiting - 1)])
+            results = catch_up(twin, take_backlog(owned, waiting - 1, overloaded=twin.budget.overloaded))
         yield from traffic.process_results(twin.config.uav, twin.telemetry.last_step_t, results)
         waiting = 1
     for queued in reversed(range(waiting)):

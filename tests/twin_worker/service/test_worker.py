@@ -25,6 +25,7 @@ from twin_worker.ownership.twin_store import INBOX_SIZE
 from twin_worker.service import worker as live
 from twin_worker.service.queries import latest_prediction as told_of
 from twin_worker.service.worker import Worker
+from twin_worker.twin.state import budget
 from twin_worker.whatif import read_grid, resample
 
 NAN = float("nan")
@@ -289,6 +290,33 @@ def test_a_flood_sheds_the_oldest_and_says_so(bus, worker):
         bus.publish(status)
     assert worker.sweep() == INBOX_SIZE
     assert "7 messages dropped" in worker.state().sentence
+
+
+def test_an_overloaded_worker_takes_the_newest_telemetry_of_each_and_counts_the_rest(bus, worker):
+    """Else the queue holds minutes, and so do the predictions, although the newest seconds would have sufficed."""
+    made = told(bus, Prediction)
+    fly(bus, 2)
+    worker.sweep()
+    bus.publish(Params(uav=2, t=f.T0 + 6.0, values={"TECS_SPDWEIGHT": 1.5}))
+    fly(bus, 2, 60.0)
+    waiting = sum(len(owned.inbox) for owned in worker.owned_twins())
+    worker.quota.limit, worker.quota.overloaded = 1.0, True
+    assert worker.sweep() == waiting
+    owned = next(owned for owned in worker.owned_twins() if owned.twin.config.uav == 2)
+    assert not owned.inbox and owned.dropped == worker.state().dropped_messages
+    assert waiting - 45 < owned.dropped < waiting - 15  # two seconds at ten samples a second, and what is no sample
+    assert made[-1][0].t == pytest.approx(f.T0 + 60.0, abs=0.5)
+    assert owned.twin.onboard.params is not None and owned.twin.onboard.params.values["TECS_SPDWEIGHT"] == 1.5
+
+
+def test_a_worker_is_overloaded_where_its_own_cpu_time_of_a_sweep_is_long(monkeypatch):
+    used = [0.0]
+    monkeypatch.setattr(budget.time, "thread_time", lambda: used[0])
+    quota = budget.ComputeBudget(max_limit=0.05)
+    for seconds, late, overloaded in ((0.0, True, False), (2.0, True, False), (4.0, True, True), (4.0, False, False)):
+        used[0] += seconds
+        quota.yield_to_telemetry(late)
+        assert quota.overloaded is overloaded
 
 
 def test_a_silent_aircraft_ages_by_the_wall_clock(bus, worker, clock):

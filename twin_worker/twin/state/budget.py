@@ -121,6 +121,7 @@ class Timer(msgspec.Struct):
 
 WORK_PER_SWEEP_S = 0.05  # heavy work per sweep, CPU [s]
 MIN_WORK_S = 1e-3  # minimum in a late sweep, so that heavy work continues [s]
+OVERLOAD_CPU_S = 3.0  # CPU time of a sweep from which telemetry arrives faster than it is processed [s]
 LATE_CPU_FRACTION = 0.5  # share of this thread's CPU time for heavy work while sweeps are late [-]
 _RECOVERY_FACTOR = 1.2  # recovery factor per sweep on time [-]
 _START_FRACTION = {Work.PREDICT: 1.0, Work.IDENTIFY: 0.7, Work.ENSEMBLE: 0.5}  # of the limit [-]
@@ -135,6 +136,7 @@ class ComputeBudget:
         max_limit: limit while telemetry is on time, CPU [s]
         first_prediction_pending: an aircraft has no prediction yet; no other work starts
         backlog: telemetry of this aircraft is queued; a prediction made now would be outdated
+        overloaded: telemetry arrives faster than it is processed; only the newest counts
         offloaded: kinds of work that another thread does
         done, refused: number of starts and refusals of each kind
     """
@@ -143,6 +145,7 @@ class ComputeBudget:
     max_limit: float = WORK_PER_SWEEP_S
     first_prediction_pending: bool = False
     backlog: bool = False
+    overloaded: bool = False
     offloaded: frozenset[Work] = frozenset()
     done: Counter[Work] = field(default_factory=Counter)
     refused: Counter[Work] = field(default_factory=Counter)
@@ -171,6 +174,7 @@ class ComputeBudget:
         """Set the limit to a share of the last sweep's CPU time if it was late; raise it slowly otherwise."""
         limit, now = min(self.limit, self.max_limit), time.thread_time()
         used, self._sweep_start_cpu, self._last_sweep_late = now - self._sweep_start_cpu, now, late
+        self.overloaded = late and used > OVERLOAD_CPU_S
         if not late:
             self.limit = min(_RECOVERY_FACTOR * limit, self.max_limit)
         elif used == used:
