@@ -313,7 +313,7 @@ def test_a_worker_is_overloaded_where_its_own_cpu_time_of_a_sweep_is_long(monkey
     used = [0.0]
     monkeypatch.setattr(budget.time, "thread_time", lambda: used[0])
     quota = budget.ComputeBudget(max_limit=0.05)
-    for seconds, late, overloaded in ((0.0, True, False), (2.0, True, False), (4.0, True, True), (4.0, False, False)):
+    for seconds, late, overloaded in ((0.0, True, False), (0.6, True, False), (2.0, True, True), (2.0, False, False)):
         used[0] += seconds
         quota.yield_to_telemetry(late)
         assert quota.overloaded is overloaded

@@ -24,6 +24,7 @@ from twin_worker.twin import step as loop
 from twin_worker.twin.state import budget as clocked
 from twin_worker.twin.state.budget import (
     LATE_CPU_FRACTION,
+    LATE_WORK_S,
     LIVE_SCHEDULE,
     MIN_WORK_S,
     WORK_PER_SWEEP_S,
@@ -107,7 +108,7 @@ def test_heavy_work_earns_a_share_of_the_cpu_time_while_telemetry_is_late_and_co
         quota.yield_to_telemetry(late)
         limits.append(quota.limit)
     assert limits[:5] == pytest.approx(
-        [WORK_PER_SWEEP_S, LATE_CPU_FRACTION * 0.02, LATE_CPU_FRACTION * 0.01, MIN_WORK_S, WORK_PER_SWEEP_S]
+        [WORK_PER_SWEEP_S, LATE_CPU_FRACTION * 0.02, LATE_CPU_FRACTION * 0.01, MIN_WORK_S, LATE_WORK_S]
     )
     assert limits[-1] == WORK_PER_SWEEP_S
 

@@ -120,8 +120,9 @@ class Timer(msgspec.Struct):
 
 
 WORK_PER_SWEEP_S = 0.05  # heavy work per sweep, CPU [s]
+LATE_WORK_S = 1.0  # the same in a late sweep, at most: where sweeps are long, a smaller limit would starve rollouts
 MIN_WORK_S = 1e-3  # minimum in a late sweep, so that heavy work continues [s]
-OVERLOAD_CPU_S = 3.0  # CPU time of a sweep from which telemetry arrives faster than it is processed [s]
+OVERLOAD_CPU_S = 1.0  # CPU time of a sweep from which telemetry arrives faster than it is processed [s]
 LATE_CPU_FRACTION = 0.5  # share of this thread's CPU time for heavy work while sweeps are late [-]
 _RECOVERY_FACTOR = 1.2  # recovery factor per sweep on time [-]
 _START_FRACTION = {Work.PREDICT: 1.0, Work.IDENTIFY: 0.7, Work.ENSEMBLE: 0.5}  # of the limit [-]
@@ -133,7 +134,7 @@ class ComputeBudget:
 
     Attributes:
         limit: heavy work per sweep, CPU [s]; an overrun is deducted from the next sweep
-        max_limit: limit while telemetry is on time, CPU [s]
+        max_limit: limit while telemetry is on time, CPU [s]; late sweeps have a share of their own length
         first_prediction_pending: an aircraft has no prediction yet; no other work starts
         backlog: telemetry of this aircraft is queued; a prediction made now would be outdated
         overloaded: telemetry arrives faster than it is processed; only the newest counts
@@ -178,7 +179,7 @@ class ComputeBudget:
         if not late:
             self.limit = min(_RECOVERY_FACTOR * limit, self.max_limit)
         elif used == used:
-            self.limit = min(max(LATE_CPU_FRACTION * used, MIN_WORK_S), self.max_limit)
+            self.limit = min(max(LATE_CPU_FRACTION * used, MIN_WORK_S), LATE_WORK_S)
 
     def end_work(self) -> None:
         """Stop the measurement of the running work, if any."""
