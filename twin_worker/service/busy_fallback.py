@@ -14,7 +14,7 @@ from twin_worker.twin.state.budget import EARLY_FRACTION
 from twin_worker.twin.steps.extrapolate import MAX_OVERDUE_AGE_S, MAX_ROLLOUT_AGE_S, propagate
 
 CHECK_PERIOD_S = 0.4  # between checks for aircraft without a prediction [s]
-KEPT_S = 2.0  # of the telemetry of an aircraft that an overloaded worker processes [s]
+NEWEST_S = 2.0  # of the telemetry of an aircraft that an overloaded worker processes [s]
 MIN_OVERDUE_S = 1.0  # minimum age of the last published prediction before a fallback is due [s]
 _OVERDUE_PERIODS = 1.2  # the same in scheduled prediction periods [-]
 _MISSING_FACTOR = 2.0  # multiple of that age at which the aircraft counts as without a prediction [-]
@@ -43,14 +43,14 @@ def fallback_prediction(owned: OwnedTwin) -> Prediction | None:
 
 
 def take_backlog(owned: OwnedTwin, n: int, *, overloaded: bool) -> list[Message]:
-    """Take n messages from the inbox; when overloaded drop and count samples older than the newest by over `KEPT_S`."""
+    """Take n messages from the inbox; when overloaded drop and count samples older than the newest by over `NEWEST_S`."""
     taken = [owned.inbox.popleft() for _ in range(n)]
     if not overloaded:
         return taken
     newest = max((message.t for message in taken if isinstance(message, Sample)), default=0.0)
-    kept = [message for message in taken if not isinstance(message, Sample) or message.t > newest - KEPT_S]
-    owned.dropped += len(taken) - len(kept)
-    return kept
+    newer = [message for message in taken if not isinstance(message, Sample) or message.t > newest - NEWEST_S]
+    owned.dropped += len(taken) - len(newer)
+    return newer
 
 
 def publish_fallbacks(owned_twins: list[OwnedTwin], publish: Callable[[Message, OwnedTwin], None]) -> None:
