@@ -43,7 +43,7 @@ def fallback_prediction(owned: OwnedTwin) -> Prediction | None:
 
 
 def take_backlog(owned: OwnedTwin, n: int, *, overloaded: bool) -> list[Message]:
-    """Take n messages from the inbox; when overloaded drop samples over `NEWEST_S` older than the newest, and count them."""
+    """Take n messages from the inbox; when overloaded drop and count samples older than the last `NEWEST_S`."""
     taken = [owned.inbox.popleft() for _ in range(n)]
     if not overloaded:
         return taken
