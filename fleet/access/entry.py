@@ -72,7 +72,7 @@ def without_samples(control: dict[str, Any], interfaces: list[str]) -> dict[str,
     """
     rule = _rule(_NO_SAMPLES, ("put",), "egress", [f"{ROOT}/*/sample"]) | {"permission": "deny"}
     subjects, policies = control["subjects"], control["policies"]
-    if subjects:  # an interface would not do: what one subject of a connection may do, is allowed
+    if subjects:  # a rule by interface has no effect: what any subject of a connection may receive is forwarded
         policies = [
             one | {"rules": [*one["rules"], _NO_SAMPLES]} if one["subjects"] == [ROUTER_ROLE] else one
             for one in policies

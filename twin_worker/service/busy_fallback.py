@@ -47,8 +47,9 @@ def take_backlog(owned: OwnedTwin, n: int, *, overloaded: bool) -> list[Message]
     taken = [owned.inbox.popleft() for _ in range(n)]
     if not overloaded:
         return taken
-    newest = max((message.t for message in taken if isinstance(message, Sample)), default=0.0)
-    newer = [message for message in taken if not isinstance(message, Sample) or message.t > newest - NEWEST_S]
+    # the last to arrive, since a clock may be set back
+    last = next((message.t for message in reversed(taken) if isinstance(message, Sample)), 0.0)
+    newer = [message for message in taken if not isinstance(message, Sample) or message.t > last - NEWEST_S]
     owned.dropped += len(taken) - len(newer)
     return newer
 

@@ -112,7 +112,7 @@ def _counters(state: FleetState, bus: Bus) -> Iterator[Metric]:
     yield GaugeMetricFamily("parauav_worker_uavs", "owned aircraft", len(state.rows))
     yield GaugeMetricFamily("parauav_worker_router", "1 if a router is connected", float(bool(bus.router)))
     yield CounterMetricFamily("parauav_worker_undecodable", "messages that cannot be decoded", bus.bad)
-    yield CounterMetricFamily("parauav_worker_dropped_messages", "messages dropped, inbox full", state.dropped_messages)
+    yield CounterMetricFamily("parauav_worker_dropped_messages", "messages dropped, overload", state.dropped_messages)
     work_counter = CounterMetricFamily("parauav_worker_tasks", "completed heavy work", labels=["work"])
     for work, count in state.tasks.items():
         work_counter.add_metric([work], count)

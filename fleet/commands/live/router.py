@@ -26,7 +26,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--beside", action="append", metavar="ENDPOINT", help="another router of the site; repeatable")
     parser.add_argument(
         "--between", action="append", metavar="INTERFACE",
-        help="interface to routers of other regions, which get no samples; with roles, no router does; repeatable",
+        help="interface to routers of other regions, which get no samples (with roles: no router does); repeatable",
     )  # fmt: skip
 
 

@@ -1,5 +1,8 @@
 """The live driver on a bus in memory: its range, its answers, its table, and peace between the aircraft."""
 
+from collections import deque
+from types import SimpleNamespace
+
 import msgspec
 import numpy as np
 import pytest
@@ -23,6 +26,7 @@ from tests.support.flights import item
 from tests.support.memory_bus import MemoryBus
 from twin_worker.ownership.twin_store import INBOX_SIZE
 from twin_worker.service import worker as live
+from twin_worker.service.busy_fallback import take_backlog
 from twin_worker.service.queries import latest_prediction as told_of
 from twin_worker.service.worker import Worker
 from twin_worker.twin.state import budget
@@ -307,6 +311,14 @@ def test_an_overloaded_worker_takes_the_newest_telemetry_of_each_and_counts_the_
     assert waiting - 45 < owned.dropped < waiting - 15  # two seconds at ten samples a second, and what is no sample
     assert made[-1][0].t == pytest.approx(f.T0 + 60.0, abs=0.5)
     assert owned.twin.onboard.params is not None and owned.twin.onboard.params.values["TECS_SPDWEIGHT"] == 1.5
+
+
+def test_an_overloaded_worker_takes_what_arrived_last_also_where_a_clock_was_set_back():
+    ahead, behind = (Sample(uav=2, t=t) for t in (f.T0 + 500.0, f.T0))
+    owned = SimpleNamespace(inbox=deque([ahead, behind]), dropped=0)
+    assert behind in take_backlog(owned, 2, overloaded=True)
+    owned = SimpleNamespace(inbox=deque([behind, ahead]), dropped=0)
+    assert take_backlog(owned, 2, overloaded=True) == [ahead] and owned.dropped == 1
 
 
 def test_a_worker_is_overloaded_where_its_own_cpu_time_of_a_sweep_is_long(monkeypatch):
