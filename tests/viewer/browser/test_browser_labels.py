@@ -19,7 +19,8 @@ def crowd(chromium: str) -> Iterator[SimpleNamespace]:
     """The page of a crowd, its most severe aircraft selected and all of it framed, at 1280 x 720."""
     with page_of(chromium, lambda bus: Wild(bus, CROWD)) as site:
         site.page.get_by_text(f"{CROWD} UAVs").first.wait_for(timeout=PATIENCE_MS)
-        site.page.locator("tr.pick").first.dispatch_event("pointerdown")
+        severest = site.page.locator("tr.pick").first.get_attribute("data-uav", timeout=PATIENCE_MS)
+        view_of(site).focus_on(int(severest or 0))  # not by a click: one that arrives late would undo `show_all`
         yield site
 
 
