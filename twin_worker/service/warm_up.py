@@ -39,7 +39,7 @@ from twin_worker.prediction.fixed_wing.point_mass_rollout import unexplained_vel
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.resample import Resampler
 from twin_worker.twin.state.flight_phase import speed_extremes
-from twin_worker.twin.steps.extrapolate import shift_to_position, widen_tube
+from twin_worker.twin.steps.extrapolate import continue_path, widen_tube
 from twin_worker.validation.held_out import HeldOut
 from twin_worker.validation.verify import verify
 
@@ -178,8 +178,8 @@ def _run_propagation() -> None:
     """Propagate a prediction, update the wind filter, detect flight, and compare positions with an area."""
     ahead, path = (Array.of(values).numpy() for values in (np.arange(5.0), np.zeros((5, 3))))
     displacement_along_path(np.outer(AHEAD, [_SPEED, 0.0, 0.0]), AHEAD)
-    shift_to_position(ahead, path, 1.0, np.zeros(3), np.empty((4, 3), np.float32))  # type: ignore[call-arg]
-    widen_tube(ahead, path, 1.0, np.empty((4, 3), np.float32))  # type: ignore[call-arg]
+    keeps_along = continue_path(ahead, path, 1.0, np.zeros(3), np.zeros(3), np.empty((4, 3), np.float32))  # type: ignore[call-arg]
+    widen_tube(ahead, path, 1.0, keeps_along, np.empty((4, 3), np.float32))  # type: ignore[call-arg]
     speed_extremes(np.zeros((3, 3)))  # type: ignore[call-arg]
     Area("area", ((_HOME.lat_e7, 0), (0, _HOME.lon_e7), (0, 0)), exclusion=True).depth(np.zeros((1, 3)), _HOME)
     WindFilter().update(1e9, np.array([_SPEED, 0.0, 0.0]), _SPEED, reported_direction(0.0, 0.0, 0.0, 0.0, _SPEED))

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+MEAN_S = 1.0  # over which the newest reported velocities are compared with the positions [s]
 _FIT_S = 1.0  # newest positions in the fit of a parabola [s]
 _COMPARED_S = 20.0  # flight over which both are compared [s]
 _CLEARLY = 0.7  # ratio of the errors below which the velocity from positions replaces the reported one [-]
@@ -34,3 +35,25 @@ def present_velocity(p: np.ndarray, v: np.ndarray, dt: float, rows: int) -> np.n
     if np.sqrt(np.mean(error_fitted**2)) < _CLEARLY * np.sqrt(np.mean(error_reported**2)):
         return np.array([*fitted[-1, :2], reported[2]])
     return reported
+
+
+def corrected_velocity(t: np.ndarray, p: np.ndarray, velocity_t: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Return the newest reported ground velocity, corrected by the displacement, NED, (3,) [m/s]; nan if unknown.
+
+    The mean difference of reported velocity and displacement over a second, an error of the estimator, is subtracted.
+
+    Args:
+        t, p: times and positions, newest last, NED, (n,) and (n, 3) [s, m]
+        velocity_t, v: times and reported velocities, newest last, NED, (k,) and (k, 3) [s, m/s]
+    """
+    unknown = np.full(3, np.nan)
+    if not len(t) or not len(velocity_t):
+        return unknown
+    newest = min(t[-1], velocity_t[-1])
+    first, first_v = int(t.searchsorted(newest - MEAN_S)), int(velocity_t.searchsorted(newest - MEAN_S))
+    duration, duration_v = t[-1] - t[first], velocity_t[-1] - velocity_t[first_v]
+    if max(t[-1], velocity_t[-1]) - newest > MEAN_S or min(duration, duration_v) < 0.5 * MEAN_S:
+        return unknown
+    v, steps = v[first_v:], np.diff(velocity_t[first_v:])
+    mean = 0.5 * steps @ (v[1:] + v[:-1]) / duration_v
+    return v[-1] + (p[-1] - p[first]) / duration - mean

@@ -10,12 +10,15 @@ from fleet.contract import Array, Prediction, Sample
 from fleet.frames import Origin, to_geodetic
 from tests.support import flights as f
 from twin_worker.confidence.tube_and_horizon import AHEAD
+from twin_worker.numerics.prediction_errors import along_cross_down, track_frame
 from twin_worker.prediction.closed_loop import MIN_ROLLOUT_S
+from twin_worker.telemetry.velocity import corrected_velocity
 from twin_worker.twin.state.budget import LIVE_SCHEDULE, LONGEST_PERIOD_S, Schedule
 from twin_worker.twin.step import Twin, advance
 from twin_worker.twin.steps.extrapolate import (
     MAX_OVERDUE_AGE_S,
     MAX_ROLLOUT_AGE_S,
+    continue_path,
     departure,
     extrapolate,
     widen_tube,
@@ -31,6 +34,12 @@ def on(twin: Twin, seconds: float, off: np.ndarray) -> None:
     twin.telemetry.history.add(Sample(uav=1, t=t, position=f.rows([t], lat_lon_alt)))
 
 
+def kept(ahead: np.ndarray) -> np.ndarray:
+    """Share of an offset along, across and down that is left, (n, 3)."""
+    share = (1.0 + ahead / 4.0) * np.exp(-ahead / 4.0)
+    return np.stack([np.ones(len(ahead)), share, share], axis=-1)
+
+
 def test_a_renewed_prediction_begins_where_the_aircraft_is_and_comes_back_to_the_path(twin: Twin) -> None:
     twin.prediction.last_rollout = twin.prediction.latest
     off = np.array([3.0, -4.0, 1.0])
@@ -43,9 +52,65 @@ def test_a_renewed_prediction_begins_where_the_aircraft_is_and_comes_back_to_the
         [np.interp(2.5 + made.ahead.numpy(), base.ahead.numpy(), c) for c in base.path.numpy().T]
     )
     apart = made.path.numpy() - foreseen
-    assert apart[0] == pytest.approx(off, abs=0.05) and np.abs(apart[-1]).max() < 0.1
+    assert apart[0] == pytest.approx(off, abs=0.05)
+    along, across, down = along_cross_down(track_frame(foreseen, made.ahead.numpy().astype(float)), apart).T
+    assert np.abs(across[-1]) < 0.1 and np.abs(down[-1]) < 0.1
+    assert along[-1] == pytest.approx(along[0], rel=0.1)  # a lead remains, at nearly the same speed
     assert base.ahead.numpy()[-1] - 2.5 - 5.0 < far <= base.ahead.numpy()[-1] - 2.5
     assert made.prediction_region_half_axes.shape == made.path.shape == (len(made.ahead.numpy()), 3)
+
+
+def continued(path: np.ndarray, position: list[float], velocity: list[float]) -> tuple[np.ndarray, bool]:
+    """A path of one row a second, continued at 2 s."""
+    ahead, out = np.arange(float(len(path))), np.empty((len(path) - 10, 3), np.float32)
+    keeps_along = continue_path(ahead, path.astype(np.float32), 2.0, np.array(position), np.array(velocity), out)  # type: ignore[call-arg]
+    return out.astype(float), bool(keeps_along)
+
+
+STRAIGHT = np.outer(np.arange(100.0), [20.0, 0.0, 0.0])
+
+
+def test_a_faster_aircraft_keeps_its_lead_and_returns_to_the_predicted_speed() -> None:
+    out, keeps_along = continued(STRAIGHT, [45.0, 0.0, 0.0], [22.0, 0.0, 0.0])
+    assert keeps_along
+    speed = np.diff(out[:, 0])
+    assert speed[0] == pytest.approx(22.0, abs=0.2) and speed[8] == pytest.approx(20.0 + 2.0 / np.e, abs=0.2)
+    assert out[-1, 0] - (40.0 + 20.0 * (len(out) - 1)) == pytest.approx(5.0 + 2.0 * 8.0, abs=0.1)
+
+
+def test_an_offset_across_and_down_is_critically_damped() -> None:
+    out, _ = continued(STRAIGHT, [40.0, 3.0, -2.0], [20.0, 1.0, 0.0])
+    tau = np.arange(len(out))
+    assert out[:, 1] == pytest.approx((3.0 + (1.0 + 3.0 / 4.0) * tau) * np.exp(-tau / 4.0), abs=1e-3)
+    assert out[:, 2] == pytest.approx((-2.0 - 2.0 / 4.0 * tau) * np.exp(-tau / 4.0), abs=1e-3)
+
+
+def test_without_a_velocity_that_of_the_path_counts() -> None:
+    unknown, _ = continued(STRAIGHT, [45.0, 3.0, 0.0], [np.nan] * 3)
+    known, _ = continued(STRAIGHT, [45.0, 3.0, 0.0], [20.0, 0.0, 0.0])
+    assert unknown == pytest.approx(known, abs=1e-3)
+
+
+def test_a_path_without_direction_has_no_lead() -> None:
+    out, keeps_along = continued(np.tile([1.0, 2.0, 3.0], (100, 1)), [4.0, 2.0, 3.0], [0.5, 0.0, 0.0])
+    assert not keeps_along and out[0] == pytest.approx([4.0, 2.0, 3.0]) and out[-1] == pytest.approx([1.0, 2.0, 3.0])
+
+
+@pytest.mark.parametrize("error", [0.0, 3.0])
+def test_a_reported_velocity_is_corrected_by_the_displacement(error: float) -> None:
+    """In a turn of 0.1 rad/s: the correction is that of the estimator, without the lag of a mean."""
+    t = np.arange(0.0, 2.05, 0.1)
+    p = 200.0 * np.stack([np.sin(0.1 * t), 1.0 - np.cos(0.1 * t), 0.0 * t], axis=-1)
+    v = 20.0 * np.stack([np.cos(0.1 * t), np.sin(0.1 * t), 0.0 * t], axis=-1)
+    found = corrected_velocity(t, p, t, v + [error, 0.0, 0.0])
+    assert found == pytest.approx(v[-1], abs=0.01)
+
+
+def test_a_velocity_is_unknown_without_recent_rows() -> None:
+    t, rows = np.arange(0.0, 2.05, 0.1), np.zeros((21, 3))
+    for of_positions, of_velocities in ((t[:0], t), (t, t[:0]), (t, t[-1:]), (t[-3:], t), (t + 9.0, t)):
+        found = corrected_velocity(of_positions, rows[: len(of_positions)], of_velocities, rows[: len(of_velocities)])
+        assert np.isnan(found).all()
 
 
 def test_a_renewed_prediction_is_as_wide_as_the_age_of_its_rollout_demands(twin: Twin) -> None:
@@ -58,11 +123,11 @@ def test_a_renewed_prediction_is_as_wide_as_the_age_of_its_rollout_demands(twin:
         on(twin, age, np.zeros(3))
         (made,) = extrapolate(twin)
         at, half = made.ahead.numpy().astype(float), made.prediction_region_half_axes.numpy() / [3.0, 2.0, 1.0]
-        fade = np.exp(-at / 10.0)
-        wanted = np.sqrt((np.sqrt(at + age) + 0.1) ** 2 - (np.sqrt(age) + 0.1) ** 2 * fade * (2.0 - fade))
-        wanted = np.maximum(wanted, np.sqrt(at) + 0.1)
-        assert half == pytest.approx(np.tile(wanted[:, None], 3), rel=0.02, abs=0.02)  # straight between look-aheads
-        assert (half[at >= 5.0, 0] > np.sqrt(at[at >= 5.0]) + 0.1).all()
+        share = kept(at)
+        wanted = np.sqrt((np.sqrt(at + age) + 0.1) ** 2 - (np.sqrt(age) + 0.1) ** 2 * share.T * (2.0 - share.T)).T
+        wanted = np.maximum(wanted, np.sqrt(at)[:, None] + 0.1)
+        assert half == pytest.approx(wanted, rel=0.02, abs=0.02)  # straight between look-aheads
+        assert (half[at >= 5.0, 1:] > np.sqrt(at[at >= 5.0])[:, None] + 0.1).all()
         assert made.rollout_age_s == pytest.approx(age) and made.horizon_s == pytest.approx(30.0 - age)
 
 
@@ -71,9 +136,8 @@ def test_errors_of_a_random_walk_are_held_as_often_by_renewed_tubes_as_by_new_on
     walk = np.cumsum(rng.standard_normal((n, len(AHEAD[:61]), 3)), axis=1)
     half = np.outer(np.sqrt(np.arange(61.0) + 1.0), np.full(3, 2.114))  # of 0.9 in all three at once
     tube = np.empty((50, 3), np.float32)
-    widen_tube(AHEAD[:61], half, float(age), tube)
-    fade = np.exp(-AHEAD[:50] / 10.0)[:, None]
-    error = walk[:, age : age + 50] - fade * walk[:, [age]]
+    widen_tube(AHEAD[:61], half, float(age), True, tube)
+    error = walk[:, age : age + 50] - kept(AHEAD[:50]) * walk[:, [age]]
     held = (np.abs(error) <= tube).all(axis=2).mean(axis=0)
     as_new = (np.abs(error) <= half[:50]).all(axis=2).mean(axis=0)
     assert held[1:] == pytest.approx(np.full(49, 0.9), abs=0.1) and (held[1:] > 0.88).all()
