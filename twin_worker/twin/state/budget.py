@@ -65,7 +65,7 @@ class Schedule:
         return max(self.identify, LONGEST_PERIOD_S) if self.information else self.identify
 
 
-LIVE_SCHEDULE = Schedule(renew=1.0, departure=0.5, information=0.2)
+LIVE_SCHEDULE = Schedule(ensemble=20.0, renew=1.0, departure=0.5, information=0.2)
 """Schedule of a worker: heavy work where it changes the result. Its loss of accuracy: `tests/bench/schedule.py`."""
 
 # of all other fields: `_PERIOD_LIMITS`

@@ -232,7 +232,7 @@ _FREE_RUN_S = (2.0, 4.0, 2.0, 8.0)  # free-run length of the n-th attempt of `--
 _WINDOW_FRACTION = (1.0, 1.0, 0.6, 1.0)  # share of the window used by the n-th attempt [-]
 _RUN_S, _RUN_EVERY_S = 20.0, 5.0  # free runs for the forecast shrinkage: length, period [s]
 _COLD_START_PERIOD_S = 4.0  # between identifications without a warm start [s]
-_PUBLISH_PERIOD_S = 5.0  # between published models without a changed outcome [s]
+_PUBLISH_PERIOD_S = 10.0  # between published models without a changed outcome [s]
 
 
 def identify_and_verify(twin: Twin) -> list[Message]:
