@@ -139,6 +139,55 @@ def _correct(
                 P[i, j] += AP[i, k] * A[j, k]
 
 
+@kernel
+def _update_hypotheses(
+    x: np.ndarray,
+    P: np.ndarray,
+    mean_nis: np.ndarray,
+    walk_evidence: np.ndarray,
+    drift_evidence: np.ndarray,
+    dt: float,
+    c: float,
+    s: float,
+    mean_airspeed: float,
+    north_before: float,
+    east_before: float,
+    north: float,
+    east: float,
+    variance: float,
+    gate: float,
+) -> bool:
+    """Update the state of every hypothesis, and the evidence of each; return whether all winds are plausible.
+
+    Args:
+        x, P, mean_nis, walk_evidence, drift_evidence: as in `WindFilter`, changed in place
+        dt, c, s, mean_airspeed, north_before, east_before, north, east, variance, gate: see `_predict_and_correct`
+    """
+    plausible, likeliest, mean = True, np.empty(len(_DRIFTS)), 0.0
+    for i in range(len(_DRIFTS)):
+        constant = likelihood = 0.0
+        for j in range(len(_HEADING_WALKS)):
+            nis, likelihood = _predict_and_correct(
+                x[i, j], P[i, j], dt, c, s, mean_airspeed, north_before, east_before, north, east, variance, gate,
+                _DRIFTS[i], _HEADING_WALKS[j],
+            )  # fmt: skip
+            mean_nis[i, j] += dt / _NIS_AVERAGE_S * (min(nis, _GATE) / 2 - mean_nis[i, j])
+            if j == 0:
+                constant = likelihood
+            wind_n, wind_e = x[i, j, 2] + x[i, j, 4], x[i, j, 3] + x[i, j, 5]
+            total = 0.0
+            for k in range(8):
+                for m in range(8):
+                    total += abs(P[i, j, k, m])
+            plausible = plausible and wind_n * wind_n + wind_e * wind_e < _MAX_WIND**2 and total < inf  # false for nan
+        walk_evidence[i] += likelihood - constant - min(dt / _EVIDENCE_S, 1.0) * walk_evidence[i]
+        likeliest[i] = likelihood if walk_evidence[i] > _EVIDENCE else constant
+        mean += likeliest[i] / len(_DRIFTS)
+    for i in range(len(_DRIFTS)):
+        drift_evidence[i] += likeliest[i] - mean - min(dt / _DRIFT_EVIDENCE_S, 1.0) * drift_evidence[i]
+    return plausible
+
+
 @dataclass(init=False, eq=False)
 class WindFilter:
     """Estimate a, b, mean, drift, gust of  v = Va cos(gamma) (a e(psi) + b e(psi + 90 deg)) + mean + drift + gust.
@@ -209,24 +258,9 @@ class WindFilter:
         readings = (dt, level * cos(psi), level * sin(psi), self._mean_airspeed, *self._ground, north, east)
         self._ground = north, east
         variance = _SIGMA**2 + (_YAW_LAG_S * G * p) ** 2
-        likelihood = np.empty((len(_DRIFTS), 2))
-        for i, drift in enumerate(_DRIFTS.tolist()):
-            for j, walk in enumerate(_HEADING_WALKS):
-                row = (self._x[i, j], self._P[i, j], *readings, variance, gate, drift, walk)
-                nis, likelihood[i, j] = _predict_and_correct(*row)  # type: ignore[call-arg]
-                self._mean_nis[i, j] += dt / _NIS_AVERAGE_S * (min(nis, _GATE) / 2 - self._mean_nis[i, j])
-        ratio = likelihood[:, 1] - likelihood[:, 0]
-        self._walk_evidence += ratio - min(dt / _EVIDENCE_S, 1.0) * self._walk_evidence
-        likeliest = likelihood[range(len(_DRIFTS)), self._selected_walks]
-        forgotten = min(dt / _DRIFT_EVIDENCE_S, 1.0) * self._drift_evidence
-        self._drift_evidence += likeliest - likeliest.mean() - forgotten
-        if not self._is_plausible():
+        evidence = self._walk_evidence, self._drift_evidence
+        if not _update_hypotheses(self._x, self._P, self._mean_nis, *evidence, *readings, variance, gate):  # type: ignore[call-arg]
             self._reset()
-
-    def _is_plausible(self) -> bool:
-        """Return whether the wind estimates are plausible; false for nan."""
-        total = self._x[..., 2:4] + self._x[..., 4:6]
-        return bool((np.hypot(total[..., 0], total[..., 1]) < _MAX_WIND).all() and np.isfinite(self._P).all())
 
     def expect_scale(self, altitude: float) -> None:
         """Begin with the scale of the standard atmosphere at an altitude [m]; ignored after the first row.

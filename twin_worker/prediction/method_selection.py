@@ -5,7 +5,7 @@ Source: Bates & Granger 1969, "The combination of forecasts" (the mean of two fo
 
 from collections import deque
 from dataclasses import dataclass, field
-from math import cos, log, sin
+from math import cos, exp, log, sin
 
 import numpy as np
 from filterpy.kalman import IMMEstimator, KalmanFilter
@@ -37,6 +37,7 @@ Median errors over path length of 288 starts of 16 simulated flights of the cali
 `copter` are assumptions: slightly below its better part, between `hybrid` and `greybox`, and below the route lines.
 """
 _LOG_PRIOR = {name: np.log(np.interp(SCORE_AHEAD[1:], _PRIOR_AHEAD, row)) for name, row in PRIOR_ERRORS.items()}
+_MEAN_LOG_PRIOR = {name: float(row.mean()) for name, row in _LOG_PRIOR.items()}
 _PRIOR_WEIGHT = 0.25  # weight of the prior, in completely scored predictions: three look-aheads [-]
 _MIN_ERROR = 0.01  # smaller relative errors are as good as this: a tenth of the limit of the horizon [-]
 _SMOOTHING = 0.1  # smoothing weight of the newest score
@@ -106,7 +107,7 @@ class MethodSelector:
         t, positions = flight
         times = start_t + SCORE_AHEAD[start_t + SCORE_AHEAD <= t[-1]]
         due = np.flatnonzero(times[1:] > self.scored_t)
-        if not len(due) or start_t < t[0]:
+        if not len(due) or start_t < t[0] or not paths:
             return
         right = np.clip(np.searchsorted(t, times), 0, len(t) - 1)
         time_gap = np.minimum(np.abs(t[right] - times), np.abs(t[np.maximum(right - 1, 0)] - times))
@@ -114,28 +115,28 @@ class MethodSelector:
             return
         actual = interpolate_rows(times, t, positions)
         length = path_length(actual, speed)
-        for method, path in paths.items():
-            error = np.linalg.norm(path[: len(times)] - actual, axis=1)[1:] / length[1:]
-            log_error = np.log(np.maximum(error[due], _MIN_ERROR))
-            self._update(method, float(np.mean(log_error - _LOG_PRIOR[method][due])), len(due) / len(SCORE_AHEAD[1:]))
+        errors = np.stack([path[1 : len(times)] for path in paths.values()]) - actual[1:]  # (methods, k, 3)
+        relative = np.sqrt(np.einsum("mki,mki->mk", errors, errors))[:, due] / length[1:][due]
+        priors = np.stack([_LOG_PRIOR[method][due] for method in paths])
+        log_ratios = (np.log(np.maximum(relative, _MIN_ERROR)) - priors).mean(axis=1).tolist()
+        for method, log_ratio in zip(paths, log_ratios, strict=True):
+            self._update(method, log_ratio, len(due) / len(SCORE_AHEAD[1:]))
 
     def _update(self, method: str, log_ratio: float, weight: float) -> None:
         n = self.n_scored[method] = self.n_scored.get(method, 0.0) + weight
-        log_error = log_ratio + _log_prior_error(method)
+        log_error = log_ratio + _MEAN_LOG_PRIOR[method]
         previous = log(self.mean_error[method]) if method in self.mean_error else log_error
-        self.mean_error[method] = float(
-            np.exp(previous + max(_SMOOTHING * weight, weight / n) * (log_error - previous))
-        )
+        self.mean_error[method] = exp(previous + max(_SMOOTHING * weight, weight / n) * (log_error - previous))
 
     def expected_error(self, method: str) -> float:
         """Return the relative error expected of a method, from prior and scores [-]."""
-        n, prior = self.n_scored.get(method, 0.0), _log_prior_error(method)
-        scored = float(np.log(self.mean_error[method])) if n > 0.0 else prior
-        return float(np.exp((n * scored + _PRIOR_WEIGHT * prior) / (n + _PRIOR_WEIGHT)))
+        n, prior = self.n_scored.get(method, 0.0), _MEAN_LOG_PRIOR[method]
+        scored = log(self.mean_error[method]) if n > 0.0 else prior
+        return exp((n * scored + _PRIOR_WEIGHT * prior) / (n + _PRIOR_WEIGHT))
 
     def best(self, methods: tuple[str, ...]) -> str:
         """Return the method with the smallest prior error, unless another has a clearly smaller expected error."""
-        preferred, best = (min(methods, key=error) for error in (_log_prior_error, self.expected_error))
+        preferred, best = (min(methods, key=error) for error in (_MEAN_LOG_PRIOR.__getitem__, self.expected_error))
         return best if self.expected_error(best) < _SWITCH_RATIO * self.expected_error(preferred) else preferred
 
     def describe(self, method: str) -> str:
@@ -146,11 +147,6 @@ class MethodSelector:
         others = ", ".join(f"{METHOD_TEXTS[name]} {100 * error:.1f} %" for error, name in errors)
         own = f"{METHOD_TEXTS[method]}: mean error of past predictions {100 * self.mean_error[method]:.1f} %"
         return f"predicted with {own} of path length; other methods: {others}"
-
-
-def _log_prior_error(method: str) -> float:
-    """Return the logarithm of the prior error of a method, mean over the look-aheads."""
-    return float(_LOG_PRIOR[method].mean())
 
 
 STEP = 0.5  # filter step [s]

@@ -1,5 +1,7 @@
 """Present ground velocity: reported, or from the positions where the reported one contradicts them."""
 
+from functools import lru_cache
+
 import numpy as np
 
 MEAN_S = 1.0  # over which the newest reported velocities are compared with the positions [s]
@@ -24,8 +26,7 @@ def present_velocity(p: np.ndarray, v: np.ndarray, dt: float, rows: int) -> np.n
     reported = v[-rows:].mean(axis=0)
     if len(p) < 4 * n or not np.isfinite(p).all():
         return reported
-    ages = dt * np.arange(-n, 1)
-    slope = np.linalg.pinv(np.vander(ages, 3, increasing=True))[1]  # of the parabola at its end, by position
+    slope = _slope_of_parabola(n, dt)
     fitted = np.stack([np.convolve(column, slope[::-1], "valid") for column in p.T], axis=-1)  # from row n on
     displaced = (p[2 * half :] - p[: -2 * half]) / (2 * half * dt)  # around row `half` and later
     integral = np.vstack([np.zeros(3), np.cumsum(0.5 * dt * (v[1:] + v[:-1]), axis=0)])
@@ -35,6 +36,13 @@ def present_velocity(p: np.ndarray, v: np.ndarray, dt: float, rows: int) -> np.n
     if np.sqrt(np.mean(error_fitted**2)) < _CLEARLY * np.sqrt(np.mean(error_reported**2)):
         return np.array([*fitted[-1, :2], reported[2]])
     return reported
+
+
+@lru_cache
+def _slope_of_parabola(n: int, dt: float) -> np.ndarray:
+    """Return the slope at the end of a parabola through n + 1 rows, by position, (n + 1,) [1/s]."""
+    slope: np.ndarray = np.linalg.pinv(np.vander(dt * np.arange(-n, 1), 3, increasing=True))[1]
+    return slope
 
 
 def corrected_velocity(t: np.ndarray, p: np.ndarray, velocity_t: np.ndarray, v: np.ndarray) -> np.ndarray:

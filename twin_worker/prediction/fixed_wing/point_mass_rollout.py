@@ -28,13 +28,13 @@ _MIN_WIND_HEIGHT = 10.0  # minimum reference height of the wind profile [m]
 _NO_NOISE = np.empty((0, 4))
 
 
-def start_state(context: PredictionContext, window: Window) -> np.ndarray:
-    """Return the state at the end of the window, (N_START,)."""
+def start_state(context: PredictionContext, window: Window, velocity: np.ndarray) -> np.ndarray:
+    """Return the state at the end of the window, (N_START,), where the ground velocity is `velocity`, (3,) [m/s]."""
     V = _present_airspeed(context, window)
     out = np.empty(H.N_START)
     out[:3], out[H.V] = window.p[-1], V
     out[[H.PHI, H.THETA, H.PSI, H.P_RATE, H.Q_RATE]] = window.x[-1, [6, 7, 8, 3, 4]]
-    climb = -float(present_velocity(window.p, window.v, window.dt, _GROUND_ROWS)[2])
+    climb = -float(velocity[2])
     out[H.GAMMA] = asin(float(np.clip(climb / max(V, 5.0), -_MAX_PATH_SINE, _MAX_PATH_SINE)))
     out[H.THROTTLE] = window.u[-1, 3]
     return out
@@ -80,15 +80,16 @@ def unexplained_velocity(start: np.ndarray, air: np.ndarray, v: np.ndarray) -> n
 
 
 def ground_velocity(window: Window) -> np.ndarray:
-    """Return the newest ground velocity, north and east, (2,) [m/s]."""
-    return present_velocity(window.p, window.v, window.dt, _GROUND_ROWS)[:2]
+    """Return the newest ground velocity, NED, (3,) [m/s]."""
+    return present_velocity(window.p, window.v, window.dt, _GROUND_ROWS)
 
 
 def start_and_air(context: PredictionContext, window: Window) -> tuple[np.ndarray, np.ndarray]:
     """Return state (N_START,) and air (N_AIR,) at the end of the window."""
-    start = start_state(context, window)
+    velocity = ground_velocity(window)
+    start = start_state(context, window, velocity)
     air = air_state(context, start)
-    air[[H.REST_N, H.REST_E]] = unexplained_velocity(start, air, ground_velocity(window))
+    air[[H.REST_N, H.REST_E]] = unexplained_velocity(start, air, velocity[:2])
     if context.onboard.override is not None and context.onboard.override.speed is not None:
         start[H.V] = context.onboard.override.speed
     return start, air
