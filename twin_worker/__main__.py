@@ -233,8 +233,8 @@ def main(argv: list[str] | None = None) -> int:
         default=LIVE_SCHEDULE,
         metavar="WORK=S,…",
         help="shortest periods of rollouts, identifications, ensembles, renewals "
-        "(predict=1,identify=1,ensemble=10,renew=1), changes below which rollouts and identifications wait up "
-        "to 10 s (departure=0.1,information=0.2; 0: never), size and look-ahead of an ensemble (members=24,span=180)",
+        "(predict=1,identify=1,ensemble=20,renew=1), changes below which rollouts and identifications wait up "
+        "to 10 s (departure=0.5,information=0.2; 0: never), size and look-ahead of an ensemble (members=24,span=180)",
     )
     parser.add_argument(
         "--terrain",

@@ -39,14 +39,7 @@ _INITIAL_SIGMA = np.array([0.03, 0.03, 6.0, 6.0, 0.0, 0.0, GUST, GUST])  # witho
 def _predict_and_correct(
     x: np.ndarray,
     P: np.ndarray,
-    dt: float,
-    c: float,
-    s: float,
-    mean_airspeed: float,
-    north_before: float,
-    east_before: float,
-    north: float,
-    east: float,
+    readings: tuple[float, ...],
     variance: float,
     gate: float,
     drift: float,
@@ -56,11 +49,8 @@ def _predict_and_correct(
 
     Args:
         x, P: state (8,) and covariance (8, 8), changed in place
-        dt: time since the previous row [s]
-        c, s: horizontal reported air velocity along north and east, by the attitude [m/s]
-        mean_airspeed: of the last half minute, reported [m/s]
-        north_before, east_before: ground velocity of the previous row [m/s]
-        north, east: ground velocity [m/s]
+        readings: time since the previous row [s]; reported air velocity by the attitude, north, east; mean reported
+            airspeed of the last half minute; ground velocity of the previous row and of this one, north, east [m/s]
         variance: of sideslip and sensors in each of its components [m2/s2]
         gate: NIS from which the correction is skipped
         drift: standard deviation of the slow changes of the wind [m/s]
@@ -73,6 +63,7 @@ def _predict_and_correct(
     and the direction of the previous ground velocity minus the wind.
     Source: Bar-Shalom 2001, 5.2.4 (Joseph form); Söderström & Stoica 1983 (instrumental variables).
     """
+    dt, c, s, mean_airspeed, north_before, east_before, north, east = readings
     decay, H, HP, y = np.ones(8), np.zeros((2, 8)), np.zeros((2, 8)), np.empty(2)
     for i in range(2):
         decay[4 + i], decay[6 + i] = exp(-dt / DRIFT_S), exp(-dt / GUST_S)
@@ -146,14 +137,7 @@ def _update_hypotheses(
     mean_nis: np.ndarray,
     walk_evidence: np.ndarray,
     drift_evidence: np.ndarray,
-    dt: float,
-    c: float,
-    s: float,
-    mean_airspeed: float,
-    north_before: float,
-    east_before: float,
-    north: float,
-    east: float,
+    readings: tuple[float, ...],
     variance: float,
     gate: float,
 ) -> bool:
@@ -161,16 +145,15 @@ def _update_hypotheses(
 
     Args:
         x, P, mean_nis, walk_evidence, drift_evidence: as in `WindFilter`, changed in place
-        dt, c, s, mean_airspeed, north_before, east_before, north, east, variance, gate: see `_predict_and_correct`
+        readings, variance, gate: see `_predict_and_correct`
     """
+    dt = readings[0]
     plausible, likeliest, mean = True, np.empty(len(_DRIFTS)), 0.0
     for i in range(len(_DRIFTS)):
         constant = likelihood = 0.0
         for j in range(len(_HEADING_WALKS)):
-            nis, likelihood = _predict_and_correct(
-                x[i, j], P[i, j], dt, c, s, mean_airspeed, north_before, east_before, north, east, variance, gate,
-                _DRIFTS[i], _HEADING_WALKS[j],
-            )  # fmt: skip
+            walk = _HEADING_WALKS[j]
+            nis, likelihood = _predict_and_correct(x[i, j], P[i, j], readings, variance, gate, _DRIFTS[i], walk)
             mean_nis[i, j] += dt / _NIS_AVERAGE_S * (min(nis, _GATE) / 2 - mean_nis[i, j])
             if j == 0:
                 constant = likelihood
@@ -259,7 +242,7 @@ class WindFilter:
         self._ground = north, east
         variance = _SIGMA**2 + (_YAW_LAG_S * G * p) ** 2
         evidence = self._walk_evidence, self._drift_evidence
-        if not _update_hypotheses(self._x, self._P, self._mean_nis, *evidence, *readings, variance, gate):  # type: ignore[call-arg]
+        if not _update_hypotheses(self._x, self._P, self._mean_nis, *evidence, readings, variance, gate):  # type: ignore[call-arg]
             self._reset()
 
     def expect_scale(self, altitude: float) -> None:

@@ -51,6 +51,7 @@ class OwnedTwin:
     epoch: int
     inbox: deque[Message] = field(default_factory=lambda: deque(maxlen=INBOX_SIZE))
     last_arrival: float = float("nan")  # wall time of the newest sample [s, monotonic]
+    processed_at: float = float("-inf")  # wall time of the last step [s, monotonic]
     recent: deque[Sample] = field(default_factory=lambda: deque(maxlen=_RECENT))  # with positions, newest last
     fallback_t: float = float("-inf")  # data time of the newest prediction without the twin [s since 1970]
     published_at: float = float("-inf")  # wall time of the newest published prediction [s, monotonic]
@@ -65,6 +66,14 @@ class OwnedTwin:
     encoded: tuple[Prediction, EncodedMessage] | None = (
         None  # newest prediction, and the same encoded with law and parameters
     )
+
+    def collects(self, now: float, period: float) -> bool:
+        """Return whether a predicting twin still collects samples, for `period` since its last step [s]."""
+        return (
+            now - self.processed_at < period
+            and self.twin.prediction.latest is not None
+            and all(isinstance(message, Sample) for message in tuple(self.inbox))
+        )
 
 
 def data_time(owned: OwnedTwin) -> float:

@@ -57,7 +57,8 @@ _MAX_STALL_S = 1.0  # maximum silence counted between two sweeps, because a stal
 _STATE_S = 1.0  # between fleet tables [s]
 _FOREIGN_PERIOD_S = 0.4  # between reads of other workers' predictions [s]
 _FOREIGN_CPU_SHARE = 0.1  # maximum share of the CPU time of this process for these reads [-]
-_SWEEP_S = 0.015  # telemetry is collected for this time before a sweep [s]
+_SWEEP_S = 0.015  # pause before a sweep, in which telemetry arrives [s]
+_COLLECTED_SHARE, _MAX_COLLECTING_S = 0.25, 0.25  # of the propagation period for which samples are collected; limit [s]
 _LATE_LIMITS_S = 0.12, 0.2  # limits of the sweep period above which telemetry counts as late [s]
 _LATE_PERIODS, _HEAVY_SHARE = 1.2, 0.25  # that period in propagation periods; share of it for heavy work, CPU [-]
 _JOIN_TIMEOUT_S = 1.0  # wait for the end of each thread; a blocked one is abandoned [s]
@@ -87,7 +88,6 @@ class Worker:
         self.omega, self.method, self.airframe = omega, method, airframe or load(GENERIC)
         self._terrain, self._areas = terrain, areas
         self.schedule, self._use_siblings = schedule or Schedule(), use_siblings
-        # short for frequent propagation
         self._late_after_s = min(max(_LATE_PERIODS * self.schedule.renew, _LATE_LIMITS_S[0]), _LATE_LIMITS_S[1])
         self.quota = ComputeBudget(max_limit=_HEAVY_SHARE * self._late_after_s)
         self.sentence = self._diagnosis_defect = ""
@@ -95,7 +95,8 @@ class Worker:
         self.rates = WorkRates()
         self.cpu_share = CpuShareLimiter()
         self.identifier = IdentificationThread(self._with_history, self.publish, self.rates, self.cpu_share)
-        self._sweep_start = float("-inf")  # start of the last sweep [s, monotonic]
+        # start of the last sweep [s, monotonic], and time for which the samples of an aircraft are collected [s]
+        self._sweep_start, self._collecting_s = float("-inf"), 0.0
         self.traffic = TrafficMonitor(separation or Separation())
         self._twins = TwinStore(bus, uavs, self._create_twin, self)
         self._twins.run_paced = self.cpu_share.run
@@ -217,13 +218,15 @@ class Worker:
         for owned in self._sweep_order():
             with self._fallback_lock:
                 waiting = len(owned.inbox)
-            ingested += waiting
-            if not waiting and not started - owned.last_arrival > SILENT_S and not owned.lock.locked():
+            idle = not waiting and not started - owned.last_arrival > SILENT_S and not owned.lock.locked()
+            if idle or (waiting and owned.collects(started, self._collecting_s)):
                 continue  # the usual case
+            ingested += waiting
             if owned.lock.locked():  # in identification or copied
                 if (prediction := fallback_prediction(owned)) is not None:
                     self.publish(prediction, owned)
                 continue
+            owned.processed_at = started
             self.wind_sharing.apply(owned)
             if self._use_siblings:
                 self.sibling_sharing.apply(owned)
@@ -243,15 +246,11 @@ class Worker:
 
         The budget may allow heavy work for the first twins only, and a twin that cannot be propagated needs a rollout.
         """
-        ordered = self.owned_twins()
-        new = [
-            owned
-            for owned in ordered
-            if owned.twin.prediction.latest is None and time.monotonic() - owned.ready_since < _NEW_AIRCRAFT_S
-        ]
+        ordered, now = self.owned_twins(), time.monotonic()
+        first = [one for one in ordered if one.twin.prediction.latest is None]
+        new = [one for one in first if now - one.ready_since < _NEW_AIRCRAFT_S]
         self._update_budget()
         self.quota.begin_sweep(first_prediction_pending=bool(new))
-        now = time.monotonic()
         ordered.sort(key=lambda one: (one not in new, not lacks_prediction(one, now), -rollout_age_s(one.twin)))
         return ordered
 
@@ -324,6 +323,7 @@ class Worker:
     def run(self, stop: threading.Event) -> None:
         """Connect, sweep until `stop` is set, publish the fleet table once a second; then hand everything over."""
         self.ownership.threaded, self.quota.offloaded = True, frozenset({Work.IDENTIFY})
+        self._collecting_s = min(_COLLECTED_SHARE * self.schedule.renew, _MAX_COLLECTING_S)
         self.connect()
         loops = (
             self.ownership.run,

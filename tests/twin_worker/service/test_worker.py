@@ -343,6 +343,28 @@ def test_a_silent_aircraft_ages_by_the_wall_clock(bus, worker, clock):
     assert row.sample_age_s == pytest.approx(4.0, abs=0.5) and row.state is TwinState.LINK_LOST
 
 
+def test_samples_of_a_predicting_aircraft_are_collected_and_nothing_else_waits(bus, worker, clock, heard):
+    own = [msgspec.structs.replace(message, uav=3) for message in heard]
+    for message in own:
+        bus.publish(message)
+    worker.sweep()
+    owned = worker.owned_twins()[0]
+    assert owned.twin.prediction.latest is not None
+    worker._collecting_s = 0.25
+    rest = f.shifted([m for m in own if isinstance(m, Sample)][-9:], 1.0, 1e9)
+    taken = []
+    for sample in rest:
+        clock[0] += 0.1
+        bus.publish(sample)
+        taken.append(worker.sweep())
+    assert taken == [0, 0, 3] * 3
+    bus.publish(next(m for m in own if isinstance(m, Status)))
+    assert worker.sweep() == 1, "a status is processed at once"
+    owned.twin.prediction.latest = None
+    bus.publish(rest[0])
+    assert worker.sweep() == 1, "before the first prediction nothing is collected"
+
+
 def test_garbled_bytes_on_the_bus_are_counted(bus, worker):
     bus.deliver(Sample, b"\xc1 no msgpack", "application/msgpack;parauav.sample.1")
     bus.deliver(Sample, b"\x80", "application/msgpack;parauav.sample.99")

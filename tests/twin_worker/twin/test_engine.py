@@ -39,7 +39,7 @@ from twin_worker.twin.step import Twin, advance
 def test_a_pace_is_read_and_refused_in_a_sentence() -> None:
     assert parse_schedule("identify=5,renew=0.1") == replace(LIVE_SCHEDULE, identify=5.0, renew=0.1)
     assert parse_schedule("members=50,span=60") == replace(LIVE_SCHEDULE, members=50, span=60.0)
-    assert parse_schedule("departure=0,information=0") == Schedule(renew=1.0)
+    assert parse_schedule("departure=0,information=0") == Schedule(ensemble=20.0, renew=1.0)
     for odd in (
         "",
         "identify",
