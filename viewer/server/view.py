@@ -100,6 +100,7 @@ class View:
         self.selected, self.camera, self.offset = previous.selected, previous.camera, previous.offset
         self.timeline.player = previous.timeline.player
         self._framed_key, self._framed_box = previous._framed_key, previous._framed_box
+        self._force_framing = previous._force_framing
         self._followed = previous._followed
 
     def show_error(self, error: str) -> bool:

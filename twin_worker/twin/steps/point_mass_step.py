@@ -11,10 +11,10 @@ from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_point_mass
 from twin_worker.prediction.replay_window import Rollout
 from twin_worker.twin.state.state import Twin
 
-IDENTIFY_PERIOD_S = 10.0  # between identifications [s]
+IDENTIFY_PERIOD_S = 5.0  # between identifications [s]
 _HOLD_OUT_S = 20.0  # newest flight, held out [s]
 _REPLACE_AFTER_S = 60.0  # flight after a fault onset before the model adapted by a diagnosis is replaced [s]
-_CHECK_PERIOD_S = 20.0  # between checks on held-out flight [s]
+_CHECK_PERIOD_S = 10.0  # between checks on held-out flight [s]
 _MAX_ERROR = 0.10  # final error over path length below which the model predicts, and below that of the active one [-]
 
 
