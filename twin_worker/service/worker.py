@@ -44,7 +44,7 @@ from twin_worker.service.busy_fallback import (
 )
 from twin_worker.service.identification_thread import CpuShareLimiter, IdentificationThread
 from twin_worker.service.proposal_thread import ProposalThread
-from twin_worker.service.queries import QueryHandlers, copy_twin, latest_prediction
+from twin_worker.service.queries import QueryHandlers, copy_twin
 from twin_worker.service.sibling_sharing import SiblingSharing
 from twin_worker.service.wind_sharing import WindSharing
 from twin_worker.service.work_rates import WorkRates
@@ -275,7 +275,6 @@ class Worker:
             self.bus.publish(result, Stamp(owned.epoch, self.bus.writer))
             if isinstance(result, Prediction):
                 owned.publishing, owned.published_at = True, time.monotonic()
-                latest_prediction(owned)  # encoded before a query needs it
 
     def _diagnose(self) -> None:
         """Run the background diagnosis once, and publish its results."""
@@ -302,9 +301,13 @@ class Worker:
         writer = f"{self.bus.writer:016x}"
         rows = [
             fleet_row(
-                owned.twin, data_time(owned), self.active_alerts(owned),
-                worker=writer, epoch=owned.epoch, mismatch=summary(self._mismatch(owned)),
-            )  # fmt: skip
+                owned.twin,
+                data_time(owned),
+                self.active_alerts(owned),
+                worker=writer,
+                epoch=owned.epoch,
+                mismatch=summary(self._mismatch(owned)),
+            )
             for owned in self.owned_twins()
         ]
         dropped = sum(entry.dropped for entry in self.owned_twins())

@@ -3,11 +3,11 @@
     python -m tests.bench.asking --json asking.json
     python -m tests.bench.asking --zenohd ~/.cargo/bin/zenohd
 
-1,000 aircraft with 4 workers that predict and publish each anew once a second and do nothing else. `wildcard`:
-`parauav/*/prediction`, an answer each, unpacked; `batch`: `parauav/@fleet/prediction/*`, an answer of each worker, whose
-predictions are unpacked by who reads them. Both are asked of all, without consolidation. `frozen`: the same while one
-worker is stopped, as a suspended machine is; the others' answers count. `plain`: the same bytes and as many answers by
-Zenoh alone, not unpacked.
+1,000 aircraft with 4 workers that predict each anew once a second and do nothing else; what is asked for is packed
+the first time. `wildcard`: `parauav/*/prediction`, an answer each, unpacked;
+`batch`: `parauav/@fleet/prediction/*`, an answer of each worker, whose predictions are unpacked by who reads them. Both
+are asked of all, without consolidation. `frozen`: the same while one worker is stopped, as a suspended machine is; the
+others' answers count. `plain`: the same bytes and as many answers by Zenoh alone, not unpacked.
 """
 
 import argparse

@@ -47,7 +47,6 @@ def main(router: str, low: int, high: int) -> None:
         while not stop.wait(_EVERY_S):
             for held in worker.owned_twins():
                 held.twin.prediction.latest = msgspec.structs.replace(held.twin.prediction.latest, t=time.time())
-                worker.publish(held.twin.prediction.latest, held)
 
 
 if __name__ == "__main__":
