@@ -22,6 +22,7 @@ from fleet.contract import (
     Mismatch,
     Model,
     Prediction,
+    Rows,
     Sample,
 )
 from twin_worker.alerts.hysteresis import AlertState
@@ -37,7 +38,6 @@ from twin_worker.twin.state.state import Twin, ingest
 
 _log = logging.getLogger(__name__)
 INBOX_SIZE = 4096  # queued messages per UAV; the oldest are dropped and counted
-_RECENT = 15  # received samples at hand for a prediction without the twin
 _PUBLISH_GRACE_S = 1.0  # after this time an acquired snapshot counts as published, with or without a prediction [s]
 SILENT_S = 1.0  # wall time without a sample after which data time follows the wall clock [s]
 _LOCK_TIMEOUT_S = 0.3  # wait for a busy twin; the requester tries again [s]
@@ -52,7 +52,7 @@ class OwnedTwin:
     inbox: deque[Message] = field(default_factory=lambda: deque(maxlen=INBOX_SIZE))
     last_arrival: float = float("nan")  # wall time of the newest sample [s, monotonic]
     processed_at: float = float("-inf")  # wall time of the last step [s, monotonic]
-    recent: deque[Sample] = field(default_factory=lambda: deque(maxlen=_RECENT))  # with positions, newest last
+    last_position: Rows | None = None  # newest received positions
     fallback_t: float = float("-inf")  # data time of the newest prediction without the twin [s since 1970]
     published_at: float = float("-inf")  # wall time of the newest published prediction [s, monotonic]
     dropped: int = 0
@@ -127,9 +127,7 @@ class TwinStore:
                 self._last_messages.setdefault(message.uav, {})[type(message)] = message
             return False
         if isinstance(message, Sample):
-            owned.last_arrival = time.monotonic()
-            if message.position is not None:
-                owned.recent.append(message)
+            owned.last_arrival, owned.last_position = time.monotonic(), message.position or owned.last_position
         with owned.inbox_lock:  # never `lock`, which an identification holds for its whole duration
             owned.dropped += len(owned.inbox) == INBOX_SIZE
             owned.inbox.append(message)

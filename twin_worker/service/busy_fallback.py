@@ -20,44 +20,27 @@ _OVERDUE_PERIODS = 1.2  # the same in scheduled prediction periods [-]
 _MISSING_FACTOR = 2.0  # multiple of that age at which the aircraft counts as without a prediction [-]
 _CLOCK_BACK_S = 1.0  # telemetry this far before the last prediction means that the clock was set back [s]
 _MAX_COORDINATE = 2e9  # larger coordinates are invalid [1e-7 deg, mm]
-_MAX_VELOCITY = 1e3  # larger velocities are invalid [m/s]
+_NO_VELOCITY = np.empty(0), np.empty((0, 3))  # times and velocities: one sample has too few
 
 
 def fallback_prediction(owned: OwnedTwin) -> Prediction | None:
     """Propagate the last prediction of a locked twin, without a change to the twin."""
-    twin, samples = owned.twin, tuple(owned.recent)
-    if not samples or not owned.ready:
+    twin, rows = owned.twin, owned.last_position
+    if rows is None or not owned.ready:
         return None
     try:
-        t, x = _newest_rows(samples, "position", _MAX_COORDINATE)
-        velocity_t, v = _newest_rows(samples, "velocity", _MAX_VELOCITY)
-    except (IndexError, ValueError):
+        t, x = rows.t.numpy(), rows.x.numpy().astype(float)
+    except ValueError:
         return None
-    if not len(t):
+    if not len(t) or x.shape != (len(t), 3) or not (np.abs(x[-1]) < _MAX_COORDINATE).all():
         return None
     published_t = max(owned.fallback_t, twin.prediction.latest.t if twin.prediction.latest else -np.inf)
     if not t[-1] >= published_t + EARLY_FRACTION * min(twin.config.schedule.renew, twin.config.schedule.predict):
         return None
-    prediction = propagate(twin, t, x, velocity_t, v)
+    prediction = propagate(twin, t[-1:], x[-1:], *_NO_VELOCITY)
     if prediction is not None:
         owned.fallback_t = prediction.t
     return prediction
-
-
-def _newest_rows(samples: tuple[Sample, ...], name: str, limit: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return times and values of one kind, the valid ones in rising order up to the newest, (n,) and (n, 3).
-
-    Raises:
-        IndexError, ValueError: when a message is damaged.
-    """
-    rows = [one for one in (getattr(sample, name) for sample in samples) if one is not None]
-    t = np.concatenate([np.empty(0), *(one.t.numpy() for one in rows)])
-    x = np.concatenate([np.empty((0, 3)), *(one.x.numpy() for one in rows)])
-    valid = np.isfinite(t) & (np.abs(x) < limit).all(axis=1)
-    t, x = t[valid], x[valid]
-    falling = np.flatnonzero(np.diff(t) <= 0.0)  # a clock set back, late or repeated messages
-    first = int(falling[-1]) + 1 if len(falling) else 0
-    return t[first:], x[first:]
 
 
 def take_backlog(owned: OwnedTwin, n: int, *, overloaded: bool) -> list[Message]:
@@ -99,7 +82,7 @@ def is_superseded(result: Message, owned: OwnedTwin) -> bool:
         return False
     return (
         result.t > owned.fallback_t - MAX_ROLLOUT_AGE_S
-        or not owned.recent
+        or owned.last_position is None
         or _newest_position_t(owned) > owned.fallback_t - _CLOCK_BACK_S
     )
 
@@ -107,7 +90,7 @@ def is_superseded(result: Message, owned: OwnedTwin) -> bool:
 def _newest_position_t(owned: OwnedTwin) -> float:
     """Return the time of the newest received position [s since 1970]."""
     try:
-        t = owned.recent[-1].position.t.numpy()  # type: ignore[union-attr]
+        t = owned.last_position.t.numpy() if owned.last_position is not None else np.empty(0)
     except ValueError:
         return np.inf
     return float(t[-1]) if len(t) else np.inf

@@ -223,14 +223,14 @@ def test_who_is_not_reached_in_time_is_renewed_from_the_position_received_last(h
     twin.prediction.last_rollout, told = twin.prediction.latest, []
     held = OwnedTwin(twin, 1)
     for message in f.shifted([m for m in heard if isinstance(m, Sample) and m.t > heard[-1].t - 31.0], 31.0, 1e9):
-        held.recent.extend((message,) if message.position is not None else ())
+        held.last_position = message.position or held.last_position
         held.published_at = time.monotonic() - (2.0 if message.t > twin.prediction.latest.t + 30.0 else 0.0)
         publish_fallbacks([held], lambda made, _: told.append(made))
     times = np.array([made.t for made in told])
     assert len(times) and times[0] > twin.prediction.latest.t + 29.5 and (np.diff(times) > 0.8).all()
     late = msgspec.structs.replace(twin.prediction.latest, t=times[0] - 20.0)
     assert is_superseded(late, held) and not is_superseded(msgspec.structs.replace(late, t=times[-1] + 1.0), held)
-    held.recent.append(Sample(uav=1, t=times[0] - 25.0, position=f.rows([times[0] - 25.0], [[0.0, 0.0, 0.0]])))
+    held.last_position = f.rows([times[0] - 25.0], [[0.0, 0.0, 0.0]])
     assert not is_superseded(late, held), "the clock was set back"
 
 
