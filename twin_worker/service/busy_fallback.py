@@ -1,6 +1,6 @@
 """What a worker does instead where CPU time is short: fallback predictions, and the newest telemetry only.
 
-A fallback prediction of a late or locked twin is its last path, shifted to the newest position.
+A fallback prediction of a late or locked twin is its last path, continued from the newest position.
 """
 
 import time

@@ -33,7 +33,7 @@ def on(twin: Twin, seconds: float, off: np.ndarray) -> None:
     twin.telemetry.history.add(Sample(uav=1, t=t, position=f.rows([t], lat_lon_alt)))
 
 
-def kept(ahead: np.ndarray) -> np.ndarray:
+def remaining_share(ahead: np.ndarray) -> np.ndarray:
     """Share of an offset along, across and down that is left, (n, 3)."""
     share = (1.0 + ahead / 4.0) * np.exp(-ahead / 4.0)
     return np.stack([np.ones(len(ahead)), share, share], axis=-1)
@@ -121,7 +121,7 @@ def test_a_renewed_prediction_is_as_wide_as_the_age_of_its_rollout_demands(twin:
         on(twin, age, np.zeros(3))
         (made,) = extrapolate(twin)
         at, half = made.ahead.numpy().astype(float), made.prediction_region_half_axes.numpy() / [3.0, 2.0, 1.0]
-        share = kept(at)
+        share = remaining_share(at)
         wanted = np.sqrt((np.sqrt(at + age) + 0.1) ** 2 - (np.sqrt(age) + 0.1) ** 2 * share.T * (2.0 - share.T)).T
         wanted = np.maximum(wanted, np.sqrt(at)[:, None] + 0.1)
         assert half == pytest.approx(wanted, rel=0.02, abs=0.02)  # straight between look-aheads
@@ -135,7 +135,7 @@ def test_errors_of_a_random_walk_are_held_as_often_by_renewed_tubes_as_by_new_on
     half = np.outer(np.sqrt(np.arange(61.0) + 1.0), np.full(3, 2.114))  # of 0.9 in all three at once
     tube = np.empty((50, 3), np.float32)
     widen_tube(AHEAD[:61], half, float(age), True, tube)
-    error = walk[:, age : age + 50] - kept(AHEAD[:50]) * walk[:, [age]]
+    error = walk[:, age : age + 50] - remaining_share(AHEAD[:50]) * walk[:, [age]]
     held = (np.abs(error) <= tube).all(axis=2).mean(axis=0)
     as_new = (np.abs(error) <= half[:50]).all(axis=2).mean(axis=0)
     assert held[1:] == pytest.approx(np.full(49, 0.9), abs=0.1) and (held[1:] > 0.88).all()

@@ -24,7 +24,7 @@ def crowd(chromium: str) -> Iterator[SimpleNamespace]:
         yield site
 
 
-# light first: a change of the theme makes the labels anew, so that the page has noted each from its beginning
+# light first: a theme change creates the labels again, after the script that records them has started
 @pytest.mark.parametrize("light", [True, False], ids=["light", "dark"])
 def test_labels_of_a_crowd_do_not_overlap_on_the_screen(crowd: SimpleNamespace, *, light: bool) -> None:
     """Twenty-four seconds, with time marks, horizon, alerts; the page takes positions and texts of one record."""

@@ -1,4 +1,4 @@
-"""Extrapolate a prediction between two rollouts: continue the last path from the newest position."""
+"""Extrapolate a prediction between two rollouts: continue the last path from the newest position and velocity."""
 
 from math import exp, inf, sqrt
 
@@ -18,7 +18,7 @@ _NEAR_S = 5.0  # look-ahead whose region is the scale of a departure [s]
 _RETURN_S = 4.0  # time constant of the return to the predicted path, across it and vertically [s]
 _SPEED_S = 8.0  # time constant of the return to the predicted ground speed [s]
 _MIN_SPEED = 1.0  # slower predicted paths have no direction [m/s]
-_MAX_SLOWER = 0.5  # greatest share of the predicted speed by which an aircraft counts as slower
+_MAX_SLOWER = 0.5  # largest speed deficit used, as a share of the predicted speed [-]
 
 
 @no_alloc_kernel
@@ -109,7 +109,7 @@ def widen_tube(ahead: np.ndarray, tube: np.ndarray, elapsed: float, keeps_along:
 
 
 def extrapolate(twin: Twin) -> list[Message]:
-    """Continue the last rollout from the newest position; return nothing if either is missing."""
+    """Continue the last rollout from the newest position and velocity; return nothing without a recent position."""
     if twin.prediction.last_rollout is None:
         return []
     since = twin.telemetry.history.newest - 2.0 * MEAN_S
