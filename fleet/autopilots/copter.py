@@ -18,6 +18,8 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
+from fleet.compiled_frames import assign
+
 LAW = "copter: route at limited speed, acceleration and jerk, behind a lag"
 
 # columns of one segment
@@ -166,7 +168,7 @@ def follow(
     t, r, a = np.empty(3), np.empty(3), np.empty(3)
     wn, zeta = par[WN], par[ZETA]
     for k in range(len(out)):
-        out[k] = x
+        assign(out[k], x)
         segment = segments[int(ref[SEGMENT])]
         for i in range(3):
             t[i] = segment[B_N + i] - segment[A_N + i]

@@ -35,6 +35,7 @@ from fleet.autopilots.position_loop import (
     stopping_time,
     track_reference,
 )
+from fleet.compiled_frames import assign
 
 LAW = "copter: jerk-limited legs that overlap at corners, behind the position loop"
 
@@ -111,7 +112,7 @@ def _plan(segment: np.ndarray, top: float, start: np.ndarray, par: np.ndarray, o
         distance = speed * time + (speed + last) * over
         distance += last * _ramp(last, acc, jerk, out[_DOWN : _DOWN + 2])
     else:
-        out[_DOWN : _DOWN + 2] = out[_UP : _UP + 2]
+        assign(out[_DOWN : _DOWN + 2], out[_UP : _UP + 2])
     out[_CRUISE], out[_DELAY] = max(length - distance, 0.0) / last, 0.5 * rise
     out[_END] = rise + out[_CRUISE]
     for part in (_UP, _CHANGE, _DOWN):
@@ -237,7 +238,7 @@ def navigate(
                 state[SEGMENT] += 1.0
                 state[TAIL], state[T], state[LEAD], state[WAIT] = state[T], state[LEAD], -1.0, 0.0
                 state[TAIL_TOP], state[TOP] = state[TOP], _speed_after_change(segments[k + 1], v, a, par)
-                state[START_N : START_D + 1] = segments[k + 1, A_N : A_N + 3]
+                assign(state[START_N : START_D + 1], segments[k + 1, A_N : A_N + 3])
                 return
     if segment[LEG_JERK] == 0.0:  # a take-off does not wait for the aircraft
         _scale(state, xva, par, dt, r)
@@ -258,7 +259,7 @@ def _begin_segment(state: np.ndarray, segments: np.ndarray, xva: np.ndarray, par
     k = int(state[SEGMENT]) + 1
     state[SEGMENT] = k
     state[T], state[TAIL], state[LEAD], state[WAIT], state[TOP] = 0.0, -1.0, -1.0, 0.0, 0.0
-    state[START_N : START_D + 1] = segments[k, A_N : A_N + 3]
+    assign(state[START_N : START_D + 1], segments[k, A_N : A_N + 3])
     if segments[k, HOLD] == 0.0 and abs(segments[k, B_N + 2] - segments[k, A_N + 2]) < _PLACE_M:
         # a return first climbs from the stopping point to the present height, if no further
         state[START_D] = segments[k, B_N + 2] + max(_PLACE_M, abs(xva[1, 2]) / par[POS_P_Z])
@@ -355,7 +356,7 @@ def follow(
     r = np.zeros((3, 3))
     navigate(state, segments, xva, par, 0.0, r)
     for k in range(len(out)):
-        out[k] = xva[0]
+        assign(out[k], xva[0])
         for _ in range(_SUBSTEPS):
             _step(state, segments, xva, r, par, dt / _SUBSTEPS)
 
@@ -381,20 +382,19 @@ def simulated_states(
     """
     state, r, xva = np.zeros(N_STATE), np.zeros((3, 3)), np.zeros((4, 3))
     state[TAIL], state[LEAD], state[SCALE] = -1.0, -1.0, 1.0
-    state[START_N : START_D + 1] = segments[0, A_N : A_N + 3]
-    xva[0] = segments[0, A_N : A_N + 3]
-    drag_n, drag_e = drag(0.0, 0.0, par)
-    for row in range(2, 4):
-        xva[row, 0], xva[row, 1] = drag_n, drag_e
+    assign(state[START_N : START_D + 1], segments[0, A_N : A_N + 3])
+    assign(xva[0], segments[0, A_N : A_N + 3])
+    xva[2:, 0], xva[2:, 1] = drag(0.0, 0.0, par)
     if segments[0, TURN] != 0.0:
         begin_circle(state, segments[0], xva, par)
     elif segments[0, DESCENT] > 0.0:
         state[SHAPED] = segments[0, A_N + 2]
-    r[0] = xva[0]
+    assign(r[0], xva[0])
     for k in range(len(states)):
         for _ in range(_SUBSTEPS):
             _step(state, segments, xva, r, par, dt / _SUBSTEPS)
-        states[k], simulated[k] = state, xva
+        assign(states[k], state)
+        assign(simulated[k].ravel(), xva.ravel())
         if state[SEGMENT] > last or (state[WAIT] > 0.0 and segments[int(state[SEGMENT]), HOLD] > 1e6):
             return k + 1
     return len(states)

@@ -16,6 +16,7 @@ from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane.l1 import to_roll
 from fleet.autopilots.control_law import SWITCH_S, array_kernel, clip
 from fleet.autopilots.laws import switch_when_due
+from fleet.compiled_frames import assign
 from fleet.frames import G
 from fleet.mission import KIND, LAND, VA_C
 
@@ -55,7 +56,7 @@ def follow(
     v_before = np.zeros(3)
     for k in range(len(out)):
         if landed:
-            out[k] = p
+            assign(out[k], p)
             continue
         V_horizontal = sqrt(max(V * V - h_dot * h_dot, 1.0))
         v[0], v[1], v[2] = V_horizontal * cos(psi) + wind[0], V_horizontal * sin(psi) + wind[1], -h_dot

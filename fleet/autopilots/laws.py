@@ -175,7 +175,8 @@ def _height_states(par: np.ndarray) -> int:
 def remember(ctl: np.ndarray, par: np.ndarray, h: float) -> np.ndarray:
     """Return the state for `restore`, with heights relative to the aircraft at height `h` [m], (N_CTL,)."""
     memory = ctl.copy()
-    memory[H_IN : H_IN + _height_states(par)] -= h
+    for j in range(H_IN, H_IN + _height_states(par)):
+        memory[j] -= h
     return memory
 
 

@@ -14,6 +14,8 @@ from math import exp, sqrt
 import numba as nb
 import numpy as np
 
+from fleet.compiled_frames import assign
+
 # parameters: gains [1/s], lag of the attitude [s], jerk [m/s3], WPNAV_RADIUS [m], corner and horizontal limit [m/s2],
 # integral and derivative of the horizontal velocity [1/s2, -], time in which the jerk rises [s], whether the law is
 # ArduCopter's (1) or PX4's (0), linear and quadratic drag over mass [1/s, 1/m], wind [m/s], jerk of shaping [m/s3],
@@ -65,9 +67,10 @@ def drag_integrator(v: np.ndarray, tilt: np.ndarray, par: np.ndarray, step: floa
     for k in range(len(v)):
         out[0, 0], out[0, 1] = drag(v[k, 0], v[k, 1], par)
         if k == 0:
-            out[1] = out[0]
+            assign(out[1], out[0])
         if not sqrt(tilt[k, 0] ** 2 + tilt[k, 1] ** 2) > largest:
-            out[1] += recovery * (out[0] - out[1])
+            for i in range(2):
+                out[1, i] += recovery * (out[0, i] - out[1, i])
     return out
 
 

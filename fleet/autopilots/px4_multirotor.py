@@ -20,6 +20,7 @@ import numpy as np
 from fleet.autopilots.copter import A_N, B_N, HOLD, N_SEGMENT, SPEED
 from fleet.autopilots.position_loop import JERK, POS_P, VEL_D, VEL_P, drag, track_reference
 from fleet.autopilots.position_loop import N_PAR as _N_LOOP
+from fleet.compiled_frames import assign
 
 LAW = "px4: jerk-limited velocity along the legs, behind the position loop"
 
@@ -88,13 +89,15 @@ def _waypoints(segments: np.ndarray, k: int, x: np.ndarray, radius: float, out: 
     from_n, from_e = x[0] - out[0, 0], x[1] - out[0, 1]
     along = from_n * n + from_e * e
     if along > length:  # the target is behind
-        out[0] = x
+        assign(out[0], x)
     elif along < 0.0 and from_n**2 + from_e**2 > radius**2:  # the point before is in front
-        out[2], out[1], out[0] = out[1].copy(), out[0].copy(), x
+        assign(out[2], out[1])
+        assign(out[1], out[0])
+        assign(out[0], x)
     elif (from_n * e - from_e * n) ** 2 > radius**2:  # far from the line
-        out[2] = out[1].copy()
+        assign(out[2], out[1])
         out[1, 0], out[1, 1] = out[0, 0] + along * n, out[0, 1] + along * e
-        out[0] = x
+        assign(out[0], x)
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
@@ -226,7 +229,7 @@ def _step(r: np.ndarray, target: np.ndarray, acc: np.ndarray, jerk: float, dt: f
 def begin_trajectory(state: np.ndarray, xva: np.ndarray, par: np.ndarray) -> None:
     """Set the trajectory with whose velocity and acceleration the aircraft accelerates as it does."""
     r = state[TRAJECTORY:].reshape(3, 3)
-    r[:] = xva[:3]
+    assign(state[TRAJECTORY:], xva[:3].ravel())
     resistance = drag(xva[1, 0], xva[1, 1], par)
     for i in range(2):
         r[2, i] -= resistance[i]
@@ -244,7 +247,7 @@ def follow(
     r, target, acc = state[TRAJECTORY:].reshape(3, 3), np.zeros(3), np.full(3, par[ACC])
     h = dt / _SUBSTEPS
     for row in range(len(out)):
-        out[row] = xva[0]
+        assign(out[row], xva[0])
         for _ in range(_SUBSTEPS):
             _velocity_target(state, segments, (xva[0], r), par, target)
             acc[2] = par[ACC_UP] if target[2] < 0.0 else par[ACC_DOWN]
@@ -276,4 +279,4 @@ def _arrive(state: np.ndarray, segments: np.ndarray, xva: np.ndarray, par: np.nd
             state[SEGMENT], state[WAIT] = k + 1.0, 0.0
             if segments[k + 1, PHASE] == CLIMB_IN_PLACE:
                 segments[k + 1, B_N], segments[k + 1, B_N + 1] = xva[0, 0], xva[0, 1]
-                segments[k + 1, A_N : A_N + 3] = xva[0]
+                assign(segments[k + 1, A_N : A_N + 3], xva[0])

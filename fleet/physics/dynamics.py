@@ -14,6 +14,7 @@ from math import cos, sin
 
 import numpy as np
 
+from fleet.compiled_frames import assign
 from fleet.frames import G
 from fleet.physics.kernel import kernel, no_alloc_kernel
 from fleet.physics.wrench import WIND, terms, wrench, wrench_jacobian
@@ -103,7 +104,7 @@ def free_runs(
     x, work = np.empty(N_X), np.empty((3, N_X))
     out[:] = np.nan
     for m in range(len(begins)):
-        x[:] = starts[m]
+        assign(x, starts[m])
         for k in range(begins[m], min(begins[m] + length, len(out))):
             if is_diverged(x):
                 break

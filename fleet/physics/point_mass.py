@@ -16,6 +16,7 @@ from math import cos, exp, nan, sin, sqrt, tan
 import numpy as np
 
 from fleet.autopilots.laws import guide
+from fleet.compiled_frames import assign
 from fleet.frames import G, air_direction, wrap
 from fleet.physics.kernel import inlined_kernel, kernel
 
@@ -171,4 +172,4 @@ def simulate_ensemble(
         )
         for k in range(len(steps)):
             if steps[k] < n_valid:
-                out[i, k] = path[steps[k]]
+                assign(out[i, k], path[steps[k]])

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fleet.compiled_frames import assign
 from fleet.physics.kernel import kernel
 
 _CUTOFF_SIGMA = 2.0  # standard deviations beyond which a pair is rejected: probability below 0.023 [-]
@@ -158,9 +159,9 @@ def conflict_probability(
             r1[1] = separation[i, 1] + root[i, 1] * z[0] + root[i, 2] * z[1]
             r1[2] = separation[i, 2] + root[i, 3] * z[2]
             if i == 0:
-                r0[:] = r1
+                assign(r0, r1)
             if _violates(r0, r1, limits[0], limits[1]):
                 hits += 1
                 break
-            r0[:] = r1
+            assign(r0, r1)
     return hits / len(draws)

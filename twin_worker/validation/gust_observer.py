@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fleet.compiled_frames import assign
 from fleet.physics.dynamics import N_X, is_diverged, step
 from fleet.physics.kernel import kernel
 from fleet.physics.wrench import OFFSETS
@@ -82,7 +83,7 @@ def _filter_rows(
             if i < 6:
                 d[i] += _BETA[i] * e / dt
         if is_diverged(x):
-            x[:] = y[k]
+            assign(x, y[k])
             d[:] = 0.0
         for i in range(N_X):
             out[k, i] = x[i]
@@ -124,7 +125,8 @@ def _free_run(
     x, d, par_with_gust, work = np.empty(N_X), np.empty(6), par.copy(), np.empty((3, N_X))
     out[:] = np.nan
     for m in range(len(start_rows)):
-        x[:], d[:] = filtered[m, :N_X], filtered[m, N_X:]
+        assign(x, filtered[m, :N_X])
+        assign(d, filtered[m, N_X:])
         for k in range(min(out.shape[1], len(delta) - start_rows[m])):
             if is_diverged(x):
                 break

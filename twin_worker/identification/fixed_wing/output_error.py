@@ -13,6 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from fleet.compiled_frames import assign
 from fleet.physics.dynamics import N_X, is_diverged, jacobian, step
 from fleet.physics.kernel import kernel, no_alloc_kernel
 from fleet.physics.wrench import N_AERO, N_PAR, ROW, WIND
@@ -105,7 +106,7 @@ def residuals_and_jacobian(
     S, S_next, term = np.empty((N_X, N_COLUMN)), np.empty((N_X, N_COLUMN)), np.empty(N_AERO)
     cost, row = 0.0, 0
     for m in range(len(segments)):
-        x[:] = starts[m]
+        assign(x, starts[m])
         S[:] = 0.0
         for i in range(N_X):
             S[i, N_PAR + i] = 1.0
@@ -119,7 +120,7 @@ def residuals_and_jacobian(
             row += 1
             for j in range(GROUP):
                 if 2 * j == GROUP:
-                    half[:] = x
+                    assign(half, x)
                 step(x, delta[k + j], par, trim_velocity, dt, work)
             if is_diverged(x):
                 return np.inf

@@ -9,6 +9,8 @@ import numba as nb
 import numpy as np
 import scipy.linalg
 
+from fleet.compiled_frames import assign
+
 _MAX_ERROR = 20.0  # errors are clipped to this [scaled units]
 
 
@@ -49,7 +51,7 @@ def normal_equations(
     for k in range(len(y)):
         if k % length == 0 or not running:
             running, diverged = ok[k], False
-            x[:] = y[k]
+            assign(x, y[k])
             S[:] = 0.0
         elif ok[k]:
             for i in range(n):
@@ -67,15 +69,15 @@ def normal_equations(
             z[j] = x[j]
         for j in range(m):
             z[n + j] = u[k, j]
-        S_next[:] = A @ S
+        assign(S_next.ravel(), (A @ S).ravel())
         for i in range(n):
             s = 0.0
             for j in range(q):
                 s += D[i, j] * z[j]
                 S_next[i, i * q + j] += z[j]
             x_next[i] = min(max(s, -50.0), 50.0)
-        x[:] = x_next
-        S[:] = S_next
+        assign(x, x_next)
+        assign(S.ravel(), S_next.ravel())
         if not np.abs(x).max() < 50.0:
             diverged = True
         if diverged:
