@@ -78,12 +78,11 @@ def interrupt_deferred() -> Iterator[None]:
 
 
 def install() -> None:
-    """Install the handler, unless the process was started with SIGINT ignored (as by nohup)."""
-    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        return
-    signal.signal(signal.SIGINT, _on_sigint)
-    sys.unraisablehook = _on_unraisable
+    """Install the exit without teardown, and the handler unless SIGINT is ignored (as in a background job)."""
     atexit.register(_exit_at_end)  # registered first, so it runs last
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _on_sigint)
+        sys.unraisablehook = _on_unraisable
 
 
 def _on_sigint(*_: object) -> None:

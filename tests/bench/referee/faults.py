@@ -150,9 +150,11 @@ def _barred(site: Site, worker: Worker, how: str, seconds: float) -> dict[str, A
     uavs, was = _held(site, worker), worker.name
     begun = time.monotonic()
     setattr(worker.way, how, True)
-    found = _taken_over(site, uavs, was, begun)
-    wait(max(begun + seconds - time.monotonic(), 0.0))
-    setattr(worker.way, how, False)
+    try:
+        found = _taken_over(site, uavs, was, begun)
+        wait(max(begun + seconds - time.monotonic(), 0.0))
+    finally:  # also when nobody took over in time
+        setattr(worker.way, how, False)
     return found | {"back": _back(site, worker)}
 
 

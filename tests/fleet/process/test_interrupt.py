@@ -193,10 +193,16 @@ def handled(monkeypatch):
 
 @pytest.mark.parametrize(("name", "torn_down"), [("fleet", False), ("other", True)])
 @pytest.mark.parametrize("code", [0, 1, 2])
-def test_a_command_ends_without_tearing_down_the_interpreter(code, name, torn_down, tmp_path):
-    """Else a thread of a foreign library that asks for the interpreter in that moment aborts the process."""
+@pytest.mark.parametrize("trap", ["", "trap '' INT; "], ids=["foreground", "background"])
+def test_a_command_ends_without_tearing_down_the_interpreter(trap, code, name, torn_down, tmp_path):
+    """Else a thread of a foreign library that asks for the interpreter in that moment aborts the process.
+
+    What a shell starts in the background ignores SIGINT.
+    """
     (tmp_path / name).write_text(TEARDOWN)
+    script = f'{trap}exec "$0" "$@"'
     command, env = [sys.executable, str(tmp_path / name), str(code)], os.environ | {"PYTHONPATH": str(ROOT)}
+    command = ["sh", "-c", script, *command]
     ended = subprocess.run(command, env=env, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert (ended.returncode, ended.stdout) == (code, "donecleaned up ")
     assert ended.stderr.endswith("torn down") == torn_down
