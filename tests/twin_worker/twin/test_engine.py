@@ -84,7 +84,7 @@ def test_ensembles_give_way_before_flights_ahead_and_time_of_others_does_not_cou
 def test_who_has_no_prediction_yet_comes_first_and_without_a_limit_nobody_waits(clock: list[float]) -> None:
     limited, free = ComputeBudget(limit=1.0), ComputeBudget()
     for quota in (limited, free):
-        quota.begin_sweep(first_prediction_pending=True)
+        quota.begin_sweep(rollouts_only=True)
         assert quota.try_acquire(Work.PREDICT)
     assert not limited.try_acquire(Work.IDENTIFY) and free.try_acquire(Work.IDENTIFY)
     clock[0] += 1e6
