@@ -3,12 +3,16 @@
 import argparse
 import contextlib
 import gc
+import importlib
 import logging
+import math
 import os
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +23,7 @@ from fleet.process.children import Children
 from fleet.process.file_options import airframe_file, input_file, model_of
 from fleet.process.logs import log_arguments, report_progress, report_status
 from fleet.process.malloc_trim import enable_malloc_trim
+from twin_worker import CACHE_COMPLETE
 from twin_worker.twin.state.budget import LIVE_SCHEDULE, parse_schedule
 
 _POLL_S = 0.5
@@ -31,8 +36,9 @@ if TYPE_CHECKING:
 SWITCH_INTERVAL_S = 5e-4  # maximum wait of a bus thread for the interpreter [s]
 EXIT_TIMEOUT_S = 10.0  # time from a stop signal to a forced exit [s]
 COMPILING_PERIOD_S = 1.0  # between two reports that the worker compiles [s]
+LOW_PRIORITY_S = 15.0  # after which the rest of the start has a higher priority, so that it ends on a busy machine [s]
 COMPILING_STEP_S = 10  # step of the time in these reports [s]
-NICE_INCREMENT = 5  # increment of the nice value of the warm-up thread
+NICE_INCREMENTS = 10, 5  # of the nice value of the threads that import and warm up, at first and later
 GC_THRESHOLD = 50_000  # allocations between garbage collections
 MMAP_THRESHOLD_B = 16 << 20  # malloc blocks above this are mapped separately [bytes]
 MALLOC_TRIM_THRESHOLD_B = 64 << 20  # free memory that the heap keeps between trims [bytes]
@@ -97,19 +103,61 @@ def _force_exit(stop: threading.Event) -> None:
     os._exit(1)
 
 
-def _prepare() -> None:
-    """Import and compile at low priority, because other workers on the machine need the CPU."""
+def _import_steps(*names: str) -> Iterator[Callable[[], object]]:
+    """Yield one step for each module."""
+    return (partial(importlib.import_module, name) for name in names)
+
+
+def _preparation() -> Iterator[Callable[[], object]]:
+    """Yield the steps before any claim: imports and the warm-up. A compiling worker cannot take over aircraft."""
+    yield from _import_steps("numba", "scipy.interpolate", "scipy.optimize", "scipy.signal")
+    from twin_worker.service.warm_up import warm_up_steps
+
+    yield from warm_up_steps()
+    yield from _import_steps("twin_worker.mismatch.process", "twin_worker.service.worker")
+
+
+def _run_steps(steps: Iterator[Callable[[], object]], increment: int, until: float) -> bool:
+    """Run steps at lower priority, none that starts after `until`, monotonic [s]; return whether all are done."""
     if sys.platform == "linux":
         thread_id = threading.get_native_id()
-        os.setpriority(os.PRIO_PROCESS, thread_id, os.getpriority(os.PRIO_PROCESS, thread_id) + NICE_INCREMENT)
-    from twin_worker.service.warm_up import warm_up  # numba imports slowly: report the state first
+        os.setpriority(os.PRIO_PROCESS, thread_id, os.getpriority(os.PRIO_PROCESS, thread_id) + increment)
+    while time.monotonic() < until:
+        step = next(steps, None)
+        if step is None:
+            return True
+        step()
+    return False
 
-    warm_up()  # before any claim: a compiling worker cannot take over aircraft
+
+def run_at_low_priority(
+    steps: Iterator[Callable[[], object]], low_priority_s: float, report: Callable[[float], None] = lambda _: None
+) -> None:
+    """Run steps on a thread of low priority, because other workers on the machine need the CPU.
+
+    A thread can lower its priority but not raise it again: another one continues.
+
+    Args:
+        steps: are run in order
+        low_priority_s: no step starts at the lowest priority after this time, so that a busy machine delays them little
+        report: called once a second with the time since the start [s]
+    """
+    started = time.monotonic()
+    for increment, limit_s in zip(NICE_INCREMENTS, (low_priority_s, math.inf), strict=True):
+        with ThreadPoolExecutor(1) as pool:
+            done = pool.submit(_run_steps, steps, increment, started + limit_s)
+            report(time.monotonic() - started)
+            while not wait([done], COMPILING_PERIOD_S).done:
+                report(time.monotonic() - started)
+            if done.result():
+                return
 
 
 def _run(args: argparse.Namespace) -> int:
     enable_malloc_trim(MMAP_THRESHOLD_B, MALLOC_TRIM_THRESHOLD_B)  # before other threads have heaps of their own
-    from fleet.airframes import GENERIC, load  # here, as --help and --version need none of these
+    basics = "fleet.bus.session", "fleet.airframes", "fleet.metrics", "fleet.terrain.areas", "fleet.terrain.raster"
+    run_at_low_priority(_import_steps(*basics), LOW_PRIORITY_S)  # here, as --help and --version need none of these
+    from fleet.airframes import GENERIC, load
     from fleet.bus.session import connect
     from fleet.contract import FleetState
     from fleet.metrics import serve
@@ -122,15 +170,14 @@ def _run(args: argparse.Namespace) -> int:
     stop = stop_on_signal()
     threading.Thread(target=_force_exit, args=(stop,), daemon=True).start()
     with connect(bus_config_from(args, WORKER)) as bus:
-        with ThreadPoolExecutor(1) as pool:  # a thread can lower its priority but not raise it again
-            prepared, done = pool.submit(_prepare), False
-            begun = time.monotonic()
-            while not done:  # repeated, for a viewer that starts later
-                elapsed_s = int((time.monotonic() - begun) // COMPILING_STEP_S * COMPILING_STEP_S)
-                since = f" ({elapsed_s} s so far)" if elapsed_s else ""
-                bus.publish(FleetState(t=0.0, sentence=f"compiling the twins' physics, once per installation{since}"))
-                done = bool(wait([prepared], COMPILING_PERIOD_S).done)
-            prepared.result()
+
+        def report(elapsed_s: float) -> None:  # repeated, for a viewer that starts later
+            elapsed = int(elapsed_s // COMPILING_STEP_S * COMPILING_STEP_S)
+            since = f" ({elapsed} s so far)" if elapsed else ""
+            bus.publish(FleetState(t=0.0, sentence=f"compiling the twins' physics, once per installation{since}"))
+
+        is_compiled = (Path(os.environ["NUMBA_CACHE_DIR"]) / CACHE_COMPLETE).exists()  # else a minute of CPU time
+        run_at_low_priority(_preparation(), LOW_PRIORITY_S if is_compiled else 0.0, report)
         from twin_worker.alerts.conflict_probability import Separation
         from twin_worker.mismatch.coordinator import Coordinator
         from twin_worker.mismatch.process import DiagnosisProcess

@@ -104,7 +104,7 @@ def _from_parts(kind: Any, parts: Any) -> Any:
         ValueError, TypeError: when the parts do not make one.
     """
     if kind is np.ndarray:
-        return _array(*msgspec.convert(parts, tuple[str, tuple[int, ...], bytes | list[str]]))
+        return _array(parts)
     if get_origin(kind) is deque:
         item_type = get_args(kind)[0]
         maxlen, items = msgspec.convert(parts, tuple[int | None, list[item_type]], dec_hook=_from_parts)  # type: ignore[valid-type]
@@ -121,12 +121,19 @@ def _from_parts(kind: Any, parts: Any) -> Any:
     raise ValueError(f"{kind} of {first.shape} and {second.shape}")
 
 
-def _array(dtype: str, shape: tuple[int, ...], data: bytes | list[str]) -> np.ndarray:
-    """Return a writable array of numbers, or of text."""
-    if isinstance(data, list):
-        return np.array(data, object).reshape(shape)
-    if np.dtype(dtype).kind not in "biuf" or min(shape, default=0) < 0:
+def _array(parts: Any) -> np.ndarray:
+    """Return a writable array of numbers, or of text; without msgspec, because a twin has hundreds of them.
+
+    Raises:
+        ValueError, TypeError: when the parts are not type, shape and data.
+    """
+    dtype, shape, data = parts
+    if type(dtype) is not str or type(shape) is not list or not all(type(n) is int and n >= 0 for n in shape):
         raise ValueError(f"an array of {dtype!r} {shape}")
+    if type(data) is list:
+        return np.array(msgspec.convert(data, list[str]), object).reshape(shape)
+    if type(data) is not bytes or np.dtype(dtype).kind not in "biuf":
+        raise ValueError(f"an array of {dtype!r} of {type(data).__name__}")
     return np.frombuffer(data, dtype).reshape(shape).copy()
 
 

@@ -39,6 +39,11 @@ _BATCH_TIMEOUT_S = 20.0  # for all snapshots requested from one worker at once [
 _SNAPSHOT_TIMEOUT_S = (
     1.4  # for one snapshot; below half of the handover timeout, so that two lost ones do not end the handover [s]
 )
+# Rest between two snapshots from an owner that stays, in times of the duration of the last one [-], and its limit; the
+# limit and two lost snapshots fit into the handover timeout [s]. The CPU time of a handover delays predictions.
+_REST_FACTOR, _MAX_REST_S = 4.0, 0.15
+_TRANSFER_PAUSE_S = 0.5  # handovers count as ended this long after the last snapshot [s]
+_MAX_TRANSFER_S = 10.0  # heavy work waits no longer for handovers [s]
 _LEAVE_TIMEOUT_S = 5.0  # for the other workers to acquire everything at shutdown [s]
 _REPAIR_PERIOD_S = 1.0  # between checks for incomplete acquisitions [s]
 _MAX_CLOCK_WARNINGS = 100  # maximum number of workers with a clock warning
@@ -68,6 +73,8 @@ class OwnershipProtocol:
         self._query_threads: list[threading.Thread] = []
         self._unknown_peer = False  # a worker without a known token announces; tokens can arrive out of order
         self._repaired_t = float("-inf")
+        # times of the first and the last snapshot of the handovers in progress [s, monotonic]
+        self._transfer_begun = self._transferred_t = float("-inf")
         self._clock_warned: set[str] = set()  # workers whose epochs were rejected
 
     # --- from any thread ---------------------------------------------------------------------------------------------
@@ -94,6 +101,18 @@ class OwnershipProtocol:
     def may_write(self) -> bool:
         """Return whether this worker may publish results."""
         return not self.threaded or self.state.may_write(time.monotonic())
+
+    @property
+    def transferring(self) -> bool:
+        """Return whether snapshots are sent or received now, for which less urgent work should wait."""
+        now = time.monotonic()
+        return now - self._transferred_t < _TRANSFER_PAUSE_S and now - self._transfer_begun < _MAX_TRANSFER_S
+
+    def _count_transfer(self) -> None:
+        now = time.monotonic()
+        if now - self._transferred_t >= _TRANSFER_PAUSE_S:
+            self._transfer_begun = now
+        self._transferred_t = now
 
     def observe_stamp(self, uav: int, stamp: Stamp | None) -> None:
         """Record the publisher of an aircraft's result."""
@@ -153,6 +172,7 @@ class OwnershipProtocol:
         for uav in wanted:
             with self._lock:
                 epoch = self.state.owned.get(uav)
+            self._count_transfer()
             if epoch is not None and (twin := self._store.snapshot(uav, epoch)) is not None:
                 yield twin, None
 
@@ -248,17 +268,23 @@ class OwnershipProtocol:
     def _fetch_snapshots(self, worker: str, uavs: list[int]) -> None:
         """Request snapshots from one owner and acquire each on arrival.
 
-        One at a time: unread snapshots must fit into the buffers between two processes, else they are dropped.
+        One at a time: unread snapshots must fit into the buffers between two processes, else they are dropped. An owner
+        that stays publishes meanwhile, so its handover may last; one that leaves has little time.
         """
-        until = time.monotonic() + _BATCH_TIMEOUT_S
+        until, rest = time.monotonic() + _BATCH_TIMEOUT_S, threading.Event()
         for uav in uavs:
-            remaining_s = min(until - time.monotonic(), _SNAPSHOT_TIMEOUT_S)
+            started = time.monotonic()
+            remaining_s = min(until - started, _SNAPSHOT_TIMEOUT_S)
             if remaining_s > 0.0 and uav not in self.state.owned:
+                self._count_transfer()
                 payload = msgspec.msgpack.encode(HandoverRequest(uavs=(uav,)))
                 for twin in self._bus.get_stream(Handover, worker, payload, remaining_s):
                     self._accept_snapshot(worker, uavs, twin)
+                if self.threaded and uav in self.state.owned and worker in self.state.successors():
+                    rest.wait(min(_REST_FACTOR * (time.monotonic() - started), _MAX_REST_S))
 
     def _accept_snapshot(self, worker: str, uavs: list[int], twin: Handover) -> None:
+        self._count_transfer()
         now = time.monotonic()  # the owner responds: keep waiting for the rest
         with self._lock:
             self._requested = self._requested | dict.fromkeys(uavs, now)

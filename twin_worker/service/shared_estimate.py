@@ -102,12 +102,15 @@ class SharedEstimate(Generic[M]):
         return owner(self.assigned_id, dict.fromkeys([*workers, state.worker_id], ids)) == state.worker_id
 
     def step(self) -> None:
-        """Estimate and publish if this worker is assigned to it and an estimate is due."""
+        """Estimate and publish if this worker is assigned to it and an estimate is due; during handovers later.
+
+        A handover also assigns the estimate to another worker, for which it is due at once.
+        """
         if not self.is_assigned():
             self._epoch = 0
             return
         now = time.monotonic()
-        if now < self._due_t:
+        if now < self._due_t or self._ownership.transferring:
             return
         self._due_t = now + self.period_s
         with self._lock:

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from fleet.physics import point_mass, wrench
 from fleet.physics.simulate import N_STATE, coupled_plant, linear_plant, simulate
 from fleet.terrain.areas import Area
 from fleet.window import Window
+from twin_worker import CACHE_COMPLETE
 from twin_worker.alerts.traffic import TrafficMonitor
 from twin_worker.confidence.adaptive_conformal import AdaptiveLevels
 from twin_worker.confidence.prediction_log import PredictionLog
@@ -43,7 +44,6 @@ from twin_worker.twin.steps.extrapolate import continue_path, widen_tube
 from twin_worker.validation.held_out import HeldOut
 from twin_worker.validation.verify import verify
 
-_COMPLETE = "complete"  # file in the compile cache once it holds all functions
 _SPEED = 22.0  # [m/s]
 _HOME = Origin(470_000_000, 80_000_000, 100_000)
 _ITEMS = tuple(
@@ -56,22 +56,32 @@ def warm_up() -> None:
 
     With an empty cache two processes compile at once. Workers that start together wait for the first one's cache.
     """
+    for step in warm_up_steps():
+        step()
+
+
+def warm_up_steps() -> tuple[Callable[[], None], ...]:
+    """Return the steps of the warm-up, in order."""
+    return _fill_cache, *(step for group in _GROUPS for step in group)
+
+
+def _fill_cache() -> None:
+    """Compile everything if no process has done so before."""
     folder = Path(os.environ["NUMBA_CACHE_DIR"])
-    complete = folder / _COMPLETE
+    complete = folder / CACHE_COMPLETE
     if not complete.exists():
         with _locked(folder / "lock"):
             if not complete.exists():
                 _compile_in_two_processes()
                 complete.touch()
-    for group in _GROUPS:
-        group()
 
 
 def _compile_in_two_processes() -> None:
     """Compile the first group here and the second in a process of its own, which ends with this one."""
     command = f"from {__name__} import compile_second_group; compile_second_group()"
     with subprocess.Popen([sys.executable, "-c", command], stdin=subprocess.PIPE) as other:
-        _GROUPS[0]()
+        for step in _GROUPS[0]:
+            step()
         other.wait()  # what it failed to compile is compiled here
 
 
@@ -79,7 +89,8 @@ def compile_second_group() -> None:
     """Compile what the parent does not; end when the parent ends and closes standard input."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     threading.Thread(target=_exit_at_end_of_input, daemon=True).start()
-    _GROUPS[1]()
+    for step in _GROUPS[1]:
+        step()
 
 
 def _exit_at_end_of_input() -> None:
@@ -188,8 +199,9 @@ def _run_propagation() -> None:
         unexplained_velocity(start, air, np.zeros((*rows, 2)))
 
 
-def _run_telemetry(window: Window) -> None:
+def _run_telemetry() -> None:
     """Resample telemetry, hold an input, and score a prediction."""
+    window = _synthetic_flight()
     positions = to_geodetic(_HOME, window.p).astype(float)
     history = TelemetryHistory()
     for name, rows in (("attitude", window.x[:, 3:]), ("velocity", window.v), ("position", positions)):
@@ -215,15 +227,10 @@ def _run_identification() -> None:
     wrap(np.zeros((2, 3))[:, 2])
 
 
-def _run_others() -> None:
-    """Run the identification, multirotors, resampling, and the conflict detection."""
-    _run_identification()
-    _run_multirotors()
-    _run_telemetry(_synthetic_flight())
-    _run_traffic()
-
-
-_GROUPS = _run_fixed_wings, _run_others  # each takes half of the time of all
+_GROUPS = (  # each takes half of the time of all
+    (_run_fixed_wings,),
+    (_run_identification, _run_multirotors, _run_telemetry, _run_traffic),
+)
 
 
 def _synthetic_flight(seconds: float = 20.0, dt: float = 0.04) -> Window:

@@ -209,8 +209,10 @@ class Worker:
         return self._twins.ready()
 
     def _with_history(self) -> list[OwnedTwin]:
-        """Return the ready twins with past telemetry."""
-        return [owned for owned in self.owned_twins() if not owned.without_history]
+        """Return the ready twins with past telemetry; none during handovers, which need the CPU time."""
+        return (
+            [] if self.ownership.transferring else [owned for owned in self.owned_twins() if not owned.without_history]
+        )
 
     def sweep(self) -> int:
         """Step every twin once; return the number of ingested messages."""
@@ -250,7 +252,7 @@ class Worker:
         first = [one for one in ordered if one.twin.prediction.latest is None]
         new = [one for one in first if now - one.ready_since < _NEW_AIRCRAFT_S]
         self._update_budget()
-        self.quota.begin_sweep(first_prediction_pending=bool(new))
+        self.quota.begin_sweep(rollouts_only=bool(new) or self.ownership.transferring)
         ordered.sort(key=lambda one: (one not in new, not lacks_prediction(one, now), -rollout_age_s(one.twin)))
         return ordered
 
@@ -262,7 +264,7 @@ class Worker:
         if _MAX_STALL_S < elapsed < float("inf"):  # messages received meanwhile are not ingested yet: no silence
             for owned in self._owned.copy().values():
                 owned.last_arrival = min(owned.last_arrival + elapsed - _MAX_STALL_S, now)
-        self.cpu_share.yield_to_telemetry(late)
+        self.cpu_share.yield_to_telemetry(late or self.ownership.transferring)  # later raised step by step
         if self.ownership.threaded:
             self.quota.yield_to_telemetry(late)
         for work in (Work.PREDICT, Work.ENSEMBLE):
@@ -325,20 +327,18 @@ class Worker:
         self.ownership.threaded, self.quota.offloaded = True, frozenset({Work.IDENTIFY})
         self._collecting_s = min(_COLLECTED_SHARE * self.schedule.renew, _MAX_COLLECTING_S)
         self.connect()
-        loops = (
-            self.ownership.run,
-            self.identifier.run,
-            self.proposals.run,
-            self.wind_sharing.run,
-            self.sibling_sharing.run,
-        )
-        threads = [threading.Thread(target=run, args=(stop,), daemon=True) for run in (*loops, self._publish_fallbacks)]
+        sharing = self.wind_sharing.run, self.sibling_sharing.run
+        loops = self.ownership.run, self.identifier.run, self.proposals.run, *sharing
+        threads = [threading.Thread(target=run, args=(stop,), daemon=True) for run in loops]
+        left = threading.Event()
+        threads.append(threading.Thread(target=self._publish_fallbacks, args=(left,), daemon=True))
         for thread in threads:
             thread.start()
         self._sweep_while(lambda: not stop.is_set())
         handover = threading.Thread(target=self.ownership.leave, daemon=True)
         handover.start()
         self._sweep_while(handover.is_alive)  # each aircraft is published until its handover
+        left.set()
         for thread in (*threads, handover):
             thread.join(_JOIN_TIMEOUT_S)
 

@@ -4,7 +4,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from math import isfinite
-from typing import Any
+from typing import Any, ClassVar
 
 import msgspec
 import pytest
@@ -15,6 +15,7 @@ from fleet.bus.codec import encode
 from fleet.contract import Claim, Handover, HandoverRequest, History, Message, Sample, Status
 from tests.support import flights as f
 from tests.support.memory_bus import MemoryBus
+from twin_worker.ownership import protocol
 from twin_worker.ownership.cold_start import query_history
 from twin_worker.ownership.protocol import OwnershipProtocol
 from twin_worker.ownership.twin_store import INBOX_SIZE
@@ -94,6 +95,72 @@ def test_who_hands_over_many_is_waited_for_as_long_as_copies_come(
     assert claiming._request_handovers({OTHER.worker: [3]}) == [3]
 
 
+def test_other_work_waits_while_aircraft_change_hands_but_not_for_long(
+    worker: Worker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr("twin_worker.ownership.protocol.time.monotonic", lambda: now[0])
+    claiming, wanted = worker.ownership, msgspec.msgpack.encode(HandoverRequest(uavs=(1,)))
+    worker.bus.publish(Sample(uav=1, t=f.T0))
+    worker._owned[1].ready_since = float("-inf")
+    worker.quota.limit = 1.0
+
+    def free() -> bool:
+        worker._sweep_order()
+        assert worker.quota.rollouts_only == (worker._with_history() == [])
+        return bool(worker._with_history())
+
+    assert free()
+    assert list(worker.bus.get_stream(Handover, "x", wanted, 1.0)) and not free(), "a copy is sent"
+    assert worker.cpu_share.share < 1.0, "what has waited begins slowly"
+    now[0] += 0.6
+    assert free()
+    claiming._accept_snapshot("b", [2], Handover(t=f.T0, uav=2, epoch=1, code="", snapshot=b""))
+    assert not free(), "a copy has come"
+    for _ in range(30):
+        now[0] += 0.4
+        list(worker.bus.get_stream(Handover, "x", wanted, 1.0))
+    assert free(), "whoever asks on and on stops nothing"
+
+
+@pytest.mark.parametrize("leaving", [False, True])
+def test_who_stays_hands_over_slowly_and_who_leaves_does_not(
+    worker: Worker, monkeypatch: pytest.MonkeyPatch, leaving: bool
+) -> None:
+    class Rest:
+        taken: ClassVar[list[float]] = []
+
+        def wait(self, seconds: float) -> None:
+            self.taken.append(seconds)
+
+    now, claiming, asked = [100.0], worker.ownership, []
+
+    def get_stream(kind: type, who: object, payload: bytes, timeout_s: float) -> Iterator[Handover]:
+        (uav,) = msgspec.msgpack.decode(payload, type=HandoverRequest).uavs
+        now[0] += took[len(asked)]
+        asked.append(uav)
+        if uav != 3:  # that one is lost
+            yield Handover(t=f.T0, uav=uav, epoch=1, code=fleet.SOURCES, snapshot=b"")
+
+    took = [0.01, 1.4, 0.4]
+    monkeypatch.setattr("twin_worker.ownership.protocol.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("twin_worker.ownership.protocol.threading.Event", Rest)
+    monkeypatch.setattr(worker.bus, "get_stream", get_stream)
+    monkeypatch.setattr(worker._twins, "acquire", lambda *_: None)
+    claiming.threaded = True
+    worker.bus.declare_liveliness(OTHER.token)
+    claiming.state.on_claim(OTHER.worker, {}, leaving)
+    for one in (2, 3, 4):
+        now[0] += 0.01
+        claiming.tick()
+        claiming.state.resynchronise(1)
+        claiming._fetch_snapshots(OTHER.worker, [one])
+    expected = [] if leaving else [pytest.approx(4.0 * 0.01), protocol._MAX_REST_S]
+    assert asked == [2, 3, 4] and Rest.taken == expected
+    assert 2 * protocol._SNAPSHOT_TIMEOUT_S + protocol._MAX_REST_S < protocol._HANDOVER_TIMEOUT_S
+    Rest.taken.clear()
+
+
 # --- while threads of the bus are at work ----------------------------------------------------------------------------
 
 BLOCKED_S = 0.5  # how long a thread that may be waiting for a lock is waited for [s]
@@ -137,6 +204,18 @@ def test_what_the_bus_appends_while_a_twin_begins_is_taken_in(worker: Worker) ->
     for thread in held.inbox.threads:
         thread.join()
     assert [message.t - f.T0 for message in held.inbox] == [0.0, 1.0, 2.0, 3.0]
+
+
+def test_fallbacks_are_published_until_everything_is_handed_over(
+    worker: Worker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stop, published, found = threading.Event(), threading.Event(), list[bool]()
+    monkeypatch.setattr("twin_worker.service.worker.CHECK_PERIOD_S", 0.01)
+    monkeypatch.setattr("twin_worker.service.worker.publish_fallbacks", lambda *_: published.set())
+    monkeypatch.setattr(worker.ownership, "leave", lambda: found.append(published.wait(20.0)))
+    stop.set()
+    worker.run(stop)
+    assert found == [True]
 
 
 def test_two_that_are_asked_at_once_are_both_known_to_answer() -> None:

@@ -79,6 +79,17 @@ def test_the_other_takes_over_at_once_with_a_higher_epoch(seen) -> None:
     assert second._stamp == published[1][1] and first._stamp == published[1][1]
 
 
+def test_an_estimate_waits_while_aircraft_change_hands(seen) -> None:
+    _, sharing, published = seen
+    (estimator,) = [one for one in sharing if one.is_assigned()]
+    estimator._ownership._count_transfer()
+    estimator.step()
+    assert not published
+    estimator._ownership._transferred_t = float("-inf")
+    estimator.step()
+    assert len(published) == 1
+
+
 def test_bad_messages_are_counted_and_change_nothing(seen, caplog: pytest.LogCaptureFixture) -> None:
     bus, sharing, _ = seen
     for one in sharing:

@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import subprocess
 import sys
 import threading
 import time
@@ -10,11 +11,12 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from conftest import ROOT
 
 from fleet.contract import Prediction, Sample
 from tests.support import flights as f
 from tests.support.memory_bus import MemoryBus
-from twin_worker.__main__ import NICE_INCREMENT, _prepare
+from twin_worker.__main__ import NICE_INCREMENTS, run_at_low_priority
 from twin_worker.confidence.tube_and_horizon import AHEAD
 from twin_worker.service.busy_fallback import is_superseded, publish_fallbacks
 from twin_worker.service.identification_thread import MIN_SHARE, CpuShareLimiter
@@ -82,7 +84,7 @@ def test_ensembles_give_way_before_flights_ahead_and_time_of_others_does_not_cou
 def test_who_has_no_prediction_yet_comes_first_and_without_a_limit_nobody_waits(clock: list[float]) -> None:
     limited, free = ComputeBudget(limit=1.0), ComputeBudget()
     for quota in (limited, free):
-        quota.begin_sweep(first_prediction_pending=True)
+        quota.begin_sweep(rollouts_only=True)
         assert quota.try_acquire(Work.PREDICT)
     assert not limited.try_acquire(Work.IDENTIFY) and free.try_acquire(Work.IDENTIFY)
     clock[0] += 1e6
@@ -334,18 +336,36 @@ def test_who_renews_often_does_less_heavy_work_in_one_sweep() -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere threads have no priority of their own")
 def test_who_gets_ready_gives_way_to_those_that_hold_aircraft(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a thread of its own: nobody gets a priority back that was given away."""
-    nice, before = [], os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+    """On threads of their own: nobody gets a priority back that was given away."""
+    nice, before, now = [], os.getpriority(os.PRIO_PROCESS, threading.get_native_id()), [100.0]
+    monkeypatch.setattr("twin_worker.__main__.time.monotonic", lambda: now[0])
 
-    def found() -> None:
-        nice.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
+    def step() -> None:
+        nice.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) - before)
+        now[0] += 10.0
 
-    monkeypatch.setattr("twin_worker.service.warm_up.warm_up", found)
-    thread = threading.Thread(target=_prepare)
-    thread.start()
-    thread.join()
-    found()
-    assert nice == [min(before + NICE_INCREMENT, 19), before]
+    low, later = (min(before + increment, 19) - before for increment in NICE_INCREMENTS)
+    for limit_s, found in ((1e6, [low] * 4), (15.0, [low, low, later, later]), (0.0, [later] * 4)):
+        nice.clear()
+        said: list[float] = []
+        run_at_low_priority(iter([step] * 4), limit_s, said.append)
+        assert nice == found and said, "it ends on a busy machine as well"
+    step()
+    assert nice[-1] == 0
+
+
+def test_what_gets_ready_at_low_priority_is_all_that_a_worker_imports() -> None:
+    code = (
+        "import sys; from twin_worker import __main__ as main\n"
+        "for step in main._preparation(): step()\n"
+        "before = set(sys.modules)\n"
+        "from twin_worker.mismatch.process import DiagnosisProcess\n"
+        "from twin_worker.service.work_rates import counters\n"
+        "from twin_worker.service.worker import Worker\n"
+        "print(sorted(set(sys.modules) - before))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stdout.strip()) == (0, "[]"), done.stderr[-2000:]
 
 
 def test_who_could_not_even_be_renewed_is_the_first_to_be_flown_ahead() -> None:

@@ -135,7 +135,7 @@ class ComputeBudget:
     Attributes:
         limit: heavy work per sweep, CPU [s]; an overrun is deducted from the next sweep
         max_limit: limit while telemetry is on time, CPU [s]; late sweeps have a share of their own length
-        first_prediction_pending: an aircraft has no prediction yet; no other work starts
+        rollouts_only: an aircraft has no prediction yet, or is handed over; no other work starts
         backlog: telemetry of this aircraft is queued; a prediction made now would be outdated
         overloaded: telemetry arrives faster than it is processed; only the newest counts
         offloaded: kinds of work that another thread does
@@ -144,7 +144,7 @@ class ComputeBudget:
 
     limit: float = float("inf")
     max_limit: float = WORK_PER_SWEEP_S
-    first_prediction_pending: bool = False
+    rollouts_only: bool = False
     backlog: bool = False
     overloaded: bool = False
     offloaded: frozenset[Work] = frozenset()
@@ -162,14 +162,11 @@ class ComputeBudget:
         """Return whether a limit applies; offline runs have none."""
         return self.limit < float("inf")
 
-    def begin_sweep(self, *, first_prediction_pending: bool = False) -> None:
+    def begin_sweep(self, *, rollouts_only: bool = False) -> None:
         """Begin another sweep."""
         self.end_work()
         self._rollout_was_refused, self._rollout_refused = self._rollout_refused, False
-        self._spent, self.first_prediction_pending = (
-            max(self._spent - self.limit, 0.0),
-            first_prediction_pending and self.limited,
-        )
+        self._spent, self.rollouts_only = max(self._spent - self.limit, 0.0), rollouts_only and self.limited
 
     def yield_to_telemetry(self, late: bool) -> None:
         """Set the limit to a share of the last sweep's CPU time if it was late; raise it slowly otherwise."""
@@ -194,7 +191,7 @@ class ComputeBudget:
         if work is Work.RENEW:
             return True
         self.end_work()
-        rollouts_only = self.first_prediction_pending or (self._last_sweep_late and self._rollout_was_refused)
+        rollouts_only = self.rollouts_only or (self._last_sweep_late and self._rollout_was_refused)
         granted = self._spent < self.limit * _START_FRACTION[work] and not (rollouts_only and work is not Work.PREDICT)
         self._rollout_refused |= work is Work.PREDICT and not granted
         (self.done if granted else self.refused)[work] += 1
