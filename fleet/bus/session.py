@@ -189,7 +189,7 @@ class Bus(AbstractContextManager):
                     query.reply_err(str(error).encode(), encoding="text/plain")
 
         declared = key_of(kind, "*" if kind in PER_UAV else f"{self.writer:016x}")
-        channel = self._zenoh.handlers.RingChannel(_QUEUE_SIZE)
+        channel: zenoh.handlers.RingChannel[zenoh.Query] = self._zenoh.handlers.RingChannel(_QUEUE_SIZE)
         queryable = self._session.declare_queryable(declared, channel, complete=False)
         self._declared.append(queryable)
         self._consume(queryable.handler, on_query, declared)
