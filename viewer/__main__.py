@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     """
     check_port("--port", args.port)
     _check_approvals(args)
-    from fleet.bus.session import connect  # here, as --help and --version need none of these
+    from fleet.bus.session import connect, receive_on_one_thread  # here, as --help and --version need none of these
     from fleet.terrain.areas import read_areas
     from fleet.terrain.raster import read_raster
     from viewer.browser.http_server import serve, stop_server
@@ -96,6 +96,7 @@ def run(args: argparse.Namespace) -> int:
     areas = read_areas(args.areas) if args.areas else ()
     stop = stop_on_signal()
     gc.set_threshold(*GC_THRESHOLDS)
+    receive_on_one_thread()
     enable_malloc_trim(LARGE_BLOCK_BYTES)
     terrain_layer = TerrainLayer(terrain, imagery, tiles)
     with ExitStack() as stack:

@@ -124,4 +124,4 @@ def unpack_stamp(attachment: bytes | None) -> Stamp | None:
     """Unpack the attachment; None where it is missing or not 16 bytes."""
     if attachment is None or len(attachment) != _STAMP.size:
         return None
-    return Stamp(*_STAMP.unpack(attachment))
+    return Stamp._make(_STAMP.unpack(attachment))

@@ -11,6 +11,7 @@ from __future__ import annotations  # zenoh is imported when it is used: no `--h
 
 import json
 import logging
+import os
 import secrets
 import socket
 import threading
@@ -162,7 +163,7 @@ class Bus(AbstractContextManager):
                 samples: Iterable[zenoh.Sample] = islice(iter(channel.try_recv, None), _BUFFER_SIZE)
                 if kind in latest_only:
                     samples = {sample.key_expr: sample for sample in samples}.values()
-                if batch := [_raw_message(sample) for sample in samples]:
+                if batch := _raw_messages(samples):
                     callback(batch)
         finally:
             self._dispatching.release()
@@ -172,23 +173,26 @@ class Bus(AbstractContextManager):
 
         def on_query(query: zenoh.Query) -> None:
             with query:
-                uav = uav_of_key(str(query.key_expr)) if kind in PER_UAV else None
+                queried = query.key_expr
+                uav = uav_of_key(str(queried)) if kind in PER_UAV else None
+                is_wildcard = str(queried) == declared
                 reply_encoding = self._zenoh.Encoding(encoding(kind))
                 payload = query.payload.to_bytes() if query.payload is not None else b""
                 try:
                     for message, stamp in replies_about(uav, handler(uav, _parameters(query), payload)):
-                        name = key_of(kind, message.uav if kind in PER_UAV else f"{self.writer:016x}")
-                        if not query.key_expr.intersects(name):
+                        name = key_of(kind, message.uav) if kind in PER_UAV else declared
+                        if not (is_wildcard or queried.intersects(name)):
                             continue  # a key expression outside the contract, such as parauav/1$*/status
                         attachment = pack_stamp(stamp) if stamp else None
                         query.reply(name, encode(message), encoding=reply_encoding, attachment=attachment)
                 except ValueError as error:
                     query.reply_err(str(error).encode(), encoding="text/plain")
 
-        name = key_of(kind, "*" if kind in PER_UAV else f"{self.writer:016x}")
-        queryable = self._session.declare_queryable(name, self._zenoh.handlers.RingChannel(_QUEUE_SIZE), complete=False)
+        declared = key_of(kind, "*" if kind in PER_UAV else f"{self.writer:016x}")
+        channel: zenoh.handlers.RingChannel[zenoh.Query] = self._zenoh.handlers.RingChannel(_QUEUE_SIZE)
+        queryable = self._session.declare_queryable(declared, channel, complete=False)
         self._declared.append(queryable)
-        self._consume(queryable.handler, on_query, name)
+        self._consume(queryable.handler, on_query, declared)
 
     def get(self, kind: type[M], target: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
         """Query all writers of a class for at most `timeout_s` [s]; return the reply of highest epoch per aircraft.
@@ -216,8 +220,8 @@ class Bus(AbstractContextManager):
     def get_stream(self, kind: type[M], target: int | str, payload: bytes, timeout_s: float) -> Iterator[M]:
         """Query with a payload and yield every reply on arrival, for at most `timeout_s` [s]; omit error replies."""
         for reply in self._iter_replies(key_of(kind, target), timeout_s, payload, self._large_replies):
-            if (sample := reply.ok) is not None and (pair := self._decode_sample(kind, sample)) is not None:
-                yield pair[0]
+            if (sample := reply.ok) is not None and (message := self._decode(kind, sample)) is not None:
+                yield message
 
     def get_payloads(self, kind: type, target: int | str, timeout_s: float) -> Iterator[bytes]:
         """Query and yield the payload of every reply on arrival; skip other versions."""
@@ -248,13 +252,16 @@ class Bus(AbstractContextManager):
         return select_latest([pair for pair in pairs if pair is not None])
 
     def _decode_sample(self, kind: type, sample: zenoh.Sample) -> tuple[Any, Stamp | None] | None:
+        message = self._decode(kind, sample)
+        return None if message is None else (message, _stamp(sample))
+
+    def _decode(self, kind: type[M], sample: zenoh.Sample) -> M | None:
         try:
             uav = uav_of_key(str(sample.key_expr))
-            message: Any = decode_for_key(kind, uav, sample.payload.to_bytes(), str(sample.encoding))
+            return decode_for_key(kind, uav, sample.payload.to_bytes(), str(sample.encoding))
         except ValueError:
             self.bad += 1
             return None
-        return message, _stamp(sample)
 
     def declare_liveliness(self, name: str) -> None:
         """Declare the liveliness token `parauav/@live/{name}` for the lifetime of the session."""
@@ -289,8 +296,16 @@ def _stamp(sample: zenoh.Sample) -> Stamp | None:
     return unpack_stamp(sample.attachment.to_bytes() if sample.attachment is not None else None)
 
 
-def _raw_message(sample: zenoh.Sample) -> RawMessage:
-    return uav_of_key(str(sample.key_expr)), sample.payload.to_bytes(), str(sample.encoding), _stamp(sample)
+def _raw_messages(samples: Iterable[zenoh.Sample]) -> list[RawMessage]:
+    return [
+        (
+            uav_of_key(str(sample.key_expr)),
+            sample.payload.to_bytes(),
+            str(sample.encoding),
+            None if (attachment := sample.attachment) is None else unpack_stamp(attachment.to_bytes()),
+        )
+        for sample in samples
+    ]
 
 
 def _parameters(query: zenoh.Query) -> dict[str, str]:
@@ -310,6 +325,15 @@ def _config(settings: dict[str, Any]) -> zenoh.Config:
 
 def _as_bus_config(router: str | BusConfig) -> BusConfig:
     return router if isinstance(router, BusConfig) else BusConfig(router)
+
+
+def receive_on_one_thread() -> None:
+    """Let Zenoh receive on the thread of its other tasks; call it before the first `connect` of a process.
+
+    For processes with one router that only listen. By default two threads receive: they hand over to each other for
+    every few messages, which takes about a third of the CPU time of receiving. ZENOH_RUNTIME has precedence.
+    """
+    os.environ.setdefault("ZENOH_RUNTIME", "(rx: (handover: app))")
 
 
 def connect(router: str | BusConfig = ROUTER, *, retry: bool = False) -> Bus:

@@ -1,6 +1,8 @@
 """One law for both buses: what is published is heard, what is asked is answered, the highest epoch wins."""
 
 import os
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -365,3 +367,23 @@ def test_reachable_follows_the_router(free_port: int) -> None:
     with open_router(router):
         assert accepts_connections(router)
     assert not accepts_connections(router)
+
+
+LISTENER = """
+import sys, threading
+from pathlib import Path
+from fleet.bus.session import connect, receive_on_one_thread
+from fleet.contract import Status
+receive_on_one_thread()
+heard = threading.Event()
+with connect(sys.argv[1]) as bus:
+    bus.subscribe(Status, lambda message, stamp: heard.set())
+    bus.publish(Status(uav=7, t=1.0))
+    names = [(task / "comm").read_text() for task in Path("/proc/self/task").iterdir()]
+    print(heard.wait(10), any(name.startswith("rx") for name in names))
+"""
+
+
+def test_a_listener_receives_without_threads_of_its_own_for_it(router: tuple[str, zenoh.Session]) -> None:
+    run = subprocess.run([sys.executable, "-c", LISTENER, router[0]], capture_output=True, text=True, timeout=60)
+    assert run.stdout.split() == ["True", "False"], run.stderr

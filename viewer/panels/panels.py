@@ -229,7 +229,8 @@ class Panels:
         """
         self._pulse, palette, pick = not self._pulse, self._palette, self._handler(self._pick_input)
         selected_vehicle = next((vehicle for vehicle in fleet if vehicle.uav == selected), None)
-        shown = [vehicle for vehicle in fleet if self._passes(vehicle, now, selected)]
+        terms = self._search.value.lower().split()
+        shown = [vehicle for vehicle in fleet if self._passes(vehicle, now, selected, terms)]
         shown = sorted(shown, key=lambda vehicle: severity(vehicle, now))[:MAX_ROWS]
         self._browser.mark_present()
         self._workers = store.worker_texts()
@@ -281,12 +282,12 @@ class Panels:
         executed = execution_html(vehicle.execution, vehicle.uav, palette, code)
         return pending + executed + proposals_html(vehicle, palette, now, self.units, code)
 
-    def _passes(self, vehicle: Vehicle, now: float, selected: int | None) -> bool:
+    def _passes(self, vehicle: Vehicle, now: float, selected: int | None, terms: list[str]) -> bool:
         if self._filter == "Alerts" and not vehicle.alerts:
             return False
         if self._filter == "Selected" and vehicle.uav != selected:
             return False
-        if not (terms := self._search.value.lower().split()):
+        if not terms:
             return True
         mode = vehicle.status.mode if vehicle.status is not None else ""
         text = f"{vehicle.name} {vehicle.uav} {state_style(vehicle.record(now))[2]} {mode}".lower()

@@ -82,6 +82,11 @@ class FleetArrays:
         """Return the row of a UAV; None when it is not drawn."""
         return self._rows.get(uav) if uav is not None else None
 
+    def position(self, uav: int) -> np.ndarray | None:
+        """Return the drawn position of a UAV, (3,) [10 m]; None when it is not drawn."""
+        row = self.index(uav)
+        return None if row is None else self.at[row]
+
     def update_fleet(self, fleet: list[Vehicle], now: float) -> None:
         """Update UAVs and statuses; call it once per second."""
         self.fleet, self.now = fleet, now
@@ -162,9 +167,9 @@ class FleetArrays:
         self.trails = np.concatenate([self.trails[:, 1:], self.at[:, None]], axis=1)
         jumped = np.linalg.norm(self.trails[:, -1] - self.trails[:, -2], axis=1) > JUMP_M / UNIT_M
         self.trails[jumped] = self.trails[jumped, -1:]
-        for i, uav in enumerate(self.uavs):
-            if uav in played:
-                self.trails[i] = played[uav]
+        for uav, trail in played.items():
+            if (row := self.index(uav)) is not None:
+                self.trails[row] = trail
         self.trail_steps += 1
         self.revision += bool(jumped.any() or played)
 

@@ -54,8 +54,10 @@ class Labels:
             if tag.key not in self._assigned:
                 self._assigned[tag.key] = next(free)
             node = self._assigned[tag.key]
-            node.text, node.anchor = tag.text, tag.anchor
-            node.position, node.visible = tuple(float(x) for x in tag.at), True
+            for name, value in (("text", tag.text), ("anchor", tag.anchor), ("visible", True)):
+                if getattr(node, name) != value:
+                    setattr(node, name, value)
+            node.position = tuple(tag.at.tolist())
 
 
 class CameraView(NamedTuple):
@@ -91,22 +93,22 @@ def visible_labels(tags: list[Tag], camera_view: CameraView) -> tuple[list[Tag],
         return [], []
     points, depth = camera_view.project(np.array([tag.at for tag in tags]))
     shown: list[Tag] = []
-    boxes: list[np.ndarray] = []
+    boxes: list[Box] = []
     height = camera_view.height_px
     half = camera_view.aspect / 2 - EDGE_PX / height
-    lowest = np.array([-half, -0.5 + (camera_view.bottom_px + EDGE_PX) / height])
-    highest = np.array([half, 0.5 - (camera_view.top_px + EDGE_PX) / height])
-    for tag, point, label_depth in zip(tags, points, depth, strict=True):
-        for anchor in _ANCHORS[tag.anchor]:
-            box = _box(candidate := tag._replace(anchor=anchor), point, height)
-            inside = label_depth > 0 and (box[0] >= lowest).all() and (box[1] <= highest).all()
-            if inside and not any(overlap(box, other) for other in boxes):
-                shown.append(candidate)
+    lowest = -0.5 + (camera_view.bottom_px + EDGE_PX) / height
+    highest = 0.5 - (camera_view.top_px + EDGE_PX) / height
+    for tag, point, label_depth in zip(tags, points.tolist(), depth.tolist(), strict=True):
+        for anchor in _ANCHORS[tag.anchor] if label_depth > 0 else ():
+            box = (left, low), (right, high) = _box(tag.text, anchor, point, height)
+            inside = left >= -half and low >= lowest and right <= half and high <= highest
+            if inside and not any(_overlap(box, other) for other in boxes):
+                shown.append(tag._replace(anchor=anchor))
                 boxes.append(box)
                 break
         if len(shown) == MAX_LABELS:
             break
-    return shown, boxes
+    return shown, [np.array(box) for box in boxes]
 
 
 def overlap(box: np.ndarray, other: np.ndarray) -> bool:
@@ -114,12 +116,20 @@ def overlap(box: np.ndarray, other: np.ndarray) -> bool:
     return bool((box[0] < other[1]).all() and (other[0] < box[1]).all())
 
 
-def _box(tag: Tag, point: np.ndarray, height_px: float) -> np.ndarray:
-    """Return the corners of a label in the image, (2, 2) [image heights]."""
-    size = np.array([CHAR_EM * len(tag.text) + PADDING_EM, LINE_EM]) * EM_PX / height_px
-    vertical, horizontal = tag.anchor.split("-")
-    low = point + np.array([_SHIFT[horizontal], _SHIFT[vertical]]) * size
-    return np.stack([low, low + size])
+Box = tuple[tuple[float, float], tuple[float, float]]
+"""Low and high corner of a label, each right and up [image heights]."""
+
+
+def _overlap(box: Box, other: Box) -> bool:
+    return all(box[0][k] < other[1][k] and other[0][k] < box[1][k] for k in (0, 1))
+
+
+def _box(text: str, anchor: str, point: list[float], height_px: float) -> Box:
+    """Return the corners of a label at a point of the image, (2,) [image heights]."""
+    width, height = (CHAR_EM * len(text) + PADDING_EM) * EM_PX / height_px, LINE_EM * EM_PX / height_px
+    vertical, horizontal = anchor.split("-")
+    left, low = point[0] + _SHIFT[horizontal] * width, point[1] + _SHIFT[vertical] * height
+    return (left, low), (left + width, low + height)
 
 
 MAX_ALERT_LABELS = 6  # most labels at once; overlapping ones are omitted

@@ -17,11 +17,13 @@ class Strokes:
             name, _EMPTY, np.zeros((1, 2, 3), np.uint8), thickness=width, thickness_units="screen"
         )
 
+        self._colours: tuple[np.ndarray, int] | None = None  # as last drawn, and of how many segments
+
     def draw_parts(self, parts: list[tuple[np.ndarray, np.ndarray]]) -> None:
         """Show segments of several colours: pairs of segments (..., 2, 3) [10 m] and their one colour (3,)."""
         lines = [np.zeros((0, 2, 3)), *(segments.reshape(-1, 2, 3) for segments, _ in parts)]
-        colours = [np.broadcast_to(colour, (len(part), 3)) for part, (_, colour) in zip(lines[1:], parts, strict=True)]
-        self.draw(np.concatenate(lines), np.concatenate([np.zeros((0, 3)), *colours]))
+        colours = np.array([colour for _, colour in parts]).reshape(-1, 3)
+        self.draw(np.concatenate(lines), np.repeat(colours, [len(part) for part in lines[1:]], axis=0))
 
     def draw(self, segments: np.ndarray, colours: np.ndarray | None = None) -> None:
         """Show segments (n, 2, 3) [10 m]; colours (3,), (n, 3) or (n, 2, 3), sRGB [0..255]; None keeps them."""
@@ -34,7 +36,10 @@ class Strokes:
 
     def colour(self, colours: np.ndarray, n: int) -> None:
         """Colour n segments."""
-        colours = np.asarray(colours, float)
+        colours = np.array(colours, float)
+        if self._colours is not None and self._colours[1] == n and np.array_equal(self._colours[0], colours):
+            return
+        self._colours = colours, n
         if colours.ndim == 2:
             colours = colours[:, None, :]
         self._node.colors = np.broadcast_to(line_colour(colours), (n, 2, 3))
@@ -85,7 +90,7 @@ def faded(colour: np.ndarray, ground: np.ndarray, shares: np.ndarray) -> np.ndar
 
 def closed_loops(ring: np.ndarray) -> np.ndarray:
     """Return the closed loops of corners (..., sides, 3): (..., sides, 2, 3)."""
-    return np.stack([ring, np.roll(ring, -1, axis=-2)], axis=-2)
+    return np.stack([ring, np.concatenate([ring[..., 1:, :], ring[..., :1, :]], axis=-2)], axis=-2)
 
 
 def circle(centre: np.ndarray, radius: float, sides: int = 48) -> np.ndarray:

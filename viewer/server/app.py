@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
+from math import isfinite
 
 import numpy as np
 import viser
@@ -260,6 +261,6 @@ def estimate_ground(fleet: list[Vehicle], origin_m: float, previous: float) -> f
     homes = [alt for vehicle in fleet if (alt := home_alt_m(vehicle.mission)) is not None]
     if homes:
         return (min(homes) - origin_m) / UNIT_M
-    if floors := [vehicle.floor for vehicle in fleet if np.isfinite(vehicle.floor)]:
+    if floors := [vehicle.floor for vehicle in fleet if isfinite(vehicle.floor)]:
         return min([*floors, *(float(v.at[2]) for v in fleet if v.at is not None)]) - 0.05
     return min([previous, *(float(v.at[2]) - 6.0 for v in fleet if v.at is not None)])

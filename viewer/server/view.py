@@ -62,7 +62,7 @@ class View:
         self.measure, self._route = Measure(client.scene, palette), NOTHING
         self.heights: Callable[[np.ndarray], np.ndarray] = unknown_heights  # terrain under scene points
         self.areas: tuple[Area, ...] = ()  # geofence areas of the operator
-        self._positions: dict[int, np.ndarray] = {}  # drawn positions while measuring, by UAV
+        self._drawn: tuple[tuple[int, ...], np.ndarray] = (), np.zeros((0, 3))  # UAVs and their positions, (n, 3)
         self.selection, self._labels = Selection(client.scene, palette), Labels(client.scene)
         commands = {
             "Camera: show the whole fleet": ("F", self.show_all),
@@ -186,7 +186,7 @@ class View:
         self._pick(view.position, view.look_at - view.position)
 
     def _pick(self, start: np.ndarray, direction: np.ndarray) -> None:
-        anchors = [Anchor(f"UAV-{uav:03d}", at, uav) for uav, at in self._positions.items()]
+        anchors = [Anchor(f"UAV-{uav:03d}", at, uav) for uav, at in zip(*self._drawn, strict=True)]
         route = self._route
         anchors += [Anchor(f"item {n}", at) for n, at in zip(route.items.tolist(), route.points, strict=True)]
         view, level = self.camera.view(), self.scene.ground.height
@@ -275,8 +275,8 @@ class View:
             self.selection.clear()
         else:
             self.selection.draw(vehicle, self._store, now, ground=scene.ground.height, unit=scene.glyphs.unit)
-        self._positions = dict(zip(fleet_arrays.uavs, fleet_arrays.at, strict=True))
-        self.measure.draw(self._positions.get, scene.ground.height, scene.glyphs.unit, self.panels.units)
+        self._drawn = fleet_arrays.uavs, fleet_arrays.at
+        self.measure.draw(fleet_arrays.position, scene.ground.height, scene.glyphs.unit, self.panels.units)
         tags, marks = [*self.measure.tags, *self.selection.tags], self.selection.marks
         alerts = alert_labels(fleet_arrays, self._shown, self.selected, scene.glyphs.unit)
         self._labels.draw([*tags, *marks[:1], *alerts, *marks[1:]], camera_view)

@@ -93,10 +93,9 @@ def detect_events(state: DetectorState, message: Any) -> Detection:
 
 def _status(state: DetectorState, status: Status) -> Detection:
     lost = status.link is Link.LOST
-    if state.lost is None:
-        state = state._replace(lost=None if lost else False)
+    if state.lost is None and not lost:
+        state = state._replace(lost=False)
     state, events = _link(state, status.t, lost) if state.lost is not None else (state, [])
-    state = state._replace(status_t=status.t)
     if status.mode and status.mode != state.mode:
         events.append(TimelineEvent(status.t, EventKind.MODE, clip(status.mode, MAX_TEXT)))
     if status.armed != state.armed:
@@ -105,7 +104,8 @@ def _status(state: DetectorState, status: Status) -> Detection:
     sentence = "" if lost else status.sentence  # while lost, the sentence only counts seconds
     if sentence and sentence != state.sentence:
         events.append(TimelineEvent(status.t, EventKind.WARNING, _without_uav_prefix(sentence, status.uav)))
-    return state._replace(mode=status.mode or state.mode, armed=status.armed, sentence=sentence), events
+    mode = status.mode or state.mode
+    return state._replace(mode=mode, armed=status.armed, sentence=sentence, status_t=status.t), events
 
 
 def _link(state: DetectorState, t: float, lost: bool) -> Detection:

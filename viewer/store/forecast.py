@@ -1,18 +1,35 @@
 """Prediction in scene coordinates (checked on arrival, transformed on first use), and its error against the flight."""
 
-from functools import cached_property
+from functools import cached_property, lru_cache
+from math import isfinite
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
-from fleet.contract import Prediction
+from fleet.contract import Array, Prediction
 from viewer.store.place import REACH_M, UNIT_M, SceneFrame
 
 MAX_STEPS, MAX_AHEAD_S = 5_000, 3_600.0  # accepted look-ahead: steps, and time [s]
 MAX_ALTERNATIVES = 8  # accepted alternative paths
 _CHORD_S, _MAX_PARTS = 1.5, 4  # steps longer than this are subdivided, into at most so many parts
 PAST_AHEAD_S = 31.0  # look-ahead kept of a past prediction [s]
+
+
+class LookAheads(NamedTuple):
+    """Look-aheads of predictions: most workers send the same for every aircraft."""
+
+    s: np.ndarray  # (n,) [s]
+    is_rising: bool  # increasing, within one hour
+    past: np.ndarray  # those kept of a past prediction [s]
+
+
+@lru_cache(maxsize=64)
+def look_aheads(ahead: Array) -> LookAheads:
+    """Return the look-aheads of a prediction, (n,) with n of 2 to `MAX_STEPS`."""
+    s = ahead.numpy()
+    is_rising = (s[1:] > s[:-1]).all() and abs(s[0]) <= MAX_AHEAD_S and abs(s[-1]) <= MAX_AHEAD_S
+    return LookAheads(s, bool(is_rising), s[: int(np.searchsorted(s, PAST_AHEAD_S, side="right"))].copy())
 
 
 class ScenePrediction:
@@ -27,8 +44,8 @@ class ScenePrediction:
     @cached_property
     def horizon_s(self) -> float:
         """Return the confidence horizon, at most the last look-ahead sent [s]."""
-        horizon, last = self.message.horizon_s, float(self.message.ahead.numpy()[-1])
-        return float(min(max(horizon if np.isfinite(horizon) else 0.0, 0.0), last))
+        horizon, last = self.message.horizon_s, float(look_aheads(self.message.ahead).s[-1])
+        return float(min(max(horizon if isfinite(horizon) else 0.0, 0.0), last))
 
     @property
     def ahead(self) -> np.ndarray:
@@ -70,13 +87,10 @@ class ScenePrediction:
         """Interpolate the half-axes at look-aheads (k,) [s] -> (k, 3) [10 m]."""
         return np.stack([np.interp(ahead, self.ahead, self.tube[:, i]) for i in range(3)], axis=-1)
 
-    def to_past(self, previous: "PastPrediction | None" = None) -> "PastPrediction":
-        """Return the reduced record of this prediction; `previous` is the record before it."""
-        path, ahead = self.message.path.numpy(), self.message.ahead.numpy()
-        ahead = ahead[: int(np.searchsorted(ahead, PAST_AHEAD_S, side="right"))]
-        same = previous is not None and np.array_equal(previous.ahead, ahead)
-        ahead = previous.ahead if previous is not None and same else ahead.copy()
-        ned = path[: len(ahead)].copy()
+    def to_past(self) -> "PastPrediction":
+        """Return the reduced record of this prediction; records share their look-aheads."""
+        ahead = look_aheads(self.message.ahead).past
+        ned = self.message.path.numpy()[: len(ahead)].copy()
         return PastPrediction(self.t, self.horizon_s, ahead, ned, self.message.origin, self.scene_frame)
 
 
@@ -103,17 +117,16 @@ def check_prediction(message: Prediction, scene_frame: SceneFrame, received: flo
         ValueError: when its arrays disagree, are not finite or not increasing in time; the worker must resend.
         OutOfRangeError: when it is farther than 100 km from the fleet.
     """
-    ahead, path, tube = (a.numpy() for a in (message.ahead, message.path, message.prediction_region_half_axes))
-    n = ahead.shape[0] if ahead.ndim == 1 else -1
-    if n == 0:
+    ahead, path, tube = message.ahead, message.path.numpy(), message.prediction_region_half_axes.numpy()
+    n = ahead.shape[0] if len(ahead.shape) == 1 else -1
+    if n == 0 and not ahead.numpy().size:  # raises when the array is invalid
         return None
     if not 2 <= n <= MAX_STEPS or path.shape != (n, 3) or tube.shape != (n, 3):
         raise ValueError(
             f"uav-{message.uav}: prediction has shapes {ahead.shape} {path.shape} {tube.shape}, "
             f"expected (n,) (n, 3) (n, 3) with 2 to {MAX_STEPS} steps; resend"
         )
-    is_rising = (ahead[1:] > ahead[:-1]).all() and abs(ahead[0]) <= MAX_AHEAD_S and abs(ahead[-1]) <= MAX_AHEAD_S
-    if not is_rising or not np.isfinite(message.t):
+    if not look_aheads(ahead).is_rising or not isfinite(message.t):
         raise ValueError(f"uav-{message.uav}: prediction has times that do not increase within one hour; resend")
     others = [one.path.numpy() for one in message.alternatives]
     if len(others) > MAX_ALTERNATIVES or any(other.shape != (n, 3) for other in others):
@@ -121,7 +134,7 @@ def check_prediction(message: Prediction, scene_frame: SceneFrame, received: flo
             f"uav-{message.uav}: prediction has {len(others)} alternatives of shapes {[x.shape for x in others[:3]]}, "
             f"expected at most {MAX_ALTERNATIVES} of (n, 3); resend"
         )
-    if not all(np.abs(one).max() <= REACH_M for one in (path, *others)):  # also rejects NaN
+    if not all(one.min() >= -REACH_M and one.max() <= REACH_M for one in (path, *others)):  # also rejects NaN
         raise ValueError(f"uav-{message.uav}: prediction has a path that is not finite or beyond 100 km; resend")
     scene_frame.from_geodetic_point(*message.origin)
     return ScenePrediction(message, scene_frame, received)

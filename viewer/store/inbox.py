@@ -5,9 +5,9 @@ fleet only what is drawn is decoded.
 """
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
-from functools import cache
+from functools import cache, lru_cache
 from itertools import takewhile
 from math import inf, isfinite
 from typing import Any, NamedTuple
@@ -115,13 +115,17 @@ class Inbox(CoalescingQueue):
 
     def put(self, samples: list[RawMessage], now: float) -> None:
         """Queue samples in order of arrival."""
-        leg_changed = self._leg_changed_uavs
+        leg_changed, full_rate_uavs, large_fleet = self._leg_changed_uavs, self.full_rate_uavs, self.large_fleet
+        pending = self._pending
         for uav, payload, _, _ in samples:
             if uav is None:
                 self.dropped += 1
                 continue
-            is_new_leg = self.large_fleet and _LEG_KEY in payload and self._is_new_leg(uav, payload)
-            keep = not self.large_fleet or uav in self.full_rate_uavs or uav in leg_changed
+            is_new_leg = large_fleet and _LEG_KEY in payload and self._is_new_leg(uav, payload)
+            keep = not large_fleet or uav in full_rate_uavs or uav in leg_changed
+            if not (keep or is_new_leg) and uav in pending:  # most samples of a large fleet
+                pending[uav][1][-1] = QueuedMessage(payload, now)
+                continue
             if not self.add(uav, QueuedMessage(payload, now), keep=keep):
                 self.dropped += 1
                 continue
@@ -213,6 +217,16 @@ def _packed(dtype: str, width: int) -> struct.Struct:
     return struct.Struct(f"<{width}{_STRUCT_CODES[dtype]}")
 
 
+@lru_cache(maxsize=256)
+def _last_row_layout(dtype: str, shape: tuple[int, ...]) -> tuple[Callable[..., tuple[float, ...]], int, int]:
+    """Return the unpacker of the last row of a table, its offset, and the size of the table [bytes]; -1: invalid."""
+    n, width = shape
+    if n < 0 or not 0 < width < 100:
+        return tuple, 0, -1
+    pack = _packed(dtype, width)
+    return pack.unpack_from, (n - 1) * pack.size, n * pack.size
+
+
 def last_row(x: Array) -> tuple[float, ...]:
     """Return the last row of a table; empty when there is none.
 
@@ -221,11 +235,11 @@ def last_row(x: Array) -> tuple[float, ...]:
     """
     if len(x.shape) != 2 or not x.shape[0]:
         return ()
-    n, width = x.shape
-    if x.dtype not in _STRUCT_CODES or not 0 < width < 100 or len(x.data) != n * _packed(x.dtype, width).size:
-        return tuple(map(float, x.numpy()[-1]))  # raises with the reason
-    pack = _packed(x.dtype, width)
-    return pack.unpack_from(x.data, (n - 1) * pack.size)
+    if x.dtype in _STRUCT_CODES:
+        unpack_from, offset, size = _last_row_layout(x.dtype, x.shape)
+        if len(x.data) == size:
+            return unpack_from(x.data, offset)
+    return tuple(map(float, x.numpy()[-1]))  # raises with the reason
 
 
 def position_rows(uav: int, rows: Rows) -> tuple[Any, Any]:

@@ -4,6 +4,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ from viewer.store.forecast import PastPrediction, check_prediction
 from viewer.store.inbox import LARGE_FLEET, CoalescingQueue, Inbox, QueuedMessage, SampleSubset, decode_sample
 from viewer.store.place import OutOfRangeError, SceneFrame, checked_origin, first_fix
 from viewer.store.proposal import MAX_PROPOSALS, SceneProposal, check_proposal
-from viewer.store.vehicle import ENDED_S, JUMP_S, ProposalKey, Vehicle, stamp_of
+from viewer.store.vehicle import ENDED_S, JUMP_S, ProposalKey, Vehicle, mean_fit, stamp_of
 from viewer.theme.events import MAX_ALERTS
 
 MAX_VEHICLES = 2_000  # ids are untrusted input: further UAVs are counted, not stored
@@ -313,9 +314,9 @@ class FleetStore:
             return
         vehicle.model = model
         vehicle.process(model, now)
-        fits = [fit for fit in model.verdict.fit.values() if np.isfinite(fit)]
-        if fits and np.isfinite(model.t):
-            vehicle.fits.append((model.t, float(np.clip(np.mean(fits), 0, 100))))
+        fit = mean_fit(model.verdict.fit)
+        if fit is not None and isfinite(model.t):
+            vehicle.fits.append((model.t, min(max(fit, 0.0), 100.0)))
 
     def _prediction(self, message: Prediction, stamp: Stamp | None, now: float) -> None:
         vehicle = self._vehicle(message.uav)
@@ -336,7 +337,7 @@ class FleetStore:
         coasting = message.coast_s > COASTING_S
         vehicle.last_updated_forecast = vehicle.last_updated_forecast if coasting else scene_prediction
         if not coasting and (not vehicle.past or scene_prediction.t - vehicle.past[-1].t >= 0.9):
-            vehicle.past.append(scene_prediction.to_past(vehicle.past[-1] if vehicle.past else None))
+            vehicle.past.append(scene_prediction.to_past())
             while vehicle.past[0].t < scene_prediction.t - PAST_S:
                 vehicle.past.popleft()
 

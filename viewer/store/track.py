@@ -18,7 +18,7 @@ class FlightTrack:
 
     def __init__(self) -> None:
         self._rows = np.full((POINTS, 4), np.nan)  # t [s], scene ENU [10 m]; preallocated
-        self._n, self._step, self._last = 0, STEP_S, -np.inf
+        self._n, self._step, self._first, self._last = 0, STEP_S, -np.inf, -np.inf
 
     def add(self, points: list[tuple[float, float, float, float]]) -> bool:
         """Append points in time order, t [s], scene ENU [10 m]; skip older ones. Return whether the path jumped."""
@@ -30,12 +30,13 @@ class FlightTrack:
             if self._n == POINTS:
                 self._n, self._step = POINTS // 2, 2 * self._step
                 self._rows[: self._n] = self._rows[::2].copy()
+            self._first = self._first if self._n else point[0]
             self._rows[self._n] = point
             self._n, self._last = self._n + 1, point[0]
         return jumped
 
     def _is_jump(self, point: tuple[float, float, float, float]) -> bool:
-        if not self._n or point[0] - self._rows[0, 0] > STARTUP_S:
+        if not self._n or point[0] - self._first > STARTUP_S:
             return False
         last = self._rows[self._n - 1].tolist()
         return UNIT_M * dist(point[1:], last[1:]) > JUMP_M + JUMP_M_S * max(point[0] - last[0], 0.0)
@@ -50,7 +51,7 @@ class FlightTrack:
 
     def clear(self) -> None:
         """Remove all points."""
-        self._n, self._step, self._last = 0, STEP_S, -np.inf
+        self._n, self._step, self._first, self._last = 0, STEP_S, -np.inf, -np.inf
 
     def rows(self) -> np.ndarray:
         """Copy all points: (n, 4) t [s], scene ENU [10 m]."""
@@ -83,7 +84,8 @@ class Trail:
         """Copy the stored rows, oldest first: (n, 5)."""
         if self._n <= TRAIL_ROWS:
             return self._rows[: self._n].copy()
-        return np.roll(self._rows, -(self._n % TRAIL_ROWS), axis=0)
+        oldest = self._n % TRAIL_ROWS
+        return np.concatenate([self._rows[oldest:], self._rows[:oldest]])
 
 
 def _before(rows: np.ndarray, current: np.ndarray) -> np.ndarray:

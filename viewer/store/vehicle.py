@@ -3,6 +3,7 @@
 import re
 from collections import deque
 from dataclasses import dataclass, field
+from functools import lru_cache
 from math import isfinite
 from typing import Any, NamedTuple
 
@@ -44,6 +45,7 @@ JUMP_S = 5.0  # a larger step back in time is another flight: reset [s]
 OTHER_FLIGHT_S = 86_400.0  # a status farther from the sample time belongs to another flight [s]
 
 
+TIMED = SampleSubset, Status  # messages that carry the data time of the aircraft
 ProposalKey = tuple[AlertKind | None, int]
 """Identity of a proposal within one UAV, `Proposal.about`."""
 
@@ -99,6 +101,7 @@ class Vehicle:
     past: deque[PastPrediction] = field(default_factory=lambda: deque(maxlen=65))  # predictions of the last minute
     last_updated_forecast: ScenePrediction | None = None  # newest prediction made with current telemetry
     fits: deque = field(default_factory=lambda: deque(maxlen=64))  # t, mean fit [%]
+    fit_cache: list[tuple[dict[str, float], float | None]] = field(default_factory=lambda: [({}, None)])
 
     def trail_rows(self) -> np.ndarray:
         """Copy the newest stretch of the flown path: (n, 5) data time [s], scene ENU [10 m], Va [m/s]."""
@@ -141,7 +144,8 @@ class Vehicle:
 
     def _compute_record(self, now: float) -> StatusRecord:
         data_t, forecast = self.data_time(now), self.forecast
-        age_s = None if forecast is None or not isfinite(data_t) else max(data_t - forecast.t, 0.0)
+        lag_s = data_t - forecast.t if forecast is not None else 0.0
+        age_s = None if forecast is None or not isfinite(data_t) else max(lag_s, 0.0)
         horizon_s = claimed_horizon_s(forecast.horizon_s, age_s) if forecast is not None else 0.0
         return StatusRecord(
             data_t,
@@ -149,9 +153,9 @@ class Vehicle:
             self._fit(),
             horizon_s,
             bool(horizon_s) and forecast is not None and forecast.message.horizon_open,
-            self.sample_age_s(now),
+            max(data_t - self.t, 0.0) if isfinite(self.t) else np.inf,
             age_s,
-            self.prediction_lag_s(now),
+            self.prediction_lag_s(now) if lag_s > LATE_S else 0.0,
             now - self.result_accepted,
         )
 
@@ -159,7 +163,11 @@ class Vehicle:
         source: dict[str, float] = self.row.fit if self.row is not None else {}
         if self.model is not None:
             source = (self.model.active_verdict or self.model.verdict).fit
-        return mean_fit(source)
+        cached_source, cached = self.fit_cache[0]
+        if cached_source is not source:
+            cached = mean_fit(source)
+            self.fit_cache[0] = source, cached
+        return cached
 
     def at_pose_of(self, newest: "Vehicle", now: float) -> "Vehicle":
         """Return this snapshot at the newer pose and data time of another snapshot of the same UAV."""
@@ -212,7 +220,7 @@ class Vehicle:
 
     def process(self, message: Any, now: float) -> None:
         """Update data time and events from a message."""
-        if isinstance(message, SampleSubset | Status) and abs(message.t - self.t) < OTHER_FLIGHT_S:  # also rejects NaN
+        if isinstance(message, TIMED) and abs(message.t - self.t) < OTHER_FLIGHT_S:  # also rejects NaN
             self.time = self.time.update(message.t, now)
         if isinstance(message, SampleSubset):
             leg, active = message.leg, (self.detector_state.seq,)
@@ -283,4 +291,9 @@ def mean_fit(fit: dict[str, float]) -> float | None:
 
 def stamp_of(row: FleetRow) -> Stamp:
     """Return the fencing token of a fleet table row; the writer is untrusted text."""
-    return Stamp(row.epoch, int(row.worker, 16) if re.fullmatch("[0-9a-f]{16}", row.worker) else 0)
+    return Stamp(row.epoch, _writer(row.worker) if len(row.worker) == 16 else 0)
+
+
+@lru_cache(maxsize=256)
+def _writer(worker: str) -> int:
+    return int(worker, 16) if re.fullmatch("[0-9a-f]{16}", worker) else 0

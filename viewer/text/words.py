@@ -140,10 +140,13 @@ def fit_colour(fit: float | None, palette: Palette) -> str:
     return palette.verified if fit is not None and fit >= LOW_FIT else palette.predicting
 
 
+_STATE_RANK = {state: rank for rank, state in enumerate(STATE_STYLE)}
+
+
 def severity(vehicle: Vehicle, now: float) -> tuple[bool, int, float, int]:
     """Return a sort key: alerts first, then worst state, then shortest horizon; ended recordings last."""
     record = vehicle.record(now)
-    rank = len(STATE_STYLE) if vehicle.ended else list(STATE_STYLE).index(record.state)
+    rank = len(STATE_STYLE) if vehicle.ended else _STATE_RANK[record.state]
     return (not (vehicle.alerts or in_force(vehicle.mismatch)), rank, record.horizon_s, vehicle.uav)
 
 

@@ -1,5 +1,7 @@
 """Recording of one UAV for replay on the page: rows, predictions every 5 s, and states at a time."""
 
+from functools import lru_cache
+from math import isfinite
 from typing import NamedTuple
 
 import msgspec
@@ -7,7 +9,7 @@ import numpy as np
 
 from fleet.contract import Alert, AlertKey, Array, Link, Mismatch, Status, TwinState
 from fleet.frames import wrap
-from viewer.store.forecast import ScenePrediction
+from viewer.store.forecast import ScenePrediction, look_aheads
 from viewer.store.track import TRAIL_ROWS
 from viewer.store.vehicle import JUMP_S, Vehicle
 from viewer.theme.events import TimelineEvent
@@ -80,6 +82,16 @@ class UavRecording:
         return self._t[: self._n]
 
     @property
+    def first_t(self) -> float:
+        """Return the time of the first row [s since 1970]; inf without rows."""
+        return self._t.item(0) if self._n else np.inf
+
+    @property
+    def last_t(self) -> float:
+        """Return the time of the last row [s since 1970]; -inf without rows."""
+        return self._t.item(self._n - 1) if self._n else -np.inf
+
+    @property
     def x(self) -> np.ndarray:
         """Return the rows, (n, 7): scene ENU [10 m], phi theta psi [rad], Va [m/s]."""
         return self._x[: self._n]
@@ -93,17 +105,17 @@ class UavRecording:
 
         `now` is monotonic [s], `step_s` the shortest time between two recorded predictions [s].
         """
-        if self._n and vehicle.t < self._t[self._n - 1] - JUMP_S:
+        if vehicle.t < self.last_t - JUMP_S:
             self.__init__()  # type: ignore[misc]  # clock step back: another flight
-        if vehicle.at is not None and np.isfinite(vehicle.t) and (not self._n or vehicle.t > self._t[self._n - 1]):
+        if vehicle.at is not None and isfinite(vehicle.t) and vehicle.t > self.last_t:
             self._fill(vehicle, trail)
-            if not self._n or vehicle.t >= self._t[self._n - 1] + self._step:
-                self._append(vehicle.t, [*vehicle.at, *vehicle.attitude, vehicle.Va], vehicle.recorded)
+            if vehicle.t >= self.last_t + self._step:
+                self._append(vehicle.t, [*vehicle.at.tolist(), *vehicle.attitude, vehicle.Va], vehicle.recorded)
         self._record_state(vehicle, now, step_s)
 
     def _fill(self, vehicle: Vehicle, trail: np.ndarray) -> None:
         """Insert positions between two records, as for a fast replay; heading is the course."""
-        last = self._t[self._n - 1] if self._n else -np.inf
+        last = self.last_t
         if vehicle.t - last < GAP_S or len(trail) < 2:
             return
         between = trail[(trail[:, 0] > last + GAP_MARGIN_S) & (trail[:, 0] < vehicle.t - GAP_MARGIN_S)]
@@ -134,7 +146,7 @@ class UavRecording:
     def _record_state(self, vehicle: Vehicle, now: float, step_s: float) -> None:
         """Record the newest prediction if due, and the state if it changed."""
         at = vehicle.data_time(now)
-        if not np.isfinite(at):
+        if not isfinite(at):
             return
         forecast, self.events = vehicle.forecast, vehicle.events
         if forecast is not None and (not self.predictions or forecast.t >= self.predictions[-1].t + step_s):
@@ -198,18 +210,26 @@ def _size_bytes(forecast: ScenePrediction) -> int:
 def _reduced(forecast: ScenePrediction, previous: ScenePrediction | None) -> ScenePrediction:
     """Reduce a prediction to what is drawn: look-aheads up to `AFTER_S` past the horizon, shared texts."""
     message = forecast.message
-    ahead = message.ahead.numpy()
-    n = max(int(np.searchsorted(ahead, forecast.horizon_s + AFTER_S)) + 1, 2)
+    ahead = look_aheads(message.ahead).s
+    indices, recorded = _recorded_look_aheads(
+        message.ahead, max(int(np.searchsorted(ahead, forecast.horizon_s + AFTER_S)) + 1, 2)
+    )
     last = previous.message if previous is not None else None
     same = {name: getattr(last, name) for name in TEXT_FIELDS if getattr(last, name, None) == getattr(message, name)}
-    first, last_s = float(ahead[0]), float(ahead[:n][-1])
-    near_end = min(first + NEAR_S, last_s)
-    near, far = np.arange(first, near_end, NEAR_STEP_S), np.arange(near_end, last_s, FAR_STEP_S)
-    indices = np.unique(np.searchsorted(ahead[:n], np.concatenate([near, far, [last_s]])))
-    names = ("ahead", "path", "prediction_region_half_axes")
+    names = ("path", "prediction_region_half_axes")
     arrays = {name: Array.of(getattr(message, name).numpy()[indices]) for name in names}
-    if last is not None and last.ahead == arrays["ahead"]:
-        arrays["ahead"] = last.ahead
+    arrays["ahead"] = last.ahead if last is not None and last.ahead == recorded else recorded
     return ScenePrediction(
         msgspec.structs.replace(message, controller=None, **arrays, **same), forecast.scene_frame, forecast.received
     )
+
+
+@lru_cache(maxsize=256)
+def _recorded_look_aheads(ahead: Array, n: int) -> tuple[np.ndarray, Array]:
+    """Return the indices of the look-aheads recorded of the first n, and these look-aheads."""
+    s = look_aheads(ahead).s[:n]
+    first, last_s = float(s[0]), float(s[-1])
+    near_end = min(first + NEAR_S, last_s)
+    near, far = np.arange(first, near_end, NEAR_STEP_S), np.arange(near_end, last_s, FAR_STEP_S)
+    indices = np.unique(np.searchsorted(s, np.concatenate([near, far, [last_s]])))
+    return indices, Array.of(s[indices])

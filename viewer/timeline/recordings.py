@@ -106,10 +106,10 @@ class RecordingStore:
             the range, and the clock offsets of recordings of other days [s]
         """
         recordings = {vehicle.uav: self.by_uav[vehicle.uav] for vehicle in fleet}
-        reference_t = recordings[clock_vehicle.uav].t[0]
-        ahead = {v.uav: float(recordings[v.uav].t[0] - reference_t) for v in fleet if v.recorded}
+        reference_t = recordings[clock_vehicle.uav].first_t
+        ahead = {v.uav: recordings[v.uav].first_t - reference_t for v in fleet if v.recorded}
         shift = {uav: t for uav, t in ahead.items() if abs(t) > MAX_START_GAP_S}
-        end = max(recording.t[-1] - shift.get(uav, 0.0) for uav, recording in recordings.items())
-        begin = min(recording.t[0] - shift.get(uav, 0.0) for uav, recording in recordings.items())
+        end = max(recording.last_t - shift.get(uav, 0.0) for uav, recording in recordings.items())
+        begin = min(recording.first_t - shift.get(uav, 0.0) for uav, recording in recordings.items())
         begin = begin if clock_vehicle.recorded else max(begin, end - RETENTION_S)
-        return TimelineRange(float(begin), float(end)), shift
+        return TimelineRange(begin, end), shift

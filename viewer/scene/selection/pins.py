@@ -110,30 +110,38 @@ def path_frame(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     cross = np.stack([-ahead[:, 1], ahead[:, 0], np.zeros(len(path))], axis=-1)
     along = np.where(np.linalg.norm(run, axis=1)[index, None] > 1e-6, run[index], ahead)
     along = along / np.linalg.norm(along, axis=1)[:, None]
-    return cross, np.cross(along, cross)
+    x, y, z = along.T
+    cross_x, cross_y = cross[:, 0], cross[:, 1]
+    return cross, np.stack([-z * cross_y, z * cross_x, x * cross_y - y * cross_x], axis=-1)  # along x cross
 
 
-def rings(path: np.ndarray, axes: np.ndarray, sides: np.ndarray | None = None) -> np.ndarray:
+PathFrame = tuple[np.ndarray, np.ndarray]
+"""Cross and vertical unit vectors along a path, as of `path_frame`."""
+
+
+def rings(
+    path: np.ndarray, axes: np.ndarray, sides: np.ndarray | None = None, frame: PathFrame | None = None
+) -> np.ndarray:
     """Return the cross-sections (n, SIDES, 3) of the tube around a path (n, 3) with half-axes (n, 3) [10 m].
 
     `sides` are half-axes to the left and to the right, (n, 2) [10 m]; None: the half-axis across the path for both.
+    `frame` is that of the path where it is known.
     """
-    cross, up = path_frame(path)
+    cross, up = frame or path_frame(path)
     left, right = (axes[:, 1], axes[:, 1]) if sides is None else sides.T
     turn = np.linspace(0, 2 * np.pi, SIDES, endpoint=False)[None, :]
-    across = np.cos(turn) * np.where(np.cos(turn) > 0, left[:, None], right[:, None])
-    return (
-        path[:, None] + across[..., None] * cross[:, None] + np.sin(turn)[..., None] * (axes[:, 2, None] * up)[:, None]
-    )
+    cos, sin = np.cos(turn), np.sin(turn)
+    across = cos * np.where(cos > 0, left[:, None], right[:, None])
+    return path[:, None] + across[..., None] * cross[:, None] + sin[..., None] * (axes[:, 2, None] * up)[:, None]
 
 
-def surface_sides(path: np.ndarray, axes: np.ndarray) -> np.ndarray:
+def surface_sides(path: np.ndarray, axes: np.ndarray, frame: PathFrame | None = None) -> np.ndarray:
     """Return the half-axes left and right of a path (n, 3) at which its surface is drawn: (n, 2) [10 m].
 
     Towards the inside of a turn cross-sections wider than its radius intersect, and their surface would fold: it ends
     before the centre of the turn. Rings at single look-aheads are drawn in full.
     """
-    cross, _ = path_frame(path)
+    cross, _ = frame or path_frame(path)
     direction = np.unwrap(np.arctan2(-cross[:, 0], cross[:, 1]))  # of the horizontal path, from east [rad]
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1))])
     k = np.arange(len(path))
@@ -183,10 +191,15 @@ def tube_faces(n: int) -> np.ndarray:
 
 def curtain(path: np.ndarray, ground: float) -> tuple[np.ndarray, np.ndarray]:
     """Return a vertical surface from a path to the ground: corners (2 n, 3), triangles (2 (n - 1), 3)."""
-    foot = path * [1.0, 1.0, 0.0] + [0.0, 0.0, ground]
     k = np.arange(len(path) - 1) * 2
     faces = np.concatenate([np.stack([k, k + 1, k + 2], -1), np.stack([k + 1, k + 3, k + 2], -1)])
-    return np.stack([path, foot], axis=1).reshape(-1, 3), faces.astype(np.uint32)
+    return curtain_corners(path, ground), faces.astype(np.uint32)
+
+
+def curtain_corners(path: np.ndarray, ground: float) -> np.ndarray:
+    """Return the corners of the curtain of a path (n, 3): (2 n, 3) [10 m]."""
+    foot = path * [1.0, 1.0, 0.0] + [0.0, 0.0, ground]
+    return np.stack([path, foot], axis=1).reshape(-1, 3)
 
 
 def marked_look_aheads(horizon_s: float) -> list[float]:
@@ -194,13 +207,13 @@ def marked_look_aheads(horizon_s: float) -> list[float]:
     return [step for step in (5, 10, 20, 30, 60, 120) if step < horizon_s - max(2.0, 0.12 * horizon_s)]
 
 
-def sample_paths(path: np.ndarray, axes: np.ndarray, n: int, seed: int) -> np.ndarray:
+def sample_paths(path: np.ndarray, axes: np.ndarray, n: int, seed: int, frame: PathFrame | None = None) -> np.ndarray:
     """Sample paths that the tube around a path (k, 3) with half-axes (k, 3) [10 m] contains: (n, k, 3).
 
     Cross and vertical offsets are standard normal in units of the half-axes over `BAND_SIGMA` and rotate slowly into
     a second pair, so that errors are correlated along the path. A constant seed per UAV avoids flicker.
     """
-    cross, up = path_frame(path)
+    cross, up = frame or path_frame(path)
     begin, end = np.random.default_rng(seed).standard_normal((2, n, 2, 1))
     turn = np.linspace(0.0, 0.9, len(path))
     offset = (np.cos(turn) * begin + np.sin(turn) * end) / BAND_SIGMA

@@ -12,9 +12,11 @@ from viewer.scene.selection.ghosts import GhostPaths
 from viewer.scene.selection.pins import (
     EventMarkers,
     curtain,
+    curtain_corners,
     mark_tags,
     marked_look_aheads,
     pass_number,
+    path_frame,
     rings,
     sample_paths,
     surface_sides,
@@ -85,6 +87,11 @@ MARK_STEP_S = 0.5  # step of the path in which passes through one place are coun
 BEYOND_S = 20.0  # look-ahead of the grey dashes beyond the horizon [s]
 SHORTEST_S = 0.2  # shortest stretch of tube drawn before the horizon [s]
 SAMPLES = 6  # sample paths
+
+
+def _show(node: Any, *, visible: bool) -> None:
+    if node.visible != visible:
+        node.visible = visible
 
 
 class Selection:
@@ -179,20 +186,22 @@ class Selection:
         start = min(start, horizon_s - SHORTEST_S)
         at = slice_times(forecast, start, horizon_s)
         path, axes = forecast.position_at(at), forecast.half_axes_at(at)
-        sections = rings(path, axes, surface_sides(path, axes))
+        frame = path_frame(path)
+        sections = rings(path, axes, surface_sides(path, axes, frame), frame)
         opacities = band_opacities(axes, self._unit)
         for b, band in enumerate(self._bands):
             band.vertices = sections[b * BAND_STEPS : (b + 1) * BAND_STEPS + 1].reshape(-1, 3)
-            band.visible = self.tube
+            _show(band, visible=self.tube)
             if abs(band.opacity - opacities[b]) > 0.02:
                 band.opacity = float(opacities[b])
-        self._curtain.vertices, self._curtain.visible = curtain(path, ground)[0], self.tube
+        self._curtain.vertices = curtain_corners(path, ground)
+        _show(self._curtain, visible=self.tube)
         bold.append((chain(path), rgb(p.ink)))
         foot = path * [1, 1, 0] + [0, 0, ground + 0.05]
         thin.append((chain(foot), mix(p.tube, p.ground, 0.5)))
         thin.append((np.stack([path[-1], foot[-1]]), mix(p.horizon, p.ground, 0.5)))
         if self.tube:
-            paths = sample_paths(path, axes, SAMPLES, vehicle.uav)
+            paths = sample_paths(path, axes, SAMPLES, vehicle.uav, frame)
             thin.append((chain(paths), mix(p.tube, p.ground, 0.6)))
         self._draw_marks(forecast, record, start, thin)
         for k, (other, claim) in enumerate(zip(forecast.alternatives, forecast.message.alternatives, strict=True)):
@@ -226,7 +235,7 @@ class Selection:
 
     def _hide_tube(self) -> None:
         for node in (*self._bands, self._curtain):
-            node.visible = False
+            _show(node, visible=False)
         self._horizon.draw(NOTHING.legs)
 
     def draw_flight(self, vehicle: Vehicle, rows: np.ndarray, now: float, unit: float) -> None:
