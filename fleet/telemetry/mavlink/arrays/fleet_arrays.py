@@ -9,7 +9,7 @@ from fleet.contract import Sample
 from fleet.telemetry.mavlink.arrays.counts import MessageCounters
 from fleet.telemetry.mavlink.arrays.pack import FIELDS
 from fleet.telemetry.mavlink.arrays.row_arbiter import new_arbiter_state
-from fleet.telemetry.mavlink.arrays.rows import MAX_COLUMNS, WITH_EXTRA, PendingRows
+from fleet.telemetry.mavlink.arrays.rows import PendingRows
 from fleet.telemetry.tables import clock
 
 
@@ -53,15 +53,11 @@ class AircraftArrays:
             t: fleet time, increasing and later than all earlier rows, (n,) [s since 1970]
             x: values, (n, k)
         """
-        width = MAX_COLUMNS if x.shape[1] <= MAX_COLUMNS else WITH_EXTRA
-        padded = np.pad(x, ((0, 0), (0, width - x.shape[1])))
-        self.pending.add_rows(np.full(len(t), number * len(FIELDS) + FIELDS.index(field)), t, t, padded)
+        self.pending.add_rows(np.full(len(t), number * len(FIELDS) + FIELDS.index(field)), t, t, x)
 
     def take_samples(self, now: float) -> dict[int, EncodedMessage]:
         """Return the samples of rows received up to `now` [s since 1970], by aircraft number."""
         self.counts.count_until(now)
-        uavs = self.pending.uavs
-        return {
-            number: EncodedMessage(Sample, int(uavs[number]), payload, t)
-            for number, payload, t in self.pending.take_samples(now)
-        }
+        samples = self.pending.take_samples(now)
+        uavs = self.pending.uavs.tolist() if samples else []
+        return {number: EncodedMessage(Sample, uavs[number], payload, t) for number, payload, t in samples}
