@@ -167,12 +167,10 @@ def number_addresses(names, sizes, count):
 
 @nb.njit(cache=True, nogil=True)
 def _equal(a, b, size_a, size_b):
-    if size_a != size_b:
-        return False
-    for k in range(nb.uint64(min(size_a, len(a)))):
-        if a[k] != b[k]:
-            return False
-    return True
+    same = size_a == size_b
+    for k in range(min(size_a, len(a))):
+        same &= a[k] == b[k]
+    return same
 
 
 def read_address(raw: bytes) -> Hashable:

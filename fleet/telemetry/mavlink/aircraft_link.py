@@ -60,7 +60,7 @@ class AircraftLink:
         self.link = Link.LIVE
         self.autopilot, self.mode, self.armed = "generic", "", False
         self.custom_mode = 0  # of the last heartbeat
-        self.observer: Callable[[Any, float], None] | None = None  # receives each processed message, and its arrival
+        self._observer: Callable[[Any, float], None] | None = None
         self.vehicle_type = vehicles.UNKNOWN  # vehicle type from the heartbeat
         self.firmware = ""
         self.board_id = ""  # hardware id and firmware version of the autopilot, or empty
@@ -82,6 +82,16 @@ class AircraftLink:
         """Return the vehicle type; an ArduPlane quadplane also sends MAV_TYPE_FIXED_WING."""
         is_quadplane = self.vehicle_type == vehicles.FIXED_WING and self.params.values.get("Q_ENABLE", 0.0) > 0
         return vehicles.QUADPLANE if is_quadplane else self.vehicle_type
+
+    @property
+    def observer(self) -> Callable[[Any, float], None] | None:
+        """Return the function that receives each processed message, and its arrival."""
+        return self._observer
+
+    @observer.setter
+    def observer(self, observer: Callable[[Any, float], None] | None) -> None:
+        self._observer = observer
+        self.arrays.observed[self.number] = observer is not None
 
     @property
     def last_arrival(self) -> float:
@@ -127,6 +137,7 @@ class AircraftLink:
     def update_identity(self, message: Any) -> None:
         """Set autopilot and vehicle type from a heartbeat."""
         self.autopilot, self.vehicle_type = heartbeat.autopilot(message), heartbeat.vehicle(message)
+        self.arrays.autopilots[self.number] = heartbeat.AUTOPILOTS.index(self.autopilot)
 
     def process(self, message: Any, now: float) -> None:
         """Process one MAVLink message that is not a table row."""
@@ -147,8 +158,8 @@ class AircraftLink:
             self.board_id = heartbeat.board_id(message)
             if message.flight_sw_version:
                 self.firmware = self.firmware or heartbeat.firmware(message)
-        if self.observer is not None:
-            self.observer(message, now)
+        if self._observer is not None:
+            self._observer(message, now)
 
     def _process_home(self, message: Any) -> None:
         """Process HOME_POSITION: item 0 of an ArduPilot mission, the reference of relative altitudes of PX4."""

@@ -6,6 +6,7 @@ import numpy as np
 
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
 from fleet.telemetry.mavlink.arrays.fleet_arrays import AircraftArrays
+from fleet.telemetry.mavlink.arrays.pack import WIDEST, WIDTHS
 from fleet.telemetry.mavlink.arrays.row_arbiter import (
     ACCEPTED,
     FIELDS,
@@ -14,8 +15,8 @@ from fleet.telemetry.mavlink.arrays.row_arbiter import (
     SOURCE_TIMEOUT_S,
     arbitrate_rows,
 )
-from fleet.telemetry.mavlink.arrays.pack import WIDEST, WIDTHS
 from fleet.telemetry.mavlink.arrays.rows import sort_numbers
+from fleet.telemetry.mavlink.heartbeat import AUTOPILOTS
 from fleet.telemetry.mavlink.parsing.decode import Fields, Frames, GroupedFrames
 from fleet.telemetry.tables import clock
 from fleet.telemetry.tables.mavlink import SECOND_PORT, TABLE, own_seconds
@@ -40,7 +41,7 @@ def process_table_rows(
         aircraft: the aircraft on this link
         arrays: their state
     """
-    read = _read(frames, owner, aircraft)
+    read = _read(frames, owner, aircraft, arrays.autopilots)
     if read is None:
         return
     row, frame_numbers, raw_s, at, values = _join_ports(read, frames.arrival, owner, arrays.second_ports)
@@ -63,21 +64,22 @@ def process_table_rows(
         aircraft[k].queue(newest, aircraft[k].count_rejected, int(rejected[k]))
 
 
-def _read(frames: Frames, owner: np.ndarray, aircraft: Sequence[AircraftLink]) -> tuple[np.ndarray, ...] | None:
+def _read(
+    frames: Frames, owner: np.ndarray, aircraft: Sequence[AircraftLink], autopilots: np.ndarray
+) -> tuple[np.ndarray, ...] | None:
     """Apply all table rows to the frames of their messages; None without valid frames.
 
     Returns:
-        number in `TABLE`, (n,); frame number, (n,), non-decreasing; time stamp of the message, (n,) [s]; position of the
-        first value in the last array, (n,); values of all rows, (m,)
+        number in `TABLE`, (n,); frame number, (n,), non-decreasing; time stamp of the message, (n,) [s]; position of
+        the first value in the last array, (n,); values of all rows, (m,)
     """
     grouped = GroupedFrames(frames)
     messages = {name: _owned(*grouped.fields(name), owner) for name in grouped.names() if name in _MESSAGES}
-    masks = {row.autopilots: np.array([link.autopilot in row.autopilots for link in aircraft]) for row in _RESTRICTED}
     numbers, parts = [], []
     for number, row in enumerate(TABLE):
         if row.message not in messages:
             continue
-        frame_numbers, fields = _applicable(row, *messages[row.message], owner, masks)
+        frame_numbers, fields = _applicable(row, *messages[row.message], owner, autopilots)
         values, valid = _values(row, fields) if len(frame_numbers) else (np.empty((0, 0)), np.ones(0, bool))
         raw_s = own_seconds(row, fields) + np.zeros(len(frame_numbers))
         if not valid.all():
@@ -98,7 +100,7 @@ def _read(frames: Frames, owner: np.ndarray, aircraft: Sequence[AircraftLink]) -
 
 
 _MESSAGES = {row.message for row in TABLE}
-_RESTRICTED = [row for row in TABLE if row.autopilots]
+_IS_APPLICABLE = {row.autopilots: np.array([name in row.autopilots for name in AUTOPILOTS]) for row in TABLE}
 
 
 def _owned(frame_numbers: np.ndarray, fields: Fields, owner: np.ndarray) -> tuple[np.ndarray, Fields]:
@@ -111,15 +113,12 @@ def _selected(frame_numbers: np.ndarray, fields: Fields, mask: np.ndarray) -> tu
 
 
 def _applicable(
-    row: FieldSource,
-    frame_numbers: np.ndarray,
-    fields: Fields,
-    owner: np.ndarray,
-    masks: dict[tuple[str, ...], np.ndarray],
+    row: FieldSource, frame_numbers: np.ndarray, fields: Fields, owner: np.ndarray, autopilots: np.ndarray
 ) -> tuple[np.ndarray, Fields]:
-    """Return the frames to which a table row applies; `masks`: whether each aircraft has one of some autopilots."""
+    """Return the frames to which a table row applies."""
     if row.autopilots:
-        frame_numbers, fields = _selected(frame_numbers, fields, masks[row.autopilots][owner[frame_numbers]])
+        is_applicable = _IS_APPLICABLE[row.autopilots][autopilots]
+        frame_numbers, fields = _selected(frame_numbers, fields, is_applicable[owner[frame_numbers]])
     if row.when is not None:
         with np.errstate(all="ignore"):
             frame_numbers, fields = _selected(frame_numbers, fields, row.when(fields))

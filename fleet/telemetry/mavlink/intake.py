@@ -13,7 +13,7 @@ from fleet.config import MAX_UAVS
 from fleet.contract import Alert, Mission, Params, Sample, Status
 from fleet.telemetry.mavlink.aircraft_link import LINK_LOST_S, AircraftLink
 from fleet.telemetry.mavlink.arrays.counts import LAST_ARRIVAL
-from fleet.telemetry.mavlink.arrays.fleet_arrays import AircraftArrays
+from fleet.telemetry.mavlink.arrays.fleet_arrays import NOT_REPEATED, AircraftArrays
 from fleet.telemetry.mavlink.batch import process_table_rows
 from fleet.telemetry.mavlink.heartbeat import SenderConflict, is_aircraft
 from fleet.telemetry.mavlink.microservices.route import MISSION_MESSAGES
@@ -45,6 +45,10 @@ IS_SINGLE = np.zeros(len(EXTRA), bool)  # by message id: processed individually,
 IS_SINGLE[[IDS[name] for name in (*EARLY_MESSAGES, "HEARTBEAT", "STATUSTEXT", "AUTOPILOT_VERSION")]] = True
 IS_SINGLE[[IDS[name] for name in ("COMMAND_ACK", "MISSION_REQUEST", "MISSION_REQUEST_INT")]] = True
 IS_SINGLE[IDS["MISSION_CURRENT"]] = True  # also a table row
+_REPEATED = np.full(len(EXTRA), NOT_REPEATED)  # state messages, which an aircraft sends again and again
+_REPEATED[[IDS["HEARTBEAT"], IDS["MISSION_CURRENT"]]] = 0, 1
+_IS_TIMING = np.zeros(len(EXTRA), bool)
+_IS_TIMING[[IDS["SYSTEM_TIME"], IDS["TIMESYNC"]]] = True
 
 
 class MavlinkReceiver:
@@ -81,6 +85,7 @@ class MavlinkReceiver:
         self._early_count = 0  # number of these messages
         self._aircraft_by_number: list[AircraftLink] = []  # by number in the arrays, including removed aircraft
         self._registered_t: dict[int, float] = {}  # registration time by system id [s since 1970]
+        self._number_by_system: dict[int, int] = {}  # aircraft number by system id, also of removed aircraft
 
     def receive(self, arrival: float, data: bytes, source: Hashable = None) -> None:
         """Receive bytes that arrived together; the next `flush` processes them.
@@ -136,6 +141,7 @@ class MavlinkReceiver:
             elif message.get_type() in MISSION_MESSAGES:
                 target = self.aircraft.get(getattr(message, "target_system", 0))
                 if target is not None:
+                    self.arrays.forget_payloads(target.number)
                     target.queue(arrival, target.process_uplink, message)
 
     def release_sender(self, source: Hashable) -> None:
@@ -203,10 +209,18 @@ class MavlinkReceiver:
         """Process a batch of frames; `collect` returns the resulting messages."""
         if not len(frames.headers):
             return
-        frame_numbers = np.flatnonzero(IS_SINGLE[frames.headers[:, ID]])
-        for i, message in zip(frame_numbers.tolist(), frames.messages(frame_numbers), strict=True):
-            self._dispatch(i, float(frames.arrival[i]), message, frames.senders[frames.sender[i]])
-        owner = self._frame_owners(frames)
+        known = self._known_owners(frames)
+        singles = np.flatnonzero(IS_SINGLE[frames.headers[:, ID]])
+        is_repeated = self.arrays.find_repeated(frames.buf, frames.headers[singles], known[singles], _REPEATED)
+        if not is_repeated.all():
+            self._dispatch_all(frames, singles[~is_repeated])
+            before, known = known, self._known_owners(frames)
+            is_changed = known[singles] != before[singles]
+            if is_changed.any():  # an aircraft or sender is new: nothing of it is a repetition
+                self.arrays.forget_payloads(slice(None))
+                self._dispatch_all(frames, singles[is_repeated & is_changed])
+                known = self._known_owners(frames)
+        owner = self._frame_owners(frames, known)
         self._first_heartbeat.clear()
         owned = np.flatnonzero(owner >= 0)
         if len(owned):
@@ -215,17 +229,24 @@ class MavlinkReceiver:
             )
             process_table_rows(frames, owner, self._aircraft_by_number, self.arrays)
             queue_targets(frames, owner, self._aircraft_by_number)
-            update_timings(frames, owner, [link.timing for link in self._aircraft_by_number])
+            if _IS_TIMING[frames.headers[:, ID]].any():
+                update_timings(frames, owner, [link.timing for link in self._aircraft_by_number])
 
-    def _frame_owners(self, frames: Frames) -> np.ndarray:
-        """Return the aircraft number of each frame, -1 without owner, (n,)."""
-        links = self._aircraft_by_number
-        sender_index = {sender: index for index, sender in enumerate(frames.senders)}
-        is_owner = [self._id_owners.get(link.uav, link) is link for link in links]
-        pairs = zip(links, is_owner, strict=True)
-        expected = np.array([sender_index.get(craft.source, -1) if owns else -1 for craft, owns in pairs] + [-1])
+    def _dispatch_all(self, frames: Frames, frame_numbers: np.ndarray) -> None:
+        for i, message in zip(frame_numbers.tolist(), frames.messages(frame_numbers), strict=True):
+            self._dispatch(i, float(frames.arrival[i]), message, frames.senders[frames.sender[i]])
+
+    def _known_owners(self, frames: Frames) -> np.ndarray:
+        """Return the number of the aircraft that each frame's sender owns, -1 without, (n,)."""
+        index = {sender: number for number, sender in enumerate(frames.senders)}
+        owners, links = self._id_owners, self._aircraft_by_number
+        expected = [index.get(craft.source, -1) if owners.get(craft.uav, craft) is craft else -1 for craft in links]
         owner = self._number_by_address[(frames.headers[:, SYSTEM] << 8) + frames.headers[:, COMPONENT]]
-        owner[(owner >= 0) & (expected[owner] != frames.sender)] = -1
+        owner[(owner >= 0) & (np.array([*expected, -1])[owner] != frames.sender)] = -1
+        return owner
+
+    def _frame_owners(self, frames: Frames, owner: np.ndarray) -> np.ndarray:
+        """Return the aircraft number of each frame, -1 without owner, (n,); `owner`: as far as it is known."""
         counters, owned = self.arrays.counts.state, np.flatnonzero(owner >= 0)
         counters[owner[owned], LAST_ARRIVAL] = frames.arrival[owned]
         for group in _group_by_sender(frames, np.flatnonzero(owner < 0)):
@@ -287,10 +308,11 @@ class MavlinkReceiver:
 
     def _create_aircraft(self, uav: int, system: int, component: int, source: Hashable) -> AircraftLink:
         """Create an aircraft; reuse the previous number of its system id, if any."""
-        number = next((link.number for link in self._aircraft_by_number if link.system == system), None)
+        number = self._number_by_system.get(system)
         created = AircraftLink(self.arrays, uav, system, component, source, number=number)
         if number is None:
             self._aircraft_by_number.append(created)
+            self._number_by_system[system] = created.number
         else:
             self._aircraft_by_number[number] = created
             self.arrays.next_due_t[number] = -np.inf
@@ -326,6 +348,7 @@ class MavlinkReceiver:
         name = message.get_type()
         target = self.aircraft.get(getattr(message, "target_system", 0))
         if name in MISSION_MESSAGES and target is not None:
+            self.arrays.forget_payloads(target.number)
             target.queue(arrival, target.process_uplink, message)
         elif name == "HEARTBEAT":
             reason = "a second autopilot on one system id" if is_aircraft(message) else "not an aircraft"
