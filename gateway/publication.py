@@ -220,12 +220,20 @@ class Publisher:
 
     def publish(self, messages: Iterable[Any]) -> None:
         """Put messages on the bus."""
+        plain: list[EncodedMessage] = []  # not sent yet
         for message in messages:
             kind, stamp = type(message), None
             if kind in RESULT_TYPES and getattr(message, "kind", None) is not AlertKind.SECOND_SENDER:
                 message, stamp = self._with_epoch(message)
             wire = EncodedMessage(kind, message.uav if kind in PER_UAV else -1, encode(message), message.t)
-            self._send([wire], str(getattr(message, "kind", "")), stamp)
+            variant = str(getattr(message, "kind", ""))
+            if not variant and stamp is None:
+                plain.append(wire)
+                continue
+            self._send(plain)
+            self._send([wire], variant, stamp)
+            plain = []
+        self._send(plain)
 
     def put(self, wires: Sequence[EncodedMessage]) -> None:
         """Put packed messages on the bus; they never contain results of workers."""

@@ -248,7 +248,7 @@ class AircraftLink:
         self._rejected_values += count
 
     def _status(self, now: float) -> Status | None:
-        counters = self.arrays.counts.state[self.number]
+        counters = self.arrays.counts.state[self.number].tolist()
         self.link = Link.LOST if now - counters[LAST_COUNTED] > LINK_LOST_S else Link.LIVE
         state = (self.link, self.mode, self.armed, self._clock_jumps, self._clock_advance_s, self.home)
         elapsed = now - self._published_t

@@ -195,14 +195,13 @@ class MavlinkReceiver:
         messages: list[TelemetryMessage | EncodedMessage] = [
             alert for conflict in self._conflicts.values() for alert in conflict.take_alerts(now)
         ]
-        samples, due = self.arrays.take_samples(now), set(np.flatnonzero(self.arrays.next_due_t <= now).tolist())
-        for number in sorted(due.union(samples)):
-            link = self._aircraft_by_number[number]
-            if self._id_owners.get(link.uav) is link:
-                if number in samples:
-                    messages.append(samples[number])
-                if number in due:
-                    messages += link.collect(now)
+        samples, due = self.arrays.take_samples(now), np.flatnonzero(self.arrays.next_due_t <= now).tolist()
+        owners, links = self._id_owners, self._aircraft_by_number
+        messages += [wire for number, wire in samples.items() if owners.get(wire.uav) is links[number]]
+        for number in due:
+            link = links[number]
+            if owners.get(link.uav) is link:
+                messages += link.collect(now)
         return messages
 
     def process(self, frames: Frames) -> None:

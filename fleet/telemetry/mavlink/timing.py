@@ -54,12 +54,12 @@ class LinkTiming:
         """Return the timing fields of `Status`; `now` is fleet time [s since 1970]."""
         boot = self._clocks()[c.BOOT]
         self._update_drift(boot, now)
-        worst, boot[c.WORST_DELAY] = float(boot[c.WORST_DELAY]), 0.0
+        state, boot[c.WORST_DELAY] = boot.tolist(), 0.0
         return {
-            "clock_offset_s": float(boot[c.OFFSET]),
+            "clock_offset_s": state[c.OFFSET],
             "clock_drift": self.drift,
-            "latency_s": float(boot[c.DELAY]),
-            "latency_worst_s": worst,
+            "latency_s": state[c.DELAY],
+            "latency_worst_s": state[c.WORST_DELAY],
             "round_trip_s": min(self._round_trips) if self._round_trips else None,
             "gps_offset_s": self._gps_offset_s,
         }
