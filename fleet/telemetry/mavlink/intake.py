@@ -44,11 +44,8 @@ EARLY_MESSAGES = MISSION_MESSAGES | {"PARAM_VALUE", "HOME_POSITION"}  # sent onc
 IS_SINGLE = np.zeros(len(EXTRA), bool)  # by message id: processed individually, not as table rows
 IS_SINGLE[[IDS[name] for name in (*EARLY_MESSAGES, "HEARTBEAT", "STATUSTEXT", "AUTOPILOT_VERSION")]] = True
 IS_SINGLE[[IDS[name] for name in ("COMMAND_ACK", "MISSION_REQUEST", "MISSION_REQUEST_INT")]] = True
-IS_SINGLE[IDS["MISSION_CURRENT"]] = True  # also a table row
 _REPEATED = np.full(len(EXTRA), NOT_REPEATED)  # state messages, which an aircraft sends again and again
 _REPEATED[[IDS["HEARTBEAT"], IDS["MISSION_CURRENT"]]] = 0, 1
-_IS_TIMING = np.zeros(len(EXTRA), bool)
-_IS_TIMING[[IDS["SYSTEM_TIME"], IDS["TIMESYNC"]]] = True
 
 
 class MavlinkReceiver:
@@ -150,7 +147,7 @@ class MavlinkReceiver:
         self._process_pending()
         for link in self.aircraft.values():
             if link.source == source:
-                link.source = None
+                link.source = self.arrays.sources = None
 
     def _process_pending(self) -> None:
         if self._pending_frames:
@@ -184,6 +181,7 @@ class MavlinkReceiver:
         self._conflicting_systems.discard(system)
         self._number_by_address[(system << 8) + link.component] = -1
         self.arrays.reset_aircraft(link.number)
+        self.arrays.sources = None
         removed = AircraftLink(self.arrays, link.uav, system, link.component, number=link.number)
         self._aircraft_by_number[link.number] = removed
 
@@ -198,8 +196,7 @@ class MavlinkReceiver:
         samples, due = self.arrays.take_samples(now), np.flatnonzero(self.arrays.next_due_t <= now).tolist()
         owners, links = self._id_owners, self._aircraft_by_number
         messages += [wire for number, wire in samples.items() if owners.get(wire.uav) is links[number]]
-        for number in due:
-            link = links[number]
+        for link in [links[number] for number in due]:
             if owners.get(link.uav) is link:
                 messages += link.collect(now)
         return messages
@@ -213,9 +210,10 @@ class MavlinkReceiver:
         is_repeated = self.arrays.find_repeated(frames.buf, frames.headers[singles], known[singles], _REPEATED)
         if not is_repeated.all():
             self._dispatch_all(frames, singles[~is_repeated])
-            before, known = known, self._known_owners(frames)
-            is_changed = known[singles] != before[singles]
-            if is_changed.any():  # an aircraft or sender is new: nothing of it is a repetition
+            before, known = known[singles], self._known_owners(frames)
+            if (
+                is_changed := known[singles] != before
+            ).any():  # an aircraft or sender is new: nothing of it is a repetition
                 self.arrays.forget_payloads(slice(None))
                 self._dispatch_all(frames, singles[is_repeated & is_changed])
                 known = self._known_owners(frames)
@@ -228,8 +226,7 @@ class MavlinkReceiver:
             )
             process_table_rows(frames, owner, self._aircraft_by_number, self.arrays)
             queue_targets(frames, owner, self._aircraft_by_number)
-            if _IS_TIMING[frames.headers[:, ID]].any():
-                update_timings(frames, owner, [link.timing for link in self._aircraft_by_number])
+            update_timings(frames, owner, self._aircraft_by_number)
 
     def _dispatch_all(self, frames: Frames, frame_numbers: np.ndarray) -> None:
         for i, message in zip(frame_numbers.tolist(), frames.messages(frame_numbers), strict=True):
@@ -237,12 +234,21 @@ class MavlinkReceiver:
 
     def _known_owners(self, frames: Frames) -> np.ndarray:
         """Return the number of the aircraft that each frame's sender owns, -1 without, (n,)."""
-        index = {sender: number for number, sender in enumerate(frames.senders)}
-        owners, links = self._id_owners, self._aircraft_by_number
-        expected = [index.get(craft.source, -1) if owners.get(craft.uav, craft) is craft else -1 for craft in links]
+        if self.arrays.sources is None:
+            index: dict[Hashable, int] = {}
+            pairs = [(craft.source, self._id_owners.get(craft.uav) is craft) for craft in self._aircraft_by_number]
+            numbers = [index.setdefault(source, len(index)) if owns else -1 for source, owns in pairs]
+            self.arrays.sources = index, np.array([*numbers, -1])
+        index, expected = self.arrays.sources
+        sender = np.array([index.get(source, -2) for source in frames.senders])[frames.sender]
         owner = self._number_by_address[(frames.headers[:, SYSTEM] << 8) + frames.headers[:, COMPONENT]]
-        owner[(owner >= 0) & (np.array([*expected, -1])[owner] != frames.sender)] = -1
+        owner[expected[owner] != sender] = -1
         return owner
+
+    def _set_owner(self, uav: int, owner: AircraftLink) -> None:
+        """Give a UAV id to an aircraft, or update its sender."""
+        self._id_owners.get(uav, owner).arrays.sources = owner.arrays.sources = None
+        self._id_owners[uav] = owner
 
     def _frame_owners(self, frames: Frames, owner: np.ndarray) -> np.ndarray:
         """Return the aircraft number of each frame, -1 without owner, (n,); `owner`: as far as it is known."""
@@ -295,7 +301,8 @@ class MavlinkReceiver:
         else:
             self._conflicting_systems.discard(system)
             link = self._create_aircraft(uav, system, message.get_srcComponent(), source)
-            self.aircraft[system] = self._id_owners[uav] = link
+            self.aircraft[system] = link
+            self._set_owner(uav, link)
             self._registered_t[system] = self.arrays.counts.state[link.number, LAST_ARRIVAL] = arrival
             self._number_by_address[(system << 8) + link.component] = link.number
             self._first_heartbeat[system] = i
@@ -323,6 +330,7 @@ class MavlinkReceiver:
         if arrival - oldest.last_arrival <= SILENCE_LIMIT_S:
             return False
         del self._id_owners[oldest.uav]  # the receiver of its link removes it
+        oldest.arrays.sources = None
         return True
 
     def _accept_sender(self, link: AircraftLink, source: Hashable, arrival: float, count: int = 1) -> bool:
@@ -334,7 +342,8 @@ class MavlinkReceiver:
         if arrival - owner.last_arrival < LINK_LOST_S and not is_released:
             self._report_conflict(owner, arrival, source, count)
             return False
-        self._id_owners[link.uav], link.source = link, source
+        link.source = source
+        self._set_owner(link.uav, link)
         return True
 
     def _report_conflict(self, link: AircraftLink, arrival: float, source: Hashable, count: int = 1) -> None:

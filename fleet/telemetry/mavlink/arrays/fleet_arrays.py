@@ -1,6 +1,6 @@
 """Array state of the aircraft of one link or log: clocks, row arbitration, pending rows, counters."""
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 import numba as nb
 import numpy as np
@@ -35,6 +35,9 @@ class AircraftArrays:
         self.autopilots = np.empty(0, np.int8)  # index in `heartbeat.AUTOPILOTS`, (m,)
         self.observed = np.empty(0, bool)  # every message is processed, also a repeated one, (m,)
         self._last_payloads = np.empty((0, _REPEATED_KINDS, 1 + _MAX_REPEATED), np.uint8)  # size and bytes
+        self.sources: tuple[dict[Hashable, int], np.ndarray] | None = (
+            None  # senders of all aircraft; None: they changed
+        )
         self.second_ports: dict[int, tuple[float, np.ndarray]] = {}  # by aircraft: arrival [s since 1970], (8,) [us]
 
     def add_aircraft(self, uav: int) -> int:

@@ -18,6 +18,7 @@ WIDEST = np.array([ROW_WIDTHS[field][-1] for field in FIELDS])  # with the extra
 _INTEGER_FIELDS = {"position", "leg", "target", "gnss"}  # integer fields, <i4; all others are <f4
 IS_INTEGER = np.array([field in _INTEGER_FIELDS for field in FIELDS])
 _MAX_FIELD_HEADER = 160  # upper limit of the bytes of a field without its numbers
+_MAX_ABSENT = 24  # the same of a field without rows
 
 
 def _concatenated(*parts: bytes) -> tuple[np.ndarray, np.ndarray]:
@@ -162,10 +163,10 @@ def _max_size(start, stop, widths):
         has_rows = False
         for field in range(len(widths)):
             rows = stop[owner, field] - start[owner, field]
-            size += rows * (8 + 4 * widths[field])
+            size += rows * (8 + 4 * widths[field]) + (_MAX_FIELD_HEADER - _MAX_ABSENT if rows > 0 else 0)
             has_rows = has_rows or rows > 0
         if has_rows:
-            size += 64 + _MAX_FIELD_HEADER * len(widths)
+            size += 64 + _MAX_ABSENT * len(widths)
     return size
 
 
