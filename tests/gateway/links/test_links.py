@@ -292,31 +292,6 @@ def test_many_datagrams_at_once_are_what_one_by_one_are(family):
     assert told[0] == told[1]
 
 
-def test_a_round_takes_all_that_has_come_up_to_a_limit():
-    with udp() as far, udp() as near:
-        receive._set_buffer(far)
-        reader = receive.BatchReceiver(far)
-        assert receive.receive_round(reader) == (None, True)
-        sent = [bytes([k % 251]) * 3 for k in range(receive.MAX_DATAGRAMS)]
-        for data in (*sent, b"last"):
-            near.sendto(data, far.getsockname())
-        received, is_empty = receive.receive_round(reader)
-        assert [data for _, _, data in pieces(received)] == [*sent, b"last"] and is_empty
-        assert {sender for _, sender, _ in pieces(received)} == {near.getsockname()}
-
-
-class Flood:
-    """A receiver that always has more."""
-
-    def receive(self) -> ReceivedBytes:
-        return ReceivedBytes.from_pieces([(wall(), "foe", bytes(1000))] * receive.MAX_DATAGRAMS)
-
-
-def test_a_round_ends_in_a_flood():
-    received, is_empty = receive.receive_round(Flood())
-    assert len(received.start) == 2 * receive.MAX_DATAGRAMS and not is_empty
-
-
 def test_on_another_system_datagrams_come_one_by_one(monkeypatch):
     monkeypatch.setattr(receive.sys, "platform", "darwin")
     with udp() as sock:
