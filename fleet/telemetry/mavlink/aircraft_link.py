@@ -90,6 +90,7 @@ class AircraftLink:
 
     @observer.setter
     def observer(self, observer: Callable[[Any, float], None] | None) -> None:
+        """Set it, or remove it with None; an observed aircraft's repeated messages are processed too."""
         self._observer = observer
         self.arrays.observed[self.number] = observer is not None
 

@@ -27,7 +27,7 @@ from fleet.telemetry.mavlink.parsing.decode import (
     restore_message,
 )
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes, merge_received
-from fleet.telemetry.mavlink.parsing.scan import COMPONENT, EXTRA, ID, SEQ, SYSTEM
+from fleet.telemetry.mavlink.parsing.scan import COMPONENT, EXTRA, ID, PAYLOAD, SEQ, SIZE, SYSTEM
 from fleet.telemetry.mavlink.targets import queue_targets
 from fleet.telemetry.mavlink.timing import update_timings
 
@@ -196,9 +196,8 @@ class MavlinkReceiver:
         samples, due = self.arrays.take_samples(now), np.flatnonzero(self.arrays.next_due_t <= now).tolist()
         owners, links = self._id_owners, self._aircraft_by_number
         messages += [wire for number, wire in samples.items() if owners.get(wire.uav) is links[number]]
-        for link in [links[number] for number in due]:
-            if owners.get(link.uav) is link:
-                messages += link.collect(now)
+        for link in [links[number] for number in due if owners.get(links[number].uav) is links[number]]:
+            messages += link.collect(now)
         return messages
 
     def process(self, frames: Frames) -> None:
@@ -207,7 +206,9 @@ class MavlinkReceiver:
             return
         known = self._known_owners(frames)
         singles = np.flatnonzero(IS_SINGLE[frames.headers[:, ID]])
-        is_repeated = self.arrays.find_repeated(frames.buf, frames.headers[singles], known[singles], _REPEATED)
+        headers = frames.headers[singles]
+        payloads, kind = headers[:, [PAYLOAD, SIZE]], _REPEATED[headers[:, ID]]
+        is_repeated = self.arrays.find_repeated(frames.buf, payloads, known[singles], kind)
         if not is_repeated.all():
             self._dispatch_all(frames, singles[~is_repeated])
             before, known = known[singles], self._known_owners(frames)
@@ -236,8 +237,8 @@ class MavlinkReceiver:
         """Return the number of the aircraft that each frame's sender owns, -1 without, (n,)."""
         if self.arrays.sources is None:
             index: dict[Hashable, int] = {}
-            pairs = [(craft.source, self._id_owners.get(craft.uav) is craft) for craft in self._aircraft_by_number]
-            numbers = [index.setdefault(source, len(index)) if owns else -1 for source, owns in pairs]
+            owners, links = self._id_owners, self._aircraft_by_number
+            numbers = [index.setdefault(k.source, len(index)) if owners.get(k.uav) is k else -1 for k in links]
             self.arrays.sources = index, np.array([*numbers, -1])
         index, expected = self.arrays.sources
         sender = np.array([index.get(source, -2) for source in frames.senders])[frames.sender]
@@ -246,7 +247,7 @@ class MavlinkReceiver:
         return owner
 
     def _set_owner(self, uav: int, owner: AircraftLink) -> None:
-        """Give a UAV id to an aircraft, or update its sender."""
+        """Assign a UAV id to an aircraft, or update its sender."""
         self._id_owners.get(uav, owner).arrays.sources = owner.arrays.sources = None
         self._id_owners[uav] = owner
 
@@ -301,8 +302,8 @@ class MavlinkReceiver:
         else:
             self._conflicting_systems.discard(system)
             link = self._create_aircraft(uav, system, message.get_srcComponent(), source)
-            self.aircraft[system] = link
             self._set_owner(uav, link)
+            self.aircraft[system] = link
             self._registered_t[system] = self.arrays.counts.state[link.number, LAST_ARRIVAL] = arrival
             self._number_by_address[(system << 8) + link.component] = link.number
             self._first_heartbeat[system] = i
@@ -379,10 +380,9 @@ class MavlinkReceiver:
             self.rejected[NO_HEARTBEAT] += 1
 
     def _pop_early(self, system: int) -> list[tuple[float, Any]]:
-        buffered = self._early.pop(system, [])
+        buffered, decode = self._early.pop(system, []), msgspec.msgpack.decode
         self._early_count -= len(buffered)
-        rows = map(msgspec.msgpack.decode, buffered)
-        return [(arrival, restore_message(name, values)) for arrival, name, *values in rows]
+        return [(arrival, restore_message(name, values)) for arrival, name, *values in map(decode, buffered)]
 
 
 def unpacked(messages: list[TelemetryMessage | EncodedMessage]) -> list[TelemetryMessage]:

@@ -11,7 +11,6 @@ from fleet.telemetry.mavlink.arrays.counts import MessageCounters
 from fleet.telemetry.mavlink.arrays.pack import FIELDS
 from fleet.telemetry.mavlink.arrays.row_arbiter import new_arbiter_state
 from fleet.telemetry.mavlink.arrays.rows import PendingRows
-from fleet.telemetry.mavlink.parsing.scan import ID, PAYLOAD, SIZE
 from fleet.telemetry.tables import clock
 
 NOT_REPEATED = -1
@@ -61,16 +60,16 @@ class AircraftArrays:
         self.second_ports.pop(number, None)
         self.next_due_t[number] = np.inf
 
-    def find_repeated(self, buf: np.ndarray, headers: np.ndarray, owner: np.ndarray, kinds: np.ndarray) -> np.ndarray:
-        """Return whether each frame repeats the last payload of its kind and aircraft, (n,) bool; store the others.
+    def find_repeated(self, buf: np.ndarray, payloads: np.ndarray, owner: np.ndarray, kind: np.ndarray) -> np.ndarray:
+        """Return whether each message repeats the last payload of its kind and aircraft, (n,) bool; store the others.
 
         Args:
-            buf: bytes that contain the frames
-            headers: of the frames in order of reception, (n, 9)
-            owner: number of the aircraft of each frame, -1 without, (n,)
-            kinds: by message id: a number, 0 or 1, of messages whose repetition changes nothing, else NOT_REPEATED
+            buf: bytes that contain the messages
+            payloads: start and size of their payloads, in order of reception, (n, 2)
+            owner: number of the aircraft, -1 without, (n,)
+            kind: a number, 0 or 1, of a message whose repetition changes nothing, else NOT_REPEATED, (n,)
         """
-        return _find_repeated(buf, headers, owner, kinds, self.observed, self._last_payloads)
+        return _find_repeated(buf, payloads, owner, kind, self.observed, self._last_payloads)
 
     def forget_payloads(self, number: int | slice) -> None:
         """Forget the last payloads of an aircraft: the next messages count as new."""
@@ -96,13 +95,13 @@ class AircraftArrays:
 
 
 @nb.njit(cache=True, nogil=True)
-def _find_repeated(buf, headers, owner, kinds, observed, last):
-    repeated = np.zeros(len(headers), np.bool_)
-    for i in range(len(headers)):
-        kind, size, start = kinds[headers[i, ID]], headers[i, SIZE], headers[i, PAYLOAD]
-        if owner[i] < 0 or kind == NOT_REPEATED or size >= last.shape[2]:
+def _find_repeated(buf, payloads, owner, kind, observed, last):
+    repeated = np.zeros(len(payloads), np.bool_)
+    for i in range(len(payloads)):
+        start, size = payloads[i, 0], payloads[i, 1]
+        if owner[i] < 0 or kind[i] == NOT_REPEATED or size >= last.shape[2]:
             continue
-        known = last[owner[i], kind]
+        known = last[owner[i], kind[i]]
         is_same = known[0] == size
         for k in range(size):
             is_same = is_same and known[1 + k] == buf[start + k]

@@ -171,7 +171,7 @@ def _max_size(start, stop, widths):
 
 
 def pack_samples(
-    uavs: np.ndarray, start: np.ndarray, stop: np.ndarray, t: np.ndarray, values: np.ndarray, at: np.ndarray
+    uavs: np.ndarray, start: np.ndarray, stop: np.ndarray, t: np.ndarray, values: np.ndarray, *, at: np.ndarray
 ) -> list[Packed]:
     """Encode the rows of all aircraft that have rows.
 

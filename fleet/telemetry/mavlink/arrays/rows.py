@@ -66,7 +66,7 @@ class PendingRows:
         stop, limited = np.empty_like(self._start), np.empty_like(self._start)
         self._next_arrival = _find_arrived(self._start, self._end, self._arrival, now, stop, limited, self.dropped)
         start, self._start = self._start, stop
-        packed = pack_samples(self.uavs, start, limited, self._t, self._values, self._at)
+        packed = pack_samples(self.uavs, start, limited, self._t, self._values, at=self._at)
         if self._next_arrival == np.inf:
             self._row_keys, self._arrival = self._row_keys[:0], self._arrival[:0]
             self._t, self._at, self._values = self._t[:0], self._at[:0], self._values[:0]
