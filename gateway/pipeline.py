@@ -30,6 +30,7 @@ from gateway.record.recorder import LinkRecorder, RecordedQueue
 from gateway.status import StatisticsCollector
 
 TICK_S = 0.1  # between two publications of a live link [s]
+TICK_LAG_S = 0.01  # from a multiple of `TICK_S`, at which busy links receive, to the publication [s]
 IDLE_WAIT_S = 0.02  # wait at an empty queue [s]
 FLUSH_BYTES = 1 << 20  # bytes received that trigger a publication before the next tick, as in a flood
 STATISTICS_S = 1.0  # between two publications of statistics [s]
@@ -92,7 +93,8 @@ class Pipeline:
         for number, link in enumerate(self.links):
             link.start(number, self._queue, stop)
         try:
-            tick_due = statistics_due = time.monotonic()
+            statistics_due = time.monotonic()
+            tick_due = statistics_due - statistics_due % TICK_S + TICK_LAG_S
             while self._open and not stop.is_set():
                 self._drain(tick_due, stop)
                 now = time.monotonic()

@@ -31,6 +31,7 @@ from fleet.telemetry.recording.fleet_news import RESULT_TYPES
 
 HISTORY_S = 160.0  # length of the history of a twin
 MAX_BYTES = 512 << 20  # bytes over all aircraft; beyond, the history of every aircraft becomes shorter
+TRIM_S = 1.0  # excess of the history at which its oldest messages are deleted
 KINDS = (Sample, Status)
 
 
@@ -41,10 +42,12 @@ class _UavHistory:
         self.payloads: dict[type, deque[tuple[float, bytes]]] = {kind: deque() for kind in KINDS}
         self.size = 0
         self.since = since  # complete from this time on [s since 1970]
+        self.trimmed_before = since  # nothing older than this is stored [s since 1970]
 
     def trim(self, before: float, max_bytes: int) -> int:
         """Delete messages older than `before` [s since 1970] or beyond `max_bytes`; return the bytes deleted."""
         size = self.size
+        self.trimmed_before = before
         for queue in self.payloads.values():
             while queue and queue[0][0] < before:
                 self._drop_oldest(queue)
@@ -75,21 +78,24 @@ class HistoryStore:
 
     def add(self, wires: Iterable[EncodedMessage]) -> None:
         """Store packed messages; those without a time are skipped."""
+        longest_s = self._seconds + TRIM_S
         with self._lock:
-            for wire in wires:
-                if wire.kind in KINDS and isfinite(wire.t):
-                    self._add(wire)
+            for kind, uav, payload, t in wires:
+                if kind not in KINDS or not isfinite(t):
+                    continue
+                history = self._histories.get(uav) or self._add_uav(uav, t)
+                size = len(payload)
+                history.payloads[kind].append((t, payload))
+                history.size += size
+                self.size += size
+                if t - history.trimmed_before > longest_s or history.size > self._share:
+                    self.size -= history.trim(t - self._seconds, self._share)
 
-    def _add(self, wire: EncodedMessage) -> None:
-        history = self._histories.get(wire.uav)
-        if history is None:
-            history = self._histories[wire.uav] = _UavHistory(wire.t)
-            self._share = self._max_bytes // len(self._histories)
-            self.size -= sum(other.trim(float("-inf"), self._share) for other in self._histories.values())
-        size = len(wire.payload)
-        history.payloads[wire.kind].append((wire.t, wire.payload))
-        history.size += size
-        self.size += size - history.trim(wire.t - self._seconds, self._share)
+    def _add_uav(self, uav: int, t: float) -> _UavHistory:
+        history = self._histories[uav] = _UavHistory(t)
+        self._share = self._max_bytes // len(self._histories)
+        self.size -= sum(other.trim(other.trimmed_before, self._share) for other in self._histories.values())
+        return history
 
     def remove(self, uavs: Iterable[int]) -> None:
         """Remove aircraft; the others get their share of memory."""
@@ -175,8 +181,9 @@ class RouterSession:
         if not self._router:
             self.unsent += len(wires)
             return
+        put = self._bus.put
         for wire in wires:
-            self._bus.put(wire, stamp)
+            put(wire, stamp)
         self.published += len(wires)
 
 
@@ -213,12 +220,20 @@ class Publisher:
 
     def publish(self, messages: Iterable[Any]) -> None:
         """Put messages on the bus."""
+        plain: list[EncodedMessage] = []  # not sent yet
         for message in messages:
             kind, stamp = type(message), None
             if kind in RESULT_TYPES and getattr(message, "kind", None) is not AlertKind.SECOND_SENDER:
                 message, stamp = self._with_epoch(message)
             wire = EncodedMessage(kind, message.uav if kind in PER_UAV else -1, encode(message), message.t)
-            self._send([wire], str(getattr(message, "kind", "")), stamp)
+            variant = str(getattr(message, "kind", ""))
+            if not variant and stamp is None:
+                plain.append(wire)
+                continue
+            self._send(plain)
+            self._send([wire], variant, stamp)
+            plain = []
+        self._send(plain)
 
     def put(self, wires: Sequence[EncodedMessage]) -> None:
         """Put packed messages on the bus; they never contain results of workers."""
@@ -252,10 +267,11 @@ class Publisher:
 
     def _send(self, wires: Sequence[EncodedMessage], variant: str = "", stamp: Stamp | None = None) -> None:
         """Store and put messages; the latest of each `variant`, e.g. kind of alert, is stored."""
+        latest = self._latest
         with self._lock:
             for wire in wires:
-                if wire.kind in self._latest:
-                    self._latest[wire.kind][wire.uav, variant] = wire, stamp
+                if wire[0] in latest:
+                    latest[wire.kind][wire.uav, variant] = wire, stamp
         self.history.add(wires)
         self.session.send(wires, stamp)
 

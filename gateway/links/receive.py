@@ -16,7 +16,7 @@ from typing import Any, cast
 import numba as nb
 import numpy as np
 
-from fleet.telemetry.mavlink.parsing.received import ReceivedBytes, compact, read_only
+from fleet.telemetry.mavlink.parsing.received import ReceivedBytes, compact, merge_received, read_only
 from gateway.link_spec import LinkSpec
 from gateway.links.link import FIRST_RETRY_S, LAST_RETRY_S, POLL_S, Endpoint, wall
 
@@ -91,31 +91,25 @@ class BatchReceiver:
         self._messages_at = self._messages.ctypes.data
         sock.setsockopt(socket.SOL_SOCKET, _TIMESTAMPNS, 1)
         self._name_sizes, self._stamp_sizes = self._messages["name_size"], self._messages["control_size"]
-        self._senders: dict[bytes, Hashable] = {}
-        number_addresses(self._names[:2], self._name_sizes[:2])  # compile before the first datagram
+        self._lengths, self._senders = self._messages["length"], dict[bytes, Hashable]()
+        self._take(0)  # compile before the first datagram
 
     def receive(self) -> ReceivedBytes | None:
         """Return the pending datagrams; None without any."""
         self._name_sizes[:], self._stamp_sizes[:] = _ADDRESS, self._stamps.itemsize * _STAMP_NUMBERS
         count = self._recvmmsg(self._sock.fileno(), self._messages_at, MAX_DATAGRAMS, _DONTWAIT, None)
-        if count <= 0:  # no datagram, or an earlier send failed
-            return None
-        lengths = self._messages["length"][:count].astype(np.int64)
-        buf, stop = compact(self._slots, self._starts[:count], lengths)
-        if lengths.max() > _PAGE:
-            self._memory.madvise(mmap.MADV_DONTNEED)
-        sender, first = number_addresses(self._names[:count], self._name_sizes[:count])
-        names = [self._names[i, : self._name_sizes[i]].tobytes() for i in first.tolist()]
-        return ReceivedBytes(buf, stop - lengths, stop, self._arrivals(count), sender, tuple(map(self._sender, names)))
+        return self._take(count) if count > 0 else None  # no datagram, or an earlier send failed
 
-    def _arrivals(self, count: int) -> np.ndarray:
-        """Return the arrival times, non-decreasing, (n,) [s since 1970]; now for datagrams without a time stamp."""
-        now, stamps = wall(), self._stamps[:count]
-        stamped = (self._stamp_sizes[:count] > 0) & (stamps[:, 1] == _STAMPED)
-        delay = np.where(stamped, time.time() - stamps[:, 2] - stamps[:, 3] * 1e-9, 0.0)
-        arrivals = np.maximum.accumulate(np.maximum(now - np.clip(delay, 0.0, _MAX_DELAY_S), self._newest))
-        self._newest = float(arrivals[-1])
-        return arrivals
+    def _take(self, count: int) -> ReceivedBytes:
+        """Copy the first `count` datagrams."""
+        control = (self._stamps, self._stamp_sizes, wall(), time.time())
+        lengths, arrival, self._newest = read_headers(self._lengths, *control, self._newest, count)
+        buf, stop = compact(self._slots, self._starts[:count], lengths)
+        if len(buf) > _PAGE and lengths.max() > _PAGE:
+            self._memory.madvise(mmap.MADV_DONTNEED)
+        sender, first = number_addresses(self._names, self._name_sizes, count)
+        names = [self._names[i, : self._name_sizes[i]].tobytes() for i in first.tolist()]
+        return ReceivedBytes(buf, stop - lengths, stop, arrival, sender, tuple(map(self._sender, names)))
 
     def _sender(self, address: bytes) -> Hashable:
         if address not in self._senders:
@@ -131,13 +125,39 @@ def _addresses(array: np.ndarray) -> np.ndarray:
 
 
 @nb.njit(cache=True, nogil=True)
-def number_addresses(names, sizes):
+def read_headers(sizes, stamps, stamp_sizes, now, system_now, newest, count):
+    """Read the lengths and arrival times of the first `count` datagrams.
+
+    Args:
+        sizes: lengths, (m,) [bytes]
+        stamps, stamp_sizes: time stamp messages, (m, 4), and their sizes, (m,) [bytes]
+        now: fleet time [s since 1970]
+        system_now: the system's clock [s since 1970]
+        newest: arrival of the last datagram before [s since 1970]
+    Returns:
+        lengths, (n,) [bytes]; arrival times, non-decreasing, (n,) [s since 1970], now for datagrams without a time
+        stamp; the last of them
+    """
+    lengths, arrival = np.empty(count, np.int64), np.empty(count)
+    for i in range(count):
+        delay = 0.0
+        if stamp_sizes[i] > 0 and stamps[i, 1] == _STAMPED:
+            delay = min(max(system_now - stamps[i, 2] - stamps[i, 3] * 1e-9, 0.0), _MAX_DELAY_S)
+        newest = max(now - delay, newest)
+        lengths[i], arrival[i] = sizes[i], newest
+    return lengths, arrival, newest
+
+
+@nb.njit(cache=True, nogil=True)
+def number_addresses(names, sizes, count):
     """Number distinct addresses: number of each address, (n,), and index of its first occurrence, (k,)."""
-    number, first, k = np.empty(len(names), np.int64), np.empty(len(names), np.int64), 0
-    for i in range(len(names)):
-        candidate = 0
-        while candidate < k and not _equal(names[first[candidate]], names[i], sizes[first[candidate]], sizes[i]):
-            candidate += 1
+    number, first, k = np.empty(count, np.int64), np.empty(count, np.int64), 0
+    for i in range(count):
+        candidate = number[i - 1] if i else 0  # often the sender of the last datagram
+        if not (k and _equal(names[first[candidate]], names[i], sizes[first[candidate]], sizes[i])):
+            candidate = 0
+            while candidate < k and not _equal(names[first[candidate]], names[i], sizes[first[candidate]], sizes[i]):
+                candidate += 1
         if candidate == k:
             first[k] = i
             k += 1
@@ -148,7 +168,7 @@ def number_addresses(names, sizes):
 @nb.njit(cache=True, nogil=True)
 def _equal(a, b, size_a, size_b):
     same = size_a == size_b
-    for k in range(min(size_a, size_b)):
+    for k in range(min(size_a, len(a))):
         same &= a[k] == b[k]
     return same
 
@@ -164,10 +184,22 @@ def read_address(raw: bytes) -> Hashable:
 
 BUFFER = 1 << 26  # requested receive buffer: two seconds of 250 aircraft; memory is used only when filled [bytes]
 _RCVBUFFORCE = 33  # SO_RCVBUFFORCE: exceeds the system's limit, if permitted
-_MAX_WAIT_S = 0.02
+_WAIT_S, _BUSY_WAIT_S = 0.02, 0.05  # between two rounds of a link; of one that receives many datagrams [s]
+_BUSY = 100  # datagrams in a round of a busy link
+_ROUND_BYTES = 1 << 18  # received in one round, at least [bytes]
 _FLOOD_BYTES_S = 4e8  # buffer use of a flood of 300,000 datagrams a second [bytes/s]
 
 _log = logging.getLogger(__name__)
+
+
+def receive_round(source: "BatchReceiver | SingleReceiver") -> tuple[ReceivedBytes | None, bool]:
+    """Return the pending datagrams up to a limit, None without any; and whether none are left."""
+    parts: list[ReceivedBytes] = []
+    size, count = 0, MAX_DATAGRAMS
+    while count == MAX_DATAGRAMS and size < _ROUND_BYTES and (received := source.receive()) is not None:
+        parts.append(received)
+        size, count = size + len(received.buf), len(received.start)
+    return merge_received(parts) if parts else None, count < MAX_DATAGRAMS or size < _ROUND_BYTES
 
 
 class Udp(Endpoint):
@@ -201,17 +233,18 @@ class Udp(Endpoint):
 
     def _receive(self, sock: socket.socket) -> None:
         source = make_receiver(sock)
-        size = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-        wait_s = min(_MAX_WAIT_S, size / _FLOOD_BYTES_S)  # a batch of datagrams costs little more than one
+        longest_s = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) / _FLOOD_BYTES_S
         with selectors.DefaultSelector() as ready:
             ready.register(sock, selectors.EVENT_READ)
             while not self._stop.is_set():
                 if ready.select(POLL_S):
-                    received = source.receive()
+                    received, is_empty = receive_round(source)
                     if received is not None:
                         self._put(received)
-                    if received is None or len(received.start) < MAX_DATAGRAMS:  # else there is more
-                        self._stop.wait(wait_s)
+                    if is_empty:
+                        is_busy = received is not None and len(received.start) >= _BUSY
+                        wait_s = min(_BUSY_WAIT_S if is_busy else _WAIT_S, longest_s)
+                        self._stop.wait(wait_s - time.monotonic() % wait_s)  # all links at once, before a publication
 
     def send(self, where: Hashable, data: bytes, messages: int = 1) -> None:
         """Send one datagram; count its messages as unsent if the buffer is full or the peer unreachable."""

@@ -60,7 +60,7 @@ class AircraftLink:
         self.link = Link.LIVE
         self.autopilot, self.mode, self.armed = "generic", "", False
         self.custom_mode = 0  # of the last heartbeat
-        self.observer: Callable[[Any, float], None] | None = None  # receives each processed message, and its arrival
+        self._observer: Callable[[Any, float], None] | None = None
         self.vehicle_type = vehicles.UNKNOWN  # vehicle type from the heartbeat
         self.firmware = ""
         self.board_id = ""  # hardware id and firmware version of the autopilot, or empty
@@ -82,6 +82,17 @@ class AircraftLink:
         """Return the vehicle type; an ArduPlane quadplane also sends MAV_TYPE_FIXED_WING."""
         is_quadplane = self.vehicle_type == vehicles.FIXED_WING and self.params.values.get("Q_ENABLE", 0.0) > 0
         return vehicles.QUADPLANE if is_quadplane else self.vehicle_type
+
+    @property
+    def observer(self) -> Callable[[Any, float], None] | None:
+        """Return the function that receives each processed message, and its arrival."""
+        return self._observer
+
+    @observer.setter
+    def observer(self, observer: Callable[[Any, float], None] | None) -> None:
+        """Set it, or remove it with None; an observed aircraft's repeated messages are processed too."""
+        self._observer = observer
+        self.arrays.observed[self.number] = observer is not None
 
     @property
     def last_arrival(self) -> float:
@@ -127,6 +138,7 @@ class AircraftLink:
     def update_identity(self, message: Any) -> None:
         """Set autopilot and vehicle type from a heartbeat."""
         self.autopilot, self.vehicle_type = heartbeat.autopilot(message), heartbeat.vehicle(message)
+        self.arrays.autopilots[self.number] = heartbeat.AUTOPILOTS.index(self.autopilot)
 
     def process(self, message: Any, now: float) -> None:
         """Process one MAVLink message that is not a table row."""
@@ -147,8 +159,8 @@ class AircraftLink:
             self.board_id = heartbeat.board_id(message)
             if message.flight_sw_version:
                 self.firmware = self.firmware or heartbeat.firmware(message)
-        if self.observer is not None:
-            self.observer(message, now)
+        if self._observer is not None:
+            self._observer(message, now)
 
     def _process_home(self, message: Any) -> None:
         """Process HOME_POSITION: item 0 of an ArduPilot mission, the reference of relative altitudes of PX4."""
@@ -237,7 +249,7 @@ class AircraftLink:
         self._rejected_values += count
 
     def _status(self, now: float) -> Status | None:
-        counters = self.arrays.counts.state[self.number]
+        counters = self.arrays.counts.state[self.number].tolist()
         self.link = Link.LOST if now - counters[LAST_COUNTED] > LINK_LOST_S else Link.LIVE
         state = (self.link, self.mode, self.armed, self._clock_jumps, self._clock_advance_s, self.home)
         elapsed = now - self._published_t

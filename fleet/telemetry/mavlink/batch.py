@@ -6,6 +6,7 @@ import numpy as np
 
 from fleet.telemetry.mavlink.aircraft_link import AircraftLink
 from fleet.telemetry.mavlink.arrays.fleet_arrays import AircraftArrays
+from fleet.telemetry.mavlink.arrays.pack import WIDEST, WIDTHS
 from fleet.telemetry.mavlink.arrays.row_arbiter import (
     ACCEPTED,
     FIELDS,
@@ -14,7 +15,8 @@ from fleet.telemetry.mavlink.arrays.row_arbiter import (
     SOURCE_TIMEOUT_S,
     arbitrate_rows,
 )
-from fleet.telemetry.mavlink.arrays.rows import MAX_COLUMNS, WITH_EXTRA, same_width
+from fleet.telemetry.mavlink.arrays.rows import sort_numbers
+from fleet.telemetry.mavlink.heartbeat import AUTOPILOTS
 from fleet.telemetry.mavlink.parsing.decode import Fields, Frames, GroupedFrames
 from fleet.telemetry.tables import clock
 from fleet.telemetry.tables.mavlink import SECOND_PORT, TABLE, own_seconds
@@ -24,6 +26,7 @@ _TICK = np.array([row.tick for row in TABLE])
 _FIELD = np.array([FIELDS.index(row.field) for row in TABLE])
 _RANK = np.array([row.rank for row in TABLE])
 _SERVO = FIELDS.index("servo")
+_EXTRA = slice(int(WIDTHS[_SERVO]), int(WIDEST[_SERVO]))
 _REQUIRES = np.array([FIELDS.index(row.requires) if row.requires else NO_FIELD for row in TABLE])
 
 
@@ -38,10 +41,10 @@ def process_table_rows(
         aircraft: the aircraft on this link
         arrays: their state
     """
-    read = _read(frames, owner, aircraft)
+    read = _read(frames, owner, aircraft, arrays.autopilots)
     if read is None:
         return
-    row, frame_numbers, raw_s, values = _join_ports(read, frames.arrival, owner, arrays.second_ports)
+    row, frame_numbers, raw_s, at, values = _join_ports(read, frames.arrival, owner, arrays.second_ports)
     field, owner, arrival = _FIELD[row], owner[frame_numbers], frames.arrival[frame_numbers]
     n, count = len(row), len(aircraft)
     t, decision, advanced, jumped = np.empty(n), np.empty(n, np.int8), np.empty(n), np.full(count, np.nan)
@@ -49,7 +52,7 @@ def process_table_rows(
     arbitrate_rows(arrays.clocks, arrays.arbiter_state, *columns, t, decision, jumped, advanced)
     accepted = np.flatnonzero(decision == ACCEPTED)
     key = owner[accepted] * len(FIELDS) + field[accepted]
-    arrays.pending.add_rows(key, arrival[accepted], t[accepted], values[accepted])
+    arrays.pending.add_values(key, arrival[accepted], t[accepted], values, at[accepted])
     for k in np.flatnonzero(~np.isnan(jumped)).tolist():
         aircraft[k].queue(float(jumped[k]), aircraft[k].apply_clock_jump, clock.jumps(arrays.clocks[k]))
     for i in np.flatnonzero(advanced).tolist():
@@ -61,56 +64,76 @@ def process_table_rows(
         aircraft[k].queue(newest, aircraft[k].count_rejected, int(rejected[k]))
 
 
-def _read(frames: Frames, owner: np.ndarray, aircraft: Sequence[AircraftLink]) -> tuple[np.ndarray, ...] | None:
+def _read(
+    frames: Frames, owner: np.ndarray, aircraft: Sequence[AircraftLink], autopilots: np.ndarray
+) -> tuple[np.ndarray, ...] | None:
     """Apply all table rows to the frames of their messages; None without valid frames.
 
     Returns:
-        number in `TABLE`, (n,); frame number, (n,), non-decreasing; time stamp of the message, (n,) [s]; values,
-        (n, 8), or (n, 16) if an aircraft of the batch uses extra columns
+        number in `TABLE`, (n,); frame number, (n,), non-decreasing; time stamp of the message, (n,) [s]; position of
+        the first value in the last array, (n,); values of all rows, (m,)
     """
-    grouped, autopilots = GroupedFrames(frames), np.array([link.autopilot for link in aircraft])
-    names, parts = set(grouped.names()), []
+    grouped = GroupedFrames(frames)
+    messages = {name: _owned(*grouped.fields(name), owner) for name in grouped.names() if name in _MESSAGES}
+    numbers, parts = [], []
     for number, row in enumerate(TABLE):
-        if row.message not in names:
+        if row.message not in messages:
             continue
-        frame_numbers, fields = grouped.fields(row.message)
-        applicable = _applicable(row, fields, owner[frame_numbers], autopilots)
-        frame_numbers, fields = frame_numbers[applicable], Fields(fields.rows[applicable])
-        if not len(frame_numbers):
-            continue
-        values, valid = _values(row, fields)
-        _reject(row.message, frames, frame_numbers[~valid], owner, aircraft)
-        raw_s = np.broadcast_to(own_seconds(row, fields), len(frame_numbers))
-        parts.append((np.full(valid.sum(), number), frame_numbers[valid], raw_s[valid], values[valid]))
+        frame_numbers, fields = _applicable(row, *messages[row.message], owner, autopilots)
+        values, valid = _values(row, fields) if len(frame_numbers) else (np.empty((0, 0)), np.ones(0, bool))
+        raw_s = own_seconds(row, fields) + np.zeros(len(frame_numbers))
+        if not valid.all():
+            _reject(row.message, frames, frame_numbers[~valid], owner, aircraft)
+            frame_numbers, raw_s, values = frame_numbers[valid], raw_s[valid], values[valid]
+        if len(frame_numbers):
+            numbers.append(number)
+            parts.append((frame_numbers, raw_s, values))
     if not parts:
         return None
-    *others, all_values = zip(*parts, strict=True)
-    columns = [np.concatenate(column) for column in (*others, same_width(*all_values))]
-    order = np.argsort(columns[1], kind="stable")
-    return tuple(column[order] for column in columns)
+    counts, widths = [len(part[0]) for part in parts], [part[2].shape[1] for part in parts]
+    row_number, width = np.repeat(numbers, counts), np.repeat(widths, counts)
+    frame_numbers, raw_s = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
+    order, _ = sort_numbers(frame_numbers, len(frames.headers))
+    at = np.cumsum(width) - width
+    all_values = np.concatenate([values.ravel() for *_, values in parts])
+    return row_number[order], frame_numbers[order], raw_s[order], at[order], all_values
 
 
-def _applicable(row: FieldSource, fields: Fields, owner: np.ndarray, autopilots: np.ndarray) -> np.ndarray:
-    """Return a mask of the frames to which a table row applies, (n,)."""
-    applicable = owner >= 0
-    if row.autopilots and applicable.any():
-        applicable[applicable] = np.isin(autopilots, row.autopilots)[owner[applicable]]
+_MESSAGES = {row.message for row in TABLE}
+_IS_APPLICABLE = {row.autopilots: np.array([name in row.autopilots for name in AUTOPILOTS]) for row in TABLE}
+
+
+def _owned(frame_numbers: np.ndarray, fields: Fields, owner: np.ndarray) -> tuple[np.ndarray, Fields]:
+    """Return the frames that have an owner."""
+    return _selected(frame_numbers, fields, owner[frame_numbers] >= 0)
+
+
+def _selected(frame_numbers: np.ndarray, fields: Fields, mask: np.ndarray) -> tuple[np.ndarray, Fields]:
+    return (frame_numbers, fields) if mask.all() else (frame_numbers[mask], Fields(fields.rows[mask]))
+
+
+def _applicable(
+    row: FieldSource, frame_numbers: np.ndarray, fields: Fields, owner: np.ndarray, autopilots: np.ndarray
+) -> tuple[np.ndarray, Fields]:
+    """Return the frames to which a table row applies."""
+    if row.autopilots:
+        is_applicable = _IS_APPLICABLE[row.autopilots][autopilots]
+        frame_numbers, fields = _selected(frame_numbers, fields, is_applicable[owner[frame_numbers]])
     if row.when is not None:
         with np.errstate(all="ignore"):
-            applicable &= row.when(fields)
-    return applicable
+            frame_numbers, fields = _selected(frame_numbers, fields, row.when(fields))
+    return frame_numbers, fields
 
 
 def _values(row: FieldSource, fields: Fields) -> tuple[np.ndarray, np.ndarray]:
-    """Apply a table row: values (n, 8), (n, 16) with extra columns in use, and a mask of the plausible ones (n,)."""
+    """Apply a table row: values (n, k), k as in `WIDEST`, and a mask of the plausible ones (n,)."""
     with np.errstate(all="ignore"):  # NaN propagates and is rejected
         columns = row.columns(fields)
-        values = np.zeros((len(fields.rows), MAX_COLUMNS if len(columns) <= MAX_COLUMNS else WITH_EXTRA))
+        values = np.empty((len(fields.rows), WIDEST[FIELDS.index(row.field)]))
+        values[:, len(columns) :] = 0.0
         for k, column in enumerate(columns):
             values[:, k] = column
-        if len(columns) > MAX_COLUMNS and not values[:, MAX_COLUMNS:].any():
-            values = values[:, :MAX_COLUMNS]
-        return values, is_plausible(row.field, values[:, : min(len(columns), values.shape[1])])
+        return values, is_plausible(row.field, values)
 
 
 def _join_ports(
@@ -126,20 +149,19 @@ def _join_ports(
         arrival, owner: of all frames, (m,)
         second_ports: newest outputs of the second port by aircraft, changed in place
     """
-    row, frame_numbers, _, values = read
+    row, frame_numbers, _, at, values = read
     is_second = row == SECOND_PORT
     if not second_ports and not is_second.any():
         return read
-    (values,) = same_width(values, np.empty((0, WITH_EXTRA)))[:1]
     for i in np.flatnonzero(_FIELD[row] == _SERVO).tolist():
-        frame = frame_numbers[i]
+        frame, extra = frame_numbers[i], values[at[i] : at[i] + WIDEST[_SERVO]][_EXTRA]
         aircraft, t = int(owner[frame]), float(arrival[frame])
         if is_second[i]:
-            second_ports[aircraft] = (t, values[i, MAX_COLUMNS:].copy())
-        elif aircraft in second_ports and not values[i, MAX_COLUMNS:].any():
+            second_ports[aircraft] = (t, extra.copy())
+        elif aircraft in second_ports and not extra.any():
             since, outputs = second_ports[aircraft]
-            values[i, MAX_COLUMNS:] = outputs if t - since <= SOURCE_TIMEOUT_S else 0.0
-    return tuple(column[~is_second] for column in (*read[:3], values))
+            extra[:] = outputs if t - since <= SOURCE_TIMEOUT_S else 0.0
+    return *(column[~is_second] for column in read[:4]), values
 
 
 def _reject(

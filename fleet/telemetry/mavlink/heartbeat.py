@@ -9,6 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from fleet.contract import Alert, AlertKind
 from fleet.vehicles import FIXED_WING, HELICOPTER, MULTIROTOR, QUADPLANE, UNKNOWN
 
+AUTOPILOTS = ("generic", "ardupilot", "px4")
 _AUTOPILOT = {dialect.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot", dialect.MAV_AUTOPILOT_PX4: "px4"}
 _VEHICLE = {
     dialect.MAV_TYPE_FIXED_WING: FIXED_WING,

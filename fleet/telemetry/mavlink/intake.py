@@ -13,7 +13,7 @@ from fleet.config import MAX_UAVS
 from fleet.contract import Alert, Mission, Params, Sample, Status
 from fleet.telemetry.mavlink.aircraft_link import LINK_LOST_S, AircraftLink
 from fleet.telemetry.mavlink.arrays.counts import LAST_ARRIVAL
-from fleet.telemetry.mavlink.arrays.fleet_arrays import AircraftArrays
+from fleet.telemetry.mavlink.arrays.fleet_arrays import NOT_REPEATED, AircraftArrays
 from fleet.telemetry.mavlink.batch import process_table_rows
 from fleet.telemetry.mavlink.heartbeat import SenderConflict, is_aircraft
 from fleet.telemetry.mavlink.microservices.route import MISSION_MESSAGES
@@ -27,7 +27,7 @@ from fleet.telemetry.mavlink.parsing.decode import (
     restore_message,
 )
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes, merge_received
-from fleet.telemetry.mavlink.parsing.scan import COMPONENT, EXTRA, ID, SEQ, SYSTEM
+from fleet.telemetry.mavlink.parsing.scan import COMPONENT, EXTRA, ID, PAYLOAD, SEQ, SIZE, SYSTEM
 from fleet.telemetry.mavlink.targets import queue_targets
 from fleet.telemetry.mavlink.timing import update_timings
 
@@ -44,7 +44,8 @@ EARLY_MESSAGES = MISSION_MESSAGES | {"PARAM_VALUE", "HOME_POSITION"}  # sent onc
 IS_SINGLE = np.zeros(len(EXTRA), bool)  # by message id: processed individually, not as table rows
 IS_SINGLE[[IDS[name] for name in (*EARLY_MESSAGES, "HEARTBEAT", "STATUSTEXT", "AUTOPILOT_VERSION")]] = True
 IS_SINGLE[[IDS[name] for name in ("COMMAND_ACK", "MISSION_REQUEST", "MISSION_REQUEST_INT")]] = True
-IS_SINGLE[IDS["MISSION_CURRENT"]] = True  # also a table row
+_REPEATED = np.full(len(EXTRA), NOT_REPEATED)  # state messages, which an aircraft sends again and again
+_REPEATED[[IDS["HEARTBEAT"], IDS["MISSION_CURRENT"]]] = 0, 1
 
 
 class MavlinkReceiver:
@@ -81,6 +82,7 @@ class MavlinkReceiver:
         self._early_count = 0  # number of these messages
         self._aircraft_by_number: list[AircraftLink] = []  # by number in the arrays, including removed aircraft
         self._registered_t: dict[int, float] = {}  # registration time by system id [s since 1970]
+        self._number_by_system: dict[int, int] = {}  # aircraft number by system id, also of removed aircraft
 
     def receive(self, arrival: float, data: bytes, source: Hashable = None) -> None:
         """Receive bytes that arrived together; the next `flush` processes them.
@@ -136,6 +138,7 @@ class MavlinkReceiver:
             elif message.get_type() in MISSION_MESSAGES:
                 target = self.aircraft.get(getattr(message, "target_system", 0))
                 if target is not None:
+                    self.arrays.forget_payloads(target.number)
                     target.queue(arrival, target.process_uplink, message)
 
     def release_sender(self, source: Hashable) -> None:
@@ -144,7 +147,7 @@ class MavlinkReceiver:
         self._process_pending()
         for link in self.aircraft.values():
             if link.source == source:
-                link.source = None
+                link.source = self.arrays.sources = None
 
     def _process_pending(self) -> None:
         if self._pending_frames:
@@ -178,6 +181,7 @@ class MavlinkReceiver:
         self._conflicting_systems.discard(system)
         self._number_by_address[(system << 8) + link.component] = -1
         self.arrays.reset_aircraft(link.number)
+        self.arrays.sources = None
         removed = AircraftLink(self.arrays, link.uav, system, link.component, number=link.number)
         self._aircraft_by_number[link.number] = removed
 
@@ -189,24 +193,32 @@ class MavlinkReceiver:
         messages: list[TelemetryMessage | EncodedMessage] = [
             alert for conflict in self._conflicts.values() for alert in conflict.take_alerts(now)
         ]
-        samples, due = self.arrays.take_samples(now), set(np.flatnonzero(self.arrays.next_due_t <= now).tolist())
-        for number in sorted(due.union(samples)):
-            link = self._aircraft_by_number[number]
-            if self._id_owners.get(link.uav) is link:
-                if number in samples:
-                    messages.append(samples[number])
-                if number in due:
-                    messages += link.collect(now)
+        samples, due = self.arrays.take_samples(now), np.flatnonzero(self.arrays.next_due_t <= now).tolist()
+        owners, links = self._id_owners, self._aircraft_by_number
+        messages += [wire for number, wire in samples.items() if owners.get(wire.uav) is links[number]]
+        for link in [links[number] for number in due if owners.get(links[number].uav) is links[number]]:
+            messages += link.collect(now)
         return messages
 
     def process(self, frames: Frames) -> None:
         """Process a batch of frames; `collect` returns the resulting messages."""
         if not len(frames.headers):
             return
-        frame_numbers = np.flatnonzero(IS_SINGLE[frames.headers[:, ID]])
-        for i, message in zip(frame_numbers.tolist(), frames.messages(frame_numbers), strict=True):
-            self._dispatch(i, float(frames.arrival[i]), message, frames.senders[frames.sender[i]])
-        owner = self._frame_owners(frames)
+        known = self._known_owners(frames)
+        singles = np.flatnonzero(IS_SINGLE[frames.headers[:, ID]])
+        headers = frames.headers[singles]
+        payloads, kind = headers[:, [PAYLOAD, SIZE]], _REPEATED[headers[:, ID]]
+        is_repeated = self.arrays.find_repeated(frames.buf, payloads, known[singles], kind)
+        if not is_repeated.all():
+            self._dispatch_all(frames, singles[~is_repeated])
+            before, known = known[singles], self._known_owners(frames)
+            if (
+                is_changed := known[singles] != before
+            ).any():  # an aircraft or sender is new: nothing of it is a repetition
+                self.arrays.forget_payloads(slice(None))
+                self._dispatch_all(frames, singles[is_repeated & is_changed])
+                known = self._known_owners(frames)
+        owner = self._frame_owners(frames, known)
         self._first_heartbeat.clear()
         owned = np.flatnonzero(owner >= 0)
         if len(owned):
@@ -215,17 +227,32 @@ class MavlinkReceiver:
             )
             process_table_rows(frames, owner, self._aircraft_by_number, self.arrays)
             queue_targets(frames, owner, self._aircraft_by_number)
-            update_timings(frames, owner, [link.timing for link in self._aircraft_by_number])
+            update_timings(frames, owner, self._aircraft_by_number)
 
-    def _frame_owners(self, frames: Frames) -> np.ndarray:
-        """Return the aircraft number of each frame, -1 without owner, (n,)."""
-        links = self._aircraft_by_number
-        sender_index = {sender: index for index, sender in enumerate(frames.senders)}
-        is_owner = [self._id_owners.get(link.uav, link) is link for link in links]
-        pairs = zip(links, is_owner, strict=True)
-        expected = np.array([sender_index.get(craft.source, -1) if owns else -1 for craft, owns in pairs] + [-1])
+    def _dispatch_all(self, frames: Frames, frame_numbers: np.ndarray) -> None:
+        for i, message in zip(frame_numbers.tolist(), frames.messages(frame_numbers), strict=True):
+            self._dispatch(i, float(frames.arrival[i]), message, frames.senders[frames.sender[i]])
+
+    def _known_owners(self, frames: Frames) -> np.ndarray:
+        """Return the number of the aircraft that each frame's sender owns, -1 without, (n,)."""
+        if self.arrays.sources is None:
+            index: dict[Hashable, int] = {}
+            owners, links = self._id_owners, self._aircraft_by_number
+            numbers = [index.setdefault(k.source, len(index)) if owners.get(k.uav) is k else -1 for k in links]
+            self.arrays.sources = index, np.array([*numbers, -1])
+        index, expected = self.arrays.sources
+        sender = np.array([index.get(source, -2) for source in frames.senders])[frames.sender]
         owner = self._number_by_address[(frames.headers[:, SYSTEM] << 8) + frames.headers[:, COMPONENT]]
-        owner[(owner >= 0) & (expected[owner] != frames.sender)] = -1
+        owner[expected[owner] != sender] = -1
+        return owner
+
+    def _set_owner(self, uav: int, owner: AircraftLink) -> None:
+        """Assign a UAV id to an aircraft, or update its sender."""
+        self._id_owners.get(uav, owner).arrays.sources = owner.arrays.sources = None
+        self._id_owners[uav] = owner
+
+    def _frame_owners(self, frames: Frames, owner: np.ndarray) -> np.ndarray:
+        """Return the aircraft number of each frame, -1 without owner, (n,); `owner`: as far as it is known."""
         counters, owned = self.arrays.counts.state, np.flatnonzero(owner >= 0)
         counters[owner[owned], LAST_ARRIVAL] = frames.arrival[owned]
         for group in _group_by_sender(frames, np.flatnonzero(owner < 0)):
@@ -275,7 +302,8 @@ class MavlinkReceiver:
         else:
             self._conflicting_systems.discard(system)
             link = self._create_aircraft(uav, system, message.get_srcComponent(), source)
-            self.aircraft[system] = self._id_owners[uav] = link
+            self._set_owner(uav, link)
+            self.aircraft[system] = link
             self._registered_t[system] = self.arrays.counts.state[link.number, LAST_ARRIVAL] = arrival
             self._number_by_address[(system << 8) + link.component] = link.number
             self._first_heartbeat[system] = i
@@ -287,10 +315,11 @@ class MavlinkReceiver:
 
     def _create_aircraft(self, uav: int, system: int, component: int, source: Hashable) -> AircraftLink:
         """Create an aircraft; reuse the previous number of its system id, if any."""
-        number = next((link.number for link in self._aircraft_by_number if link.system == system), None)
+        number = self._number_by_system.get(system)
         created = AircraftLink(self.arrays, uav, system, component, source, number=number)
         if number is None:
             self._aircraft_by_number.append(created)
+            self._number_by_system[system] = created.number
         else:
             self._aircraft_by_number[number] = created
             self.arrays.next_due_t[number] = -np.inf
@@ -302,6 +331,7 @@ class MavlinkReceiver:
         if arrival - oldest.last_arrival <= SILENCE_LIMIT_S:
             return False
         del self._id_owners[oldest.uav]  # the receiver of its link removes it
+        oldest.arrays.sources = None
         return True
 
     def _accept_sender(self, link: AircraftLink, source: Hashable, arrival: float, count: int = 1) -> bool:
@@ -313,7 +343,8 @@ class MavlinkReceiver:
         if arrival - owner.last_arrival < LINK_LOST_S and not is_released:
             self._report_conflict(owner, arrival, source, count)
             return False
-        self._id_owners[link.uav], link.source = link, source
+        link.source = source
+        self._set_owner(link.uav, link)
         return True
 
     def _report_conflict(self, link: AircraftLink, arrival: float, source: Hashable, count: int = 1) -> None:
@@ -326,6 +357,7 @@ class MavlinkReceiver:
         name = message.get_type()
         target = self.aircraft.get(getattr(message, "target_system", 0))
         if name in MISSION_MESSAGES and target is not None:
+            self.arrays.forget_payloads(target.number)
             target.queue(arrival, target.process_uplink, message)
         elif name == "HEARTBEAT":
             reason = "a second autopilot on one system id" if is_aircraft(message) else "not an aircraft"
@@ -348,10 +380,9 @@ class MavlinkReceiver:
             self.rejected[NO_HEARTBEAT] += 1
 
     def _pop_early(self, system: int) -> list[tuple[float, Any]]:
-        buffered = self._early.pop(system, [])
+        buffered, decode = self._early.pop(system, []), msgspec.msgpack.decode
         self._early_count -= len(buffered)
-        rows = map(msgspec.msgpack.decode, buffered)
-        return [(arrival, restore_message(name, values)) for arrival, name, *values in rows]
+        return [(arrival, restore_message(name, values)) for arrival, name, *values in map(decode, buffered)]
 
 
 def unpacked(messages: list[TelemetryMessage | EncodedMessage]) -> list[TelemetryMessage]:

@@ -3,13 +3,16 @@
 from collections import deque
 from collections.abc import Callable, Sequence
 from math import sqrt
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fleet.telemetry.mavlink.parsing.decode import IDS, Frames
 from fleet.telemetry.mavlink.parsing.scan import ID
 from fleet.telemetry.tables import clock as c
+
+if TYPE_CHECKING:
+    from fleet.telemetry.mavlink.aircraft_link import AircraftLink
 
 UPDATE_PERIOD_S = 10.0  # update period of the drift filter [s]
 OFFSET_SIGMA_S = 3e-3  # standard deviation of the offset after the minimum-delay filter [s]
@@ -54,12 +57,12 @@ class LinkTiming:
         """Return the timing fields of `Status`; `now` is fleet time [s since 1970]."""
         boot = self._clocks()[c.BOOT]
         self._update_drift(boot, now)
-        worst, boot[c.WORST_DELAY] = float(boot[c.WORST_DELAY]), 0.0
+        state, boot[c.WORST_DELAY] = boot.tolist(), 0.0
         return {
-            "clock_offset_s": float(boot[c.OFFSET]),
+            "clock_offset_s": state[c.OFFSET],
             "clock_drift": self.drift,
-            "latency_s": float(boot[c.DELAY]),
-            "latency_worst_s": worst,
+            "latency_s": state[c.DELAY],
+            "latency_worst_s": state[c.WORST_DELAY],
             "round_trip_s": min(self._round_trips) if self._round_trips else None,
             "gps_offset_s": self._gps_offset_s,
         }
@@ -109,13 +112,13 @@ class OffsetFilter:
         self.P = I_KH @ P @ I_KH.T + K @ R @ K.T
 
 
-def update_timings(frames: Frames, owner: np.ndarray, timings: Sequence[LinkTiming]) -> None:
+def update_timings(frames: Frames, owner: np.ndarray, links: Sequence["AircraftLink"]) -> None:
     """Update the timing of all aircraft from SYSTEM_TIME and TIMESYNC replies.
 
     Args:
         frames: received frames
-        owner: number in `timings` of each frame's aircraft, -1 without owner, (n,)
-        timings: timing of the aircraft on this link
+        owner: number in `links` of each frame's aircraft, -1 without owner, (n,)
+        links: the aircraft on this link
     """
     frame_numbers = np.flatnonzero((frames.headers[:, ID] == IDS["SYSTEM_TIME"]) & (owner >= 0))
     if len(frame_numbers):
@@ -124,11 +127,11 @@ def update_timings(frames: Frames, owner: np.ndarray, timings: Sequence[LinkTimi
         fields = frames.fields(last, "SYSTEM_TIME")
         unix_s, boot_s = fields.time_unix_usec * 1e-6, fields.time_boot_ms * 1e-3
         for number, unix, boot in zip(owner[last].tolist(), unix_s.tolist(), boot_s.tolist(), strict=True):
-            timings[number].add_gps_time(unix, boot)
+            links[number].timing.add_gps_time(unix, boot)
     frame_numbers = np.flatnonzero((frames.headers[:, ID] == IDS["TIMESYNC"]) & (owner >= 0))
     if len(frame_numbers):
         fields = frames.fields(frame_numbers, "TIMESYNC")
         for i in np.flatnonzero(fields.tc1 != 0).tolist():
-            timings[owner[frame_numbers[i]]].add_round_trip(
+            links[owner[frame_numbers[i]]].timing.add_round_trip(
                 float(fields.ts1[i]) * 1e-9, float(frames.arrival[frame_numbers[i]])
             )

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import numba as nb
 import numpy as np
 
 from fleet.contract import FIRST_OPTIONAL_COLUMN
@@ -53,10 +54,19 @@ def is_plausible(field: str, values: np.ndarray) -> np.ndarray:
 
     Only the optional columns of `UNTOLD` may be non-finite.
     """
-    plausible = np.abs(values) <= _MAX_ARRAY[field][: values.shape[-1]]
+    rows = np.ascontiguousarray(values, float).reshape(-1, values.shape[-1])
     optional_from = FIRST_OPTIONAL_COLUMN.get(field, values.shape[-1])
-    plausible[..., optional_from:] |= np.isnan(values[..., optional_from:])
-    return plausible.all(axis=-1)
+    return _all_within(rows, _MAX_ARRAY[field], optional_from).reshape(values.shape[:-1])
+
+
+@nb.njit(cache=True, nogil=True)
+def _all_within(rows, limits, optional_from):
+    within = np.ones(len(rows), np.bool_)
+    for i in range(len(rows)):
+        for k in range(rows.shape[1]):
+            if not (abs(rows[i, k]) <= limits[k] or (k >= optional_from and np.isnan(rows[i, k]))):
+                within[i] = False
+    return within
 
 
 def euler(q: Any) -> tuple[Any, ...]:

@@ -27,6 +27,7 @@ class MessageCounters:
         self._kind_counts = np.empty((0, len(names)), np.int64)  # since the last `rates`
         self._rates_hz = np.empty((0, len(names)))  # smoothed rate of each kind; nan: never received
         self._kind_index = {name: k for k, name in enumerate(names)}
+        self._names = list(names)
         self._pending = (np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0))
         self._counted = 0  # the first pending messages, which are counted
 
@@ -44,6 +45,7 @@ class MessageCounters:
     def kind_indices(self, names: Sequence[str]) -> np.ndarray:
         """Return the indices of message names, adding new names, (n,)."""
         indices = np.array([self._kind_index.setdefault(name, len(self._kind_index)) for name in names], np.int64)
+        self._names = list(self._kind_index)
         padding = ((0, 0), (0, len(self._kind_index) - self._kind_counts.shape[1]))
         self._kind_counts = np.pad(self._kind_counts, padding)
         self._rates_hz = np.pad(self._rates_hz, padding, constant_values=np.nan)
@@ -73,7 +75,7 @@ class MessageCounters:
     def rates(self, number: int, elapsed: float) -> dict[str, float]:
         """Return the smoothed message rates of one aircraft [Hz]; `elapsed` since the last call [s]."""
         indices, rates_hz = _smooth(self._kind_counts[number], self._rates_hz[number], elapsed)
-        names = list(self._kind_index)
+        names = self._names
         return {names[k]: rate_hz for k, rate_hz in zip(indices.tolist(), rates_hz.tolist(), strict=True)}
 
 

@@ -18,6 +18,7 @@ WIDEST = np.array([ROW_WIDTHS[field][-1] for field in FIELDS])  # with the extra
 _INTEGER_FIELDS = {"position", "leg", "target", "gnss"}  # integer fields, <i4; all others are <f4
 IS_INTEGER = np.array([field in _INTEGER_FIELDS for field in FIELDS])
 _MAX_FIELD_HEADER = 160  # upper limit of the bytes of a field without its numbers
+_MAX_ABSENT = 24  # the same of a field without rows
 
 
 def _concatenated(*parts: bytes) -> tuple[np.ndarray, np.ndarray]:
@@ -69,8 +70,8 @@ def _write_bin_header(out, at, size):
 
 
 @nb.njit(cache=True, nogil=True)
-def _write_field(out, at, times, values, columns, is_integer, fragments, offsets):
-    """Write the rows of one field: times (n,), values (n, 8) or (n, 16)."""
+def _write_field(out, at, times, rows, values, columns, is_integer, fragments, offsets):
+    """Write the rows of one field: times (n,), positions in `values` (n,)."""
     n = len(times)
     as_double, as_float, as_int = np.empty(1), np.empty(1, np.float32), np.empty(1, np.int32)
     double_bytes, float_bytes, int_bytes = as_double.view(np.uint8), as_float.view(np.uint8), as_int.view(np.uint8)
@@ -86,27 +87,41 @@ def _write_field(out, at, times, values, columns, is_integer, fragments, offsets
     for i in range(n):
         for k in range(columns):
             if is_integer:
-                as_int[0] = np.int32(values[i, k])
+                as_int[0] = np.int32(values[rows[i] + k])
                 at = _copy_bytes(out, at, int_bytes, 0, 4)
             else:
-                as_float[0] = values[i, k]
+                as_float[0] = values[rows[i] + k]
                 at = _copy_bytes(out, at, float_bytes, 0, 4)
     return at
 
 
 @nb.njit(cache=True, nogil=True)
-def _used_width(values, width, widest):
+def _used_width(rows, values, width, widest):
     """Return the columns of the field in these rows: the widest form if an extra column is not 0."""
-    for i in range(len(values)):
-        for k in range(width, min(widest, values.shape[1])):
-            if values[i, k] != 0.0:
+    for at in rows:
+        for k in range(width, widest):
+            if values[at + k] != 0.0:
                 return widest
     return width
 
 
 @nb.njit(cache=True, nogil=True)
 def _write_samples(
-    out, uavs, start, stop, t, values, widths, widest, is_integer, prefix, names, name_offsets, fragments, offsets
+    out,
+    uavs,
+    start,
+    stop,
+    t,
+    values,
+    positions,
+    widths,
+    widest,
+    is_integer,
+    prefix,
+    names,
+    name_offsets,
+    fragments,
+    offsets,
 ):
     """Write a sample for every aircraft with rows; return owners, end of each in `out`, and sample times."""
     owners, ends, at = np.empty(len(start), np.int64), np.empty(len(start), np.int64), 0
@@ -129,9 +144,9 @@ def _write_samples(
             at = _copy_bytes(out, at, names, name_offsets[field], name_offsets[field + 1])
             first, end = start[owner, field], stop[owner, field]
             if first < end:
-                rows = values[first:end]
-                kind = (_used_width(rows, widths[field], widest[field]), is_integer[field])
-                at = _write_field(out, at, t[first:end], rows, *kind, fragments, offsets)
+                rows = positions[first:end]
+                columns = _used_width(rows, values, widths[field], widest[field])
+                at = _write_field(out, at, t[first:end], rows, values, columns, is_integer[field], fragments, offsets)
             else:
                 out[at] = 0xC0
                 at += 1
@@ -148,15 +163,15 @@ def _max_size(start, stop, widths):
         has_rows = False
         for field in range(len(widths)):
             rows = stop[owner, field] - start[owner, field]
-            size += rows * (8 + 4 * widths[field])
+            size += rows * (8 + 4 * widths[field]) + (_MAX_FIELD_HEADER - _MAX_ABSENT if rows > 0 else 0)
             has_rows = has_rows or rows > 0
         if has_rows:
-            size += 64 + _MAX_FIELD_HEADER * len(widths)
+            size += 64 + _MAX_ABSENT * len(widths)
     return size
 
 
 def pack_samples(
-    uavs: np.ndarray, start: np.ndarray, stop: np.ndarray, t: np.ndarray, values: np.ndarray
+    uavs: np.ndarray, start: np.ndarray, stop: np.ndarray, t: np.ndarray, values: np.ndarray, *, at: np.ndarray
 ) -> list[Packed]:
     """Encode the rows of all aircraft that have rows.
 
@@ -164,11 +179,12 @@ def pack_samples(
         uavs: UAV ids, (m,)
         start, stop: row range of each aircraft and field, at most `MAX_ROWS`, (m, fields)
         t: fleet times, increasing within a field, (n,) [s since 1970]
-        values: columns, (n, 8), or (n, 16) where extra columns are in use
+        values: numbers of all rows, (k,)
+        at: position of each row's `WIDEST` values in them, (n,)
     """
     out = np.empty(_max_size(start, stop, WIDEST), np.uint8)
     owners, ends, sample_t = _write_samples(
-        out, uavs, start, stop, t, values, WIDTHS, WIDEST, IS_INTEGER, _PREFIX, *_FIELD_NAMES, *_FRAGMENTS
+        out, uavs, start, stop, t, values, at, WIDTHS, WIDEST, IS_INTEGER, _PREFIX, *_FIELD_NAMES, *_FRAGMENTS
     )
     payload, stops = out[: ends[-1]].tobytes() if len(ends) else b"", ends.tolist()
     entries = zip(owners.tolist(), [0, *stops][:-1], stops, sample_t.tolist(), strict=True)

@@ -173,7 +173,7 @@ class GroupedFrames:
         self._payloads, payload_start, self._frame_numbers, frame_start = group_payloads(
             frames.buf, frames.headers, _KIND_BY_ID, _WIDTHS
         )
-        self._payload_start, self._frame_start = payload_start.tolist(), frame_start.tolist()
+        self._payload_start, self._frame_start = payload_start, frame_start
 
     def fields(self, name: str) -> tuple[np.ndarray, Fields]:
         """Return the frames of one message: frame numbers, (k,), and field arrays."""
@@ -184,7 +184,7 @@ class GroupedFrames:
 
     def names(self) -> list[str]:
         """Return the names of the received messages."""
-        return [name for name, kind in _KIND_BY_NAME.items() if self._frame_start[kind] < self._frame_start[kind + 1]]
+        return [MESSAGE_NAMES[kind] for kind in np.flatnonzero(np.diff(self._frame_start)).tolist()]
 
 
 class Decoder:

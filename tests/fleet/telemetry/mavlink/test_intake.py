@@ -5,7 +5,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from fleet.contract import Link, Mission, Params, Sample, Status
-from fleet.telemetry.mavlink.intake import MavlinkReceiver
+from fleet.telemetry.mavlink.aircraft_link import AircraftLink
+from fleet.telemetry.mavlink.intake import SECOND_SENDER, MavlinkReceiver
 from tests.support.talker import ARDU, PLANE, T0, Talker, of
 
 
@@ -147,3 +148,44 @@ def _replace_payload(frame, value):
     frame[10:14] = value
     crc = mav.x25crc(bytes(frame[1:-2]) + bytes([mav.MAVLink_param_value_message.crc_extra])).crc
     return bytes(frame[:-2]) + crc.to_bytes(2, "little")
+
+
+def test_state_that_is_sent_again_is_not_processed_again_and_a_change_is(monkeypatch):
+    intake, talker, processed = MavlinkReceiver(), Talker(), []
+    monkeypatch.setattr(AircraftLink, "process", lambda link, message, now: processed.append(message.get_type()))
+    item = [talker.pack(mav.MAVLink_mission_current_message(seq)) for seq in (1, 1, 2)]
+    beats = [talker.heartbeat(custom=mode) for mode in (10, 10, 11, 10)]
+    intake.receive(T0 - 1, talker.heartbeat())
+    intake.flush(T0 - 1)  # registers
+    processed.clear()
+    for k, data in enumerate((beats[0] + item[0], beats[1] + item[1], beats[2] + item[2], beats[3])):
+        intake.receive(T0 + k, data)
+    intake.flush(T0 + 10)  # in one batch
+    assert processed == ["HEARTBEAT", "MISSION_CURRENT", "HEARTBEAT", "MISSION_CURRENT", "HEARTBEAT"]
+    processed.clear()
+    for k, data in enumerate((beats[3], item[2], beats[2])):  # in a batch each
+        intake.receive(T0 + 11 + k, data)
+        intake.flush(T0 + 11 + k)
+    assert processed == ["HEARTBEAT"]
+    intake.aircraft[7].observer = lambda *_: None
+    intake.receive(T0 + 15, beats[2] + item[2])
+    intake.flush(T0 + 15)
+    assert processed == ["HEARTBEAT"] * 2 + ["MISSION_CURRENT"]
+
+
+def test_state_that_is_sent_again_keeps_an_aircraft_alive_and_is_counted():
+    intake, talker = MavlinkReceiver(), Talker()
+    for k in range(20):
+        intake.receive(T0 + k, talker.heartbeat())
+        news = intake.flush(T0 + k)
+    (status,) = of(Status, news)
+    assert (status.received, status.link, status.mode) == (20, Link.LIVE, "AUTO")
+    assert status.rates_hz["HEARTBEAT"] == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_state_of_a_second_sender_is_no_repetition():
+    intake, talker = MavlinkReceiver(), Talker()
+    for source in ("a", "a", "b", "a", "b"):
+        intake.receive(T0, talker.heartbeat(), source)
+    intake.flush(T0 + 0.1)
+    assert intake.rejected == {SECOND_SENDER: 2}

@@ -21,6 +21,7 @@ from fleet.telemetry.mavlink.intake import (
 )
 from fleet.telemetry.mavlink.parsing.received import ReceivedBytes
 from gateway import pipeline as pump_module
+from gateway.links import receive
 from gateway.links.link import Batch, wall
 from gateway.links.receive import MAX_DATAGRAMS, BatchReceiver
 from gateway.pipeline import FLUSH_BYTES, Pipeline
@@ -199,3 +200,32 @@ def test_memory_of_long_datagrams_goes_back_to_the_system():
         far.sendto(b"short", near.getsockname())
         assert bulk.receive().buf.tobytes() == b"short"
     assert len(bulk._slots) == MAX_DATAGRAMS * 65_536 <= 16 << 20
+
+
+def test_a_round_takes_all_that_has_come():
+    udp = socket.AF_INET, socket.SOCK_DGRAM
+    with socket.socket(*udp) as near, socket.socket(*udp) as far:
+        receive._set_buffer(near)
+        near.bind(("127.0.0.1", 0))
+        far.bind(("127.0.0.1", 0))
+        reader = BatchReceiver(near)
+        assert receive.receive_round(reader) == (None, True)
+        sent = [bytes([k % 251]) * 3 for k in range(MAX_DATAGRAMS)] + [b"last"]
+        for data in sent:
+            far.sendto(data, near.getsockname())
+        heard, is_empty = receive.receive_round(reader)
+        assert heard.senders == (far.getsockname(),)
+    cut = [heard.buf[start:stop].tobytes() for start, stop in zip(heard.start, heard.stop, strict=True)]
+    assert cut == sent and is_empty
+
+
+class Flood:
+    """A receiver that always has more."""
+
+    def receive(self) -> ReceivedBytes:
+        return ReceivedBytes.from_pieces([(T0, "foe", bytes(1000))] * MAX_DATAGRAMS)
+
+
+def test_a_round_ends_in_a_flood():
+    heard, is_empty = receive.receive_round(Flood())
+    assert len(heard.start) == 2 * MAX_DATAGRAMS and not is_empty
