@@ -96,7 +96,7 @@ def test_a_gateway_that_records_begins_without_a_router_and_joins_it_later(tmp_p
                 with connect(router) as bus:
                     ear = Ear(bus)
                     ear.wait(
-                        lambda e: e.of(GatewayCounters) and e.of(GatewayCounters)[-1].messages > 50 and e.of(Status, 7)
+                        lambda e: e.of(GatewayCounters) and e.of(GatewayCounters)[-1].messages > 100 and e.of(Status, 7)
                     )
                     last = ear.of(GatewayCounters)[-1]
                 session.close()
