@@ -207,7 +207,7 @@ class MavlinkReceiver:
         known = self._known_owners(frames)
         singles = np.flatnonzero(IS_SINGLE[frames.headers[:, ID]])
         headers = frames.headers[singles]
-        payloads, kind = headers[:, [PAYLOAD, SIZE]], _REPEATED[headers[:, ID]]
+        payloads, kind = np.ascontiguousarray(headers[:, [PAYLOAD, SIZE]]), _REPEATED[headers[:, ID]]
         is_repeated = self.arrays.find_repeated(frames.buf, payloads, known[singles], kind)
         if not is_repeated.all():
             self._dispatch_all(frames, singles[~is_repeated])
