@@ -210,9 +210,8 @@ class Worker:
 
     def _with_history(self) -> list[OwnedTwin]:
         """Return the ready twins with past telemetry; none during handovers, which need the CPU time."""
-        return (
-            [] if self.ownership.transferring else [owned for owned in self.owned_twins() if not owned.without_history]
-        )
+        ready = [] if self.ownership.transferring else self.owned_twins()
+        return [owned for owned in ready if not owned.without_history]
 
     def sweep(self) -> int:
         """Step every twin once; return the number of ingested messages."""

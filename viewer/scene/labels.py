@@ -102,7 +102,7 @@ def visible_labels(tags: list[Tag], camera_view: CameraView) -> tuple[list[Tag],
         for anchor in _ANCHORS[tag.anchor] if label_depth > 0 else ():
             box = (left, low), (right, high) = _box(tag.text, anchor, point, height)
             inside = left >= -half and low >= lowest and right <= half and high <= highest
-            if inside and not any(_overlap(box, other) for other in boxes):
+            if inside and not any(overlap(box, other) for other in boxes):
                 shown.append(tag._replace(anchor=anchor))
                 boxes.append(box)
                 break
@@ -111,17 +111,13 @@ def visible_labels(tags: list[Tag], camera_view: CameraView) -> tuple[list[Tag],
     return shown, [np.array(box) for box in boxes]
 
 
-def overlap(box: np.ndarray, other: np.ndarray) -> bool:
-    """Return whether two boxes, low and high corner (2, 2), overlap."""
-    return bool((box[0] < other[1]).all() and (other[0] < box[1]).all())
-
-
 Box = tuple[tuple[float, float], tuple[float, float]]
 """Low and high corner of a label, each right and up [image heights]."""
 
 
-def _overlap(box: Box, other: Box) -> bool:
-    return all(box[0][k] < other[1][k] and other[0][k] < box[1][k] for k in (0, 1))
+def overlap(box: Box | np.ndarray, other: Box | np.ndarray) -> bool:
+    """Return whether two boxes, low and high corner (2, 2), overlap."""
+    return all(bool(box[0][k] < other[1][k] and other[0][k] < box[1][k]) for k in (0, 1))
 
 
 def _box(text: str, anchor: str, point: list[float], height_px: float) -> Box:

@@ -21,7 +21,7 @@ class LookAheads(NamedTuple):
 
     s: np.ndarray  # (n,) [s]
     is_rising: bool  # increasing, within one hour
-    past: np.ndarray  # those kept of a past prediction [s]
+    past: np.ndarray  # those stored of a past prediction [s]
 
 
 @lru_cache(maxsize=64)

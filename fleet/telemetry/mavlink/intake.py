@@ -212,9 +212,8 @@ class MavlinkReceiver:
         if not is_repeated.all():
             self._dispatch_all(frames, singles[~is_repeated])
             before, known = known[singles], self._known_owners(frames)
-            if (
-                is_changed := known[singles] != before
-            ).any():  # an aircraft or sender is new: nothing of it is a repetition
+            is_changed = known[singles] != before  # of a new aircraft or sender nothing is a repetition
+            if is_changed.any():
                 self.arrays.forget_payloads(slice(None))
                 self._dispatch_all(frames, singles[is_repeated & is_changed])
                 known = self._known_owners(frames)

@@ -34,9 +34,8 @@ class AircraftArrays:
         self.autopilots = np.empty(0, np.int8)  # index in `heartbeat.AUTOPILOTS`, (m,)
         self.observed = np.empty(0, bool)  # every message is processed, also a repeated one, (m,)
         self._last_payloads = np.empty((0, _REPEATED_KINDS, 1 + _MAX_REPEATED), np.uint8)  # size and bytes
-        self.sources: tuple[dict[Hashable, int], np.ndarray] | None = (
-            None  # senders of all aircraft; None: they changed
-        )
+        # index of each sender and, by aircraft, that of its own; None: senders have changed since
+        self.sources: tuple[dict[Hashable, int], np.ndarray] | None = None
         self.second_ports: dict[int, tuple[float, np.ndarray]] = {}  # by aircraft: arrival [s since 1970], (8,) [us]
 
     def add_aircraft(self, uav: int) -> int:
