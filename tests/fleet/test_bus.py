@@ -375,12 +375,12 @@ from pathlib import Path
 from fleet.bus.session import connect, receive_on_one_thread
 from fleet.contract import Status
 receive_on_one_thread()
-heard = threading.Event()
+received = threading.Event()
 with connect(sys.argv[1]) as bus:
-    bus.subscribe(Status, lambda message, stamp: heard.set())
+    bus.subscribe(Status, lambda message, stamp: received.set())
     bus.publish(Status(uav=7, t=1.0))
     names = [(task / "comm").read_text() for task in Path("/proc/self/task").iterdir()]
-    print(heard.wait(10), any(name.startswith("rx") for name in names))
+    print(received.wait(10), any(name.startswith("rx") for name in names))
 """
 
 

@@ -347,9 +347,9 @@ def test_who_gets_ready_gives_way_to_those_that_hold_aircraft(monkeypatch: pytes
     low, later = (min(before + increment, 19) - before for increment in NICE_INCREMENTS)
     for limit_s, found in ((1e6, [low] * 4), (15.0, [low, low, later, later]), (0.0, [later] * 4)):
         nice.clear()
-        said: list[float] = []
-        run_at_low_priority(iter([step] * 4), limit_s, said.append)
-        assert nice == found and said, "it ends on a busy machine as well"
+        reported: list[float] = []
+        run_at_low_priority(iter([step] * 4), limit_s, reported.append)
+        assert nice == found and reported, "it ends on a busy machine as well"
     step()
     assert nice[-1] == 0
 

@@ -213,9 +213,9 @@ def test_a_round_takes_all_that_has_come():
         sent = [bytes([k % 251]) * 3 for k in range(MAX_DATAGRAMS)] + [b"last"]
         for data in sent:
             far.sendto(data, near.getsockname())
-        heard, is_empty = receive.receive_round(reader)
-        assert heard.senders == (far.getsockname(),)
-    cut = [heard.buf[start:stop].tobytes() for start, stop in zip(heard.start, heard.stop, strict=True)]
+        received, is_empty = receive.receive_round(reader)
+        assert received.senders == (far.getsockname(),)
+    cut = [received.buf[start:stop].tobytes() for start, stop in zip(received.start, received.stop, strict=True)]
     assert cut == sent and is_empty
 
 
@@ -227,5 +227,5 @@ class Flood:
 
 
 def test_a_round_ends_in_a_flood():
-    heard, is_empty = receive.receive_round(Flood())
-    assert len(heard.start) == 2 * MAX_DATAGRAMS and not is_empty
+    received, is_empty = receive.receive_round(Flood())
+    assert len(received.start) == 2 * MAX_DATAGRAMS and not is_empty
