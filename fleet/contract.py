@@ -15,6 +15,7 @@
     parauav/{uav}/approval               Approval     operator a person approves an option, or its undo
     parauav/{uav}/execution              Execution    gateway  what was sent for it, and how it is flown; also queryable
     parauav/@fleet/state/{writer}        FleetState   worker   one row per UAV; also queryable
+    parauav/@fleet/sample/{writer}       Samples      gateway  the same samples, those of many aircraft in one message
     parauav/@fleet/prediction/{writer}   Predictions  worker   query only: the newest prediction of all its aircraft
     parauav/@world/wind/{writer}         WindField    worker   one wind field from all aircraft; also queryable
     parauav/@world/siblings/{writer}     Siblings     worker   what aircraft of one type share; also queryable
@@ -944,6 +945,24 @@ class Predictions(msgspec.Struct, frozen=True, kw_only=True):
     epochs: Annotated[tuple[int, ...], about("claim epoch of each; readers accept the highest per aircraft")] = ()
 
 
+MAX_UAV_ID = 999_999_999
+
+
+class Samples(msgspec.Struct, frozen=True, kw_only=True, gc=False):
+    """Samples of many aircraft in one message; each is also published under its own key.
+
+    A subscriber to all aircraft receives one message for many of them. Workers, the viewer and `fleet record` receive
+    samples in this form alone: a program that publishes samples must publish both.
+    """
+
+    topic: ClassVar[str] = "@fleet/sample"
+    version: ClassVar[int] = 1
+
+    t: Annotated[float, about("fleet time of the newest sample [s since 1970]")]
+    uavs: Annotated[tuple[Annotated[int, Meta(ge=0, le=MAX_UAV_ID)], ...], about("UAV id of each sample")] = ()
+    samples: Annotated[tuple[bytes, ...], about("each a packed Sample")] = ()
+
+
 class LinkCounters(msgspec.Struct, frozen=True, kw_only=True):
     """Counters of one link since the gateway started; values in Hz and bytes/s are current rates."""
 
@@ -1042,7 +1061,7 @@ PER_UAV: tuple[type[Message], ...] = (
     *(Sample, Status, Mission, Params, History),
     *(Model, Prediction, Mismatch, Alert, Proposal, Approval, Execution),
 )
-CONTROL: tuple[type, ...] = (FleetState, Predictions, WindField, Siblings, GatewayCounters, Claim, Handover)
+CONTROL: tuple[type, ...] = (FleetState, Samples, Predictions, WindField, Siblings, GatewayCounters, Claim, Handover)
 QUERIES: dict[type, type] = {Prediction: WhatIf, Handover: HandoverRequest}  # optional payload of a query on a key
 TOPICS: dict[str, type] = {c.topic: c for c in (*PER_UAV, *CONTROL)}  # type: ignore[attr-defined]
 

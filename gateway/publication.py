@@ -181,9 +181,7 @@ class RouterSession:
         if not self._router:
             self.unsent += len(wires)
             return
-        put = self._bus.put
-        for wire in wires:
-            put(wire, stamp)
+        self._bus.put_all(wires, stamp)
         self.published += len(wires)
 
 

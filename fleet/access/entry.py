@@ -70,7 +70,8 @@ def without_samples(control: dict[str, Any], interfaces: list[str]) -> dict[str,
 
     Where roles are known these are all routers, else whatever is connected over `interfaces`.
     """
-    rule = _rule(_NO_SAMPLES, ("put",), "egress", [f"{ROOT}/*/sample"]) | {"permission": "deny"}
+    sample_keys = [topic_keys("sample"), topic_keys("@fleet/sample")]
+    rule = _rule(_NO_SAMPLES, ("put",), "egress", sample_keys) | {"permission": "deny"}
     subjects, policies = control["subjects"], control["policies"]
     if subjects:  # a rule by interface has no effect: what any subject of a connection may receive is forwarded
         policies = [
@@ -241,6 +242,7 @@ def _common_settings(mode: str, *, connect: list[str], listen: list[str]) -> dic
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
         "transport/link/tx/lease": 1000,
         "transport/link/tx/keep_alive": 4,
+        "transport/link/tx/queue/size/data": 16,  # batches of 64 kB: the samples of 1,000 aircraft come at once
         "transport/link/tx/queue/size/data_low": 16,  # batches of 64 kB: enough for large replies on a busy machine
         f"{_CONGESTION}/drop/max_wait_before_drop_fragments": 500_000,  # total for a large reply [us]
         "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,

@@ -44,6 +44,7 @@ TOPIC_RULES: dict[str, TopicRule] = {
     "approval": TopicRule((OPERATOR,), 64 * KB),
     "execution": TopicRule((GATEWAY,), 256 * KB),
     "@fleet/state": TopicRule((WORKER,), MB),
+    "@fleet/sample": TopicRule((GATEWAY,), MB),
     "@fleet/prediction": TopicRule((WORKER,), 32 * MB),  # 4 KB for each of its aircraft
     "@world/wind": TopicRule((WORKER,), MB),
     "@world/siblings": TopicRule((WORKER,), MB),

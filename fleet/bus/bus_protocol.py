@@ -1,20 +1,21 @@
-"""Keys, liveliness tokens, selection among replies, and the fence that accepts one writer for each aircraft."""
+"""Keys, batches of samples, liveliness tokens, selection among replies, and the fence against a second writer."""
 
 import re
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache
 from typing import Any, NamedTuple, TypeVar
 
 from fleet.access.roles import ROOT
-from fleet.bus.codec import Stamp, is_plausible_epoch
-from fleet.contract import PER_UAV
+from fleet.bus.codec import EncodedMessage, Stamp, decode, encode, encoding, is_plausible_epoch
+from fleet.contract import PER_UAV, Sample, Samples
 
 M = TypeVar("M")
 RawMessage = tuple[int | None, bytes, str, Stamp | None]
 """UAV id of the key, payload, encoding, stamp."""
 Replies = Iterable[tuple[Any, Stamp | None]]
 QueryHandler = Callable[[int | None, dict[str, str], bytes], Replies]
+MAX_BATCH_BYTES = 12_000  # of samples in one message: on congestion Zenoh drops a message as a whole
 
 
 def key_of(kind: type, target: int | str) -> str:
@@ -28,6 +29,38 @@ def uav_of_key(key_name: str) -> int | None:
     """Parse the UAV id of a key; None where the chunk is a wildcard or not a number."""
     chunk = key_name.split("/")[1] if key_name.count("/") >= 2 else ""
     return int(chunk) if chunk.isdecimal() and len(chunk) <= 9 else None
+
+
+def make_batches(samples: Iterable[EncodedMessage]) -> Iterator[bytes]:
+    """Pack encoded samples of any aircraft, in order, as payloads of `Samples` of at most `MAX_BATCH_BYTES`."""
+    batch: list[EncodedMessage] = []
+    size = 0
+    for sample in samples:
+        if batch and size + len(sample.payload) > MAX_BATCH_BYTES:
+            yield _pack_batch(batch)
+            batch, size = [], 0
+        batch.append(sample)
+        size += len(sample.payload)
+    if batch:
+        yield _pack_batch(batch)
+
+
+def _pack_batch(batch: list[EncodedMessage]) -> bytes:
+    _, uavs, payloads, times = zip(*batch, strict=True)
+    return encode(Samples(t=max(times), uavs=uavs, samples=payloads))
+
+
+def split_batch(message: RawMessage) -> list[RawMessage]:
+    """Split `Samples` as received into samples in order; one that does not decode remains as it is, for no aircraft."""
+    _, payload, encoding_name, stamp = message
+    try:
+        batch = decode(Samples, payload, encoding_name)
+    except ValueError:
+        return [message]
+    if len(batch.uavs) != len(batch.samples):
+        return [message]
+    sample_encoding = encoding(Sample)
+    return [(uav, sample, sample_encoding, stamp) for uav, sample in zip(batch.uavs, batch.samples, strict=True)]
 
 
 def select_latest(replies: list[tuple[M, Stamp | None]]) -> list[tuple[M, Stamp | None]]:

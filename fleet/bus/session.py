@@ -15,7 +15,7 @@ import os
 import secrets
 import socket
 import threading
-from collections.abc import Callable, Collection, Container, Iterable, Iterator
+from collections.abc import Callable, Collection, Container, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from itertools import islice
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -23,9 +23,18 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from fleet.access.entry import ROUTER, BusConfig, parse_endpoint
 from fleet.access.knock import probe_router
 from fleet.access.roles import ROOT
-from fleet.bus.bus_protocol import QueryHandler, RawMessage, key_of, replies_about, select_latest, uav_of_key
+from fleet.bus.bus_protocol import (
+    QueryHandler,
+    RawMessage,
+    key_of,
+    make_batches,
+    replies_about,
+    select_latest,
+    split_batch,
+    uav_of_key,
+)
 from fleet.bus.codec import EncodedMessage, Stamp, decode_for_key, encode, encoding, pack_stamp, unpack_stamp
-from fleet.contract import PER_UAV, Claim
+from fleet.contract import PER_UAV, Claim, Sample, Samples
 
 if TYPE_CHECKING:
     import zenoh
@@ -69,20 +78,26 @@ class Bus(AbstractContextManager):
     def publish(self, message: Any, stamp: Stamp | None = None) -> None:
         """Publish one message."""
         kind = type(message)
-        self.put(EncodedMessage(kind, message.uav if kind in PER_UAV else -1, encode(message)), stamp)
+        self.put_all([EncodedMessage(kind, message.uav if kind in PER_UAV else -1, encode(message), message.t)], stamp)
 
-    def put(self, encoded: EncodedMessage, stamp: Stamp | None = None) -> None:
-        """Publish one encoded message."""
-        publisher = self._publishers.get((encoded.kind, encoded.uav))
-        if publisher is None:
-            with self._lock:
-                if (publisher := self._publishers.get((encoded.kind, encoded.uav))) is None:
-                    name = key_of(encoded.kind, encoded.uav if encoded.kind in PER_UAV else f"{self.writer:016x}")
-                    publisher = self._session.declare_publisher(
-                        name, encoding=encoding(encoded.kind), **self._reliable.get(encoded.kind, {})
-                    )
-                    self._publishers[encoded.kind, encoded.uav] = publisher
-        publisher.put(encoded.payload, attachment=pack_stamp(stamp) if stamp else None)
+    def put_all(self, messages: Sequence[EncodedMessage], stamp: Stamp | None = None) -> None:
+        """Publish encoded messages in order, and their samples once more as batches of many aircraft."""
+        attachment = pack_stamp(stamp) if stamp else None
+        for kind, uav, payload, _ in messages:
+            publisher = self._publishers.get((kind, uav)) or self._declare_publisher(kind, uav)
+            publisher.put(payload, attachment=attachment)
+        for batch in make_batches(message for message in messages if message.kind is Sample):
+            publisher = self._publishers.get((Samples, -1)) or self._declare_publisher(Samples, -1)
+            publisher.put(batch, attachment=attachment)
+
+    def _declare_publisher(self, kind: type, uav: int) -> zenoh.Publisher:
+        with self._lock:
+            if (publisher := self._publishers.get((kind, uav))) is None:
+                name = key_of(kind, uav if kind in PER_UAV else f"{self.writer:016x}")
+                quality = self._reliable.get(kind, {})
+                publisher = self._session.declare_publisher(name, encoding=encoding(kind), **quality)
+                self._publishers[kind, uav] = publisher
+        return publisher
 
     def remove_publishers(self, uavs: Collection[int]) -> None:
         """Undeclare the publishers of aircraft that this process no longer publishes."""
@@ -105,28 +120,34 @@ class Bus(AbstractContextManager):
             accepts: filter by UAV id, applied before decoding; None: all
         """
 
-        def on_sample(sample: zenoh.Sample) -> None:
-            if accepts is not None and ((uav := uav_of_key(str(sample.key_expr))) is None or not accepts(uav)):
+        def on_message(message: RawMessage) -> None:
+            uav, payload, encoding_name, stamp = message
+            if accepts is not None and uav is not None and not accepts(uav):
                 return
-            pair = self._decode_sample(kind, sample)
-            if pair is not None:
-                callback(*pair)
+            if (decoded := self._decode(kind, uav, payload, encoding_name)) is not None:
+                callback(decoded, stamp)
 
-        self._declare_subscriber(kind, on_sample, _QUEUE_SIZE)
+        self._declare_subscriber(kind, on_message, _QUEUE_SIZE)
 
     def subscribe_raw(self, kind: type, callback: RawCallback) -> None:
         """Call `callback(payload, encoding, stamp)` for every message of a class, undecoded, on a session's thread."""
+        self._declare_subscriber(kind, lambda message: callback(*message[1:]), _BUFFER_SIZE)
+
+    def _declare_subscriber(self, kind: type, handle: Callable[[RawMessage], None], queue_size: int) -> None:
+        """Call `handle` for every message of a class on a thread of its own; queue at most `queue_size` messages."""
 
         def on_sample(sample: zenoh.Sample) -> None:
-            callback(sample.payload.to_bytes(), str(sample.encoding), _stamp(sample))
+            for message in _raw_messages(kind, (sample,)):
+                handle(message)
 
-        self._declare_subscriber(kind, on_sample, _BUFFER_SIZE)
+        self._consume(self._open_channel(kind, queue_size), on_sample, key_of(kind, "*"))
 
-    def _declare_subscriber(self, kind: type, handle: Callable[[zenoh.Sample], None], queue_size: int) -> None:
-        """Call `handle` for every message of a class on a thread of its own; queue at most `queue_size` messages."""
-        subscriber = self._session.declare_subscriber(key_of(kind, "*"), self._zenoh.handlers.RingChannel(queue_size))
+    def _open_channel(self, kind: type, size: int) -> zenoh.Handler[zenoh.Sample]:
+        """Subscribe to a class, to samples in batches; the oldest messages of a full channel are dropped."""
+        name = key_of(Samples if kind is Sample else kind, "*")
+        subscriber = self._session.declare_subscriber(name, self._zenoh.handlers.RingChannel(size))
         self._declared.append(subscriber)
-        self._consume(subscriber.handler, handle, key_of(kind, "*"))
+        return subscriber.handler
 
     def _consume(self, channel: zenoh.Handler[Any], handle: Callable[[Any], None], name: str) -> None:
         """Call `handle` for every item of a channel in order, until the session is closed."""
@@ -146,25 +167,23 @@ class Bus(AbstractContextManager):
 
     def subscribe_buffered(self, kind: type, callback: BatchCallback) -> None:
         """Buffer every message of a class, undecoded, until `dispatch`; a full buffer drops its oldest messages."""
-        subscriber = self._session.declare_subscriber(key_of(kind, "*"), self._zenoh.handlers.RingChannel(_BUFFER_SIZE))
-        self._declared.append(subscriber)
-        self._buffered.append((kind, subscriber.handler, callback))
+        self._buffered.append((kind, self._open_channel(kind, _BUFFER_SIZE), callback))
 
     def dispatch(self, latest_only: Container[type] = ()) -> None:
         """Pass the buffered messages to their callbacks in order of arrival, on this thread.
 
         Args:
-            latest_only: classes of which only the newest message of each key is passed on
+            latest_only: classes of which only the newest message of each aircraft is passed on
         """
         if not self._dispatching.acquire(blocking=False):
             return  # another thread is dispatching
         try:
             for kind, channel, callback in self._buffered:
-                samples: Iterable[zenoh.Sample] = islice(iter(channel.try_recv, None), _BUFFER_SIZE)
+                messages = _raw_messages(kind, islice(iter(channel.try_recv, None), _BUFFER_SIZE))
                 if kind in latest_only:
-                    samples = {sample.key_expr: sample for sample in samples}.values()
-                if batch := _raw_messages(samples):
-                    callback(batch)
+                    messages = list({message[0]: message for message in messages}.values())
+                if messages:
+                    callback(messages)
         finally:
             self._dispatching.release()
 
@@ -220,7 +239,7 @@ class Bus(AbstractContextManager):
     def get_stream(self, kind: type[M], target: int | str, payload: bytes, timeout_s: float) -> Iterator[M]:
         """Query with a payload and yield every reply on arrival, for at most `timeout_s` [s]; omit error replies."""
         for reply in self._iter_replies(key_of(kind, target), timeout_s, payload, self._large_replies):
-            if (sample := reply.ok) is not None and (message := self._decode(kind, sample)) is not None:
+            if reply.ok is not None and (message := self._decode(kind, *_raw_message(reply.ok)[:3])) is not None:
                 yield message
 
     def get_payloads(self, kind: type, target: int | str, timeout_s: float) -> Iterator[bytes]:
@@ -248,17 +267,13 @@ class Bus(AbstractContextManager):
             ) from None
 
     def _decode_replies(self, kind: type[M], replies: Iterable[zenoh.Reply]) -> list[tuple[M, Stamp | None]]:
-        pairs = [self._decode_sample(kind, reply.ok) for reply in replies if reply.ok is not None]
-        return select_latest([pair for pair in pairs if pair is not None])
+        raw = [_raw_message(reply.ok) for reply in replies if reply.ok is not None]
+        pairs = [(self._decode(kind, *message[:3]), message[3]) for message in raw]
+        return select_latest([(message, stamp) for message, stamp in pairs if message is not None])
 
-    def _decode_sample(self, kind: type, sample: zenoh.Sample) -> tuple[Any, Stamp | None] | None:
-        message = self._decode(kind, sample)
-        return None if message is None else (message, _stamp(sample))
-
-    def _decode(self, kind: type[M], sample: zenoh.Sample) -> M | None:
+    def _decode(self, kind: type[M], uav: int | None, payload: bytes, encoding_name: str) -> M | None:
         try:
-            uav = uav_of_key(str(sample.key_expr))
-            return decode_for_key(kind, uav, sample.payload.to_bytes(), str(sample.encoding))
+            return decode_for_key(kind, uav, payload, encoding_name)
         except ValueError:
             self.bad += 1
             return None
@@ -292,20 +307,15 @@ class Bus(AbstractContextManager):
         self.close()
 
 
-def _stamp(sample: zenoh.Sample) -> Stamp | None:
-    return unpack_stamp(sample.attachment.to_bytes() if sample.attachment is not None else None)
+def _raw_message(sample: zenoh.Sample) -> RawMessage:
+    stamp = None if (attachment := sample.attachment) is None else unpack_stamp(attachment.to_bytes())
+    return uav_of_key(str(sample.key_expr)), sample.payload.to_bytes(), str(sample.encoding), stamp
 
 
-def _raw_messages(samples: Iterable[zenoh.Sample]) -> list[RawMessage]:
-    return [
-        (
-            uav_of_key(str(sample.key_expr)),
-            sample.payload.to_bytes(),
-            str(sample.encoding),
-            None if (attachment := sample.attachment) is None else unpack_stamp(attachment.to_bytes()),
-        )
-        for sample in samples
-    ]
+def _raw_messages(kind: type, samples: Iterable[zenoh.Sample]) -> list[RawMessage]:
+    """Return the messages of a class as received, but batches of samples, unless they do not decode, split."""
+    messages = map(_raw_message, samples)
+    return [one for message in messages for one in split_batch(message)] if kind is Sample else list(messages)
 
 
 def _parameters(query: zenoh.Query) -> dict[str, str]:

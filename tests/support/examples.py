@@ -45,6 +45,7 @@ from fleet.contract import (
     ProposedPath,
     Rows,
     Sample,
+    Samples,
     SiblingData,
     SiblingDifference,
     Siblings,
@@ -67,17 +68,10 @@ def _rows(name: str) -> Rows:
 
 def _linear(states: tuple[str, ...], inputs: tuple[str, ...]) -> LinearModel:
     n, m = len(states), len(inputs)
-    return LinearModel(
-        states=states,
-        inputs=inputs,
-        A=Array.of(np.eye(n) * 0.5, "<f8"),
-        B=Array.of(np.ones((n, m)), "<f8"),
-        C=Array.of(np.eye(n), "<f8"),
-        D=Array.of(np.zeros((n, m)), "<f8"),
-        x_trim=Array.of(np.arange(n), "<f8"),
-        u_trim=Array.of(np.arange(m), "<f8"),
-        dt_s=0.04,
-    )
+    arrays = {"A": np.eye(n) * 0.5, "B": np.ones((n, m)), "C": np.eye(n), "D": np.zeros((n, m))}
+    arrays |= {"x_trim": np.arange(n), "u_trim": np.arange(m)}
+    wrapped = {name: Array.of(values, "<f8") for name, values in arrays.items()}
+    return LinearModel(states=states, inputs=inputs, dt_s=0.04, **wrapped)
 
 
 VERDICT = Verdict(
@@ -395,6 +389,7 @@ MESSAGES = (
     Handover(t=T, uav=UAV, epoch=5, code="0123456789abcdef", snapshot=b"twin"),
 )
 MESSAGES += (
+    Samples(t=T, uavs=(UAV,), samples=(encode(next(m for m in MESSAGES if isinstance(m, Sample))),)),
     Predictions(t=T, predictions=(Raw(encode(next(m for m in MESSAGES if isinstance(m, Prediction)))),), epochs=(5,)),
 )
 EXAMPLES = {type(message): message for message in MESSAGES}

@@ -1,7 +1,7 @@
 """Bus within one process, without a router: the methods of `fleet.bus.session.Bus`."""
 
 import secrets
-from collections.abc import Callable, Collection, Container, Iterator
+from collections.abc import Callable, Collection, Container, Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
 from functools import partial
 from typing import Any, TypeVar
@@ -33,9 +33,10 @@ class MemoryBus(AbstractContextManager):
         """Publish one message."""
         self.deliver(type(message), encode(message), encoding(type(message)), stamp)
 
-    def put(self, encoded: EncodedMessage, stamp: Stamp | None = None) -> None:
-        """Publish one encoded message."""
-        self.deliver(encoded.kind, encoded.payload, encoding(encoded.kind), stamp)
+    def put_all(self, messages: Sequence[EncodedMessage], stamp: Stamp | None = None) -> None:
+        """Publish encoded messages; no batches are made."""
+        for message in messages:
+            self.deliver(message.kind, message.payload, encoding(message.kind), stamp)
 
     def remove_publishers(self, uavs: Collection[int]) -> None:
         """Do nothing: this bus keeps nothing per key."""

@@ -17,7 +17,7 @@ from fleet.bus.codec import Stamp, encode, encoding
 from fleet.bus.session import Bus, connect
 from fleet.cli import stop_on_signal
 from fleet.config import bus_config_from, router_arguments
-from fleet.contract import TOPICS, Sample
+from fleet.contract import TOPICS, Sample, Samples
 from fleet.process.file_options import output_file
 from fleet.process.logs import report_progress
 from fleet.telemetry.recording.fleet_log import BusRecord
@@ -99,12 +99,13 @@ class BusRecorder:
 
     def subscribe(self) -> None:
         """Query rarely published messages, so that a recording started in flight has the missions; then subscribe."""
-        for kind in TOPICS.values():
+        recorded = [kind for kind in TOPICS.values() if kind is not Samples]  # batches are recorded as samples
+        for kind in recorded:
             if kind is not Sample:
                 replies: list[tuple[Any, Stamp | None]] = self._bus.get(kind)
                 for message, stamp in replies:
                     self._on_message(kind, encode(message), encoding(kind), stamp)
-        for kind in TOPICS.values():
+        for kind in recorded:
             self._bus.subscribe_raw(kind, partial(self._on_message, kind))
 
     def _on_message(self, kind: type, payload: bytes, encoding_name: str, stamp: Stamp | None) -> None:

@@ -26,6 +26,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from fleet.bus.bus_protocol import key_of
 from fleet.bus.session import Bus, connect
 from fleet.cli import make_parser, run_command
 from fleet.contract import Prediction, Predictions
@@ -41,7 +42,9 @@ _TIMEOUT_S = 0.5  # of a question while one worker is frozen: nobody waits for i
 def once(bus: Bus, kind: type, wanted: int, timeout_s: float = 5.0) -> float | None:
     """Ask once; give how long the last of so many answers took [s]; None where fewer came."""
     begun, last, came = time.perf_counter(), 0.0, 0
-    for _ in bus.get_stream(kind, "*", b"", timeout_s):
+    for reply in bus._iter_replies(key_of(kind, "*"), timeout_s):
+        if not bus._decode_replies(kind, [reply]):
+            continue
         last, came = time.perf_counter() - begun, came + 1
         if came == wanted:
             break

@@ -12,7 +12,8 @@ from typing import Any
 import msgpack
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from fleet.bus.codec import EncodedMessage
+from fleet.bus.bus_protocol import key_of
+from fleet.bus.codec import encoding
 from fleet.bus.session import connect
 from fleet.contract import Sample
 from fleet.telemetry.tables.mavlink import TABLE
@@ -31,6 +32,7 @@ def main() -> int:
     parser.robust_parsing = True
     rows: dict[int, dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
     heard, tick, tell = 0, time.monotonic(), time.monotonic()
+    publishers: dict[int, Any] = {}
     with connect(sys.argv[2]) as bus:
         while True:
             try:
@@ -47,7 +49,10 @@ def main() -> int:
             if now >= tick + TICK_S:
                 tick = now
                 for uav, mine in rows.items():
-                    bus.put(EncodedMessage(Sample, uav, msgpack.packb(mine)))
+                    if uav not in publishers:
+                        name = key_of(Sample, uav)
+                        publishers[uav] = bus._session.declare_publisher(name, encoding=encoding(Sample))
+                    publishers[uav].put(msgpack.packb(mine))
                 rows.clear()
             if now >= tell + TELL_S:
                 tell = now

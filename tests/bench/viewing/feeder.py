@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from fleet.bus.codec import Stamp
+from fleet.bus.codec import EncodedMessage, Stamp, encode
 from fleet.bus.session import Bus, connect, open_router
 from fleet.contract import (
     Alert,
@@ -148,8 +148,7 @@ def publish(world: World, bus: Bus, hz: float, stop: threading.Event) -> float:
     while not stop.is_set():
         who = parts[turn % PARTS]
         t = time.time()
-        for sample in samples(world, who, t):
-            bus.publish(sample)
+        bus.put_all([EncodedMessage(Sample, one.uav, encode(one), one.t) for one in samples(world, who, t)])
         second = turn // PARTS % max(round(hz), 1)
         for message in slowly(world, who[who % max(round(hz), 1) == second], t):
             bus.publish(message, None if isinstance(message, Status) else STAMP)

@@ -179,16 +179,18 @@ def test_a_router_forwards_samples_to_its_clients_and_not_to_other_regions(paper
             connect(BusConfig(at, role, None, passwords)) as reader,
             connect(BusConfig(at, "gateway", None, passwords)) as sender,
         ):
-            reader._session.declare_subscriber(
-                "parauav/*/*", lambda sample, keys=keys: keys.append(str(sample.key_expr))
-            )
+            for expression in ("parauav/*/*", "parauav/@fleet/sample/*"):
+                reader._session.declare_subscriber(
+                    expression, lambda sample, keys=keys: keys.append(str(sample.key_expr))
+                )
             until(lambda sender=sender, keys=keys: sender._session.put("parauav/1/status", b"x") or keys)
             for _ in range(5):
                 sender._session.put("parauav/2/sample", b"x")
+                sender._session.put("parauav/@fleet/sample/ab", b"x")
             sender._session.put("parauav/2/status", b"x")
             until(lambda keys=keys: "parauav/2/status" in keys)
-            counts.append(keys.count("parauav/2/sample"))
-    assert counts == [0, 5]
+            counts.append([keys.count(key) for key in ("parauav/2/sample", "parauav/@fleet/sample/ab")])
+    assert counts == [[0, 0], [5, 5]]
 
 
 # --- the script ------------------------------------------------------------------------------------------------------
