@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from fleet.access.entry import BusConfig
-from fleet.bus.codec import encode
+from fleet.bus.codec import EncodedMessage, encode
 from fleet.bus.session import connect
 from fleet.cli import make_parser, run_command, stop_on_signal
 from fleet.contract import Prediction, Sample
@@ -147,13 +147,16 @@ def publish(args: argparse.Namespace) -> None:
     with connect(LOCAL, retry=True) as bus:
         if args.role == "worker":
             bus.subscribe(Sample, lambda message, _: None, own.__contains__)
-        session = bus._session
-        publishers = [session.declare_publisher(f"parauav/{uav}/{kind.topic}") for uav in own]
+        publishers = [bus._session.declare_publisher(f"parauav/{uav}/{kind.topic}") for uav in own]
         _report_ready(args)
         begun = time.monotonic()
         while not stop.wait(max(begun + sent / (hertz * len(own)) - time.monotonic(), 0.0)):
-            for k in range(sent, sent + _BURST):
-                publishers[k % len(own)].put(payload, attachment=_TIME.pack(time.time()))
+            burst = [k % len(own) for k in range(sent, sent + _BURST)]
+            if kind is Sample:
+                bus.put_all([EncodedMessage(Sample, own[k], payload, time.time()) for k in burst])
+            else:
+                for k in burst:
+                    publishers[k].put(payload, attachment=_TIME.pack(time.time()))
             sent += _BURST
     (args.folder / f"{args.layout}-{args.role}{args.region}").write_text(str(sent / (time.monotonic() - begun)))
 
