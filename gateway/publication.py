@@ -90,11 +90,12 @@ class HistoryStore:
                 self.size += size
                 if t - history.trimmed_before > longest_s or history.size > self._share:
                     self.size -= history.trim(t - self._seconds, self._share)
+                if self.size > self._max_bytes:  # a silent aircraft has more than its share, which has become smaller
+                    self.size -= sum(one.trim(one.trimmed_before, self._share) for one in self._histories.values())
 
     def _add_uav(self, uav: int, t: float) -> _UavHistory:
         history = self._histories[uav] = _UavHistory(t)
         self._share = self._max_bytes // len(self._histories)
-        self.size -= sum(other.trim(other.trimmed_before, self._share) for other in self._histories.values())
         return history
 
     def remove(self, uavs: Iterable[int]) -> None:

@@ -60,6 +60,16 @@ def test_memory_is_bounded_whatever_comes_and_what_is_left_out_is_said():
     assert first.since == pytest.approx(T0 + 20 - 101 * 0.01)
 
 
+def test_a_silent_aircraft_gives_room_to_others():
+    store = HistoryStore(max_bytes=200_000)
+    store.add([EncodedMessage(Sample, 0, bytes(500), T0 + 0.01 * k) for k in range(390)])
+    for uav in range(1, 5):
+        store.add([EncodedMessage(Sample, uav, bytes(500), T0 + 0.01 * k) for k in range(80)])
+        assert store.size <= 200_000
+    (oldest, _), *_ = store.answer(0, {}, b"")
+    assert len(oldest.samples) == 80 and oldest.since == pytest.approx(T0 + 3.09)
+
+
 def test_one_aircraft_s_minute_is_there_within_50_ms(router):
     with connect(router) as bus, connect(router) as mine:
         publisher = Publisher(bus)
