@@ -32,7 +32,7 @@ class LegOnly(msgspec.Struct):
     leg: Rows
 
 
-class SampleSubset(msgspec.Struct, frozen=True):
+class SampleSubset(msgspec.Struct, frozen=True, gc=False):
     """Fields of a sample that the viewer uses; the others are skipped."""
 
     uav: int
@@ -65,7 +65,7 @@ def decode_sample(payload: bytes) -> SampleSubset:
         ) from None
 
 
-class QueuedMessage(NamedTuple):
+class QueuedMessage(msgspec.Struct, frozen=True, gc=False):  # thousands per second, which form no reference cycle
     """Undecoded message."""
 
     payload: bytes
@@ -116,15 +116,15 @@ class Inbox(CoalescingQueue):
     def put(self, samples: list[RawMessage], now: float) -> None:
         """Queue samples in order of arrival."""
         leg_changed, full_rate_uavs, large_fleet = self._leg_changed_uavs, self.full_rate_uavs, self.large_fleet
-        pending = self._pending
+        queued_of = self._pending.get
         for uav, payload, _, _ in samples:
             if uav is None:
                 self.dropped += 1
                 continue
             is_new_leg = large_fleet and _LEG_KEY in payload and self._is_new_leg(uav, payload)
             keep = not large_fleet or uav in full_rate_uavs or uav in leg_changed
-            if not (keep or is_new_leg) and uav in pending:  # most samples of a large fleet
-                pending[uav][1][-1] = QueuedMessage(payload, now)
+            if not (keep or is_new_leg) and (queued := queued_of(uav)) is not None:  # most samples of a large fleet
+                queued[1][-1] = QueuedMessage(payload, now)
                 continue
             if not self.add(uav, QueuedMessage(payload, now), keep=keep):
                 self.dropped += 1
@@ -242,6 +242,9 @@ def last_row(x: Array) -> tuple[float, ...]:
     return tuple(map(float, x.numpy()[-1]))  # raises with the reason
 
 
+_TIME, _ONE_TIME, _ONE_POSITION = struct.Struct("<d"), (1,), (1, 3)
+
+
 def position_rows(uav: int, rows: Rows) -> tuple[Any, Any]:
     """Return the times (n,) and rows (n, 3 or more) of positions; decode a single row without numpy.
 
@@ -249,9 +252,8 @@ def position_rows(uav: int, rows: Rows) -> tuple[Any, Any]:
         ValueError: when the shapes do not match; the gateway must resend.
     """
     t, x = rows.t, rows.x
-    if x.shape == (1, 3) and t.shape == (1,):
-        row_times, row = last_row(Array(t.dtype, (1, 1), t.data)), last_row(x)
-        return row_times, (row,)
+    if x.shape == _ONE_POSITION and t.shape == _ONE_TIME and t.dtype == "<f8" and len(t.data) == 8:
+        return _TIME.unpack(t.data), (last_row(x),)
     times, positions = t.numpy(), x.numpy()
     if positions.ndim != 2 or positions.shape[1] < 3 or times.shape != (len(positions),):
         raise ValueError(f"uav-{uav}: position rows have shape {positions.shape}, expected (n, 3) and n times; resend")
