@@ -43,6 +43,16 @@ class SampleSubset(msgspec.Struct, frozen=True, gc=False):
     leg: Rows | None = None
 
 
+class SampleValues(NamedTuple):
+    """Values of one sample that the viewer uses; None where the sample has none."""
+
+    t: float  # time of the sample [s since 1970]
+    attitude: tuple[float, float, float] | None  # phi theta psi [rad]
+    Va: float | None  # may be nan [m/s]
+    point: tuple[float, float, float, float] | None  # time [s since 1970], scene ENU [10 m]
+    leg: float | None  # current mission item
+
+
 _SUBSET_DECODER, _LEG_DECODER = msgspec.msgpack.Decoder(SampleSubset), msgspec.msgpack.Decoder(LegOnly)
 _DECODE_ERRORS = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 

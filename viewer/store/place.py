@@ -55,6 +55,19 @@ class SceneFrame:
         (point,) = self.from_geodetic(*(np.array([x]) for x in (lat_e7, lon_e7, alt_mm))).tolist()
         return point[0], point[1], point[2]
 
+    def from_geodetic_in_range(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Map positions as `from_geodetic_point` does, (n, 3 or more) latitude, longitude, altitude.
+
+        Returns:
+            scene ENU (n, 3) [10 m]; a mask (n,) of those with a fix and in range on this side of 180 degrees
+        """
+        lat, lon, alt = positions.T[:3]
+        scene = np.empty((len(positions), 3))
+        scene[:, 0] = (lon - self.origin.lon_e7) * self._east
+        scene[:, 1] = (lat - self.origin.lat_e7) * self._north
+        scene[:, 2] = (alt - self.origin.alt_mm) * 1e-3 / UNIT_M
+        return scene, (np.abs(scene) <= REACH_M / UNIT_M).all(axis=1) & ((lat != 0.0) | (lon != 0.0))
+
     def from_ned(self, origin: tuple[int, int, int], ned: np.ndarray) -> np.ndarray:
         """Map NED positions relative to another origin, (n, 3) [m], to the scene: (n, 3) ENU [10 m]."""
         ned = np.asarray(ned, float)

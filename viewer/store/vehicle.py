@@ -23,14 +23,13 @@ from fleet.contract import (
     Model,
     Outcome,
     Prediction,
-    Rows,
     Status,
     TwinState,
     claimed_horizon_s,
 )
 from viewer.store.event_detection import DetectorState, detect_events
 from viewer.store.forecast import PastPrediction, ScenePrediction
-from viewer.store.inbox import DataTime, SampleSubset, last_row, position_rows
+from viewer.store.inbox import DataTime, SampleSubset, SampleValues, last_row, position_rows
 from viewer.store.place import UNIT_M, SceneFrame
 from viewer.store.proposal import SceneProposal
 from viewer.store.track import FlightTrack, Trail
@@ -247,11 +246,7 @@ class Vehicle:
             raise ValueError(
                 f"uav-{self.uav}: sample has time {sample.t}, expected seconds since 1970; check the gateway"
             )
-        if sample.t < self.t - JUMP_S:
-            self.reset()
-        self.sample_received = now
-        if sample.t > self.t:
-            self.t = sample.t
+        self._receive(sample.t, now)
         if sample.air is not None and (air := last_row(sample.air.x)) and isfinite(air[0]):
             self.Va = air[0]
         if sample.attitude is not None and (angles := last_row(sample.attitude.x)):
@@ -259,16 +254,36 @@ class Vehicle:
             if isfinite(phi) and isfinite(theta) and isfinite(psi):
                 self.attitude = phi, theta, psi
         if sample.position is not None:
-            self._update_position(sample.position, scene_frame)
+            points: list[tuple[float, float, float, float]] = []
+            for t, row in zip(*position_rows(self.uav, sample.position), strict=True):
+                lat, lon, alt = row[:3]
+                if isfinite(t) and isfinite(lat) and isfinite(lon) and isfinite(alt) and (lat or lon):
+                    points.append((t, *scene_frame.from_geodetic_point(lat, lon, alt)))
+            if points:
+                self._add_points(points, scene_frame)
 
-    def _update_position(self, position: Rows, scene_frame: SceneFrame) -> None:
-        points: list[tuple[float, float, float, float]] = []
-        for t, row in zip(*position_rows(self.uav, position), strict=True):
-            lat, lon, alt = row[:3]
-            if isfinite(t) and isfinite(lat) and isfinite(lon) and isfinite(alt) and (lat or lon):
-                points.append((t, *scene_frame.from_geodetic_point(lat, lon, alt)))
-        if not points:
-            return
+    def update_from_values(self, values: SampleValues, scene_frame: SceneFrame, now: float) -> None:
+        """Update as `update_from_sample` and `process` do of a sample with the same mission item as before, or none."""
+        t, attitude, Va, point, _ = values
+        self._receive(t, now)
+        if Va is not None and isfinite(Va):
+            self.Va = Va
+        if attitude is not None:
+            self.attitude = attitude
+        if point is not None:
+            self._add_points([point], scene_frame)
+        self.time = self.time.update(t, now)
+
+    def _receive(self, t: float, now: float) -> None:
+        """Note the time of a sample [s since 1970] and its arrival, monotonic [s]; reset after a step back."""
+        if t < self.t - JUMP_S:
+            self.reset()
+        self.sample_received = now
+        if t > self.t:
+            self.t = t
+
+    def _add_points(self, points: list[tuple[float, float, float, float]], scene_frame: SceneFrame) -> None:
+        """Extend the path: time [s since 1970] and scene ENU [10 m] of each point."""
         if self.track.add(points):
             self.trail.clear()
             self.floor = np.nan
