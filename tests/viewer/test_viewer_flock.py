@@ -15,6 +15,7 @@ from viewer.scene.selection.selected import active_seq
 from viewer.server.app import Backfill
 from viewer.store.forecast import LOOK_AHEADS_S, prediction_errors, rms_by_look_ahead
 from viewer.store.inbox import Inbox
+from viewer.store.sample_layout import MIN_TOGETHER, SampleReader
 from viewer.store.store import COALESCE_S, FleetStore
 from viewer.text.missed_events import Absence, missed_events, missed_events_html
 from viewer.theme.events import EventKind
@@ -169,6 +170,77 @@ def test_in_a_crowd_what_comes_every_second_is_read_now_and_then_and_of_who_is_l
     clock.now += 2 * COALESCE_S[Status]
     feed.poll()
     assert mode(5) == "STAB"
+
+
+def mixed_samples(uavs: int, k: int) -> list[tuple[int, bytes]]:
+    """Return the id of the key and the payload of a sample of each UAV, most of one layout and some of no valid one."""
+    r = np.random.default_rng(k)
+
+    def rows(x: object, dtype: str = "<f4", n: int = 1) -> Rows:
+        return Rows(t=Array.of(t - 0.1 * np.arange(n), "<f8"), x=Array.of(x, dtype))
+
+    messages = []
+    for uav in range(uavs):
+        t, odd = T + k + 0.001 * uav, int(r.integers(60))
+        place = np.array([473_977_420 + 100 * k + 7 * uav, 85_455_940 + 1_300 * uav, 488_000 + 10 * k])
+        fields = {"attitude": rows(r.normal(size=(1, 6))), "air": rows([[15.0 + 0.1 * k, 0.5, 0.0]])}
+        fields |= {"imu": rows(r.normal(size=(1, 6))), "position": rows(place[None], "<i4")}
+        if r.integers(10) == 0:
+            fields["leg"] = rows([[float(k // 3)]])
+        odd_fields = {
+            1: {"attitude": None},
+            2: {"position": None},
+            3: {"attitude": rows(np.full((1, 6), np.nan))},
+            4: {"air": rows([[np.nan, 0.5, 0.0]])},
+            5: {"position": rows([[0, 0, 0]], "<i4")},
+            6: {"position": rows([[0, 0, 0]], "<i8")},
+            7: {"position": rows(place[None] + [90_000_000, 0, 0], "<i4")},
+            8: {"position": rows(place[None] + np.arange(3)[:, None], "<i4", n=3)},
+            9: {"attitude": rows(r.normal(size=(4, 6)), n=4)},
+            10: {"attitude": Rows(t=Array.of([t], "<f8"), x=Array("<f4", (1, 6), b"short"))},
+            11: {"position": Rows(t=Array.of([np.nan], "<f8"), x=Array.of(place[None], "<i4"))},
+            12: {"air": rows(np.zeros((0, 3)), n=0)},
+            13: {"attitude": rows(r.normal(size=(1, 6)), "<f8")},
+            14: {"attitude": rows(r.normal(size=6))},
+        }
+        times = {15: np.nan, 16: np.inf, 17: t - 100.0, 18: t - 1.0}
+        payload = encode(Sample(uav=uav, t=times.get(odd, t), **{**fields, **odd_fields.get(odd, {})}))
+        if odd == 19:
+            payload = payload[:-1] + b"\xc1"
+        if odd == 20:
+            payload = payload.replace(b"attitude", b"attitudf")
+        if odd == 21:
+            payload = payload.replace(b"\xa3uav", b"\xa3uaw")
+        messages.append((uav + (odd == 22), payload))
+    return messages
+
+
+def test_samples_read_together_change_the_same_as_samples_read_one_by_one(
+    clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    n, feeds, together = LARGE_FLEET + 20, [], 0
+    for least in (MIN_TOGETHER, n + 1):
+        monkeypatch.setattr("viewer.store.sample_layout.MIN_TOGETHER", least)
+        feed, _, bus = crowd_of(clock, n)
+        bus.publish(Status(uav=2, t=T, mode="AUTO", armed=False))
+        feed.inbox.full_rate_uavs = frozenset({4})
+        for k in range(1, 12):
+            for part in (k, k + 0.5):
+                messages = [(uav, payload, encoding(Sample), None) for uav, payload in mixed_samples(n, int(2 * part))]
+                feed._receiver(Sample)(messages[:: 1 if part == k else 7])
+            queued = [(uav, message) for uav, (_, messages) in feed.inbox._pending.items() for message in messages]
+            read, _ = SampleReader().read(queued, feed._vehicles, feed.scene_frame)
+            together += len(read)
+            feed.poses(tuple(feed.uavs))
+        feeds.append(feed)
+    feed, other = feeds
+    assert together > 5 * n and feed.counts == other.counts and feed.counts["strange"] > 100
+    for one, same in zip(feed.all(), other.all(), strict=True):
+        for name in ("t", "attitude", "Va", "alt_m", "time", "sample_received", "floor", "events", "refusal"):
+            assert repr(getattr(one, name)) == repr(getattr(same, name)), (one.uav, name)
+        assert np.array_equal(one.at, same.at) and one.detector_state == same.detector_state
+        assert np.array_equal(one.trail_rows(), same.trail_rows(), equal_nan=True)
+        assert np.array_equal(one.track_rows(), same.track_rows())
 
 
 def test_nobody_writes_in_the_name_of_another(clock: Clock) -> None:

@@ -1,5 +1,6 @@
 """Labels in 3-D by priority, without overlap; labels of UAVs with an alert."""
 
+from math import hypot, tan
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -73,18 +74,25 @@ class CameraView(NamedTuple):
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Project points (n, 3): right and up of the image centre in image heights, (n, 2), and depth (n,)."""
-        right, up = self.axes()
         offsets = points - self.position
-        depth = offsets @ np.cross(up, right)
-        flat = np.stack([offsets @ right, offsets @ up], axis=-1)
-        return flat / (2 * np.tan(self.fov / 2) * np.maximum(depth, 1e-3)[:, None]), depth
+        right, up, depth = (offsets @ axis for axis in self._directions())
+        flat = np.stack([right, up], axis=-1)
+        return flat / (2 * tan(self.fov / 2) * np.maximum(depth, 1e-3)[:, None]), depth
 
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the image directions right and up, two (3,)."""
-        forward = (self.look_at - self.position) / (np.linalg.norm(self.look_at - self.position) or 1.0)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right = right / (np.linalg.norm(right) or 1.0)
-        return right, np.cross(right, forward)
+        right, up, _ = self._directions()
+        return right, up
+
+    def _directions(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the directions right, up and forward of the image, three (3,)."""
+        x, y, z = (self.look_at - self.position).tolist()
+        length = hypot(x, y, z) or 1.0
+        level = hypot(x, y) or 1.0
+        right_x, right_y, z = y / level, -x / level, z / length
+        up_x, up_y, up_z = right_y * z, -right_x * z, (right_x * y - right_y * x) / length  # right x forward
+        forward = -up_z * right_y, up_z * right_x, up_x * right_y - up_y * right_x  # up x right
+        return np.array([right_x, right_y, 0.0]), np.array([up_x, up_y, up_z]), np.array(forward)
 
 
 def visible_labels(tags: list[Tag], camera_view: CameraView) -> tuple[list[Tag], list[np.ndarray]]:

@@ -16,7 +16,7 @@ class Strokes:
         self._node = scene.add_line_segments(
             name, _EMPTY, np.zeros((1, 2, 3), np.uint8), thickness=width, thickness_units="screen"
         )
-
+        self._is_empty = True
         self._colours: tuple[np.ndarray, int] | None = None  # as last drawn, and of how many segments
 
     def draw_parts(self, parts: list[tuple[np.ndarray, np.ndarray]]) -> None:
@@ -29,7 +29,10 @@ class Strokes:
         """Show segments (n, 2, 3) [10 m]; colours (3,), (n, 3) or (n, 2, 3), sRGB [0..255]; None keeps them."""
         segments = np.asarray(segments, np.float32).reshape(-1, 2, 3)
         if not len(segments):
+            if self._is_empty:
+                return
             segments, colours = _EMPTY, np.zeros(3)
+        self._is_empty = segments is _EMPTY
         if colours is not None:
             self.colour(colours, len(segments))
         self._node.points = segments

@@ -50,25 +50,33 @@ class ScenePrediction:
     @property
     def ahead(self) -> np.ndarray:
         """Return the look-ahead of each point, increasing, (n,) [s]."""
-        return self._scene_arrays[0]
+        return self._refined_path[0]
 
     @property
     def path(self) -> np.ndarray:
         """Return the mean positions, scene ENU, (n, 3) [10 m]."""
-        return self._scene_arrays[1]
-
-    @property
-    def tube(self) -> np.ndarray:
-        """Return the half-axes along, cross, vertical, (n, 3) [10 m]."""
-        return self._scene_arrays[2]
+        return self._refined_path[1]
 
     @cached_property
-    def _scene_arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _refined_path(self) -> tuple[np.ndarray, np.ndarray]:
         message = self.message
-        arrays = (message.ahead, message.path, message.prediction_region_half_axes)
-        ahead, path, tube = (array.numpy().astype(float) for array in arrays)
+        ahead, path = (array.numpy().astype(float) for array in (message.ahead, message.path))
+        return refined(ahead, self.scene_frame.from_ned(message.ned_origin(), path))
+
+    @cached_property
+    def tube(self) -> np.ndarray:
+        """Return the half-axes along, cross, vertical, (n, 3) [10 m]."""
+        message = self.message
+        ahead, tube = (array.numpy().astype(float) for array in (message.ahead, message.prediction_region_half_axes))
         tube = np.clip(np.nan_to_num(tube / UNIT_M), 0.0, 1e4)
-        return refined(ahead, self.scene_frame.from_ned(message.ned_origin(), path), tube)
+        if len(self.ahead) == len(ahead):
+            return tube
+        return np.stack([np.interp(self.ahead, ahead, column) for column in tube.T], axis=-1)
+
+    def release_arrays(self) -> None:
+        """Release the arrays in scene coordinates; they are computed again on their next use."""
+        for name in ("_refined_path", "tube"):
+            vars(self).pop(name, None)
 
     def position_at(self, ahead: np.ndarray | float) -> np.ndarray:
         """Interpolate the mean path at look-aheads (k,) [s] -> (k, 3) [10 m]; constant beyond both ends."""
@@ -134,19 +142,28 @@ def check_prediction(message: Prediction, scene_frame: SceneFrame, received: flo
             f"uav-{message.uav}: prediction has {len(others)} alternatives of shapes {[x.shape for x in others[:3]]}, "
             f"expected at most {MAX_ALTERNATIVES} of (n, 3); resend"
         )
-    if not all(one.min() >= -REACH_M and one.max() <= REACH_M for one in (path, *others)):  # also rejects NaN
+    if not all(_is_within_reach(one) for one in (path, *others)):
         raise ValueError(f"uav-{message.uav}: prediction has a path that is not finite or beyond 100 km; resend")
     scene_frame.from_geodetic_point(*message.origin)
     return ScenePrediction(message, scene_frame, received)
 
 
-def refined(ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _is_within_reach(path: np.ndarray) -> bool:
+    """Return whether all coordinates (n, 3) [m] are finite and at most `REACH_M`."""
+    flat = path.reshape(-1)
+    if flat.dtype.kind == "f" and np.vdot(flat, flat) <= 0.5 * REACH_M**2:  # bounds each of them, in one call
+        return True
+    return bool(path.min() >= -REACH_M and path.max() <= REACH_M)  # also rejects NaN
+
+
+def refined(ahead: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Insert points between look-aheads that are seconds apart, as chords cut turns by metres."""
-    if np.diff(ahead).max() <= _CHORD_S or len(ahead) < 4:
-        return ahead, path, tube
-    parts = np.minimum(np.ceil(np.diff(ahead) / _CHORD_S), _MAX_PARTS).astype(int)
+    steps = np.diff(ahead)
+    if steps.max() <= _CHORD_S or len(ahead) < 4:
+        return ahead, path
+    parts = np.minimum(np.ceil(steps / _CHORD_S), _MAX_PARTS).astype(int)
     at = np.interp(np.arange(parts.sum() + 1), np.concatenate([[0], np.cumsum(parts)]), ahead)
-    return at, _cubic(ahead, path, at), np.stack([np.interp(at, ahead, column) for column in tube.T], axis=-1)
+    return at, _cubic(ahead, path, at)
 
 
 def _cubic(ahead: np.ndarray, path: np.ndarray, at: np.ndarray) -> np.ndarray:

@@ -23,7 +23,8 @@ from viewer.theme.events import LATEST
 LARGE_FLEET = 300  # UAVs above which only the newest sample of each is decoded
 MAX_QUEUED = 40  # queued samples of one UAV; then the newest replaces the last
 MAX_UAVS = 4_000  # UAVs with queued samples: ids are untrusted input
-_LEG_KEY = b"\xa3leg\x82"  # msgpack: the key followed by a map (not nil)
+_LEG_KEY, _NO_LEG = b"\xa3leg\x82", b"\xa3leg\xc0"  # msgpack: the key followed by a map, and by nil
+MAX_SIZES = 1_000  # sizes of samples whose place of `_NO_LEG` is stored: payloads are untrusted input
 
 
 class LegOnly(msgspec.Struct):
@@ -32,7 +33,7 @@ class LegOnly(msgspec.Struct):
     leg: Rows
 
 
-class SampleSubset(msgspec.Struct, frozen=True):
+class SampleSubset(msgspec.Struct, frozen=True, gc=False):
     """Fields of a sample that the viewer uses; the others are skipped."""
 
     uav: int
@@ -41,6 +42,16 @@ class SampleSubset(msgspec.Struct, frozen=True):
     position: Rows | None = None
     air: Rows | None = None
     leg: Rows | None = None
+
+
+class SampleValues(NamedTuple):
+    """Values of one sample that the viewer uses; None where the sample has none."""
+
+    t: float  # time of the sample [s since 1970]
+    attitude: tuple[float, float, float] | None  # phi theta psi [rad]
+    Va: float | None  # may be nan [m/s]
+    point: tuple[float, float, float, float] | None  # time [s since 1970], scene ENU [10 m]
+    leg: float | None  # current mission item
 
 
 _SUBSET_DECODER, _LEG_DECODER = msgspec.msgpack.Decoder(SampleSubset), msgspec.msgpack.Decoder(LegOnly)
@@ -65,7 +76,7 @@ def decode_sample(payload: bytes) -> SampleSubset:
         ) from None
 
 
-class QueuedMessage(NamedTuple):
+class QueuedMessage(msgspec.Struct, frozen=True, gc=False):  # thousands per second, which form no reference cycle
     """Undecoded message."""
 
     payload: bytes
@@ -112,19 +123,24 @@ class Inbox(CoalescingQueue):
         self.dropped = 0  # messages without a UAV id, or beyond the limit
         self._leg_changed_uavs: set[int] = set()  # UAVs whose last queued sample changes the mission item
         self._last_leg: dict[int, bytes] = {}  # last mission item of each UAV
+        self._no_leg_at: dict[int, int] = {}  # place of `_NO_LEG` in samples without a mission item, by their size
 
     def put(self, samples: list[RawMessage], now: float) -> None:
         """Queue samples in order of arrival."""
         leg_changed, full_rate_uavs, large_fleet = self._leg_changed_uavs, self.full_rate_uavs, self.large_fleet
-        pending = self._pending
+        queued_of, no_leg_at = self._pending.get, self._no_leg_at.get
         for uav, payload, _, _ in samples:
             if uav is None:
                 self.dropped += 1
                 continue
-            is_new_leg = large_fleet and _LEG_KEY in payload and self._is_new_leg(uav, payload)
+            is_new_leg = (
+                large_fleet
+                and not payload.startswith(_NO_LEG, no_leg_at(len(payload), len(payload)))  # reads no more than this
+                and self._is_new_leg(uav, payload)
+            )
             keep = not large_fleet or uav in full_rate_uavs or uav in leg_changed
-            if not (keep or is_new_leg) and uav in pending:  # most samples of a large fleet
-                pending[uav][1][-1] = QueuedMessage(payload, now)
+            if not (keep or is_new_leg) and (queued := queued_of(uav)) is not None:  # most samples of a large fleet
+                queued[1][-1] = QueuedMessage(payload, now)
                 continue
             if not self.add(uav, QueuedMessage(payload, now), keep=keep):
                 self.dropped += 1
@@ -135,6 +151,12 @@ class Inbox(CoalescingQueue):
 
     def _is_new_leg(self, uav: int, payload: bytes) -> bool:
         """Return whether a sample changes the mission item; True when it cannot be decoded."""
+        if _LEG_KEY not in payload:
+            if len(self._no_leg_at) >= MAX_SIZES:
+                self._no_leg_at.clear()
+            if (place := payload.find(_NO_LEG)) >= 0:
+                self._no_leg_at[len(payload)] = place
+            return False
         try:
             leg = _LEG_DECODER.decode(payload).leg.x
         except _DECODE_ERRORS:
@@ -175,8 +197,11 @@ class DataTime(NamedTuple):
 
     def estimate(self, now: float) -> float:
         """Estimate the current data time [s since 1970]; -inf before the first message."""
-        silence_s = now - self.received if isfinite(self.received) else 0.0
-        return self.t + min(silence_s, COAST_S) * self.rate + max(silence_s - COAST_S, 0.0)
+        t, received, rate, _ = self
+        silence_s = now - received if isfinite(received) else 0.0
+        if silence_s <= COAST_S:
+            return t + silence_s * rate
+        return t + COAST_S * rate + (silence_s - COAST_S)
 
 
 def is_dated(t: float) -> bool:
@@ -242,6 +267,9 @@ def last_row(x: Array) -> tuple[float, ...]:
     return tuple(map(float, x.numpy()[-1]))  # raises with the reason
 
 
+_TIME, _ONE_TIME, _ONE_POSITION = struct.Struct("<d"), (1,), (1, 3)
+
+
 def position_rows(uav: int, rows: Rows) -> tuple[Any, Any]:
     """Return the times (n,) and rows (n, 3 or more) of positions; decode a single row without numpy.
 
@@ -249,9 +277,8 @@ def position_rows(uav: int, rows: Rows) -> tuple[Any, Any]:
         ValueError: when the shapes do not match; the gateway must resend.
     """
     t, x = rows.t, rows.x
-    if x.shape == (1, 3) and t.shape == (1,):
-        row_times, row = last_row(Array(t.dtype, (1, 1), t.data)), last_row(x)
-        return row_times, (row,)
+    if x.shape == _ONE_POSITION and t.shape == _ONE_TIME and t.dtype == "<f8" and len(t.data) == 8:
+        return _TIME.unpack(t.data), (last_row(x),)
     times, positions = t.numpy(), x.numpy()
     if positions.ndim != 2 or positions.shape[1] < 3 or times.shape != (len(positions),):
         raise ValueError(f"uav-{uav}: position rows have shape {positions.shape}, expected (n, 3) and n times; resend")

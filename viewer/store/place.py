@@ -1,5 +1,7 @@
 """Scene frame: one local east-north-up frame for the whole fleet, in scene units of 10 m."""
 
+from functools import lru_cache
+
 import numpy as np
 
 from fleet.frames import Origin, to_geodetic, to_ned
@@ -55,14 +57,42 @@ class SceneFrame:
         (point,) = self.from_geodetic(*(np.array([x]) for x in (lat_e7, lon_e7, alt_mm))).tolist()
         return point[0], point[1], point[2]
 
+    def from_geodetic_in_range(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Map positions as `from_geodetic_point` does, (n, 3 or more) latitude, longitude, altitude.
+
+        Returns:
+            scene ENU (n, 3) [10 m]; a mask (n,) of those with a fix and in range on this side of 180 degrees
+        """
+        lat, lon, alt = positions.T[:3]
+        scene = np.empty((len(positions), 3))
+        scene[:, 0] = (lon - self.origin.lon_e7) * self._east
+        scene[:, 1] = (lat - self.origin.lat_e7) * self._north
+        scene[:, 2] = (alt - self.origin.alt_mm) * 1e-3 / UNIT_M
+        return scene, (np.abs(scene) <= REACH_M / UNIT_M).all(axis=1) & ((lat != 0.0) | (lon != 0.0))
+
     def from_ned(self, origin: tuple[int, int, int], ned: np.ndarray) -> np.ndarray:
         """Map NED positions relative to another origin, (n, 3) [m], to the scene: (n, 3) ENU [10 m]."""
         ned = np.asarray(ned, float)
-        if not np.isfinite(ned).all() or (np.abs(ned) > 2 * REACH_M).any():
+        if not np.abs(ned).max(initial=0.0) <= 2 * REACH_M:  # also of values that are not finite
             raise ValueError("path: found values that are not finite or beyond 200 km, expected metres; resend")
         if tuple(origin) == tuple(self.origin):
             return ned_to_scene(ned)
-        return self.from_geodetic(*to_geodetic(Origin(*origin), ned).T)
+        (lat, lon, alt), (north, east) = origin, _e7_per_m(Origin(*origin))
+        scene = np.empty(ned.shape)
+        scene[:, 0] = (lon - self.origin.lon_e7 + ned[:, 1] * east) * self._east
+        scene[:, 1] = (lat - self.origin.lat_e7 + ned[:, 0] * north) * self._north
+        scene[:, 2] = ((alt - self.origin.alt_mm) * 1e-3 - ned[:, 2]) / UNIT_M
+        if np.abs(scene).max(initial=0.0) <= REACH_M / UNIT_M:
+            return scene
+        return self.from_geodetic(*to_geodetic(Origin(*origin), ned).T)  # raises, or crosses 180 degrees
+
+
+@lru_cache(maxsize=4096)
+def _e7_per_m(origin: Origin) -> tuple[float, float]:
+    """Return latitude and longitude per metre north and east of an origin [1e-7 deg / m]."""
+    far = to_geodetic(origin, np.array([1e6, 1e6, 0.0]))
+    north, east = int(far[0]) - origin.lat_e7, (int(far[1]) - origin.lon_e7) % 3_600_000_000
+    return north / 1e6, east / 1e6
 
 
 def ned_to_scene(ned: np.ndarray) -> np.ndarray:

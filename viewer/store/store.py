@@ -30,16 +30,14 @@ from viewer.store.forecast import PastPrediction, check_prediction
 from viewer.store.inbox import LARGE_FLEET, CoalescingQueue, Inbox, QueuedMessage, SampleSubset, decode_sample
 from viewer.store.place import OutOfRangeError, SceneFrame, checked_origin, first_fix
 from viewer.store.proposal import MAX_PROPOSALS, SceneProposal, check_proposal
+from viewer.store.sample_layout import SampleReader
 from viewer.store.vehicle import ENDED_S, JUMP_S, ProposalKey, Vehicle, mean_fit, stamp_of
 from viewer.theme.events import MAX_ALERTS
 
 MAX_VEHICLES = 2_000  # ids are untrusted input: further UAVs are counted, not stored
 COASTING_S = 1.0  # a prediction later than this after the last sample is not compared with the flight [s]
 MAX_SAMPLE_WAIT_S = 1.2  # longest delay of a sample in a large fleet [s]
-COALESCE_S: dict[type, float] = {
-    Prediction: 3.0,
-    Status: 2.0,
-}  # decoding interval in a large fleet for UAVs without alerts [s]
+COALESCE_S: dict[type, float] = {Prediction: 3.0, Status: 2.0}  # decoding interval in a large fleet, no alert [s]
 PAST_S = 65.0  # age up to which past predictions are compared with the flight [s]
 MAX_AWAY = 10_000  # rejected UAVs that are counted
 MAX_STEPS = 32  # steps of an execution whose aircraft are looked at
@@ -54,7 +52,7 @@ class FleetStore:
 
     def __init__(self, bus: Bus, clock: Callable[[], float] = time.monotonic) -> None:
         self._vehicles: dict[int, Vehicle] = {}
-        self.inbox = Inbox()
+        self.inbox, self._reader = Inbox(), SampleReader()
         self._scene_frame: SceneFrame | None = None
         self.sentences: dict[int, str] = {}  # status text of each worker
         self._counts: Counter[str] = Counter()
@@ -162,7 +160,13 @@ class FleetStore:
 
     def _read_samples(self, uavs: Iterable[int] | None = None) -> None:
         """Decode the queued samples of all or some UAVs; the caller owns the lock."""
-        for uav, queued in self.inbox.take(uavs):
+        taken, scene_frame = self.inbox.take(uavs), self._scene_frame
+        if self.inbox.large_fleet and scene_frame is not None:
+            read, taken = self._reader.read(taken, self._vehicles, scene_frame)
+            for vehicle, now, values in read:
+                vehicle.update_from_values(values, scene_frame, now)
+            self._counts[Sample.__name__] += len(read)
+        for uav, queued in taken:
             try:
                 sample = decode_sample(queued.payload)
             except ValueError:

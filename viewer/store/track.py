@@ -65,8 +65,8 @@ class Trail:
         self._rows = np.full((TRAIL_ROWS, 5), np.nan)  # preallocated
         self._n = 0  # rows ever written; the newest `TRAIL_ROWS` are stored
 
-    def add(self, *row: float) -> None:
-        """Add one row of five."""
+    def add(self, row: tuple[float, float, float, float, float]) -> None:
+        """Add one row."""
         self._rows[self._n % TRAIL_ROWS] = row
         self._n += 1
 

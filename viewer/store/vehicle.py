@@ -4,7 +4,7 @@ import re
 from collections import deque
 from dataclasses import dataclass, field
 from functools import lru_cache
-from math import isfinite
+from math import inf, isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,14 +23,13 @@ from fleet.contract import (
     Model,
     Outcome,
     Prediction,
-    Rows,
     Status,
     TwinState,
     claimed_horizon_s,
 )
 from viewer.store.event_detection import DetectorState, detect_events
 from viewer.store.forecast import PastPrediction, ScenePrediction
-from viewer.store.inbox import DataTime, SampleSubset, last_row, position_rows
+from viewer.store.inbox import DataTime, SampleSubset, SampleValues, last_row, position_rows
 from viewer.store.place import UNIT_M, SceneFrame
 from viewer.store.proposal import SceneProposal
 from viewer.store.track import FlightTrack, Trail
@@ -143,17 +142,20 @@ class Vehicle:
         return self.record_cache
 
     def _compute_record(self, now: float) -> StatusRecord:
-        data_t, forecast = self.data_time(now), self.forecast
-        lag_s = data_t - forecast.t if forecast is not None else 0.0
-        age_s = None if forecast is None or not isfinite(data_t) else max(lag_s, 0.0)
-        horizon_s = claimed_horizon_s(forecast.horizon_s, age_s) if forecast is not None else 0.0
+        data_t, forecast, t = self.data_time(now), self.forecast, self.t
+        lag_s, age_s, horizon_s, is_open = 0.0, None, 0.0, False
+        if forecast is not None:
+            lag_s = data_t - forecast.t
+            age_s = max(lag_s, 0.0) if isfinite(data_t) else None
+            horizon_s = claimed_horizon_s(forecast.horizon_s, age_s)
+            is_open = horizon_s > 0.0 and forecast.message.horizon_open
         return StatusRecord(
             data_t,
             self.state(now),
             self._fit(),
             horizon_s,
-            bool(horizon_s) and forecast is not None and forecast.message.horizon_open,
-            max(data_t - self.t, 0.0) if isfinite(self.t) else np.inf,
+            is_open,
+            max(data_t - t, 0.0) if isfinite(t) else inf,
             age_s,
             self.prediction_lag_s(now) if lag_s > LATE_S else 0.0,
             now - self.result_accepted,
@@ -183,7 +185,7 @@ class Vehicle:
         A recording that has ended stays at its last instant: later worker messages do not belong to the flight.
         """
         copy = object.__new__(Vehicle)
-        copy.__dict__.update(self.__dict__)
+        copy.__dict__ = self.__dict__.copy()
         copy.instant, copy.record_cache = now, None
         if self.recorded and now - self.replay_seen > ENDED_S and now - self.sample_received > ENDED_S:
             copy.ended, copy.events = True, closed_at(self.events, self.time.t)
@@ -244,30 +246,49 @@ class Vehicle:
             raise ValueError(
                 f"uav-{self.uav}: sample has time {sample.t}, expected seconds since 1970; check the gateway"
             )
-        if sample.t < self.t - JUMP_S:
-            self.reset()
-        self.sample_received, self.t = now, max(sample.t, self.t)
+        self._receive(sample.t, now)
         if sample.air is not None and (air := last_row(sample.air.x)) and isfinite(air[0]):
             self.Va = air[0]
-        if sample.attitude is not None and (angles := last_row(sample.attitude.x)) and all(map(isfinite, angles[:3])):
-            self.attitude = angles[0], angles[1], angles[2]
+        if sample.attitude is not None and (angles := last_row(sample.attitude.x)):
+            phi, theta, psi = angles[:3]
+            if isfinite(phi) and isfinite(theta) and isfinite(psi):
+                self.attitude = phi, theta, psi
         if sample.position is not None:
-            self._update_position(sample.position, scene_frame)
+            points: list[tuple[float, float, float, float]] = []
+            for t, row in zip(*position_rows(self.uav, sample.position), strict=True):
+                lat, lon, alt = row[:3]
+                if isfinite(t) and isfinite(lat) and isfinite(lon) and isfinite(alt) and (lat or lon):
+                    points.append((t, *scene_frame.from_geodetic_point(lat, lon, alt)))
+            if points:
+                self._add_points(points, scene_frame)
 
-    def _update_position(self, position: Rows, scene_frame: SceneFrame) -> None:
-        t, x = position_rows(self.uav, position)
-        points = [
-            (float(time), *scene_frame.from_geodetic_point(lat, lon, alt))
-            for time, (lat, lon, alt, *_) in zip(t, x, strict=True)
-            if isfinite(time) and isfinite(lat) and isfinite(lon) and isfinite(alt) and (lat or lon)
-        ]
-        if not points:
-            return
+    def update_from_values(self, values: SampleValues, scene_frame: SceneFrame, now: float) -> None:
+        """Update as `update_from_sample` and `process` do of a sample with the same mission item as before, or none."""
+        t, attitude, Va, point, _ = values
+        self._receive(t, now)
+        if Va is not None and isfinite(Va):
+            self.Va = Va
+        if attitude is not None:
+            self.attitude = attitude
+        if point is not None:
+            self._add_points([point], scene_frame)
+        self.time = self.time.update(t, now)
+
+    def _receive(self, t: float, now: float) -> None:
+        """Note the time of a sample [s since 1970] and its arrival, monotonic [s]; reset after a step back."""
+        if t < self.t - JUMP_S:
+            self.reset()
+        self.sample_received = now
+        if t > self.t:
+            self.t = t
+
+    def _add_points(self, points: list[tuple[float, float, float, float]], scene_frame: SceneFrame) -> None:
+        """Extend the path: time [s since 1970] and scene ENU [10 m] of each point."""
         if self.track.add(points):
             self.trail.clear()
             self.floor = np.nan
         for point in points:
-            self.trail.add(*point, self.Va)
+            self.trail.add((*point, self.Va))
         up = points[-1][3]
         if self.status is not None and self.status.mode and not self.status.armed:  # no mode: status unknown
             self.floor = min(self.floor, up) if isfinite(self.floor) else up

@@ -128,8 +128,9 @@ class Timeline:
         if not recorded:
             self._span, self._shift, self._clock_uav = TimelineRange(0.0, 0.0), {}, None
             return self.player.go_live()
-        latest = max(recorded, key=lambda uav: recorded[uav].sample_received)
-        self._clock_uav = selected if selected in recorded else latest
+        if selected not in recorded:
+            selected = max(recorded, key=lambda uav: recorded[uav].sample_received)
+        self._clock_uav = selected
         self._span, self._shift = self._recordings.playback_range(recorded[self._clock_uav], list(recorded.values()))
 
     def tab(self, label: str, icon: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from functools import lru_cache
 from math import isfinite
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -11,7 +11,7 @@ from fleet.contract import Alert, AlertKey, Array, Link, Mismatch, Status, TwinS
 from fleet.frames import wrap
 from viewer.store.forecast import ScenePrediction, look_aheads
 from viewer.store.track import TRAIL_ROWS
-from viewer.store.vehicle import JUMP_S, Vehicle
+from viewer.store.vehicle import JUMP_S, StatusRecord, Vehicle
 from viewer.theme.events import TimelineEvent
 
 
@@ -30,23 +30,23 @@ class StateRecord(NamedTuple):
     mismatch: Mismatch | None
 
 
-def state_record(vehicle: Vehicle, at: float, now: float) -> StateRecord:
-    """Return the state of a UAV at data time `at` [s since 1970]; `now` is monotonic [s]."""
-    status, record = vehicle.status or Status(uav=vehicle.uav, t=at), vehicle.record(now)
-    return StateRecord(
-        at,
+def state_values(vehicle: Vehicle, record: StatusRecord) -> tuple[Any, ...]:
+    """Return the fields of a `StateRecord` after its time, of a UAV and its record of the same instant."""
+    status, model, fit = vehicle.status or _NO_STATUS, vehicle.model, record.fit
+    return (
         record.state,
         status.link,
         status.mode,
         status.armed,
         status.sentence,
-        vehicle.model.verdict.sentence if vehicle.model is not None else "",
-        None if record.fit is None else float(round(record.fit)),
+        model.verdict.sentence if model is not None else "",
+        None if fit is None else float(round(fit)),
         vehicle.alerts,
         vehicle.mismatch,
     )
 
 
+_NO_STATUS = Status(uav=-1, t=0.0)  # before the first
 RETENTION_S = 600.0  # retention of a live flight; a recording is kept completely [s]
 PREDICTION_STEP_S = 5.0  # between two recorded predictions [s]
 NEAR_STEP_S, NEAR_S, FAR_STEP_S = 1.0, 20.0, 2.5  # step up to NEAR_S of look-ahead, and beyond; drawn as splines [s]
@@ -105,26 +105,30 @@ class UavRecording:
 
         `now` is monotonic [s], `step_s` the shortest time between two recorded predictions [s].
         """
-        if vehicle.t < self.last_t - JUMP_S:
+        t, at, last_t = vehicle.t, vehicle.at, self.last_t
+        if t < last_t - JUMP_S:
             self.__init__()  # type: ignore[misc]  # clock step back: another flight
-        if vehicle.at is not None and isfinite(vehicle.t) and vehicle.t > self.last_t:
-            self._fill(vehicle, trail)
-            if vehicle.t >= self.last_t + self._step:
-                self._append(vehicle.t, [*vehicle.at.tolist(), *vehicle.attitude, vehicle.Va], vehicle.recorded)
+            last_t = self.last_t
+        if at is not None and isfinite(t) and t > last_t:
+            if len(trail) > 1:
+                self._fill(vehicle, trail)
+                last_t = self.last_t
+            if t >= last_t + self._step:
+                self._append(t, (*at.tolist(), *vehicle.attitude, vehicle.Va), recorded=vehicle.recorded)
         self._record_state(vehicle, now, step_s)
 
     def _fill(self, vehicle: Vehicle, trail: np.ndarray) -> None:
         """Insert positions between two records, as for a fast replay; heading is the course."""
         last = self.last_t
-        if vehicle.t - last < GAP_S or len(trail) < 2:
+        if vehicle.t - last < GAP_S:
             return
         between = trail[(trail[:, 0] > last + GAP_MARGIN_S) & (trail[:, 0] < vehicle.t - GAP_MARGIN_S)]
         between = between[:: max(1, len(between) // MAX_FILLED)]
         step = np.gradient(between[:, 1:3], axis=0) if len(between) > 1 else np.zeros((len(between), 2))
         for row, psi in zip(between, np.arctan2(*step.T), strict=True):
-            self._append(float(row[0]), [*row[1:4], 0.0, 0.0, psi, row[4]], vehicle.recorded)
+            self._append(float(row[0]), (*row[1:4], 0.0, 0.0, psi, row[4]), recorded=vehicle.recorded)
 
-    def _append(self, t: float, row: list[float], recorded: bool) -> None:
+    def _append(self, t: float, row: tuple[float, ...], *, recorded: bool) -> None:
         if self._n and self._n % INITIAL_ROWS == 0 and not recorded:
             old = int(np.searchsorted(self.t, self._t[self._n - 1] - RETENTION_S))
             if old > self._n // 8:  # expired rows of a live flight
@@ -152,10 +156,10 @@ class UavRecording:
         if forecast is not None and (not self.predictions or forecast.t >= self.predictions[-1].t + step_s):
             self.predictions.append(_reduced(forecast, self.predictions[-1] if self.predictions else None))
             self._prediction_bytes += _size_bytes(self.predictions[-1])
-        record = state_record(vehicle, at, now)
-        if not self.states or record[1:] != self.states[-1][1:]:
-            self.states.append(record)
-        del self.states[:-MAX_STATES]
+        values = state_values(vehicle, vehicle.record(now))
+        if not self.states or self.states[-1][1:] != values:
+            self.states.append(StateRecord(at, *values))
+            del self.states[:-MAX_STATES]
         if not vehicle.recorded:
             if self.predictions and self.predictions[0].t < at - RETENTION_S:
                 self._prediction_bytes -= _size_bytes(self.predictions.pop(0))
@@ -193,7 +197,7 @@ class UavRecording:
         """Return the newest prediction at a time; release the scene arrays of the last one returned."""
         prediction = next((candidate for candidate in reversed(self.predictions) if candidate.t <= t + 0.5), None)
         if self._last_returned is not None and self._last_returned is not prediction:
-            vars(self._last_returned).pop("_scene_arrays", None)
+            self._last_returned.release_arrays()
         self._last_returned = prediction
         return prediction
 

@@ -91,7 +91,8 @@ class RecordingStore:
         self.prediction_step_s = PREDICTION_STEP_S * max(len(fleet) / LARGE_FLEET, 1.0)  # bounds the memory
         self._second_half, large_fleet = not self._second_half, len(fleet) > LARGE_FLEET
         for vehicle in fleet[self._second_half :: 2] if large_fleet else fleet:
-            recording = self.by_uav.setdefault(vehicle.uav, UavRecording())
+            if (recording := self.by_uav.get(vehicle.uav)) is None:
+                recording = self.by_uav[vehicle.uav] = UavRecording()
             is_behind = not large_fleet and (not len(recording) or vehicle.t - recording.t[-1] > GAP_S)
             recording.record(vehicle, store.trail(vehicle) if is_behind else NO_TRAIL, now, self.prediction_step_s)
 
@@ -109,7 +110,8 @@ class RecordingStore:
         reference_t = recordings[clock_vehicle.uav].first_t
         ahead = {v.uav: recordings[v.uav].first_t - reference_t for v in fleet if v.recorded}
         shift = {uav: t for uav, t in ahead.items() if abs(t) > MAX_START_GAP_S}
-        end = max(recording.last_t - shift.get(uav, 0.0) for uav, recording in recordings.items())
-        begin = min(recording.first_t - shift.get(uav, 0.0) for uav, recording in recordings.items())
+        shifted = [(recordings.pop(uav), t) for uav, t in shift.items()]
+        end = max([*(one.last_t for one in recordings.values()), *(one.last_t - t for one, t in shifted)])
+        begin = min([*(one.first_t for one in recordings.values()), *(one.first_t - t for one, t in shifted)])
         begin = begin if clock_vehicle.recorded else max(begin, end - RETENTION_S)
         return TimelineRange(begin, end), shift

@@ -65,7 +65,7 @@ def test_what_flies_on_is_added_after_it(asked: list[int]) -> None:
     feed.all()
     bygone.request()
     vehicle = feed.vehicles[0]
-    vehicle.trail.add(T + 1.0, 0.0, 0.0, 0.0, 20.0)
+    vehicle.trail.add((T + 1.0, 0.0, 0.0, 0.0, 20.0))
     rows = vehicle.trail_rows()
     assert len(rows) == TRAIL_ROWS and rows[-1, 0] == T + 1.0 and (np.diff(rows[:, 0]) > 0).all()
 

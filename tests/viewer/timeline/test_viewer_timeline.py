@@ -317,7 +317,7 @@ def test_every_button_does_something(flown) -> None:
 def laid(told: ScenePrediction, path: np.ndarray) -> ScenePrediction:
     """Give the same prediction with another path."""
     other = ScenePrediction(told.message, told.scene_frame, told.received)
-    vars(other)["_scene_arrays"] = told.ahead, path, told.tube
+    vars(other).update(_refined_path=(told.ahead, path), tube=told.tube)
     return other
 
 

@@ -1,5 +1,6 @@
 """Event markers of the selected UAV on its flown path, and the tube around its predicted path."""
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -89,6 +90,8 @@ def event_text(event: TimelineEvent) -> str:
 
 
 SIDES = 28  # corners of one ring
+_TURN = np.linspace(0, 2 * np.pi, SIDES, endpoint=False)[None, :]
+_COS, _SIN = np.cos(_TURN), np.sin(_TURN)
 TURN_STEPS = 4  # slices before and after a point over which its turn is measured
 HOVER = 0.1  # shorter distance within these slices is no flight [10 m]
 INNER_SHARE = 0.9  # of the radius of a turn that the surface reaches inwards [-]
@@ -129,10 +132,8 @@ def rings(
     """
     cross, up = frame or path_frame(path)
     left, right = (axes[:, 1], axes[:, 1]) if sides is None else sides.T
-    turn = np.linspace(0, 2 * np.pi, SIDES, endpoint=False)[None, :]
-    cos, sin = np.cos(turn), np.sin(turn)
-    across = cos * np.where(cos > 0, left[:, None], right[:, None])
-    return path[:, None] + across[..., None] * cross[:, None] + sin[..., None] * (axes[:, 2, None] * up)[:, None]
+    across = _COS * np.where(_COS > 0, left[:, None], right[:, None])
+    return path[:, None] + across[..., None] * cross[:, None] + _SIN[..., None] * (axes[:, 2, None] * up)[:, None]
 
 
 def surface_sides(path: np.ndarray, axes: np.ndarray, frame: PathFrame | None = None) -> np.ndarray:
@@ -214,7 +215,13 @@ def sample_paths(path: np.ndarray, axes: np.ndarray, n: int, seed: int, frame: P
     a second pair, so that errors are correlated along the path. A constant seed per UAV avoids flicker.
     """
     cross, up = frame or path_frame(path)
-    begin, end = np.random.default_rng(seed).standard_normal((2, n, 2, 1))
+    begin, end = _standard_normal(seed, n)
     turn = np.linspace(0.0, 0.9, len(path))
     offset = (np.cos(turn) * begin + np.sin(turn) * end) / BAND_SIGMA
     return path + offset[:, 0, :, None] * (axes[:, 1, None] * cross) + offset[:, 1, :, None] * (axes[:, 2, None] * up)
+
+
+@lru_cache(maxsize=16)
+def _standard_normal(seed: int, n: int) -> np.ndarray:
+    """Return the normal numbers of n sample paths: start and end of cross and vertical offsets, (2, n, 2, 1)."""
+    return np.random.default_rng(seed).standard_normal((2, n, 2, 1))

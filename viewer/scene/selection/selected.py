@@ -1,7 +1,8 @@
 """Selected UAV in 3-D: tube, rings, horizon, route, flown path, hindcast, mismatch lines and labels."""
 
+from functools import lru_cache
 from math import isfinite
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -70,11 +71,11 @@ def hindcast(past: list[PastPrediction], trail: np.ndarray, clock: float) -> tup
     reach = min(clock - prediction.t, prediction.horizon_s, float(trail[-1, 0] - prediction.t))  # at most the horizon
     if reach < MIN_REACH_S:
         return NO_HINDCAST
-    at = np.arange(5.0, reach, 5.0)
+    at, steps = np.arange(5.0, reach, 5.0), np.linspace(0, reach, 2 * int(reach) + 2)
     actual = np.stack([np.interp(prediction.t + at, trail[:, 0], trail[:, i]) for i in (1, 2, 3)], axis=-1)
-    path = dashed(prediction.position_at(np.linspace(0, reach, 2 * int(reach) + 2)))
-    lines = np.concatenate([path, np.stack([prediction.position_at(at), actual], axis=1)])
-    return lines, Tag("then", f"predicted {clock - prediction.t:.0f} s ago", prediction.position_at(0.4 * reach))
+    points = prediction.position_at(np.concatenate([steps, at, [0.4 * reach]]))  # at once: each call maps the path
+    lines = np.concatenate([dashed(points[: len(steps)]), np.stack([points[len(steps) : -1], actual], axis=1)])
+    return lines, Tag("then", f"predicted {clock - prediction.t:.0f} s ago", points[-1])
 
 
 BANDS, BAND_STEPS = 5, 20  # fading bands of the tube, slices per band
@@ -92,6 +93,15 @@ SAMPLES = 6  # sample paths
 def _show(node: Any, *, visible: bool) -> None:
     if node.visible != visible:
         node.visible = visible
+
+
+class Marks(NamedTuple):
+    """Rings of the tube at marked look-aheads and at the horizon, as drawn."""
+
+    forecast: ScenePrediction
+    steps: list[float]  # marked look-aheads [s]
+    horizon_s: float
+    sections: np.ndarray  # corners of the rings, the last at the horizon, (n, SIDES, 3) [10 m]
 
 
 class Selection:
@@ -118,6 +128,7 @@ class Selection:
         self._ground, self._unit = 0.0, 1.0  # height of the ground, drawn span of an aircraft [10 m]
         self._label_boxes: list[np.ndarray] = []  # labels shown last
         self._hidden_numbers = np.zeros(0, bool)  # items whose number a label covers
+        self._marks: Marks | None = None  # as drawn
         self._drawn_route: tuple[Vehicle, RouteLines, CameraView, float] | None = None
         self.tube = True
         self.tags: list[Tag] = []  # moving labels
@@ -214,10 +225,14 @@ class Selection:
         """Draw rings of the tube at marked look-aheads and at the horizon."""
         p, horizon_s = self._palette, record.horizon_s
         steps = [s for s in marked_look_aheads(horizon_s) if s > start + 1.0][-4:]
-        at = np.array([0.0, *steps, horizon_s])
-        sections = rings(forecast.position_at(at), forecast.half_axes_at(at))[1:]
+        if self._marks is None or self._marks[:3] != (forecast, steps, horizon_s):
+            at = np.array([0.0, *steps, horizon_s])
+            self._marks = Marks(
+                forecast, steps, horizon_s, rings(forecast.position_at(at), forecast.half_axes_at(at))[1:]
+            )
+            self._horizon.draw(closed_loops(self._marks.sections[-1]), rgb(p.horizon))
+        sections = self._marks.sections
         thin.append((closed_loops(sections[:-1]), mix(p.tube, p.ink, 0.7)))
-        self._horizon.draw(closed_loops(sections[-1]), rgb(p.horizon))
         claim = "below 10 % to the end" if record.horizon_open else "error reaches 10 %"
         top = sections[-1][np.argmax(sections[-1][:, 2])]
         self.tags.append(Tag("horizon", f"horizon {horizon_text(record)}: {claim}", top, "bottom-left"))
@@ -234,6 +249,7 @@ class Selection:
         thin.append((closed_loops(rings(other.position_at(at), other.half_axes_at(at))), mix(p.tube, p.ink, 0.7)))
 
     def _hide_tube(self) -> None:
+        self._marks = None
         for node in (*self._bands, self._curtain):
             _show(node, visible=False)
         self._horizon.draw(NOTHING.legs)
@@ -321,6 +337,7 @@ def band_opacities(axes: np.ndarray, unit: float) -> np.ndarray:
     return np.clip(NEAR_OPACITY * by_width * np.linspace(1.0, LATE_SHARE, BANDS), FAR_OPACITY, NEAR_OPACITY)
 
 
+@lru_cache(maxsize=16)
 def _beyond_horizon(forecast: ScenePrediction, start: float) -> np.ndarray:
     """Return dashes of the prediction beyond the horizon: (n, 2, 3)."""
     end = min(float(forecast.ahead[-1]), start + BEYOND_S)
