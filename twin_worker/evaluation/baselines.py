@@ -16,7 +16,7 @@ import numpy as np
 
 from twin_worker.identification.fixed_wing.derivatives_model import DerivativesModel
 from twin_worker.prediction.closed_loop import fly_ahead
-from twin_worker.prediction.method_selection import constant_turn_prediction
+from twin_worker.prediction.constant_turn import constant_turn_prediction
 from twin_worker.telemetry.track import Track
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.steps.route_lines import (

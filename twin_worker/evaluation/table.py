@@ -19,7 +19,7 @@ from twin_worker.numerics.prediction_errors import NOMINAL_COVERAGE, path_length
 _LABELS = {
     "cv": "constant velocity",
     "ct": "constant turn rate",
-    "imm": "IMM (filterpy)",
+    "imm": "IMM",
     "route": "route at ground speed",
     "route_wind": "route + wind + leg speed",
     "paper": "method of the paper",

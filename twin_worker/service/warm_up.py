@@ -36,6 +36,7 @@ from twin_worker.identification.multirotor.rotor_model import HIGH, free_run, st
 from twin_worker.identification.multirotor.rotor_window import RotorWindow
 from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.numerics.prediction_errors import AHEAD, displacement_along_path
+from twin_worker.prediction.constant_turn import imm
 from twin_worker.prediction.fixed_wing.point_mass_rollout import unexplained_velocity
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.resample import Resampler
@@ -186,8 +187,9 @@ def _run_traffic() -> None:
 
 
 def _run_propagation() -> None:
-    """Propagate a prediction, update the wind filter, detect flight, and compare positions with an area."""
+    """Propagate a prediction, predict turns, update the wind filter, detect flight, and compare with an area."""
     ahead, path = (Array.of(values).numpy() for values in (np.arange(5.0), np.zeros((5, 3))))
+    imm(np.zeros((4, 3)), np.zeros((4, 3)), AHEAD)
     displacement_along_path(np.outer(AHEAD, [_SPEED, 0.0, 0.0]), AHEAD)
     keeps_along = continue_path(ahead, path, 1.0, np.zeros(3), np.zeros(3), np.empty((4, 3), np.float32))  # type: ignore[call-arg]
     widen_tube(ahead, path, 1.0, keeps_along, np.empty((4, 3), np.float32))  # type: ignore[call-arg]

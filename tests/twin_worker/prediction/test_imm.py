@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from filterpy.kalman import IMMEstimator, KalmanFilter
 
-from twin_worker.prediction.method_selection import STEP, constant_turn_prediction, imm, imm_with_variance
+from twin_worker.prediction.constant_turn import STEP, constant_turn_prediction, imm, imm_with_variance
 from twin_worker.telemetry.track import STEP as TRACK_STEP
 from twin_worker.telemetry.track import Track
 
@@ -59,6 +60,48 @@ def test_the_variance_grows_to_that_of_a_random_turn():
         at += velocity * (np.exp(1j * rate * STEP) - 1) / (1j * rate)
         velocity *= np.exp(1j * rate * STEP)
     assert np.sqrt(variance[30]) == pytest.approx(np.sqrt(np.var(at.real) + np.var(at.imag)), rel=0.15)
+
+
+def filterpy_path(p: np.ndarray, v: np.ndarray, steps: int) -> np.ndarray:
+    """The same models in filterpy: mean p_n, p_e after each step without measurements, (steps + 1, 2)."""
+    rows = np.column_stack([p[:, 0], v[:, 0], p[:, 1], v[:, 1]])
+    transition = np.array([[0.97, 0.015, 0.015], [0.06, 0.93, 0.01], [0.06, 0.01, 0.93]])
+    filters = []
+    for rate, noise in ((1e-9, 0.5), (0.3, 1.0), (-0.3, 1.0)):
+        one = KalmanFilter(dim_x=4, dim_z=4)
+        s, c = np.sin(rate * STEP), np.cos(rate * STEP)
+        one.F = np.array(
+            [
+                [1, s / rate, 0, -(1 - c) / rate],
+                [0, c, 0, -s],
+                [0, (1 - c) / rate, 1, s / rate],
+                [0, s, 0, c],
+            ]
+        )
+        one.H, one.R, one.P, one.x = np.eye(4), np.diag([0.5, 0.05, 0.5, 0.05]), np.eye(4), rows[0].copy()
+        one.Q = noise * np.kron(np.eye(2), [[STEP**4 / 4, STEP**3 / 2], [STEP**3 / 2, STEP**2]])
+        filters.append(one)
+    estimator = IMMEstimator(filters, np.array([0.8, 0.1, 0.1]), transition)
+    for row in rows[1:]:
+        estimator.predict()
+        estimator.update(row)
+    mu, x = estimator.mu, np.stack([one.x for one in filters])
+    out = [mu @ x]
+    for _ in range(steps):
+        mixed = mu @ transition
+        x = np.stack([one.F @ ((transition[:, j] * mu) @ x / mixed[j]) for j, one in enumerate(filters)])
+        mu = mixed
+        out.append(mu @ x)
+    return np.array(out)[:, [0, 2]]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_filter_is_that_of_filterpy(seed):
+    rng = np.random.default_rng(seed)
+    v = np.array([18.0, 9.0, 0.0]) + np.cumsum(rng.standard_normal((N, 3)), axis=0)
+    p = STEP * np.cumsum(v, axis=0) + 0.5 * rng.standard_normal((N, 3))
+    found = imm(p, v, STEP * np.arange(60))[:, :2]
+    assert np.allclose(found, filterpy_path(p, v, 59), rtol=1e-6, atol=1e-5)
 
 
 def test_left_mirrors_right():
