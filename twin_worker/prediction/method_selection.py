@@ -5,13 +5,15 @@ Source: Bates & Granger 1969, "The combination of forecasts" (the mean of two fo
 
 from collections import deque
 from dataclasses import dataclass, field
+from functools import lru_cache
 from math import exp, log
 
+import numba as nb
 import numpy as np
 
 from fleet.contract import METHOD_TEXTS
-from twin_worker.confidence.tube_and_horizon import path_length
 from twin_worker.numerics.interpolation import interpolate_rows
+from twin_worker.numerics.prediction_errors import min_path_length
 
 SCORE_AHEAD = np.arange(0.0, 61.0, 5.0)  # look-ahead of the scores [s]
 SCORE_INTERVAL_S = 5.0  # interval of scored predictions [s]
@@ -92,8 +94,9 @@ class MethodSelector:
         """Score what was flown of the predictions: times (n,) [s since 1970], positions NED (n, 3) [m]."""
         if not len(t):
             return
+        flight = np.ascontiguousarray(t, float), np.ascontiguousarray(positions, float)
         for start_t, speed, paths in self.pending:
-            self._score_prediction(start_t, speed, paths, (t, positions))
+            self._score_prediction(start_t, speed, paths, flight)
         self.scored_t = float(t[-1])
         while self.pending and self.pending[0][0] + SCORE_AHEAD[-1] <= t[-1]:
             self.pending.popleft()
@@ -101,23 +104,14 @@ class MethodSelector:
     def _score_prediction(
         self, start_t: float, speed: float, paths: dict[str, np.ndarray], flight: tuple[np.ndarray, np.ndarray]
     ) -> None:
-        t, positions = flight
-        times = start_t + SCORE_AHEAD[start_t + SCORE_AHEAD <= t[-1]]
-        due = np.flatnonzero(times[1:] > self.scored_t)
-        if not len(due) or start_t < t[0] or not paths:
+        if not paths:
             return
-        right = np.clip(np.searchsorted(t, times), 0, len(t) - 1)
-        time_gap = np.minimum(np.abs(t[right] - times), np.abs(t[np.maximum(right - 1, 0)] - times))
-        if time_gap.max() > _MAX_GAP_S:
-            return
-        actual = interpolate_rows(times, t, positions)
-        length = path_length(actual, speed)
-        errors = np.stack([path[1 : len(times)] for path in paths.values()]) - actual[1:]  # (methods, k, 3)
-        relative = np.sqrt(np.einsum("mki,mki->mk", errors, errors))[:, due] / length[1:][due]
-        priors = np.stack([_LOG_PRIOR[method][due] for method in paths])
-        log_ratios = (np.log(np.maximum(relative, _MIN_ERROR)) - priors).mean(axis=1).tolist()
-        for method, log_ratio in zip(paths, log_ratios, strict=True):
-            self._update(method, log_ratio, len(due) / len(SCORE_AHEAD[1:]))
+        log_ratios = np.empty(len(paths))
+        bounds = start_t, self.scored_t, min_path_length(speed)
+        n = _log_error_ratios(bounds, *flight, np.stack(list(paths.values())), _log_priors(tuple(paths)), log_ratios)
+        for method, log_ratio in zip(paths, log_ratios.tolist(), strict=True):
+            if n:
+                self._update(method, log_ratio, n / (len(SCORE_AHEAD) - 1))
 
     def _update(self, method: str, log_ratio: float, weight: float) -> None:
         n = self.n_scored[method] = self.n_scored.get(method, 0.0) + weight
@@ -144,3 +138,64 @@ class MethodSelector:
         others = ", ".join(f"{METHOD_TEXTS[name]} {100 * error:.1f} %" for error, name in errors)
         own = f"{METHOD_TEXTS[method]}: mean error of past predictions {100 * self.mean_error[method]:.1f} %"
         return f"predicted with {own} of path length; other methods: {others}"
+
+
+@lru_cache(maxsize=256)
+def _log_priors(methods: tuple[str, ...]) -> np.ndarray:
+    """Return the logarithms of the prior errors of some methods at `SCORE_AHEAD` from its second on, (m, k)."""
+    return np.stack([_LOG_PRIOR[method] for method in methods])
+
+
+@nb.njit(cache=True, error_model="numpy", nogil=True, _nrt=False)  # type: ignore[call-overload]
+def _log_error_ratios(
+    bounds: tuple[float, float, float],
+    t: np.ndarray,
+    positions: np.ndarray,
+    paths: np.ndarray,
+    log_priors: np.ndarray,
+    out: np.ndarray,
+) -> int:
+    """Compute the mean logarithm of relative error over prior error of each path, over the look-aheads to score.
+
+    Args:
+        bounds: start of the prediction, time up to which all are scored [s since 1970], minimum path length [m]
+        t, positions: flown, rising, (n,) [s since 1970] and (n, 3) [m]
+        paths: at `SCORE_AHEAD`, (m, k + 1, 3) [m]
+        log_priors: from the second look-ahead on, (m, k)
+        out: (m,)
+    Returns:
+        number of look-aheads; 0 where none is due, or telemetry has a gap at one
+    """
+    (start_t, scored_t, min_length), n, right = bounds, len(t), 0
+    flown, due = 0.0, 0
+    north = east = down = 0.0
+    out[:] = 0.0
+    if start_t < t[0]:
+        return 0
+    for k in range(len(SCORE_AHEAD)):
+        time = start_t + SCORE_AHEAD[k]
+        if not time <= t[n - 1]:
+            break
+        while right < n - 1 and t[right] < time:
+            right += 1
+        left = max(right - 1, 0)
+        if min(abs(t[right] - time), abs(t[left] - time)) > _MAX_GAP_S:
+            return 0
+        part = (time - t[left]) / (t[right] - t[left]) if right > left else 0.0
+        north_before, east_before, down_before = north, east, down
+        north = positions[left, 0] + part * (positions[right, 0] - positions[left, 0])
+        east = positions[left, 1] + part * (positions[right, 1] - positions[left, 1])
+        down = positions[left, 2] + part * (positions[right, 2] - positions[left, 2])
+        if k == 0:
+            continue
+        flown += np.sqrt((north - north_before) ** 2 + (east - east_before) ** 2 + (down - down_before) ** 2)
+        if not time > scored_t:
+            continue
+        due += 1
+        for m in range(len(paths)):
+            square = (paths[m, k, 0] - north) ** 2 + (paths[m, k, 1] - east) ** 2 + (paths[m, k, 2] - down) ** 2
+            relative = np.sqrt(square) / max(flown, min_length)
+            out[m] += np.log(_MIN_ERROR if relative < _MIN_ERROR else relative) - log_priors[m, k - 1]
+    for m in range(len(paths)):
+        out[m] /= max(due, 1)
+    return due

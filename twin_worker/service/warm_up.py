@@ -38,6 +38,7 @@ from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.numerics.prediction_errors import AHEAD, displacement_along_path
 from twin_worker.prediction.constant_turn import imm
 from twin_worker.prediction.fixed_wing.point_mass_rollout import unexplained_velocity
+from twin_worker.prediction.method_selection import MethodSelector
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.resample import Resampler
 from twin_worker.twin.state.flight_phase import speed_extremes
@@ -214,6 +215,9 @@ def _run_telemetry() -> None:
     log = PredictionLog()
     log.add(0.0, "", "", np.outer(AHEAD, [_SPEED, 0.0, 0.0]), _SPEED)
     AdaptiveLevels().update(log, *log.evaluate(window.t, window.p), log.live)
+    selector = MethodSelector()
+    selector.add(float(window.t[0]), _SPEED, AHEAD, {"hybrid": np.outer(AHEAD, [_SPEED, 0.0, 0.0])})
+    selector.score(window.t, window.p)
 
 
 def _run_identification() -> None:
