@@ -105,13 +105,13 @@ def parameters(values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np
 
 def read(values: Mapping[str, float]) -> tuple[dict[str, float], tuple[str, ...]]:
     """Return all parameters by current name, in the units of the autopilot, and the names at defaults."""
-    inputs = {**_old_gains(values), **{k: float(v) for k, v in values.items()}}
+    inputs = {**_old_gains(values), **values}
     resolved, absent = {}, []
     for row in TABLE:
         value = lookup(row, inputs)
         if value is None:
             absent.append(row.name)
-        resolved[row.name] = float(row.default) if value is None else value
+        resolved[row.name] = float(row.default if value is None else value)
     absent += [name for name in _reset_inconsistent(resolved) if name not in absent]
     return resolved, tuple(absent)
 
