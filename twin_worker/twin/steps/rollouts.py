@@ -19,6 +19,7 @@ from twin_worker.prediction.fixed_wing.point_mass_rollout import (
     in_field_wind,
     start_in_field,
 )
+from twin_worker.prediction.method_selection import SCORE_AHEAD
 from twin_worker.prediction.replay_window import PredictionContext, Rollout
 from twin_worker.telemetry.track import Track
 from twin_worker.twin.state.budget import EARLY_FRACTION, Work
@@ -127,15 +128,20 @@ def select_method(
     due = not twin.telemetry.link_lost and selector.is_due(t)
     competes = newest.seq >= 0 and not twin.telemetry.link_lost and twin.prediction.override is None
     competes = competes and twin.config.method != PAPER  # which was selected
+    track, offset = recent.unbroken_tail(), t - float(recent.t[-1])
+    scored = ahead[: int(ahead.searchsorted(SCORE_AHEAD[-1])) + 1]
     if competes and (due or selector.best((*forecasts, *SIMPLE_METHODS)) in SIMPLE_METHODS):
-        simple = simple_paths(twin, recent.unbroken_tail(), ahead + (t - recent.t[-1]))
+        simple = simple_paths(twin, track, scored + offset)  # to the end only if it is chosen
         forecasts = forecasts | {
             name: PathForecast(path, name, SIMPLE_METHODS[name], newest.seq, "") for name, path in simple.items()
         }
     paths = {name: forecast.path for name, forecast in forecasts.items() if forecast.path is not None}
     if due and len(paths) > 1:
-        selector.add(t, float(np.linalg.norm(recent.v[-1])), ahead, paths)
+        scored_paths = {name: path[: len(scored)] for name, path in paths.items()}
+        selector.add(t, float(np.linalg.norm(recent.v[-1])), scored, scored_paths)
     chosen = forecasts[selector.best(tuple(forecasts))]
+    if chosen.method in SIMPLE_METHODS and len(scored) < len(ahead):
+        chosen = replace(chosen, path=simple_paths(twin, track, ahead + offset)[chosen.method])
     return replace(chosen, sentence="; ".join(filter(None, (selector.describe(chosen.method), chosen.sentence))))
 
 
