@@ -44,7 +44,7 @@ from twin_worker.telemetry.resample import Resampler
 from twin_worker.twin.state.flight_phase import speed_extremes
 from twin_worker.twin.steps.extrapolate import continue_path, widen_tube
 from twin_worker.validation.held_out import HeldOut
-from twin_worker.validation.verify import verify
+from twin_worker.validation.verify import verify, with_diagnostics
 
 _SPEED = 22.0  # [m/s]
 _HOME = Origin(470_000_000, 80_000_000, 100_000)
@@ -226,7 +226,7 @@ def _run_identification() -> None:
         identify_axis(axis, _synthetic_flight(), 2.0)
     window = _synthetic_flight(60.0)
     plant, n_train = identify(window, np.zeros(2), load(GENERIC)), len(window) // 2
-    verify(plant, window, n_train, 0.0, None)
+    with_diagnostics(verify(plant, window, n_train, 0.0, None), plant, window, n_train)
     bias_corrected(plant, window)
     HeldOut(plant, window, n_train).shrinkage_sample(20.0, 5.0)
     linearise(plant, window)
