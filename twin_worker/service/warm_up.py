@@ -226,9 +226,10 @@ def _run_identification() -> None:
         identify_axis(axis, _synthetic_flight(), 2.0)
     window = _synthetic_flight(60.0)
     plant, n_train = identify(window, np.zeros(2), load(GENERIC)), len(window) // 2
-    with_diagnostics(verify(plant, window, n_train, 0.0, None), plant, window, n_train)
+    held_out = HeldOut(plant, window, n_train)
+    with_diagnostics(verify(plant, window, n_train, 0.0, None), held_out)
     bias_corrected(plant, window)
-    HeldOut(plant, window, n_train).shrinkage_sample(20.0, 5.0)
+    held_out.shrinkage_sample(20.0, 5.0)
     linearise(plant, window)
     wrap(np.zeros((2, 3))[:, 2])
 

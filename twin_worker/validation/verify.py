@@ -239,9 +239,8 @@ def concluded(verdict: Verdict, errors: Consistency | None, sentence: str) -> Ve
     )
 
 
-def with_diagnostics(verdict: Verdict, plant: Plant, window: Window, start: int) -> Verdict:
+def with_diagnostics(verdict: Verdict, held_out: HeldOut) -> Verdict:
     """Add diagnostics to a verdict: the fit at other horizons and the whiteness of residuals."""
-    held_out = HeldOut(plant, window, start)
     seconds = held_out.dt * (len(held_out.y) - 1)
     fits = {h: free_run_fit(held_out, h) for h in REPORTED_S if h <= seconds + held_out.dt}
     axis_fits = {name: value for h, fit in fits.items() for name, value in fit_by_axis(fit, h).items()}
