@@ -19,6 +19,7 @@ from functools import lru_cache
 from math import ceil, floor, isfinite
 from typing import NamedTuple
 
+import numba as nb
 import numpy as np
 from scipy.stats import norm, qmc
 
@@ -113,11 +114,20 @@ def _is_valid(prediction: Prediction, ahead: np.ndarray, path: np.ndarray, tube:
         0 < prediction.t < 4e9
         and 0 < prediction.quantile < 1
         and isfinite(prediction.quantile)
-        and np.isfinite(ahead).all()
-        and (np.diff(ahead) > 0).all()
-        and (np.abs(path) < _MAX_DISTANCE).all()
-        and ((tube >= 0.0) & (tube < _MAX_DISTANCE)).all()
+        and _rises_within_limits(ahead, path, tube)
         and abs(lat) < 8.9e8
         and abs(lon) <= 1.8e9
         and abs(alt) <= 1e8
     )
+
+
+@nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath: comparisons are false for nan
+def _rises_within_limits(ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> bool:
+    """Return whether look-aheads, (n,), are finite and rise, and positions and half-axes, (n, 3), are plausible."""
+    for k in range(len(ahead)):
+        if not abs(ahead[k]) < np.inf or (k > 0 and not ahead[k] > ahead[k - 1]):
+            return False
+        for j in range(3):
+            if not abs(path[k, j]) < _MAX_DISTANCE or not 0.0 <= tube[k, j] < _MAX_DISTANCE:
+                return False
+    return True

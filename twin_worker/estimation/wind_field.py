@@ -96,8 +96,8 @@ def profile_basis(height: np.ndarray) -> np.ndarray:
 
 def _distance(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return the distances of positions, (n, 3) and (m, 3), vertical ones weighted, (n, m) [m]."""
-    weight = np.array([1.0, 1.0, _VERTICAL])
-    return np.asarray(np.linalg.norm((p[:, None] - q[None]) * weight, axis=-1))
+    square = (p[:, :1] - q[:, 0]) ** 2 + (p[:, 1:2] - q[:, 1]) ** 2 + (_VERTICAL * (p[:, 2:] - q[:, 2])) ** 2
+    return np.asarray(np.sqrt(square))
 
 
 @dataclass

@@ -243,7 +243,8 @@ def _synchronise(
 
 def _banks(recent: Track, air: np.ndarray) -> np.ndarray:
     """Return the bank at each row: reported, else from the turn rate of the track [rad]."""
-    return np.where(np.isfinite(recent.euler[:, 0]), recent.euler[:, 0], _turn_banks(air))
+    reported = np.isfinite(recent.euler[:, 0])
+    return recent.euler[:, 0] if reported.all() else np.where(reported, recent.euler[:, 0], _turn_banks(air))
 
 
 def _turn_banks(air: np.ndarray) -> np.ndarray:

@@ -1,20 +1,19 @@
-"""Selection of the prediction method with the smallest expected error, by prior and scores; turn-rate estimation.
+"""Selection of the prediction method with the smallest expected error, by prior and scores.
 
 Source: Bates & Granger 1969, "The combination of forecasts" (the mean of two forecasts is one of the methods).
 """
 
 from collections import deque
 from dataclasses import dataclass, field
-from math import cos, exp, log, sin
+from functools import lru_cache
+from math import exp, log
 
+import numba as nb
 import numpy as np
-from filterpy.kalman import IMMEstimator, KalmanFilter
 
 from fleet.contract import METHOD_TEXTS
-from twin_worker.confidence.tube_and_horizon import path_length
 from twin_worker.numerics.interpolation import interpolate_rows
-from twin_worker.telemetry.track import STEP as TRACK_STEP
-from twin_worker.telemetry.track import Track
+from twin_worker.numerics.prediction_errors import min_path_length
 
 SCORE_AHEAD = np.arange(0.0, 61.0, 5.0)  # look-ahead of the scores [s]
 SCORE_INTERVAL_S = 5.0  # interval of scored predictions [s]
@@ -95,8 +94,9 @@ class MethodSelector:
         """Score what was flown of the predictions: times (n,) [s since 1970], positions NED (n, 3) [m]."""
         if not len(t):
             return
+        flight = np.ascontiguousarray(t, float), np.ascontiguousarray(positions, float)
         for start_t, speed, paths in self.pending:
-            self._score_prediction(start_t, speed, paths, (t, positions))
+            self._score_prediction(start_t, speed, paths, flight)
         self.scored_t = float(t[-1])
         while self.pending and self.pending[0][0] + SCORE_AHEAD[-1] <= t[-1]:
             self.pending.popleft()
@@ -104,23 +104,14 @@ class MethodSelector:
     def _score_prediction(
         self, start_t: float, speed: float, paths: dict[str, np.ndarray], flight: tuple[np.ndarray, np.ndarray]
     ) -> None:
-        t, positions = flight
-        times = start_t + SCORE_AHEAD[start_t + SCORE_AHEAD <= t[-1]]
-        due = np.flatnonzero(times[1:] > self.scored_t)
-        if not len(due) or start_t < t[0] or not paths:
+        if not paths:
             return
-        right = np.clip(np.searchsorted(t, times), 0, len(t) - 1)
-        time_gap = np.minimum(np.abs(t[right] - times), np.abs(t[np.maximum(right - 1, 0)] - times))
-        if time_gap.max() > _MAX_GAP_S:
-            return
-        actual = interpolate_rows(times, t, positions)
-        length = path_length(actual, speed)
-        errors = np.stack([path[1 : len(times)] for path in paths.values()]) - actual[1:]  # (methods, k, 3)
-        relative = np.sqrt(np.einsum("mki,mki->mk", errors, errors))[:, due] / length[1:][due]
-        priors = np.stack([_LOG_PRIOR[method][due] for method in paths])
-        log_ratios = (np.log(np.maximum(relative, _MIN_ERROR)) - priors).mean(axis=1).tolist()
-        for method, log_ratio in zip(paths, log_ratios, strict=True):
-            self._update(method, log_ratio, len(due) / len(SCORE_AHEAD[1:]))
+        log_ratios = np.empty(len(paths))
+        bounds = start_t, self.scored_t, min_path_length(speed)
+        n = _log_error_ratios(bounds, *flight, np.stack(list(paths.values())), _log_priors(tuple(paths)), log_ratios)
+        for method, log_ratio in zip(paths, log_ratios.tolist(), strict=True):
+            if n:
+                self._update(method, log_ratio, n / (len(SCORE_AHEAD) - 1))
 
     def _update(self, method: str, log_ratio: float, weight: float) -> None:
         n = self.n_scored[method] = self.n_scored.get(method, 0.0) + weight
@@ -149,145 +140,62 @@ class MethodSelector:
         return f"predicted with {own} of path length; other methods: {others}"
 
 
-STEP = 0.5  # filter step [s]
-_FILTER_STEPS = 24  # past steps that the filter uses
-_TURN_RATE = 0.3  # turn rate of the two turning models [rad/s]
-_MAX_SPEED = 1e3  # faster rows are invalid [m/s]
-# transition probabilities per step
-_MODEL_TRANSITION = np.array([[0.97, 0.015, 0.015], [0.06, 0.93, 0.01], [0.06, 0.01, 0.93]])
+@lru_cache(maxsize=256)
+def _log_priors(methods: tuple[str, ...]) -> np.ndarray:
+    """Return the logarithms of the prior errors of some methods at `SCORE_AHEAD` from its second on, (m, k)."""
+    return np.stack([_LOG_PRIOR[method] for method in methods])
 
 
-def _transition(rate: float) -> np.ndarray:
-    """Return the transition matrix of p_n, v_n, p_e, v_e at one turn rate [rad/s]."""
-    if rate == 0.0:
-        block = np.array([[1.0, STEP], [0.0, 1.0]])
-        return np.kron(np.eye(2), block)
-    s, c = sin(rate * STEP), cos(rate * STEP)
-    return np.array(
-        [
-            [1, s / rate, 0, -(1 - c) / rate],
-            [0, c, 0, -s],
-            [0, (1 - c) / rate, 1, s / rate],
-            [0, s, 0, c],
-        ]
-    )
-
-
-class _TurnFilter(KalmanFilter):  # type: ignore[misc]
-    """Kalman filter whose likelihood costs no decomposition: `update` has inverted the innovation covariance."""
-
-    @property
-    def log_likelihood(self) -> float:
-        """Return the logarithm of the density of the last innovation."""
-        _, log_det = np.linalg.slogdet(2.0 * np.pi * self.S)
-        return float(-0.5 * (log_det + self.y @ self.SI @ self.y))
-
-
-def _filter(rate: float, noise: float, start: np.ndarray) -> KalmanFilter:
-    filt = _TurnFilter(dim_x=4, dim_z=4)
-    q = np.array([[STEP**4 / 4, STEP**3 / 2], [STEP**3 / 2, STEP**2]])
-    filt.F, filt.H, filt.R = _transition(rate), np.eye(4), np.diag([0.5, 0.05, 0.5, 0.05])
-    filt.Q, filt.x, filt.P = np.kron(np.eye(2), q) * noise, start.copy(), np.eye(4)
-    return filt
-
-
-def constant_turn_prediction(track: Track, ahead: np.ndarray) -> np.ndarray | None:
-    """Predict from the end of a track, NED, (k, 3) [m]; None with fewer than four gap-free steps.
-
-    A clock jump puts rows of two times on one grid; rows before the last jump are ignored.
+@nb.njit(cache=True, error_model="numpy", nogil=True, _nrt=False)  # type: ignore[call-overload]
+def _log_error_ratios(
+    bounds: tuple[float, float, float],
+    t: np.ndarray,
+    positions: np.ndarray,
+    paths: np.ndarray,
+    log_priors: np.ndarray,
+    out: np.ndarray,
+) -> int:
+    """Compute the mean logarithm of relative error over prior error of each path, over the look-aheads to score.
 
     Args:
-        track: newest flight
-        ahead: requested look-ahead times, (k,) [s]
-    """
-    stride = round(STEP / TRACK_STEP)
-    unbroken = track.unbroken_tail()
-    rows = slice((len(unbroken) - 1) % stride, None, stride)
-    p, v = _after_jump(unbroken.p[rows][-_FILTER_STEPS:], unbroken.v[rows][-_FILTER_STEPS:])
-    return imm(p, v, ahead) if len(p) >= 4 else None
-
-
-def _after_jump(p: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and velocities, (n, 3), after the last implausible row; nan is implausible."""
-    plausible = np.linalg.norm(v, axis=1) < _MAX_SPEED
-    plausible[1:] &= np.linalg.norm(np.diff(p, axis=0), axis=1) < _MAX_SPEED * STEP
-    jumps = np.flatnonzero(~plausible)
-    first = int(jumps[-1]) if len(jumps) else 0
-    # the row after a position jump is valid
-    first += int(len(jumps) > 0 and not np.linalg.norm(v[first]) < _MAX_SPEED)
-    return p[first:], v[first:]
-
-
-def imm(p: np.ndarray, v: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """Predict from recent positions and velocities.
-
-    Args:
-        p: recent positions every `STEP` seconds, NED, newest last, (n, 3) [m]
-        v: recent velocities over ground, NED, (n, 3) [m/s]
-        ahead: requested look-ahead times, (k,) [s]
+        bounds: start of the prediction, time up to which all are scored [s since 1970], minimum path length [m]
+        t, positions: flown, rising, (n,) [s since 1970] and (n, 3) [m]
+        paths: at `SCORE_AHEAD`, (m, k + 1, 3) [m]
+        log_priors: from the second look-ahead on, (m, k)
+        out: (m,)
     Returns:
-        mean path, NED, (k, 3) [m]
+        number of look-aheads; 0 where none is due, or telemetry has a gap at one
     """
-    return _mean_path(_estimate(p, v), p[-1, 2], v[-4:, 2].mean(), ahead)
-
-
-def imm_with_variance(p: np.ndarray, v: np.ndarray, ahead: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the path of `imm` and the variance of its horizontal position, north plus east, (k,) [m2].
-
-    Source: Bar-Shalom 2001, 11.6.6 (moments of the mixture).
-    """
-    estimator = _estimate(p, v)
-    variance = _mixture_variance(estimator, int(np.ceil(ahead[-1] / STEP)))
-    path = _mean_path(estimator, p[-1, 2], v[-4:, 2].mean(), ahead)
-    return path, np.interp(ahead, STEP * np.arange(len(variance)), variance)
-
-
-def _estimate(p: np.ndarray, v: np.ndarray) -> IMMEstimator:
-    """Return the estimator after all rows."""
-    rows = np.column_stack([p[:, 0], v[:, 0], p[:, 1], v[:, 1]])
-    filters = [_filter(rate, noise, rows[0]) for rate, noise in ((0.0, 0.5), (_TURN_RATE, 1.0), (-_TURN_RATE, 1.0))]
-    estimator = IMMEstimator(filters, np.array([0.8, 0.1, 0.1]), _MODEL_TRANSITION)
-    for row in rows[1:]:
-        estimator.predict()
-        estimator.update(row)
-    return estimator
-
-
-def _mean_path(estimator: IMMEstimator, p_d: float, v_d: float, ahead: np.ndarray) -> np.ndarray:
-    """Return the mean path from height `p_d` [m] and sink rate `v_d` [m/s] on, NED, (k, 3) [m]."""
-    steps = int(np.ceil(ahead[-1] / STEP))
-    track = _run_forward(estimator, steps)
-    t = STEP * np.arange(steps + 1)
-    climb = np.clip(v_d, -8.0, 8.0) * 6.0 * (1 - np.exp(-ahead / 6.0))  # the climb decays
-    return np.column_stack([np.interp(ahead, t, track[:, 0]), np.interp(ahead, t, track[:, 1]), p_d + climb])
-
-
-def _run_forward(estimator: IMMEstimator, steps: int) -> np.ndarray:
-    """Propagate the mixed models without measurements; return the mean p_n, p_e, (steps + 1, 2) [m]."""
-    mu = estimator.mu.copy()
-    x = np.stack([filt.x for filt in estimator.filters])
-    F = np.stack([filt.F for filt in estimator.filters])
-    track = [mu @ x]
-    for _ in range(steps):
-        mixed = mu @ _MODEL_TRANSITION
-        x = np.einsum("jab,jb->ja", F, (_MODEL_TRANSITION * mu[:, None]).T @ x / mixed[:, None])
-        mu = mixed
-        track.append(mu @ x)
-    return np.array(track)[:, [0, 2]]
-
-
-def _mixture_variance(estimator: IMMEstimator, steps: int) -> np.ndarray:
-    """Return the variance of p_n plus that of p_e of the mixed models without measurements, (steps + 1,) [m2]."""
-    mu = estimator.mu.copy()
-    x, P, F, Q = (np.stack([getattr(filt, name) for filt in estimator.filters]) for name in ("x", "P", "F", "Q"))
-    FT, out = F.transpose(0, 2, 1), np.empty(steps + 1)
-    for k in range(steps + 1):
-        out[k] = mu @ ((x - mu @ x)[:, [0, 2]] ** 2 + P[:, [0, 2], [0, 2]]).sum(axis=1)
-        mixed = mu @ _MODEL_TRANSITION
-        share = (_MODEL_TRANSITION * mu[:, None]).T / mixed[:, None]  # of each model in each mixed start
-        start = share @ x
-        offset = x[None] - start[:, None]
-        spread = np.einsum("ji,jia,jib->jab", share, offset, offset)
-        P = F @ (np.einsum("ji,iab->jab", share, P) + spread) @ FT + Q
-        x, mu = np.einsum("jab,jb->ja", F, start), mixed
-    return out
+    (start_t, scored_t, min_length), n, right = bounds, len(t), 0
+    flown, due = 0.0, 0
+    north = east = down = 0.0
+    out[:] = 0.0
+    if start_t < t[0]:
+        return 0
+    for k in range(len(SCORE_AHEAD)):
+        time = start_t + SCORE_AHEAD[k]
+        if not time <= t[n - 1]:
+            break
+        while right < n - 1 and t[right] < time:
+            right += 1
+        left = max(right - 1, 0)
+        if min(abs(t[right] - time), abs(t[left] - time)) > _MAX_GAP_S:
+            return 0
+        part = (time - t[left]) / (t[right] - t[left]) if right > left else 0.0
+        north_before, east_before, down_before = north, east, down
+        north = positions[left, 0] + part * (positions[right, 0] - positions[left, 0])
+        east = positions[left, 1] + part * (positions[right, 1] - positions[left, 1])
+        down = positions[left, 2] + part * (positions[right, 2] - positions[left, 2])
+        if k == 0:
+            continue
+        flown += np.sqrt((north - north_before) ** 2 + (east - east_before) ** 2 + (down - down_before) ** 2)
+        if not time > scored_t:
+            continue
+        due += 1
+        for m in range(len(paths)):
+            square = (paths[m, k, 0] - north) ** 2 + (paths[m, k, 1] - east) ** 2 + (paths[m, k, 2] - down) ** 2
+            relative = np.sqrt(square) / max(flown, min_length)
+            out[m] += np.log(_MIN_ERROR if relative < _MIN_ERROR else relative) - log_priors[m, k - 1]
+    for m in range(len(paths)):
+        out[m] /= max(due, 1)
+    return due

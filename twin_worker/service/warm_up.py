@@ -36,13 +36,15 @@ from twin_worker.identification.multirotor.rotor_model import HIGH, free_run, st
 from twin_worker.identification.multirotor.rotor_window import RotorWindow
 from twin_worker.numerics.interpolation import zero_order_hold
 from twin_worker.numerics.prediction_errors import AHEAD, displacement_along_path
+from twin_worker.prediction.constant_turn import imm
 from twin_worker.prediction.fixed_wing.point_mass_rollout import unexplained_velocity
+from twin_worker.prediction.method_selection import MethodSelector
 from twin_worker.telemetry.history import TelemetryHistory
 from twin_worker.telemetry.resample import Resampler
 from twin_worker.twin.state.flight_phase import speed_extremes
 from twin_worker.twin.steps.extrapolate import continue_path, widen_tube
 from twin_worker.validation.held_out import HeldOut
-from twin_worker.validation.verify import verify
+from twin_worker.validation.verify import verify, with_diagnostics
 
 _SPEED = 22.0  # [m/s]
 _HOME = Origin(470_000_000, 80_000_000, 100_000)
@@ -186,8 +188,9 @@ def _run_traffic() -> None:
 
 
 def _run_propagation() -> None:
-    """Propagate a prediction, update the wind filter, detect flight, and compare positions with an area."""
+    """Propagate a prediction, predict turns, update the wind filter, detect flight, and compare with an area."""
     ahead, path = (Array.of(values).numpy() for values in (np.arange(5.0), np.zeros((5, 3))))
+    imm(np.zeros((4, 3)), np.zeros((4, 3)), AHEAD)
     displacement_along_path(np.outer(AHEAD, [_SPEED, 0.0, 0.0]), AHEAD)
     keeps_along = continue_path(ahead, path, 1.0, np.zeros(3), np.zeros(3), np.empty((4, 3), np.float32))  # type: ignore[call-arg]
     widen_tube(ahead, path, 1.0, keeps_along, np.empty((4, 3), np.float32))  # type: ignore[call-arg]
@@ -212,6 +215,9 @@ def _run_telemetry() -> None:
     log = PredictionLog()
     log.add(0.0, "", "", np.outer(AHEAD, [_SPEED, 0.0, 0.0]), _SPEED)
     AdaptiveLevels().update(log, *log.evaluate(window.t, window.p), log.live)
+    selector = MethodSelector()
+    selector.add(float(window.t[0]), _SPEED, AHEAD, {"hybrid": np.outer(AHEAD, [_SPEED, 0.0, 0.0])})
+    selector.score(window.t, window.p)
 
 
 def _run_identification() -> None:
@@ -220,9 +226,10 @@ def _run_identification() -> None:
         identify_axis(axis, _synthetic_flight(), 2.0)
     window = _synthetic_flight(60.0)
     plant, n_train = identify(window, np.zeros(2), load(GENERIC)), len(window) // 2
-    verify(plant, window, n_train, 0.0, None)
+    held_out = HeldOut(plant, window, n_train)
+    with_diagnostics(verify(plant, window, n_train, 0.0, None), held_out)
     bias_corrected(plant, window)
-    HeldOut(plant, window, n_train).shrinkage_sample(20.0, 5.0)
+    held_out.shrinkage_sample(20.0, 5.0)
     linearise(plant, window)
     wrap(np.zeros((2, 3))[:, 2])
 

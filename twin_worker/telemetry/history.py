@@ -1,12 +1,14 @@
 """Telemetry of one aircraft over the last minutes, as received: row buffers and arrival delays."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from struct import Struct
+from typing import Any
 
 import numba as nb
 import numpy as np
 
-from fleet.contract import COLUMNS, DTYPES, FIRST_OPTIONAL_COLUMN, ROW_WIDTHS, Array, Rows, Sample
+from fleet.contract import COLUMNS, DTYPES, FIRST_OPTIONAL_COLUMN, ROW_WIDTHS, Rows, Sample
 
 _MIN_SPARE_ROWS = 40  # minimum spare capacity [rows]
 _MAX_PENDING_ROWS = 256  # largest number of undecoded rows
@@ -156,9 +158,20 @@ _MIN_FROZEN_ROWS = 5
 _MAX_FUTURE_S = 1.0  # rows further in the future of their message are rejected [s]
 _MAX_VALUE = 1e5  # larger values are invalid [m/s, rad, us, ...]
 _MAX_VALUE_OF = {"position": 2e9, "target": 2e9, "gnss": 2e9, "pressure": 1e6}  # exceptions [1e-7 deg, mm, Pa]
-_WIDTHS = tuple((name, widths[0], widths[-1]) for name, widths in ROW_WIDTHS.items())
-_SIZES = {name: np.dtype(name).itemsize for name in DTYPES}
-_UNPACK_TIMES = tuple(Struct(f"<{n}d").unpack for n in range(17))  # by number of rows; faster than an array
+# of batches of few rows: function that unpacks the times, bytes of times and values, type and columns of the values
+_Layout = tuple[Callable[[bytes], tuple[Any, ...]], int, int, tuple[str, int]]
+_NO_LAYOUT: _Layout = (Struct("").unpack, 0, 0, ("", 0))
+_SMALL_BATCHES: dict[tuple[str, tuple[int, ...], str, tuple[int, ...]], _Layout] = {
+    ("<f8", (n,), dtype, (n, width)): (
+        Struct(f"<{n}d").unpack,  # faster than an array
+        8 * n,
+        n * width * np.dtype(dtype).itemsize,
+        (dtype, width),
+    )
+    for n in range(1, 17)
+    for dtype in DTYPES
+    for width in sorted({width for widths in ROW_WIDTHS.values() for width in widths})
+}
 
 
 @dataclass(eq=False)
@@ -172,18 +185,25 @@ class TelemetryHistory:
     def add(self, sample: Sample) -> int:
         """Add one message; return how many of its kinds violate the contract."""
         rejected, max_t = 0, sample.t + _MAX_FUTURE_S
-        for name, width, widest in _WIDTHS:
+        for name, widths in ROW_WIDTHS.items():
             rows: Rows | None = getattr(sample, name)
             if rows is None:
                 continue
-            width = widest if rows.x.shape[1:] == (widest,) else width
-            newest = _newest_time(rows.t, rows.x, width, max_t)
-            if newest:
-                self._buffer_of(name, newest).add_bytes(
-                    rows.t.data, rows.x.data, (rows.x.dtype, width), self.newest - self.keep_s
-                )
-            else:
+            t, x = rows.t, rows.x
+            layout = _SMALL_BATCHES.get((t.dtype, t.shape, x.dtype, x.shape), _NO_LAYOUT)
+            unpack, t_size, x_size, form = layout
+            if form[1] not in widths or len(t.data) != t_size or len(x.data) != x_size:
                 rejected += self._add_checked(name, rows, max_t)
+                continue
+            newest = 0.0
+            for row_t in unpack(t.data):
+                if not 0 < row_t <= max_t:  # true for nan
+                    rejected += self._add_checked(name, rows, max_t)
+                    break
+                if row_t > newest:
+                    newest = row_t
+            else:
+                self._buffer_of(name, newest).add_bytes(t.data, x.data, form, self.newest - self.keep_s)
         return rejected
 
     def _add_checked(self, name: str, rows: Rows, max_t: float) -> bool:
@@ -265,17 +285,3 @@ class TelemetryHistory:
         """Remove all rows, for example after a clock jump."""
         self._buffers.clear()
         self.newest = -np.inf
-
-
-def _newest_time(t: Array, x: Array, width: int, max_t: float) -> float:
-    """Return the newest time of a small valid batch, none later than `max_t`; 0 for any other batch."""
-    n = len(t.data) >> 3
-    if not 0 < n < len(_UNPACK_TIMES) or t.dtype != "<f8" or t.shape != (n,) or x.shape != (n, width):
-        return 0.0
-    if len(t.data) != 8 * n or len(x.data) != n * width * _SIZES.get(x.dtype, 0):
-        return 0.0
-    times: tuple[float, ...] = _UNPACK_TIMES[n](t.data)
-    for row_t in times:
-        if not 0 < row_t <= max_t:  # true for nan
-            return 0.0
-    return max(times)

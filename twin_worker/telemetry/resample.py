@@ -4,7 +4,7 @@ Source: Huang 2021, section 3.2 (time-stamp calibration, eq. 18; Lagrange interp
 """
 
 from dataclasses import dataclass, field
-from math import ceil, cos, floor, sin
+from math import ceil, cos, floor, pi, sin
 
 import numba as nb
 import numpy as np
@@ -36,7 +36,10 @@ def lagrange(t: np.ndarray, y: np.ndarray, grid: np.ndarray) -> np.ndarray:
     Returns:
         values on the grid, (n, k)
     """
-    return _interpolate(t, y, grid, (0.0, np.inf, np.inf))[0]
+    out, flags = np.empty((len(grid), y.shape[1])), np.empty((2, len(grid)), bool)
+    rows = np.ascontiguousarray(y, float)
+    _interpolate_each(t, rows, np.ascontiguousarray(grid), (0.0, np.inf, np.inf), 0, out, flags[0], flags[1])
+    return out
 
 
 def interpolate_samples(
@@ -51,19 +54,67 @@ def interpolate_samples(
     Returns:
         values (n, k), measured or filled (n,) bool, filled across lost samples (n,) bool
     """
-    if len(t) < 4:
-        return np.zeros((len(grid), y.shape[1])), np.zeros(len(grid), bool), np.zeros(len(grid), bool)
-    gaps = np.sort(np.diff(t))
-    median_gap = 0.5 * float(gaps[(len(gaps) - 1) // 2] + gaps[len(gaps) // 2])
-    return _interpolate(t, y, grid, (median_gap, longest_gap(max_gap, median_gap), max_cubic_gaps * median_gap))
-
-
-def _interpolate(
-    t: np.ndarray, y: np.ndarray, grid: np.ndarray, limits: tuple[float, float, float]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    out, ok, lost = np.empty((len(grid), y.shape[1])), np.empty(len(grid), bool), np.empty(len(grid), bool)
-    _interpolate_each(t, np.ascontiguousarray(y, float), np.ascontiguousarray(grid), limits, out, ok, lost)
+    out, ok, lost = np.zeros((len(grid), y.shape[1])), np.ones(len(grid), bool), np.zeros(len(grid), bool)
+    _interpolate_into((out, ok, lost), 0, (t, y), grid, (max_gap, max_cubic_gaps))
     return out, ok, lost
+
+
+def _interpolate_into(
+    out: tuple[np.ndarray, np.ndarray, np.ndarray],
+    at: int,
+    samples: tuple[np.ndarray, np.ndarray],
+    grid: np.ndarray,
+    limits: tuple[float, float],
+) -> float:
+    """Write the result of `interpolate_samples` to some columns; return the median gap [s], nan with too few samples.
+
+    Args:
+        out: values, (n, m) from column `at` on; mask of valid rows, which it restricts; mask of filled rows, extended
+        at: first column
+        samples: times and values, (m,) [s] and (m, k)
+        grid: requested times, rising, (n,) [s]
+        limits: longest gap [s], largest span of a cubic in median gaps [-]
+    """
+    t, y = samples
+    if len(t) < 4:
+        out[1][:] = False
+        return float("nan")
+    median_gap = _median_gap(t, np.empty(len(t) - 1))
+    spans = median_gap, longest_gap(limits[0], median_gap), limits[1] * median_gap
+    _interpolate_each(t, np.ascontiguousarray(y, float), np.ascontiguousarray(grid), spans, at, *out)
+    return float(median_gap)
+
+
+@nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]
+def _median_gap(t: np.ndarray, gaps: np.ndarray) -> float:
+    """Return the median of the differences of rising times, (m,); `gaps`, (m - 1,), is overwritten.
+
+    Source: Hoare 1961, algorithm 65 (find).
+    """
+    n = len(gaps)
+    for k in range(n):
+        gaps[k] = t[k + 1] - t[k]
+    middle, low, high = n // 2, 0, n - 1
+    while low < high:
+        pivot, i, j = gaps[middle], low, high
+        while i <= j:
+            while gaps[i] < pivot:
+                i += 1
+            while pivot < gaps[j]:
+                j -= 1
+            if i <= j:
+                gaps[i], gaps[j] = gaps[j], gaps[i]
+                i, j = i + 1, j - 1
+        if j < middle:
+            low = i
+        if middle < i:
+            high = j
+    below = gaps[middle]
+    if n % 2 == 0:  # all before the middle are at most the middle
+        below = gaps[0]
+        for k in range(1, middle):
+            below = max(below, gaps[k])
+    return 0.5 * (below + gaps[middle])  # type: ignore[no-any-return]
 
 
 @nb.njit(cache=True, nogil=True)  # no fastmath: a gap exactly as long as the limit is filled
@@ -72,11 +123,12 @@ def _interpolate_each(
     y: np.ndarray,
     grid: np.ndarray,
     limits: tuple[float, float, float],
+    at: int,
     out: np.ndarray,
     ok: np.ndarray,
     lost: np.ndarray,
 ) -> None:
-    """Compute the result of `interpolate_samples`; limits: median gap, longest gap, longest span of a cubic [s].
+    """Compute the result of `_interpolate_into`; limits: median gap, longest gap, longest span of a cubic [s].
 
     L(a) = sum_i b_i prod_(j != i) (a - a_j) / (a_i - a_j).  Source: Huang 2021 eq. 19.
     """
@@ -86,8 +138,9 @@ def _interpolate_each(
         while right < n - 1 and t[right] < grid[g]:
             right += 1
         gap, t_clamped = t[right] - t[right - 1], min(max(grid[g], t[0]), t[n - 1])
-        ok[g] = t[0] - median_gap <= grid[g] <= t[n - 1] + median_gap and gap <= max_gap
-        lost[g] = ok[g] and gap > _LOST_GAP_RATIO * median_gap
+        valid = t[0] - median_gap <= grid[g] <= t[n - 1] + median_gap and gap <= max_gap
+        ok[g] = ok[g] and valid
+        lost[g] = lost[g] or (valid and gap > _LOST_GAP_RATIO * median_gap)
         first, count = max(min(right - 2, n - 4), 0), 4
         if n < 4 or t[min(right + 1, n - 1)] - t[max(right - 2, 0)] > max_span:
             first, count = right - 1, 2
@@ -97,9 +150,9 @@ def _interpolate_each(
                 if j != i:
                     weight[i] *= (t_clamped - t[first + j]) / (t[first + i] - t[first + j])
         for k in range(y.shape[1]):
-            out[g, k] = 0.0
+            out[g, at + k] = 0.0
             for i in range(count):
-                out[g, k] += weight[i] * y[first + i, k]
+                out[g, at + k] += weight[i] * y[first + i, k]
 
 
 @dataclass(eq=False)
@@ -173,11 +226,11 @@ class Resampler:
             return started
         assert self._origin is not None
         values, ok, filled = _resample_rows(rows, k * DT, self._origin)
-        self._append(k, values, np.column_stack([ok, filled]))
+        self._append(k, values, ok, filled)
         return True
 
-    def _append(self, k: np.ndarray, values: np.ndarray, ok: np.ndarray) -> None:
-        """Replace all rows from `k[0]` on with these rows, (n,), (n, 20), (n, 2)."""
+    def _append(self, k: np.ndarray, values: np.ndarray, ok: np.ndarray, filled: np.ndarray) -> None:
+        """Replace all rows from `k[0]` on with these rows, (n,), (n, 20), (n,), (n,)."""
         bounds = [k[0] - int(self.keep_s / DT), k[0]]
         first, stop = (self._first + int(row) for row in self._k[self._first : self._stop].searchsorted(bounds))
         if self._stop > self._first:  # angles continue without a jump of 2 pi
@@ -188,7 +241,8 @@ class Resampler:
             first, stop = 0, stop - first
         new = slice(stop, stop + len(k))
         assert self._servos is not None
-        self._k[new], self._values[new, :_INPUTS_AT], self._ok[new] = k, values[:, :_INPUTS_AT], ok
+        self._k[new], self._values[new, :_INPUTS_AT] = k, values[:, :_INPUTS_AT]
+        self._ok[new, 0], self._ok[new, 1] = ok, filled
         self._values[new, _INPUTS_AT:_TRIG_AT] = self._servos.inputs(values[:, _INPUTS_AT:])
         _fill_trig(self._values[new])
         self._first, self._stop = first, new.stop
@@ -236,21 +290,36 @@ def _resample_rows(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Interpolate every kind on the grid; return columns of `Resampler`, mask of valid rows, mask of filled rows."""
     t, attitude = rows["attitude"]
-    unwrapped = np.hstack([np.unwrap(attitude[:, :3], axis=0), attitude[:, 3:]])
+    unwrapped = np.empty(attitude.shape)
+    _unwrap_angles(attitude, unwrapped)
     t_p, position = rows["position"]
-    angles = interpolate_samples(t, unwrapped, grid, LONGEST_GAP["attitude"])
-    if len(t) >= 4 and np.median(np.diff(t)) > _SPARSE_S and unwrapped[:, 3:].any():
-        angles = (_sparse_attitude(t, unwrapped, grid), *angles[1:])
-    columns = [
-        angles,
-        interpolate_samples(*rows["velocity"], grid, LONGEST_GAP["velocity"]),
-        interpolate_samples(t_p, to_ned(origin, *position.T), grid, LONGEST_GAP["position"]),
-        interpolate_samples(
-            *rows["servo"], grid, LONGEST_GAP["servo"], 0.0
-        ),  # a cubic would overshoot, a servo does not
-    ]
-    values, ok, filled = zip(*columns, strict=True)
-    return np.hstack(values), np.logical_and.reduce(ok), np.logical_or.reduce(filled)
+    values = np.zeros((len(grid), _INPUTS_AT + rows["servo"][1].shape[1]))
+    ok, filled = np.ones(len(grid), bool), np.zeros(len(grid), bool)
+    for name, at, samples in (
+        ("attitude", 0, (t, unwrapped)),
+        ("velocity", 6, rows["velocity"]),
+        ("position", 9, (t_p, to_ned(origin, *position.T))),
+        ("servo", _INPUTS_AT, rows["servo"]),
+    ):
+        cubic_gaps = 0.0 if name == "servo" else _MAX_CUBIC_GAPS  # a cubic would overshoot, a servo does not
+        median_gap = _interpolate_into((values, ok, filled), at, samples, grid, (LONGEST_GAP[name], cubic_gaps))
+        if name == "attitude" and median_gap > _SPARSE_S and unwrapped[:, 3:].any():
+            values[:, :6] = _sparse_attitude(t, unwrapped, grid)
+    return values, ok, filled
+
+
+@nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath: as `numpy.unwrap` has it
+def _unwrap_angles(x: np.ndarray, out: np.ndarray) -> None:
+    """Copy rows, (m, 6), with their first three columns unwrapped."""
+    for j in range(x.shape[1]):
+        correction = 0.0
+        for k in range(len(x)):
+            if k > 0 and j < 3:
+                step = x[k, j] - x[k - 1, j]
+                if not abs(step) < pi:  # a nan spreads to all later rows
+                    wrapped = (step + pi) % (2.0 * pi) - pi
+                    correction += (pi if wrapped == -pi and step > 0.0 else wrapped) - step
+            out[k, j] = x[k, j] + correction
 
 
 def _sparse_attitude(t: np.ndarray, attitude: np.ndarray, grid: np.ndarray) -> np.ndarray:

@@ -176,15 +176,15 @@ def _gram_matrices(model: DerivativesModel, window: Window, runs: np.ndarray) ->
     weight, trim = np.sqrt(model.weight), model.trim_velocity
     if not np.isfinite(residuals_and_jacobian(model.par, starts, runs, y, delta, trim, window.dt, weight, e, J)):
         return None
-    columns = np.zeros((N_COLUMN + 1, _N + _M + 1 + 9))
+    columns = np.zeros((N_COLUMN, _N + _M + 1 + 9))
     columns[: len(NAMES), :_N] = model.par[:, None] * MASK
     columns[list(_NUISANCE), range(_N, _N + _M)] = 1.0
-    columns[[N_COLUMN, *range(len(NAMES), N_COLUMN)], range(_N + _M, columns.shape[1])] = 1.0
-    grams = np.empty((len(runs), N_COLUMN + 1, N_COLUMN + 1))
-    for k, (a, b) in enumerate(9 * np.column_stack([bounds[:-1], bounds[1:]])):
-        rows = np.column_stack([J.reshape(-1, N_COLUMN)[a:b], e.reshape(-1)[a:b]])
-        grams[k] = rows.T @ rows
-    grams = columns.T @ grams @ columns
+    columns[range(len(NAMES), N_COLUMN), range(_N + _M + 1, columns.shape[1])] = 1.0
+    rows = J.reshape(-1, N_COLUMN) @ columns
+    rows[:, _N + _M] = e.ravel()
+    grams = np.empty((len(runs), rows.shape[1], rows.shape[1]))
+    for gram, a, b in zip(grams, 9 * bounds[:-1], 9 * bounds[1:], strict=True):
+        gram[:] = rows[a:b].T @ rows[a:b]
     rest, by_start = slice(0, _N + _M + 1), slice(_N + _M + 1, None)
     cross, square = grams[:, by_start, rest], grams[:, by_start, by_start]
     moves = np.linalg.solve(square + np.diag(SIGMA**-2.0) / EFFECTIVE_FRACTION, cross)

@@ -98,7 +98,13 @@ class Shrinkage:
 
 
 def runs_and_measured(
-    gust_filter: AlphaBetaFilter, y: np.ndarray, delta: np.ndarray, start_rows: np.ndarray, seconds: float
+    gust_filter: AlphaBetaFilter,
+    y: np.ndarray,
+    delta: np.ndarray,
+    start_rows: np.ndarray,
+    seconds: float,
+    *,
+    filtered: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return free runs and the measured states over the same rows, nan where not measured, (k, n, 9) each.
 
@@ -108,9 +114,11 @@ def runs_and_measured(
         delta: actuator states, (n, 4)
         start_rows: first row of each run, (k,)
         seconds: length of a run [s]
+        filtered: result of the filter for these states, (n, 15); None: computed here
     """
     length = min(round(seconds / gust_filter.dt) + 1, len(y))
-    runs = gust_filter.free_run(gust_filter.filter(y, delta)[start_rows], start_rows, length, delta)
+    filtered = gust_filter.filter(y, delta) if filtered is None else filtered
+    runs = gust_filter.free_run(filtered[start_rows], start_rows, length, delta)
     rows = start_rows[:, None] + np.arange(length)
     measured = y[np.minimum(rows, len(y) - 1)]
     measured[rows >= len(y)] = np.nan

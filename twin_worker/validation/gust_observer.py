@@ -44,13 +44,14 @@ class AlphaBetaFilter:
             y: measured states, u v w over the ground, (n, 9)
             delta: actuator states, (n, 4)
         """
-        return self._filter(y, delta)[0]
+        return self.filter_and_predict(y, delta)[0]
 
     def one_step(self, y: np.ndarray, delta: np.ndarray) -> np.ndarray:
         """Predict every row from the rows before it, (n, 9); the first is measured. Arguments as for `filter`."""
-        return self._filter(y, delta)[1]
+        return self.filter_and_predict(y, delta)[1]
 
-    def _filter(self, y: np.ndarray, delta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def filter_and_predict(self, y: np.ndarray, delta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the results of `filter` and of `one_step`; both restart at nan."""
         par, trim_velocity = self.model.par, self.model.trim_velocity
         filtered, predicted = np.empty((len(y), N_X + 6)), np.empty_like(y)
         _filter_rows(y, delta, par, trim_velocity, self.dt, self.gust_decay, filtered, predicted)

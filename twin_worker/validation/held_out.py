@@ -1,5 +1,7 @@
 """Free runs of a model over held-out data."""
 
+from functools import cached_property
+
 import numpy as np
 
 from fleet.physics.simulate import TAU, lagged
@@ -44,8 +46,7 @@ class HeldOut:
     def one_step(self) -> np.ndarray:
         """Predict each row from those before it, (n, 9); nan at and after unmeasured rows, and at starts."""
         if isinstance(self._plant, DerivativesModel):
-            y = np.where(self._window.ok[:, None], self._y, np.nan)  # the filter restarts at nan
-            out = AlphaBetaFilter(self._plant, self.dt).one_step(y, self._delta)[self._start :]
+            out = self._filtered[1][self._start :]
         else:
             out = self.runs(2)
             out[::2] = np.nan
@@ -59,11 +60,23 @@ class HeldOut:
         """
         if not isinstance(self._plant, DerivativesModel):
             return None
-        y = np.where(self._window.ok[:, None], self._y, np.nan)
+        y, gust_filter = self._measured, AlphaBetaFilter(self._plant, self.dt)
         start_rows = np.arange(self._start, len(y) - round(1.0 / self.dt), round(interval / self.dt))
         earlier = self._y[: self._start][self._window.ok[: self._start]]
-        runs, measured = runs_and_measured(AlphaBetaFilter(self._plant, self.dt), y, self._delta, start_rows, seconds)
+        filtered = self._filtered[0]
+        runs, measured = runs_and_measured(gust_filter, y, self._delta, start_rows, seconds, filtered=filtered)
         return runs, measured, earlier.mean(axis=0)
+
+    @property
+    def _measured(self) -> np.ndarray:
+        """Return the states, nan where not measured, (n, 9)."""
+        return np.where(self._window.ok[:, None], self._y, np.nan)
+
+    @cached_property
+    def _filtered(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the filtered states and gusts, (n, 15), and each row predicted from those before it, (n, 9)."""
+        assert isinstance(self._plant, DerivativesModel)
+        return AlphaBetaFilter(self._plant, self.dt).filter_and_predict(self._measured, self._delta)
 
     def _start_states(self, start_rows: np.ndarray) -> np.ndarray:
         """Return the start states at rows from a line fit through the rows up to each; the row itself at gaps."""

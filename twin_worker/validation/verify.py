@@ -34,9 +34,21 @@ def whiteness(y: np.ndarray, y_hat: np.ndarray) -> np.ndarray:
     if len(e) < 3 * LAGS:
         return np.zeros(y.shape[1])
     e = e - e.mean(axis=0)
-    power = np.maximum((e**2).sum(axis=0), 1e-30)
-    rho = np.array([(e[lag:] * e[:-lag]).sum(axis=0) / power for lag in range(1, LAGS + 1)])
+    sums = np.empty((LAGS + 1, e.shape[1]))
+    _lagged_products(e, sums)
+    rho = sums[1:] / np.maximum(sums[0], 1e-30)
     return (np.abs(rho) < _BOUND / np.sqrt(len(e))).mean(axis=0)
+
+
+@nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]
+def _lagged_products(e: np.ndarray, out: np.ndarray) -> None:
+    """Compute the sums of products of rows, (n, k), with those `lag` rows earlier, by lag from 0 on, (lags, k)."""
+    for lag in range(len(out)):
+        for j in range(e.shape[1]):
+            out[lag, j] = 0.0
+        for i in range(lag, len(e)):
+            for j in range(e.shape[1]):
+                out[lag, j] += e[i, j] * e[i - lag, j]
 
 
 HORIZONS_S = (40.0, 16.0, 8.0, 4.0)  # longest first: the longest that the data allow
@@ -227,9 +239,8 @@ def concluded(verdict: Verdict, errors: Consistency | None, sentence: str) -> Ve
     )
 
 
-def with_diagnostics(verdict: Verdict, plant: Plant, window: Window, start: int) -> Verdict:
+def with_diagnostics(verdict: Verdict, held_out: HeldOut) -> Verdict:
     """Add diagnostics to a verdict: the fit at other horizons and the whiteness of residuals."""
-    held_out = HeldOut(plant, window, start)
     seconds = held_out.dt * (len(held_out.y) - 1)
     fits = {h: free_run_fit(held_out, h) for h in REPORTED_S if h <= seconds + held_out.dt}
     axis_fits = {name: value for h, fit in fits.items() for name, value in fit_by_axis(fit, h).items()}

@@ -4,6 +4,7 @@ Source: ArduPlane 4.x parameter list (names, defaults, units); older names from 
 """
 
 from collections.abc import Mapping
+from functools import lru_cache
 from math import radians
 
 import numpy as np
@@ -87,6 +88,18 @@ N_PAR = EAS2TAS + 1
 
 NAMES = tuple(row.name for row in TABLE)
 DEFAULTS: dict[str, float] = {row.name: float(row.default) for row in TABLE}
+# before 4.1, see `_old_gains`
+_OLD_PREFIXES = (("RLL2SRV_", "RLL_RATE_"), ("PTCH2SRV_", "PTCH_RATE_"))
+_OLD_GAINS = (("P", 1.0), ("I", 0.3), ("D", 0.08), ("FF", 0.0), ("IMAX", 3000.0), ("TCONST", 0.5))
+_READ_NAMES = tuple(
+    dict.fromkeys(
+        (
+            *NAMES,
+            *(older for row in TABLE for older, _ in row.old_names),
+            *(prefix + gain for prefix, _ in _OLD_PREFIXES for gain, _ in _OLD_GAINS),
+        )
+    )
+)
 
 
 def parameters(values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -105,15 +118,23 @@ def parameters(values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np
 
 def read(values: Mapping[str, float]) -> tuple[dict[str, float], tuple[str, ...]]:
     """Return all parameters by current name, in the units of the autopilot, and the names at defaults."""
-    inputs = {**_old_gains(values), **{k: float(v) for k, v in values.items()}}
+    resolved, absent = _read(tuple([values.get(name) for name in _READ_NAMES]))
+    return dict(zip(NAMES, resolved, strict=True)), absent
+
+
+@lru_cache(maxsize=1024)
+def _read(values: tuple[float | None, ...]) -> tuple[tuple[float, ...], tuple[str, ...]]:
+    """Return the values in the order of the table, and the names at defaults, from the values of `_READ_NAMES`."""
+    received = {name: value for name, value in zip(_READ_NAMES, values, strict=True) if value is not None}
+    inputs = {**_old_gains(received), **received}
     resolved, absent = {}, []
     for row in TABLE:
         value = lookup(row, inputs)
         if value is None:
             absent.append(row.name)
-        resolved[row.name] = float(row.default) if value is None else value
+        resolved[row.name] = float(row.default if value is None else value)
     absent += [name for name in _reset_inconsistent(resolved) if name not in absent]
-    return resolved, tuple(absent)
+    return tuple(resolved.values()), tuple(absent)
 
 
 def vector(resolved: Mapping[str, float], altitude_m: float = 0.0) -> np.ndarray:
@@ -142,11 +163,10 @@ def _old_gains(values: Mapping[str, float]) -> dict[str, float]:
     Source: ArduPlane 4.1 release notes; FF' = FF + max((P - I tau) tau - D, 0) with tau the time constant.
     """
     rate_gains: dict[str, float] = {}
-    for old, new in (("RLL2SRV_", "RLL_RATE_"), ("PTCH2SRV_", "PTCH_RATE_")):
+    for old, new in _OLD_PREFIXES:
         if not any(old + gain in values for gain in ("P", "I", "D", "FF", "IMAX")):
             continue
-        defaults = (("P", 1.0), ("I", 0.3), ("D", 0.08), ("FF", 0.0), ("IMAX", 3000.0), ("TCONST", 0.5))
-        p, i, d, ff, imax, tau = (float(values.get(old + gain, default)) for gain, default in defaults)
+        p, i, d, ff, imax, tau = (float(values.get(old + gain, default)) for gain, default in _OLD_GAINS)
         rate_gains |= {new + "FF": ff + max((p - i * tau) * tau - d, 0.0), new + "P": d, new + "I": i * tau}
         rate_gains[new + "IMAX"] = imax / 4500.0
     return rate_gains

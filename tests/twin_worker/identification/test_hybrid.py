@@ -46,20 +46,52 @@ def known(**other: float) -> PointMassModel:
 # --- what is identified ----------------------------------------------------------------------------------------------
 
 
+def second_order_response(command: np.ndarray, lag: tuple[float, float, float]) -> np.ndarray:
+    """The lag from rest at 0, four steps a row; back at 0 after a row without a command."""
+    (wn, zeta, bias), h = lag, energy_balance.STEP / 4
+    angle, rate, out = 0.0, 0.0, []
+    for target in command + bias:
+        out.append(angle)
+        if not np.isfinite(target):
+            angle, rate = 0.0, 0.0
+            continue
+        for _ in range(4):
+            rate += h * (wn * wn * (target - angle) - 2.0 * zeta * wn * rate)
+            angle += h * rate
+    return np.array(out)
+
+
 @pytest.mark.parametrize("lag", [(2.0, 0.7, 0.02), (4.0, 1.0, -0.03)])
 def test_a_lag_is_found_again_from_its_own_flight(lag):
     rng = np.random.default_rng(3)
     command = np.repeat(rng.uniform(-0.6, 0.6, 40), 30)
-    out = np.empty(len(command))
-    energy_balance.second_order_response(command, np.zeros(len(command)), np.array(lag), out)
+    out = second_order_response(command, lag)
     found = energy_balance.fit_attitude_lag(command, out + 0.01 * rng.standard_normal(len(out)))
     assert np.allclose(found, lag, rtol=0.08, atol=0.006)
 
 
+def test_the_derivatives_of_the_lag_are_those_of_its_free_run():
+    """One pass sums what the free runs beside each other give, also after lost commands."""
+    rng = np.random.default_rng(5)
+    command = np.repeat([0.1, 0.5, np.nan, -0.5, 0.2], 60)
+    lags = np.array([2.5, 0.8, 0.01]) + energy_balance._BESIDE
+    y = second_order_response(command, (2.0, 0.9, 0.0)) + 0.05 * rng.standard_normal(len(command))
+    y[~np.isfinite(command)] = 0.0
+    y[180] = 0.0
+    y[0] = 0.0
+    sums = np.empty((4, 4))
+    energy_balance._lag_sums(command, y, lags, np.empty((4, 2)), sums)
+    weight = 1.0 / (0.02 * np.sqrt(10))
+    runs = np.array([second_order_response(command, tuple(lag)) for lag in lags])[:, np.isfinite(command)]
+    residual = (runs[0] - y[np.isfinite(command)]) * weight
+    d = np.vstack([residual, (runs[1:] - runs[0]) * weight / np.diag(energy_balance._BESIDE[1:])[:, None]])
+    huber = 1.0 / np.maximum(np.abs(residual) / (3.0 / np.sqrt(10)), 1.0)
+    assert np.allclose(sums, (huber * d) @ d.T, rtol=1e-6)
+
+
 def test_a_lag_survives_lost_commands_and_holds_to_what_is_usual_without_any():
     command = np.repeat([0.0, 0.5, np.nan, -0.5, 0.2], 60)
-    out = np.empty(len(command))
-    energy_balance.second_order_response(command, np.zeros(len(command)), np.array([2.5, 0.8, 0.0]), out)
+    out = second_order_response(command, (2.5, 0.8, 0.0))
     assert np.isfinite(energy_balance.fit_attitude_lag(command, out)).all()
     assert np.allclose(energy_balance.fit_attitude_lag(np.full(100, np.nan), np.zeros(100)), [3.0, 0.9, 0.0], atol=1e-6)
 

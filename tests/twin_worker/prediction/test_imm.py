@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from twin_worker.prediction.method_selection import STEP, constant_turn_prediction, imm, imm_with_variance
+from twin_worker.evaluation.baselines import filterpy_path
+from twin_worker.prediction.constant_turn import STEP, constant_turn_prediction, imm, imm_with_variance
 from twin_worker.telemetry.track import STEP as TRACK_STEP
 from twin_worker.telemetry.track import Track
 
@@ -59,6 +60,15 @@ def test_the_variance_grows_to_that_of_a_random_turn():
         at += velocity * (np.exp(1j * rate * STEP) - 1) / (1j * rate)
         velocity *= np.exp(1j * rate * STEP)
     assert np.sqrt(variance[30]) == pytest.approx(np.sqrt(np.var(at.real) + np.var(at.imag)), rel=0.15)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_filter_is_that_of_filterpy(seed):
+    rng = np.random.default_rng(seed)
+    v = np.array([18.0, 9.0, 0.0]) + np.cumsum(rng.standard_normal((N, 3)), axis=0)
+    p = STEP * np.cumsum(v, axis=0) + 0.5 * rng.standard_normal((N, 3))
+    found = imm(p, v, STEP * np.arange(60))[:, :2]
+    assert np.allclose(found, filterpy_path(p, v, 59), rtol=1e-6, atol=1e-5)
 
 
 def test_left_mirrors_right():

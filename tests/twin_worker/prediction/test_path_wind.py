@@ -14,8 +14,8 @@ from tests.twin_worker.prediction.test_predict import HERE, situation
 from twin_worker.estimation.wind_field import PathWind, SharedWind
 from twin_worker.prediction.closed_loop import InitialCondition, synchronise_controller
 from twin_worker.prediction.fixed_wing import ensemble
-from twin_worker.prediction.fixed_wing.path_wind import drift_draws, with_drift, with_mean_wind
-from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_point_mass, in_field_wind
+from twin_worker.prediction.fixed_wing.path_wind import FIELD_SPAN_S, drift_draws, with_drift, with_mean_wind
+from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_point_mass, in_field_wind, start_in_field
 from twin_worker.prediction.replay_window import PredictionContext
 
 SPAN = np.arange(0.0, 61.0)
@@ -78,7 +78,7 @@ def test_the_ensemble_spreads_less_in_a_sure_field() -> None:
 def test_the_start_keeps_its_ground_velocity_in_another_wind() -> None:
     now = situation()
     start = start_of(now)
-    moved = in_field_wind(with_field(now, 3.0), start, known())
+    moved = in_field_wind(start, start_in_field(with_field(now, 3.0), start, known(), FIELD_SPAN_S))
     assert moved is not start and moved.state[2][0] == pytest.approx(3.0, abs=0.1)
     level = with_mean_wind(start, PathWind(np.array([0.0, 60.0]), np.tile([3.0, 0.0], (2, 1)), np.eye(2)))
     (before, _, air), (after, _, new_air) = start.state, level.state
@@ -87,7 +87,7 @@ def test_the_start_keeps_its_ground_velocity_in_another_wind() -> None:
     assert new_ground == pytest.approx(ground, abs=0.1)
     Va, new_Va = np.linalg.norm(before[3:6]) + air[3], np.linalg.norm(after[3:6]) + new_air[3]
     assert new_Va == pytest.approx(Va)
-    assert in_field_wind(now, start, known()) is start
+    assert in_field_wind(start, start_in_field(now, start, known(), FIELD_SPAN_S)) is start
 
 
 def test_the_draws_make_the_drift_follow_given_values() -> None:

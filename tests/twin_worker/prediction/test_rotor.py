@@ -11,7 +11,7 @@ from tests.support import hover
 from tests.support.flights import predictions, published
 from twin_worker.confidence.tube_and_horizon import AHEAD
 from twin_worker.evaluation.replay import run_offline
-from twin_worker.prediction.method_selection import imm
+from twin_worker.prediction.constant_turn import imm
 from twin_worker.twin.step import Twin
 
 SEED = 106

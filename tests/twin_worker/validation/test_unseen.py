@@ -125,7 +125,7 @@ def test_the_truth_is_verified_at_the_longest_horizon_and_told_at_every(seconds,
     plant, window = known(aircraft(2)), fly(aircraft(2), seconds, seed=2)
     verdict = verify(plant, window, START)
     assert verdict.outcome is Outcome.PLAUSIBLE and verdict.horizon_s == longest
-    more = with_diagnostics(verdict, plant, window, START)
+    more = with_diagnostics(verdict, HeldOut(plant, window, START))
     assert set(more.fit_by_length) == {f"{axis}{h}" for axis in AXES for h in (40, 16, 4, 1) if h <= longest}
     for h in (40, 16, 4, 1):
         fit = fit_and_persistence(HeldOut(plant, window, START), h)[0]
@@ -174,7 +174,7 @@ def test_a_model_of_no_numbers_is_refused(name, value):
     plant = known(aircraft(0))
     plant.par[NAMES.index(name)] = value
     window = fly(aircraft(0), 40.0)
-    verdict = with_diagnostics(verify(plant, window, START), plant, window, START)
+    verdict = with_diagnostics(verify(plant, window, START), HeldOut(plant, window, START))
     assert verdict.outcome is Outcome.DIVERGED and verdict.fit_by_length and verdict.whiteness
     assert np.isfinite([*verdict.fit.values(), *verdict.fit_by_length.values(), *verdict.whiteness.values()]).all()
 

@@ -22,24 +22,55 @@ _CORRELATED_ROWS = 10  # correlated rows that count as one
 _HUBER_LIMIT = 3.0  # Huber limit, in standard deviations [-]
 _MAX_STEPS = 8
 _DIFFERENCE_STEP = (1e-3, 1e-3, 1e-4)  # steps of the numerical derivatives
+_BESIDE = np.vstack([np.zeros(3), np.diag(_DIFFERENCE_STEP)])
 
 
-@nb.njit(cache=True, error_model="numpy", nogil=True)
-def second_order_response(command: np.ndarray, y: np.ndarray, lag: np.ndarray, out: np.ndarray) -> None:
-    """Simulate the lag over commands, (n,) [rad], into `out`, (n,); after a nan command it restarts from `y`."""
-    wn, zeta, bias = lag[0], lag[1], lag[2]
-    h = STEP / _SUBSTEPS
-    angle, rate, restart = y[0], 0.0, True
+@nb.njit(cache=True, error_model="numpy", nogil=True, _nrt=False)  # type: ignore[call-overload]
+def _lag_sums(command: np.ndarray, y: np.ndarray, lags: np.ndarray, state: np.ndarray, sums: np.ndarray) -> float:
+    """Simulate several lags, and sum over the rows with a command; after one without, each restarts from `y`.
+
+    Args:
+        command: (n,) [rad], nan where missing
+        y: measured angle, (n,) [rad], nan where missing
+        lags: the lag, and lags beside it for the numerical derivatives, (m, 3)
+        state: overwritten, (m, 2)
+        sums: output, w d_i d_j, where d_0 is the residual, the others its derivatives, w the Huber weight, (m, m)
+    Returns:
+        the Huber cost of the residuals
+    """
+    m, h, weight = len(lags), STEP / _SUBSTEPS, 1.0 / (_NOISE * np.sqrt(_CORRELATED_ROWS))
+    limit, cost, restart = _HUBER_LIMIT * weight * _NOISE, 0.0, True
+    for i in range(m):
+        for j in range(m):
+            sums[i, j] = 0.0
     for k in range(len(command)):
+        measured = y[k] if np.isfinite(y[k]) else 0.0
         if restart:
-            angle, rate = y[k], 0.0
-        out[k] = angle
+            for i in range(m):
+                state[i, 0], state[i, 1] = measured, 0.0
         restart = not np.isfinite(command[k])
         if restart:
             continue
-        for _ in range(_SUBSTEPS):
-            rate += h * (wn * wn * (command[k] + bias - angle) - 2.0 * zeta * wn * rate)
-            angle += h * rate
+        residual = (state[0, 0] - measured) * weight
+        size = abs(residual)
+        huber_weight = 1.0 / max(size / limit, 1.0)
+        cost += size * size if size < limit else limit * (2.0 * size - limit)
+        for i in range(m):
+            d_i = residual if i == 0 else (state[i, 0] - state[0, 0]) * weight / _DIFFERENCE_STEP[i - 1]
+            for j in range(i + 1):
+                d_j = residual if j == 0 else (state[j, 0] - state[0, 0]) * weight / _DIFFERENCE_STEP[j - 1]
+                sums[i, j] += huber_weight * d_i * d_j
+        for i in range(m):
+            wn, zeta, target = lags[i, 0], lags[i, 1], command[k] + lags[i, 2]
+            angle, rate = state[i, 0], state[i, 1]
+            for _ in range(_SUBSTEPS):
+                rate += h * (wn * wn * (target - angle) - 2.0 * zeta * wn * rate)
+                angle += h * rate
+            state[i, 0], state[i, 1] = angle, rate
+    for i in range(m):
+        for j in range(i):
+            sums[j, i] = sums[i, j]
+    return cost  # type: ignore[no-any-return]
 
 
 def fit_attitude_lag(command: np.ndarray, y: np.ndarray, warm_start: np.ndarray | None = None) -> np.ndarray:
@@ -50,36 +81,23 @@ def fit_attitude_lag(command: np.ndarray, y: np.ndarray, warm_start: np.ndarray 
         y: measured angle, (n,) [rad], nan where missing
         warm_start: start of the search, for example an earlier estimate
     """
-    weight = 1.0 / _NOISE / np.sqrt(_CORRELATED_ROWS)
-    y, out = np.where(np.isfinite(y), y, 0.0), np.empty(len(y))
-    valid = np.isfinite(command)
+    command, y = np.ascontiguousarray(command), np.ascontiguousarray(y)
     start = _PRIOR_MEAN if warm_start is None else warm_start
-
-    def residual_of(lag: np.ndarray) -> np.ndarray:
-        second_order_response(command, y, lag, out)
-        return np.where(valid, (out - y) * weight, 0.0)
+    state, sums, no_sums = np.empty((4, 2)), np.empty((4, 4)), np.empty((1, 1))
+    precision = _PRIOR_SIGMA**-2.0
 
     def linearise(lag: np.ndarray, count: int) -> tuple[float, np.ndarray, np.ndarray]:
-        residual = residual_of(lag)
-        J = np.column_stack([(residual_of(lag + step) - residual) / step.sum() for step in np.diag(_DIFFERENCE_STEP)])
-        huber_weight = 1.0 / np.maximum(np.abs(residual) / (_HUBER_LIMIT * weight * _NOISE), 1.0)
-        H = (J * huber_weight[:, None]).T @ J + np.diag(_PRIOR_SIGMA**-2.0)
-        ascent = (J * huber_weight[:, None]).T @ residual + (lag - _PRIOR_MEAN) / _PRIOR_SIGMA**2
-        return _cost(residual, lag, weight), H, -ascent
+        cost = _lag_sums(command, y, lag + _BESIDE, state, sums)
+        offset = lag - _PRIOR_MEAN
+        H = sums[1:, 1:] + np.diag(precision)
+        return cost + float(precision @ offset**2), H, -(sums[1:, 0] + offset * precision)
 
     def move(lag: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, float]:
         candidate = np.clip(lag + change, _LOWER, _UPPER)
-        return candidate, _cost(residual_of(candidate), candidate, weight)
+        cost = _lag_sums(command, y, candidate[None], state, no_sums)
+        return candidate, cost + float(precision @ (candidate - _PRIOR_MEAN) ** 2)
 
     return gauss_newton(start.copy(), linearise, move, steps=_MAX_STEPS, mu=0.0)[0]
-
-
-def _cost(residual: np.ndarray, lag: np.ndarray, weight: float) -> float:
-    """Return the Huber cost of the residuals plus the cost of the deviation from the prior."""
-    limit = _HUBER_LIMIT * weight * _NOISE
-    size = np.abs(residual)
-    huber = np.where(size < limit, size**2, limit * (2 * size - limit)).sum()
-    return float(huber + (((lag - _PRIOR_MEAN) / _PRIOR_SIGMA) ** 2).sum())
 
 
 _WINDOW_ROWS = 20  # rows of each mean
@@ -158,6 +176,42 @@ def load_factor(phi: np.ndarray) -> np.ndarray:
     return 1.0 / np.cos(np.clip(phi, -_MAX_BANK, _MAX_BANK))
 
 
+@nb.njit(cache=True, error_model="numpy", nogil=True, _nrt=False)  # type: ignore[call-overload]
+def _filter_turn_rate(
+    rate: np.ndarray,
+    y: np.ndarray,
+    measured: np.ndarray,
+    hypotheses: tuple[np.ndarray, np.ndarray],
+    x: np.ndarray,
+    P: np.ndarray,
+    log_likelihood: np.ndarray,
+) -> None:
+    """Filter k and b by every hypothesis, in place.
+
+    Args:
+        rate, y, measured: g tan(phi) / V, psi_dot, and whether both are known, (n,)
+        hypotheses: random walk and noise, (m,)
+        x, P: mean and covariance of k and b, (m, 2) and (m, 2, 2)
+        log_likelihood: of the flight, (m,)
+    """
+    walk, noise = hypotheses
+    for m in range(len(x)):
+        for i in range((len(y) - 1) % _WINDOW_ROWS, len(y), _WINDOW_ROWS):  # independent rows
+            P[m, 1, 1] += walk[m] ** 2 * _WINDOW_ROWS * STEP
+            if not measured[i]:
+                continue
+            from_k, from_b = P[m, 0, 0] * rate[i] + P[m, 0, 1], P[m, 1, 0] * rate[i] + P[m, 1, 1]
+            error = y[i] - x[m, 0] * rate[i] - x[m, 1]
+            variance = from_k * rate[i] + from_b + noise[m] ** 2
+            x[m, 0] += from_k * error / variance
+            x[m, 1] += from_b * error / variance
+            P[m, 0, 0] -= from_k * from_k / variance
+            P[m, 0, 1] -= from_k * from_b / variance
+            P[m, 1, 0] = P[m, 0, 1]
+            P[m, 1, 1] -= from_b * from_b / variance
+            log_likelihood[m] -= 0.5 * (error * error / variance + np.log(variance))
+
+
 def fit_turn_rate(data: PointMassData) -> RegressionResult:
     """Estimate k, and b at the end of the data.
 
@@ -170,16 +224,7 @@ def fit_turn_rate(data: PointMassData) -> RegressionResult:
     prior_mean, prior_sigma = _TURN_PRIOR
     n = len(_TURN_WALK)
     x, P, log_likelihood = np.tile(prior_mean, (n, 1)), np.tile(np.diag(prior_sigma**2), (n, 1, 1)), np.zeros(n)
-    for i in range((len(y) - 1) % _WINDOW_ROWS, len(y), _WINDOW_ROWS):  # independent rows
-        P[:, 1, 1] += _TURN_WALK**2 * _WINDOW_ROWS * STEP
-        if not measured[i]:
-            continue
-        h = np.array([rate[i], 1.0])
-        PH, error = P @ h, y[i] - x @ h
-        variance = PH @ h + _TURN_NOISE**2
-        x += PH * (error / variance)[:, None]
-        P -= PH[:, :, None] * PH[:, None, :] / variance[:, None, None]
-        log_likelihood -= 0.5 * (error**2 / variance + np.log(variance))
+    _filter_turn_rate(rate, y, measured, (_TURN_WALK, _TURN_NOISE), x, P, log_likelihood)
     weight = np.exp(log_likelihood - log_likelihood.max())
     weight /= weight.sum()
     value = weight @ x

@@ -1,22 +1,18 @@
 """Rollout of the point-mass model from the present state of the aircraft."""
 
 from math import asin
+from typing import NamedTuple
 
 import numpy as np
 
 from fleet.frames import air_direction
 from fleet.physics import point_mass as H
 from fleet.window import Window
+from twin_worker.estimation.wind_field import PathWind
 from twin_worker.estimation.wind_filter import DRIFT_S, GUST, GUST_S
 from twin_worker.identification.fixed_wing.point_mass_model import PointMassModel, airspeed_of
 from twin_worker.prediction.closed_loop import InitialCondition, sample_rollout
-from twin_worker.prediction.fixed_wing.path_wind import (
-    FIELD_SPAN_S,
-    drift_draws,
-    surer_field,
-    with_drift,
-    with_mean_wind,
-)
+from twin_worker.prediction.fixed_wing.path_wind import drift_draws, surer_field, with_drift, with_mean_wind
 from twin_worker.prediction.replay_window import PredictionContext, Rollout
 from twin_worker.telemetry.velocity import present_velocity
 
@@ -100,16 +96,38 @@ def model_ground_velocity(start: np.ndarray, air: np.ndarray) -> np.ndarray:
     return air[[H.REST_N, H.REST_E]] - unexplained_velocity(start, air, np.zeros(2))
 
 
-def in_field_wind(context: PredictionContext, initial: InitialCondition, model: PointMassModel) -> InitialCondition:
-    """Return the start of `fly_from` in the shared wind field where it is surer than the aircraft's own wind."""
-    if context.shared_wind is None:
-        return initial
-    shared = surer_field(context, initial, model, start_and_air(context, initial.window), FIELD_SPAN_S)
-    return initial if shared is None else with_mean_wind(initial, shared[0])
+class FieldStart(NamedTuple):
+    """Start of rollouts, and the wind along their path.
+
+    Attributes:
+        state, air: as of `start_and_air`
+        shared: as of `surer_field`
+    """
+
+    state: np.ndarray
+    air: np.ndarray
+    shared: tuple[PathWind, np.ndarray] | None
+
+
+def start_in_field(
+    context: PredictionContext, initial: InitialCondition, model: PointMassModel, span_s: float
+) -> FieldStart:
+    """Return the start of rollouts of `span_s` in the shared wind field where it is surer than the own wind."""
+    state, air = start_and_air(context, initial.window)
+    return FieldStart(state, air, surer_field(context, initial, model, (state, air), span_s))
+
+
+def in_field_wind(initial: InitialCondition, start: FieldStart) -> InitialCondition:
+    """Return the start of `fly_from` in the wind of `start`, which reaches at least `FIELD_SPAN_S`."""
+    return initial if start.shared is None else with_mean_wind(initial, start.shared[0])
 
 
 def fly_point_mass(
-    context: PredictionContext, initial: InitialCondition, model: PointMassModel, ahead: np.ndarray
+    context: PredictionContext,
+    initial: InitialCondition,
+    model: PointMassModel,
+    ahead: np.ndarray,
+    start: FieldStart | None = None,
 ) -> Rollout:
     """Simulate the identified point-mass model; the path is nan beyond its envelope.
 
@@ -117,11 +135,11 @@ def fly_point_mass(
         context, initial: inputs of the prediction and start of the rollout
         model: identified model
         ahead: requested look-ahead times, rising, (k,) [s]
+        start: result of `start_in_field` for at least this span; None: computed here
     """
     ctl, par, legs = initial.synchronised
-    state, air = start_and_air(context, initial.window)
+    state, air, shared = start or start_in_field(context, initial, model, float(ahead[-1]))
     out, draws = np.empty((int(ahead[-1] / H.STEP) + 2, 3)), _NO_NOISE
-    shared = surer_field(context, initial, model, (state, air), float(ahead[-1]))
     if shared is not None:
         wind, drift = shared
         air = with_drift(air, drift[0])

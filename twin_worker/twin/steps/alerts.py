@@ -141,7 +141,7 @@ def reach_s(twin: Twin, prediction: Prediction) -> float:
     """
     if prediction.method == "imm":
         return _TURN_RATE_REACH_S
-    t, _ = twin.telemetry.history.rows("position")
+    t, _ = twin.telemetry.history.rows_since("position")
     is_new = not len(t) or twin.telemetry.history.newest - t[0] < _NEW_S
     is_uncertain = is_new and not twin.models.has_model and not is_hovering(twin)
     return _DEFAULT_REACH_S if is_uncertain or prediction.calibration.startswith(UNCALIBRATED) else _REACH_S

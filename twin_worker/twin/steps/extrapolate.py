@@ -162,7 +162,7 @@ def departure(twin: Twin) -> float:
         return inf
     part = slice(max(k - 2, 0), k + 1)
     path, between = rollout.path.numpy()[part].astype(float), ahead[part].astype(float)
-    nominal = np.array([np.interp(elapsed, between, column) for column in path.T])
+    nominal = path[-2] + (elapsed - between[-2]) / (between[-1] - between[-2]) * (path[-1] - path[-2])
     error = along_cross_down(track_frame(path, between)[-2], to_ned(rollout.ned_origin(), *rows[-1]) - nominal)
     near = int(ahead.searchsorted(_NEAR_S))
     return float(np.max(np.abs(error) / rollout.prediction_region_half_axes.numpy()[min(near, len(ahead) - 1)]))

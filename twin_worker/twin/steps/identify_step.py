@@ -278,8 +278,9 @@ def identify_and_verify(twin: Twin) -> list[Message]:
     twin.identification.conclude(verdict)
     if not publish:
         return []
-    twin.identification.conclude(with_diagnostics(verdict, plant, window, n_train))
-    shrinkage_sample = HeldOut(plant, window, n_train).shrinkage_sample(_RUN_S, _RUN_EVERY_S)
+    unseen = HeldOut(plant, window, n_train)
+    twin.identification.conclude(with_diagnostics(verdict, unseen))
+    shrinkage_sample = unseen.shrinkage_sample(_RUN_S, _RUN_EVERY_S)
     if shrinkage_sample is not None:
         twin.identification.shrinkage.update(*shrinkage_sample, window.dt)
     message = model_message(twin, window)

@@ -11,8 +11,8 @@ from fleet.contract import BatteryForecast, Mission
 from fleet.mission import route_items
 from twin_worker.prediction import kinematic
 from twin_worker.prediction.autopilot_parameters import ControllerTwin, RouteOverride, multirotor_controller
+from twin_worker.prediction.constant_turn import STEP, imm_with_variance
 from twin_worker.prediction.failsafe_route import FailsafePlan
-from twin_worker.prediction.method_selection import STEP, imm_with_variance
 from twin_worker.prediction.multirotor import fit, rollout
 from twin_worker.prediction.multirotor.config import MultirotorConfig, multirotor_config, with_wing_limits
 from twin_worker.prediction.multirotor.endurance import forecast_battery

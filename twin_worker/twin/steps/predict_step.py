@@ -22,7 +22,7 @@ from twin_worker.confidence.tube_and_horizon import AHEAD, NOMINAL_COVERAGE, Con
 from twin_worker.identification.fixed_wing.plant import DYNAMICS
 from twin_worker.prediction.autopilot_parameters import IDENTIFIED, ControllerTwin
 from twin_worker.prediction.closed_loop import MIN_ROLLOUT_S
-from twin_worker.prediction.method_selection import constant_turn_prediction
+from twin_worker.prediction.constant_turn import constant_turn_prediction
 from twin_worker.telemetry.track import Track
 from twin_worker.twin.state.events import record_event
 from twin_worker.twin.state.reported_path import reported_path

@@ -13,7 +13,13 @@ from twin_worker.numerics.interpolation import interpolate_rows
 from twin_worker.prediction.closed_loop import InitialCondition, fly_from, synchronise_controller
 from twin_worker.prediction.failsafe_route import with_failsafe
 from twin_worker.prediction.fixed_wing import ensemble
-from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_point_mass, in_field_wind
+from twin_worker.prediction.fixed_wing.path_wind import FIELD_SPAN_S
+from twin_worker.prediction.fixed_wing.point_mass_rollout import (
+    fly_point_mass,
+    in_field_wind,
+    start_in_field,
+)
+from twin_worker.prediction.method_selection import SCORE_AHEAD
 from twin_worker.prediction.replay_window import PredictionContext, Rollout
 from twin_worker.telemetry.track import Track
 from twin_worker.twin.state.budget import EARLY_FRACTION, Work
@@ -122,15 +128,20 @@ def select_method(
     due = not twin.telemetry.link_lost and selector.is_due(t)
     competes = newest.seq >= 0 and not twin.telemetry.link_lost and twin.prediction.override is None
     competes = competes and twin.config.method != PAPER  # which was selected
+    track, offset = recent.unbroken_tail(), t - float(recent.t[-1])
+    scored = ahead[: int(ahead.searchsorted(SCORE_AHEAD[-1])) + 1]
     if competes and (due or selector.best((*forecasts, *SIMPLE_METHODS)) in SIMPLE_METHODS):
-        simple = simple_paths(twin, recent.unbroken_tail(), ahead + (t - recent.t[-1]))
+        simple = simple_paths(twin, track, scored + offset)  # to the end only if it is chosen
         forecasts = forecasts | {
             name: PathForecast(path, name, SIMPLE_METHODS[name], newest.seq, "") for name, path in simple.items()
         }
     paths = {name: forecast.path for name, forecast in forecasts.items() if forecast.path is not None}
     if due and len(paths) > 1:
-        selector.add(t, float(np.linalg.norm(recent.v[-1])), ahead, paths)
+        scored_paths = {name: path[: len(scored)] for name, path in paths.items()}
+        selector.add(t, float(np.linalg.norm(recent.v[-1])), scored, scored_paths)
     chosen = forecasts[selector.best(tuple(forecasts))]
+    if chosen.method in SIMPLE_METHODS and len(scored) < len(ahead):
+        chosen = replace(chosen, path=simple_paths(twin, track, ahead + offset)[chosen.method])
     return replace(chosen, sentence="; ".join(filter(None, (selector.describe(chosen.method), chosen.sentence))))
 
 
@@ -157,18 +168,18 @@ def method_paths(
 ) -> tuple[dict[str, np.ndarray], str]:
     """Return the path of each method, NED (k, 3) [m], and the reason if another failed; `due`: run all methods."""
     by_method: dict[str, np.ndarray] = {}
-    reason = ""
+    reason, in_field = "", None
+    if twin.models.point_mass is not None:  # all methods compare both winds over the same path
+        in_field = start_in_field(*initial, twin.models.point_mass, max(float(ahead[-1]), FIELD_SPAN_S))
     if twin.models.point_mass is not None and twin.config.method in (HYBRID, "auto"):
-        rollout = fly_point_mass(*initial, twin.models.point_mass, ahead)
+        rollout = fly_point_mass(*initial, twin.models.point_mass, ahead, in_field)
         by_method, reason = _with_path(by_method, HYBRID, rollout), rollout.sentence
     needed = not by_method or due or twin.prediction.selector.best((BOTH, HYBRID, DYNAMICS)) != HYBRID
     if twin.models.active_model is not None and twin.config.method != HYBRID and needed:
         dynamics_ahead = (
             ahead[: np.searchsorted(ahead, max(_DYNAMICS_SPAN_S, ahead[0]), side="right")] if by_method else ahead
         )
-        start = initial[1]
-        if twin.models.point_mass is not None:
-            start = in_field_wind(*initial, twin.models.point_mass)
+        start = initial[1] if in_field is None else in_field_wind(initial[1], in_field)
         rollout = fly_from(start, twin.models.active_model, dynamics_ahead)
         reason = reason if by_method else rollout.sentence
         if rollout.path is not None:

@@ -259,7 +259,7 @@ def _route_points(twin: Twin, track: Track, seconds: float) -> np.ndarray | None
     if remaining is None:
         if twin.onboard.mission is None:
             return None
-        seq = items_in_force(track.t, twin.telemetry.history.rows("leg"), twin.onboard.mission)
+        seq = items_in_force(track.t, twin.telemetry.history.rows_since("leg"), twin.onboard.mission)
         if not np.isfinite(seq[-1]):
             return None
         items, jumps = route_items(twin.onboard.mission), twin.onboard.jumps_taken
