@@ -167,7 +167,7 @@ def _log_error_ratios(
         number of look-aheads; 0 where none is due, or telemetry has a gap at one
     """
     (start_t, scored_t, min_length), n, right = bounds, len(t), 0
-    flown, due = 0.0, 0
+    length, due = 0.0, 0
     north = east = down = 0.0
     out[:] = 0.0
     if start_t < t[0]:
@@ -188,13 +188,13 @@ def _log_error_ratios(
         down = positions[left, 2] + part * (positions[right, 2] - positions[left, 2])
         if k == 0:
             continue
-        flown += np.sqrt((north - north_before) ** 2 + (east - east_before) ** 2 + (down - down_before) ** 2)
+        length += np.sqrt((north - north_before) ** 2 + (east - east_before) ** 2 + (down - down_before) ** 2)
         if not time > scored_t:
             continue
         due += 1
         for m in range(len(paths)):
             square = (paths[m, k, 0] - north) ** 2 + (paths[m, k, 1] - east) ** 2 + (paths[m, k, 2] - down) ** 2
-            relative = np.sqrt(square) / max(flown, min_length)
+            relative = np.sqrt(square) / max(length, min_length)
             out[m] += np.log(_MIN_ERROR if relative < _MIN_ERROR else relative) - log_priors[m, k - 1]
     for m in range(len(paths)):
         out[m] /= max(due, 1)

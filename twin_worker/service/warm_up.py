@@ -29,7 +29,7 @@ from twin_worker.confidence.adaptive_conformal import AdaptiveLevels
 from twin_worker.confidence.prediction_log import PredictionLog
 from twin_worker.estimation.wind_filter import WindFilter, reported_direction
 from twin_worker.identification.fixed_wing.derivatives_model import identify, linearise
-from twin_worker.identification.fixed_wing.energy_balance import fit_attitude_lag
+from twin_worker.identification.fixed_wing.energy_balance import PointMassData, fit_attitude_lag, fit_turn_rate
 from twin_worker.identification.fixed_wing.plant import bias_corrected
 from twin_worker.identification.linear.linear_model import AXES, identify_axis
 from twin_worker.identification.multirotor.rotor_model import HIGH, free_run, start_states
@@ -148,6 +148,7 @@ def _run_point_mass(control: tuple[np.ndarray, np.ndarray, np.ndarray], window: 
     batch = [np.tile(row, (2, 1)) for row in (parameters, air, start)]
     point_mass.simulate_ensemble(control, *batch, noise, np.arange(0, 17, 4), np.empty((2, 5, 3)))  # type: ignore
     fit_attitude_lag(np.ascontiguousarray(window.x[:, 6]), window.x[:, 6])
+    fit_turn_rate(PointMassData(*(np.ones(len(window)),) * 11))
 
 
 def _run_multirotors() -> None:

@@ -128,6 +128,13 @@ def test_the_shadow_run_passes_over_what_is_missing():
     assert np.isfinite(ctl).all() and np.isnan(rms)
 
 
+def test_a_changed_result_does_not_change_the_next_one():
+    values, absent = ap.read({"NAVL1_PERIOD": 21.0, "RLL2SRV_P": 1.2})
+    expected = dict(values)
+    values["NAVL1_PERIOD"] = 0.0
+    assert ap.read({"NAVL1_PERIOD": 21.0, "RLL2SRV_P": 1.2, "OTHER": 1.0}) == (expected, absent)
+
+
 def test_old_names_are_read():
     old = {"LIM_ROLL_CD": 5500, "TRIM_ARSPD_CM": 1800, "ARSPD_FBW_MIN": 11, "ARSPD_FBW_MAX": 27, "LIM_PITCH_MAX": 2200}
     old |= {"LIM_PITCH_MIN": -1800, "TRIM_PITCH_CD": 150, "GLIDE_SLOPE_MIN": 12, "TRIM_THROTTLE": 40, "THR_MAX": 90}

@@ -64,6 +64,17 @@ def test_a_surer_field_moves_the_path_and_an_unsure_or_old_one_changes_nothing()
     np.testing.assert_array_equal(same, own)
 
 
+def test_a_shared_start_gives_the_same_path_also_over_a_shorter_span() -> None:
+    now = with_field(situation(), 4.0)
+    start = start_of(now)
+    span = float(AHEAD[-1])
+    path = fly_point_mass(now, start, known(), AHEAD).path
+    at_once = fly_point_mass(now, start, known(), AHEAD, start_in_field(now, start, known(), span)).path
+    longer = fly_point_mass(now, start, known(), AHEAD, start_in_field(now, start, known(), span + 60.0)).path
+    np.testing.assert_array_equal(at_once, path)
+    np.testing.assert_allclose(longer, path, atol=1e-9)
+
+
 def test_the_ensemble_spreads_less_in_a_sure_field() -> None:
     now = situation()
     start = start_of(now)

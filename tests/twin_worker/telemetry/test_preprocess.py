@@ -9,7 +9,7 @@ from fleet.telemetry.tables.row import MAX_MAGNITUDE
 from tests.support import flights as f
 from tests.support.flights import T0
 from twin_worker.telemetry.history import TelemetryHistory
-from twin_worker.telemetry.resample import interpolate_samples, lagrange, preprocess
+from twin_worker.telemetry.resample import _median_gap, _unwrap_angles, interpolate_samples, lagrange, preprocess
 
 PLAIN = servo_map({})
 CALM = np.zeros(3)
@@ -125,6 +125,18 @@ def test_fill_marks_lost_and_never_fills_the_long_gap():
     assert not ok[long].any() and ok[~long].all()
     assert not lost[long].any() and not lost[~(short | long)].any()
     assert np.abs(y[ok, 0] - np.sin(grid[ok])).max() < 0.02
+
+
+@pytest.mark.parametrize("n", [4, 5, 40, 301])
+def test_median_gap_and_unwrapped_angles_are_those_of_numpy(n):
+    rng = np.random.default_rng(n)
+    t = np.cumsum(rng.choice([0.04, 0.1, 0.11, 0.7], n))
+    assert _median_gap(t, np.empty(n - 1)) == np.median(np.diff(t))
+    x = np.cumsum(rng.uniform(-4.0, 4.0, (n, 6)), axis=0)
+    x[1, 0] = x[0, 0] + np.pi  # the ambiguous step
+    out = np.empty_like(x)
+    _unwrap_angles(x, out)
+    assert np.array_equal(out, np.hstack([np.unwrap(x[:, :3], axis=0), x[:, 3:]]))
 
 
 def test_fill_does_not_reach_beyond_the_ends():
