@@ -1,5 +1,7 @@
 """The fleet as arrays, what of it is drawn, and the labels: level of detail without a browser."""
 
+import copy
+
 import numpy as np
 import pytest
 
@@ -228,7 +230,7 @@ def test_samples_read_together_change_the_same_as_samples_read_one_by_one(
             for part in (k, k + 0.5):
                 messages = [(uav, payload, encoding(Sample), None) for uav, payload in mixed_samples(n, int(2 * part))]
                 feed._receiver(Sample)(messages[:: 1 if part == k else 7])
-            queued = [(uav, message) for uav, (_, messages) in feed.inbox._pending.items() for message in messages]
+            queued = copy.deepcopy(feed.inbox).take()
             read, _ = SampleReader().read(queued, feed._vehicles, feed.scene_frame)
             together += len(read)
             feed.poses(tuple(feed.uavs))

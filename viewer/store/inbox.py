@@ -114,40 +114,73 @@ class CoalescingQueue:
 
 
 class Inbox(CoalescingQueue):
-    """Queue of samples."""
+    """Queue of samples: those to keep, in order, then the newest of each UAV of a large fleet.
+
+    Most samples of a large fleet are replaced before they are read: they are queued by operations on whole batches.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.large_fleet = False
         self.full_rate_uavs: frozenset[int] = frozenset()  # UAVs of which every sample is kept, also in a large fleet
         self.dropped = 0  # messages without a UAV id, or beyond the limit
-        self._leg_changed_uavs: set[int] = set()  # UAVs whose last queued sample changes the mission item
+        self._newest: dict[int, bytes] = {}  # payload of the newest sample, after those to keep
+        self._arrived: dict[int, float] = {}  # its arrival, monotonic [s]
+        self._since: dict[int, float] = {}  # arrival of the first sample queued of each UAV, monotonic [s]
         self._last_leg: dict[int, bytes] = {}  # last mission item of each UAV
         self._no_leg_at: dict[int, int] = {}  # place of `_NO_LEG` in samples without a mission item, by their size
 
     def put(self, samples: list[RawMessage], now: float) -> None:
         """Queue samples in order of arrival."""
-        leg_changed, full_rate_uavs, large_fleet = self._leg_changed_uavs, self.full_rate_uavs, self.large_fleet
-        queued_of, no_leg_at = self._pending.get, self._no_leg_at.get
+        if self.large_fleet and len(self._since) + len(samples) <= MAX_UAVS:
+            samples = self._replace(samples, now)
         for uav, payload, _, _ in samples:
-            if uav is None:
+            if uav is None or (uav not in self._since and len(self._since) >= MAX_UAVS):
                 self.dropped += 1
+            else:
+                self._put(uav, payload, now)
+
+    def _replace(self, samples: list[RawMessage], now: float) -> list[RawMessage]:
+        """Replace the newest samples; return those of UAVs of which one may have to be kept."""
+        no_leg_at, special = self._no_leg_at.get, {None, *self.full_rate_uavs}
+        special.update(
+            uav
+            for uav, payload, _, _ in samples
+            if not payload.startswith(_NO_LEG, no_leg_at(len(payload), len(payload)))  # reads no more of the payload
+        )
+        newest: dict[Any, bytes] = {uav: payload for uav, payload, _, _ in samples if uav not in special}
+        arrived = dict.fromkeys(newest, now)
+        self._newest.update(newest)
+        self._arrived.update(arrived)
+        self._since = arrived | self._since
+        return [message for message in samples if message[0] in special]
+
+    def _put(self, uav: int, payload: bytes, now: float) -> None:
+        self._since.setdefault(uav, now)
+        is_full_rate = not self.large_fleet or uav in self.full_rate_uavs
+        is_new_leg = self.large_fleet and self._is_new_leg(uav, payload)
+        if not (is_full_rate or is_new_leg):
+            self._newest[uav], self._arrived[uav] = payload, now
+            return
+        before, arrived = self._newest.pop(uav, None), self._arrived.pop(uav, now)
+        if before is not None and is_full_rate:
+            self.add(uav, QueuedMessage(before, arrived), keep=True)
+        self.add(uav, QueuedMessage(payload, now), keep=True)
+
+    def take(self, uavs: Iterable[int] | None = None) -> list[tuple[int, QueuedMessage]]:
+        """Remove and return the samples of all or some UAVs, each UAV in order of arrival."""
+        taken: list[tuple[int, QueuedMessage]] = []
+        for uav in list(self._since) if uavs is None else uavs:
+            if self._since.pop(uav, None) is None:
                 continue
-            is_new_leg = (
-                large_fleet
-                and not payload.startswith(_NO_LEG, no_leg_at(len(payload), len(payload)))  # reads no more than this
-                and self._is_new_leg(uav, payload)
-            )
-            keep = not large_fleet or uav in full_rate_uavs or uav in leg_changed
-            if not (keep or is_new_leg) and (queued := queued_of(uav)) is not None:  # most samples of a large fleet
-                queued[1][-1] = QueuedMessage(payload, now)
-                continue
-            if not self.add(uav, QueuedMessage(payload, now), keep=keep):
-                self.dropped += 1
-                continue
-            leg_changed.discard(uav)
-            if is_new_leg:
-                leg_changed.add(uav)
+            taken += super().take((uav,)) if uav in self._pending else ()
+            if (payload := self._newest.pop(uav, None)) is not None:
+                taken.append((uav, QueuedMessage(payload, self._arrived.pop(uav))))
+        return taken
+
+    def waiting_since(self, before: float) -> list[int]:
+        """Return the UAVs with a sample queued since before a time, monotonic [s], the earliest first."""
+        return sorted((uav for uav, since in self._since.items() if since <= before), key=self._since.__getitem__)
 
     def _is_new_leg(self, uav: int, payload: bytes) -> bool:
         """Return whether a sample changes the mission item; True when it cannot be decoded."""
