@@ -123,7 +123,7 @@ class Inbox(CoalescingQueue):
         self.large_fleet = False
         self.full_rate_uavs: frozenset[int] = frozenset()  # UAVs of which every sample is kept, also in a large fleet
         self.dropped = 0  # messages without a UAV id, or beyond the limit
-        self._kept: dict[int, list[QueuedMessage]] = {}  # before the newest
+        self._retained: dict[int, list[QueuedMessage]] = {}  # before the newest
         self._last_leg: dict[int, bytes] = {}  # last mission item of each UAV
         self._no_leg_at: dict[int, int] = {}  # place of `_NO_LEG` in samples without a mission item, by their size
 
@@ -152,15 +152,15 @@ class Inbox(CoalescingQueue):
 
     def _put(self, uav: int, message: QueuedMessage) -> bool:
         """Queue one sample and keep it where it must be read; return False beyond `MAX_UAVS`."""
-        is_kept = not self.large_fleet or uav in self.full_rate_uavs
-        before = self._newest.get(uav) if is_kept else None
-        is_kept = is_kept or self._is_new_leg(uav, message.payload)
+        is_retained = not self.large_fleet or uav in self.full_rate_uavs
+        before = self._newest.get(uav) if is_retained else None
+        is_retained = is_retained or self._is_new_leg(uav, message.payload)
         if not self.add(uav, message):
             return False
-        if is_kept:
-            kept = self._kept.setdefault(uav, [])
-            kept += [self._newest.pop(uav)] if before is None else [before, self._newest.pop(uav)]
-            del kept[MAX_QUEUED - 1 : -1]  # the newest replaces the last
+        if is_retained:
+            retained = self._retained.setdefault(uav, [])
+            retained += [self._newest.pop(uav)] if before is None else [before, self._newest.pop(uav)]
+            del retained[MAX_QUEUED - 1 : -1]  # the newest replaces the last
         return True
 
     def take(self, uavs: Iterable[int] | None = None) -> list[tuple[int, QueuedMessage]]:
@@ -169,8 +169,8 @@ class Inbox(CoalescingQueue):
         for uav in list(self._since) if uavs is None else uavs:
             if self._since.pop(uav, None) is None:
                 continue
-            if uav in self._kept:
-                taken += [(uav, message) for message in self._kept.pop(uav)]
+            if uav in self._retained:
+                taken += [(uav, message) for message in self._retained.pop(uav)]
             if (newest := self._newest.pop(uav, None)) is not None:
                 taken.append((uav, newest))
         return taken
