@@ -1,5 +1,7 @@
 """The fleet as arrays, what of it is drawn, and the labels: level of detail without a browser."""
 
+import copy
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ from viewer.scene.selection.pins import BAND_SIGMA, sample_paths
 from viewer.scene.selection.selected import active_seq
 from viewer.server.app import Backfill
 from viewer.store.forecast import LOOK_AHEADS_S, prediction_errors, rms_by_look_ahead
-from viewer.store.inbox import Inbox
+from viewer.store.inbox import MAX_QUEUED, MAX_UAVS, Inbox
 from viewer.store.sample_layout import MIN_TOGETHER, SampleReader
 from viewer.store.store import COALESCE_S, FleetStore
 from viewer.text.missed_events import Absence, missed_events, missed_events_html
@@ -127,6 +129,23 @@ def test_in_a_crowd_the_newest_sample_and_news_of_the_mission_are_read() -> None
     assert box.dropped == 1
 
 
+@pytest.mark.parametrize("large_fleet", [False, True])
+def test_samples_to_be_kept_and_uavs_are_limited(*, large_fleet: bool) -> None:
+    box = Inbox()
+    box.large_fleet, box.full_rate_uavs = large_fleet, frozenset({1})
+    payloads = [encode(Sample(uav=1, t=T + k)) for k in range(MAX_QUEUED + 5)]
+    box.put([(1, payload, "", None) for payload in payloads], 0.0)
+    assert [message.payload for _, message in box.take((1,))] == [*payloads[: MAX_QUEUED - 1], payloads[-1]]
+    box.put([(uav, payloads[0], "", None) for uav in range(MAX_UAVS + 3)], 1.0)
+    assert box.dropped == 3 and len(box.take()) == MAX_UAVS
+    box.full_rate_uavs = frozenset()
+    box.put([(2, payloads[0], "", None)], 2.0)
+    box.full_rate_uavs = frozenset({2})
+    for k in (1, 2):
+        box.put([(2, payloads[k], "", None)], 2.0 + k)
+    assert [message.now for _, message in box.take((2,))] == [2.0, 3.0, 4.0]  # the one before is kept, too
+
+
 def test_to_ask_for_the_past_of_some_of_a_crowd_nobody_is_read(clock: Clock) -> None:
     feed, _, bus = crowd_of(clock, LARGE_FLEET + 1)
     for message in fixes(LARGE_FLEET + 1, T + 1, 900):
@@ -228,7 +247,7 @@ def test_samples_read_together_change_the_same_as_samples_read_one_by_one(
             for part in (k, k + 0.5):
                 messages = [(uav, payload, encoding(Sample), None) for uav, payload in mixed_samples(n, int(2 * part))]
                 feed._receiver(Sample)(messages[:: 1 if part == k else 7])
-            queued = [(uav, message) for uav, (_, messages) in feed.inbox._pending.items() for message in messages]
+            queued = copy.deepcopy(feed.inbox).take()
             read, _ = SampleReader().read(queued, feed._vehicles, feed.scene_frame)
             together += len(read)
             feed.poses(tuple(feed.uavs))

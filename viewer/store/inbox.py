@@ -85,69 +85,95 @@ class QueuedMessage(msgspec.Struct, frozen=True, gc=False):  # thousands per sec
 
 
 class CoalescingQueue:
-    """Queue of messages per UAV, in order of the first one; the caller must own one common lock to fill or empty it."""
+    """Newest message of each UAV; the caller must own one common lock to fill or empty it."""
 
     def __init__(self) -> None:
-        self._pending: dict[int, tuple[float, list[QueuedMessage]]] = {}  # arrival of the first, monotonic [s]
+        self._newest: dict[int, QueuedMessage] = {}
+        self._since: dict[int, float] = {}  # arrival of the first message queued of each UAV, in order, monotonic [s]
 
-    def add(self, uav: int, message: QueuedMessage, *, keep: bool = False) -> bool:
-        """Queue a message in place of the previous one, or with `keep` after it; return False beyond `MAX_UAVS`."""
-        pending = self._pending.get(uav)
-        if pending is None:
-            if len(self._pending) >= MAX_UAVS:
+    def add(self, uav: int, message: QueuedMessage) -> bool:
+        """Queue a message in place of the previous one; return False beyond `MAX_UAVS`."""
+        if uav not in self._since:
+            if len(self._since) >= MAX_UAVS:
                 return False
-            self._pending[uav] = message.now, [message]
-        elif keep and len(pending[1]) < MAX_QUEUED:
-            pending[1].append(message)
-        else:
-            pending[1][-1] = message
+            self._since[uav] = message.now
+        self._newest[uav] = message
         return True
 
     def take(self, uavs: Iterable[int] | None = None) -> list[tuple[int, QueuedMessage]]:
-        """Remove and return the messages of all or some UAVs, each UAV in order of arrival."""
-        taken = [(uav, self._pending.pop(uav, None)) for uav in (list(self._pending) if uavs is None else uavs)]
-        return [(uav, message) for uav, pending in taken if pending is not None for message in pending[1]]
+        """Remove and return the messages of all or some UAVs."""
+        queued = [
+            uav for uav in (list(self._since) if uavs is None else uavs) if self._since.pop(uav, None) is not None
+        ]
+        return [(uav, self._newest.pop(uav)) for uav in queued]
 
     def waiting_since(self, before: float) -> list[int]:
-        """Return the UAVs with a message queued since before a time, monotonic [s]."""
-        return [uav for uav, _ in takewhile(lambda item: item[1][0] <= before, self._pending.items())]
+        """Return the UAVs with a message queued since before a time, monotonic [s], the earliest first."""
+        return [uav for uav, _ in takewhile(lambda item: item[1] <= before, self._since.items())]
 
 
 class Inbox(CoalescingQueue):
-    """Queue of samples."""
+    """Queue of samples: those to keep, in order, then the newest of each UAV of a large fleet.
+
+    Most samples of a large fleet are replaced before they are read: they are queued by operations on whole batches.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.large_fleet = False
         self.full_rate_uavs: frozenset[int] = frozenset()  # UAVs of which every sample is kept, also in a large fleet
         self.dropped = 0  # messages without a UAV id, or beyond the limit
-        self._leg_changed_uavs: set[int] = set()  # UAVs whose last queued sample changes the mission item
+        self._retained: dict[int, list[QueuedMessage]] = {}  # before the newest
         self._last_leg: dict[int, bytes] = {}  # last mission item of each UAV
         self._no_leg_at: dict[int, int] = {}  # place of `_NO_LEG` in samples without a mission item, by their size
 
     def put(self, samples: list[RawMessage], now: float) -> None:
         """Queue samples in order of arrival."""
-        leg_changed, full_rate_uavs, large_fleet = self._leg_changed_uavs, self.full_rate_uavs, self.large_fleet
-        queued_of, no_leg_at = self._pending.get, self._no_leg_at.get
+        if self.large_fleet and len(self._since) + len(samples) <= MAX_UAVS:
+            samples = self._add_all(samples, now)
         for uav, payload, _, _ in samples:
-            if uav is None:
+            if uav is None or not self._put(uav, QueuedMessage(payload, now)):
                 self.dropped += 1
+
+    def _add_all(self, samples: list[RawMessage], now: float) -> list[RawMessage]:
+        """Add samples as `add` does; return those of UAVs of which one may have to be kept."""
+        no_leg_at, special = self._no_leg_at.get, {None, *self.full_rate_uavs}
+        special.update(
+            uav
+            for uav, payload, _, _ in samples
+            if not payload.startswith(_NO_LEG, no_leg_at(len(payload), len(payload)))  # reads no more of the payload
+        )
+        newest: dict[Any, QueuedMessage] = {
+            uav: QueuedMessage(payload, now) for uav, payload, _, _ in samples if uav not in special
+        }
+        self._newest.update(newest)
+        self._since.update(dict.fromkeys(newest.keys() - self._since.keys(), now))
+        return [message for message in samples if message[0] in special]
+
+    def _put(self, uav: int, message: QueuedMessage) -> bool:
+        """Queue one sample and keep it where it must be read; return False beyond `MAX_UAVS`."""
+        is_retained = not self.large_fleet or uav in self.full_rate_uavs
+        before = self._newest.get(uav) if is_retained else None
+        is_retained = is_retained or self._is_new_leg(uav, message.payload)
+        if not self.add(uav, message):
+            return False
+        if is_retained:
+            retained = self._retained.setdefault(uav, [])
+            retained += [self._newest.pop(uav)] if before is None else [before, self._newest.pop(uav)]
+            del retained[MAX_QUEUED - 1 : -1]  # the newest replaces the last
+        return True
+
+    def take(self, uavs: Iterable[int] | None = None) -> list[tuple[int, QueuedMessage]]:
+        """Remove and return the samples of all or some UAVs, each UAV in order of arrival."""
+        taken: list[tuple[int, QueuedMessage]] = []
+        for uav in list(self._since) if uavs is None else uavs:
+            if self._since.pop(uav, None) is None:
                 continue
-            is_new_leg = (
-                large_fleet
-                and not payload.startswith(_NO_LEG, no_leg_at(len(payload), len(payload)))  # reads no more than this
-                and self._is_new_leg(uav, payload)
-            )
-            keep = not large_fleet or uav in full_rate_uavs or uav in leg_changed
-            if not (keep or is_new_leg) and (queued := queued_of(uav)) is not None:  # most samples of a large fleet
-                queued[1][-1] = QueuedMessage(payload, now)
-                continue
-            if not self.add(uav, QueuedMessage(payload, now), keep=keep):
-                self.dropped += 1
-                continue
-            leg_changed.discard(uav)
-            if is_new_leg:
-                leg_changed.add(uav)
+            if uav in self._retained:
+                taken += [(uav, message) for message in self._retained.pop(uav)]
+            if (newest := self._newest.pop(uav, None)) is not None:
+                taken.append((uav, newest))
+        return taken
 
     def _is_new_leg(self, uav: int, payload: bytes) -> bool:
         """Return whether a sample changes the mission item; True when it cannot be decoded."""
