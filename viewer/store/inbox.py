@@ -1,7 +1,7 @@
 """Queues of undecoded messages: a small fleet decodes every sample, a large fleet the newest of each UAV.
 
-Samples that change the mission item are always decoded. Decoding costs ten times as much as queueing, so of a large
-fleet only what is drawn is decoded.
+Samples that change the mission item are always decoded. Decoding costs more than ten times as much as queueing, so of a
+large fleet only what is drawn is decoded.
 """
 
 import struct

@@ -1,6 +1,6 @@
 """Read samples of many UAVs together: payloads of one layout differ in their values alone.
 
-Decoded one by one, a sample of a large fleet takes four times as long.
+Reading 32 samples together takes half as long as decoding them one by one, eight as long.
 """
 
 from typing import Any, NamedTuple
