@@ -10,6 +10,7 @@ import numba as nb
 import numpy as np
 
 from fleet.airframes.airframe import ServoMap
+from fleet.compiled_frames import wrap
 from fleet.frames import Origin, to_ned
 from fleet.window import INPUTS, LONGEST_GAP, STATES, Window, longest_gap
 from twin_worker.telemetry.history import TelemetryHistory
@@ -308,7 +309,7 @@ def _resample_rows(
     return values, ok, filled
 
 
-@nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath: as `numpy.unwrap` has it
+@nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath: as `numpy.unwrap`
 def _unwrap_angles(x: np.ndarray, out: np.ndarray) -> None:
     """Copy rows, (m, 6), with their first three columns unwrapped."""
     for j in range(x.shape[1]):
@@ -317,8 +318,7 @@ def _unwrap_angles(x: np.ndarray, out: np.ndarray) -> None:
             if k > 0 and j < 3:
                 step = x[k, j] - x[k - 1, j]
                 if not abs(step) < pi:  # a nan spreads to all later rows
-                    wrapped = (step + pi) % (2.0 * pi) - pi
-                    correction += (pi if wrapped == -pi and step > 0.0 else wrapped) - step
+                    correction += wrap(step) - step
             out[k, j] = x[k, j] + correction
 
 

@@ -21,7 +21,7 @@ from twin_worker.diagnosis.data import flight
 from twin_worker.diagnosis.data import flight as smooth
 from twin_worker.diagnosis.data.card import UNKNOWN
 from twin_worker.evaluation.replay import run_offline
-from twin_worker.prediction import method_selection as turn_rate
+from twin_worker.prediction import constant_turn as turn_rate
 from twin_worker.prediction.multirotor import fit as tilt
 from twin_worker.telemetry import resample
 from twin_worker.telemetry.history import TelemetryHistory
