@@ -242,8 +242,8 @@ def _common_settings(mode: str, *, connect: list[str], listen: list[str]) -> dic
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
         "transport/link/tx/lease": 1000,
         "transport/link/tx/keep_alive": 4,
-        "transport/link/tx/queue/size/data_high": 16,  # batches of 64 kB: replies about 1,000 aircraft come at once
-        "transport/link/tx/queue/size/data": 16,  # and their samples
+        "transport/link/tx/queue/size/data_high": 16,  # buffers of 64 kB: replies about 1,000 aircraft come at once
+        "transport/link/tx/queue/size/data": 16,  # samples of 1,000 aircraft come at once
         "transport/link/tx/queue/size/data_low": 16,  # enough for large replies on a busy machine
         f"{_CONGESTION}/drop/max_wait_before_drop_fragments": 500_000,  # total for a large reply [us]
         "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,

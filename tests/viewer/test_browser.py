@@ -332,7 +332,7 @@ def test_an_empty_page_says_what_it_waits_for(page) -> None:
     try:
         page.goto(f"http://127.0.0.1:{other.port}/?fixedDpr=0.5")
         page.get_by_text("No aircraft yet").wait_for(timeout=PATIENCE_MS)
-        assert "parauav/*/sample" in page.inner_text("body")
+        assert "parauav/@fleet/sample/*" in page.inner_text("body")
         aligned = "getComputedStyle(document.querySelector('.uav.empty .value')).textAlign"
         assert page.evaluate(aligned) == "left"  # sentences of several lines
     finally:

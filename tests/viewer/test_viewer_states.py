@@ -112,7 +112,9 @@ def test_no_fleet_is_said_with_what_is_received_and_what_to_check(clock: Clock) 
     feed = FleetStore(MemoryBus(), clock)
     clock.now += 42
     page = empty_html(feed, clock.now)
-    assert all(text in page for text in ("No aircraft yet", "parauav/*/sample", "42 s", "0 messages", "`fleet up`"))
+    assert all(
+        text in page for text in ("No aircraft yet", "parauav/@fleet/sample/*", "42 s", "0 messages", "`fleet up`")
+    )
     assert "start `twin_worker`" in page and "none found yet; its first start compiles" in page
 
 

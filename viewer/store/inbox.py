@@ -136,7 +136,7 @@ class Inbox(CoalescingQueue):
                 self.dropped += 1
 
     def _add_all(self, samples: list[RawMessage], now: float) -> list[RawMessage]:
-        """Add samples as `add` does; return those of UAVs of which one may have to be kept."""
+        """Add samples as `add` does; return those of UAVs of which more than the newest may be read."""
         no_leg_at, special = self._no_leg_at.get, {None, *self.full_rate_uavs}
         special.update(
             uav

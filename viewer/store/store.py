@@ -23,6 +23,7 @@ from fleet.contract import (
     Prediction,
     Proposal,
     Sample,
+    Samples,
     Status,
     TwinState,
 )
@@ -189,7 +190,7 @@ class FleetStore:
     @property
     def sample_key(self) -> str:
         """Return the key expression of samples."""
-        return key_of(Sample, "*")
+        return key_of(Samples, "*")
 
     def request_latest(self) -> None:
         """Request the latest messages published before the start; keep newer ones."""
